@@ -26,7 +26,7 @@ from pdhef_logtool.logs.decoding import (
     missing_column,
 )
 from pdhef_logtool.logs.definitions import SHIPPED
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window, nearest
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import (
     FieldInfo,
     MessageSchema,
@@ -35,6 +35,7 @@ from pdhef_logtool.logs.message_schema import (
     SchemaError,
     Selection,
     leaves,
+    nearest,
     resolve,
     stated_units,
 )
@@ -50,6 +51,8 @@ from pdhef_logtool.storage.files import scratch_folder, write_bytes
 _KEPT_BYTES, _LARGE_BYTES = 16 << 20, 16 << 10
 #: Columns of expected fields are kept up to this size.
 _COLUMN_BYTES = 64 << 20
+#: What of a span is lost: all of it.
+_ALL = ""
 #: A message in the text of a DBC file.
 _DBC = re.compile(r"^BO_ \d+ \w+ *:", re.MULTILINE)
 
@@ -84,22 +87,19 @@ class ColumnarLog(DriveLog):
         self._custom = custom
         self.distro = distro
         self.definitions = SHIPPED  # of types that the log does not define; set before anything is read
-        self._damaged: dict[tuple[int, int], Loss] = {}
         # Messages that do not decode, by container, channel and span: a repeated read must not count them again.
         self._undecodable: dict[tuple[int, int, int], IntArray] = {}
         self._by_topic: dict[str, list[tuple[int, ChannelRecord]]] = {}
         for c, container in enumerate(self.containers):
             for channel in container.channels.values():
                 self._by_topic.setdefault(channel.topic, []).append((c, channel))
-        self._rank = [{id_: i for i, id_ in enumerate(container.channels)} for container in self.containers]
         self._seen: set[tuple[int, int, frozenset[int] | None]] = set()  # what was loaded before
         self._late: dict[int, dict[int, Span]] = {}  # spans for which no time was left, by container
-        self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
+        self._found: dict[tuple[int, int, object], Loss] = {}  # in a container and span: of all of it, or of what
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._fields: dict[tuple[int, int], tuple[FieldInfo, ...]] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
         self._asked: set[tuple[int, int]] = set()  # channels that were requested or listed
-        self._wanted: set[tuple[int, int]] = set()  # channels with requested messages
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -107,7 +107,6 @@ class ColumnarLog(DriveLog):
         self._expected: dict[str, _Plan] = {}  # by topic
         self._columns: dict[tuple[int, int], dict[int, Columns]] = {}  # of expected topics, by span and channel
         self._column_bytes = 0
-        self._databases: tuple[Path, ...] | None = None
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
     @property
@@ -117,7 +116,7 @@ class ColumnarLog(DriveLog):
         for c, container in enumerate(self.containers):
             names = {id_: channel.topic for id_, channel in container.channels.items()}
             for span in container.spans:
-                if (c, span.index) not in self._damaged:
+                if (c, span.index, _ALL) not in self._found:
                     for id_, n in span.counts.items():
                         counts[names[id_]] += n
         firsts = ((name, channels[0][1]) for name, channels in sorted(self._by_topic.items()))
@@ -144,37 +143,32 @@ class ColumnarLog(DriveLog):
     def lost(self) -> tuple[Loss, ...]:
         """Losses so far."""
         losses = [*self._opened_lost, *self.recording_span.losses]
-        damaged, schemas = sorted(self._damaged.items()), sorted(self._schemas.items())
+        undecodable: Counter[tuple[int, int]] = Counter()
+        for (c, channel, _), rows in self._undecodable.items():
+            undecodable[c, channel] += len(rows)
         for c, container in enumerate(self.containers):
             losses.extend(container.lost)
-            losses.extend(loss for (of, _), loss in damaged if of == c)
-            losses.extend(loss for (of, _, _), loss in self._partial.items() if of == c)
+            losses.extend(loss for (of, _, _), loss in self._found.items() if of == c)
             if c in self._late:
                 losses.append(_out_of_time(container, list(self._late[c].values())))
-            losses.extend(self._undecodable_losses(c, container))
-            for (of, channel), schema in schemas:
-                if of != c:
-                    continue
-                topic = container.channels[channel].topic
-                is_bad = isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError)
-                if is_bad and (c, channel) in self._asked:
-                    losses.append(Loss("bad-schema", f"its messages cannot be decoded: {schema}", topic))
-                if (c, channel) in self._wanted and isinstance(schema, MessageSchema) and schema.borrowed:
-                    what = (
-                        f"read by {', '.join(map(str, schema.borrowed))} of this machine, as the log does not define "
-                    )
-                    what += "its type: correct only if they match the recorded version"
-                    losses.append(Loss("borrowed-definition", what, topic, severity="note"))
+            for of, channel in sorted(self._asked):
+                if of == c:
+                    losses.extend(self._channel_losses(c, container.channels[channel], undecodable[c, channel]))
         return tuple(losses)
 
-    def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
-        counts: Counter[int] = Counter()
-        for (of, channel, _), rows in self._undecodable.items():
-            if of == c and (of, channel) in self._wanted:
-                counts[channel] += len(rows)
-        for channel, n in sorted(counts.items()):
-            what = f"{n} messages do not fit the type of their topic"
-            yield Loss("undecodable", what, container.channels[channel].topic, count=n)
+    def _channel_losses(self, c: int, channel: ChannelRecord, undecodable: int) -> Iterator[Loss]:
+        """Yield what is lost and noted of the messages of one channel."""
+        schema = self._schemas.get((c, channel.id))
+        if undecodable:
+            what = f"{undecodable} messages do not fit the type of their topic"
+            yield Loss("undecodable", what, channel.topic, count=undecodable)
+        if isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
+            yield Loss("bad-schema", f"its messages cannot be decoded: {schema}", channel.topic)
+        if isinstance(schema, MessageSchema) and schema.borrowed:
+            files = ", ".join(map(str, schema.borrowed))
+            what = f"read by {files} of this machine, as the log does not define its type: correct only if they match"
+            what += " the recorded version"
+            yield Loss("borrowed-definition", what, channel.topic, severity="note")
 
     @property
     def messages(self) -> ColumnarLog | None:
@@ -190,20 +184,16 @@ class ColumnarLog(DriveLog):
     @property
     def databases(self) -> tuple[Path, ...]:
         """The DBC files given with the log, otherwise those among its attachments and metadata."""
-        if self.given_databases:
-            return self.given_databases
-        if self._databases is None:
-            stored = [(a.name, a.data) for a in self.attachments() if a.name.endswith(".dbc")]
-            texts = [
-                (r.name, k, text)
-                for r in self.metadata_records()
-                for k, text in r.metadata.items()
-                if _DBC.search(text)
-            ]
-            names = [key if key.endswith(".dbc") else f"{name}.{key}.dbc" for name, key, _ in texts]
-            stored += [(name, text.encode()) for name, (_, _, text) in zip(names, texts, strict=True)]
-            self._databases = tuple(self._extract(name, data) for name, data in stored)
-        return self._databases
+        return self.given_databases or self._stored_databases
+
+    @cached_property
+    def _stored_databases(self) -> tuple[Path, ...]:
+        stored = [(a.name, a.data) for a in self.attachments() if a.name.endswith(".dbc")]
+        entries = ((r.name, key, text) for r in self.metadata_records() for key, text in r.metadata.items())
+        for name, key, text in entries:
+            if _DBC.search(text):
+                stored.append((key if key.endswith(".dbc") else f"{name}.{key}.dbc", text.encode()))
+        return tuple(self._extract(name, data) for name, data in stored)
 
     def definition(self, path: Path) -> Path:
         """Return the file of a definition in the log; a name without a folder is an attached file."""
@@ -325,9 +315,7 @@ class ColumnarLog(DriveLog):
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         self.expect({topic: paths for topic, paths in requests.items() if topic in self._expected})
         if not quiet:
-            wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
-            self._asked |= wanted
-            self._wanted |= wanted
+            self._asked |= {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
         plans |= {topic: _Plan((), {}) for topic in stamps if topic not in plans}
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
         request = _Request(plans, self._expected if self._column_bytes < _COLUMN_BYTES else {}, window_ns)
@@ -376,7 +364,7 @@ class ColumnarLog(DriveLog):
         container = self.containers[c]
         want = want if container.selective else None
         key = (c, span.index)
-        if key in self._damaged:
+        if (*key, _ALL) in self._found:
             return None
         kept = self._kept.get((*key, want))
         if kept is not None and (not kept.dropped if payloads is None else kept.dropped.isdisjoint(payloads)):
@@ -396,7 +384,7 @@ class ColumnarLog(DriveLog):
             kind, text = describe_damage(error)
             count = sum(span.counts.values()) or None
             what = f"{count_text(count)} lost at byte {extent[0]}: {text}"
-            self._damaged[key] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
+            self._found[*key, _ALL] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
             return None
         if (*key, want) not in self._seen:
             self._seen.add((*key, want))
@@ -431,7 +419,7 @@ class ColumnarLog(DriveLog):
             if count > 0:
                 what = f"{count} messages {text}, at byte {start}"
                 loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
-                self._partial[c, span.index, (kind, want)] = loss
+                self._found[c, span.index, (kind, want)] = loss
 
     def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         """Return the schema of a channel of the c-th container, or the reason why it is unknown."""
@@ -529,8 +517,7 @@ class ColumnarLog(DriveLog):
             if block is None:
                 return
             stored = stored | self._decode_span(request, c, span, block)
-        for id_ in sorted(stored, key=lambda id_: self._rank[c].get(id_, -1)):
-            columns = stored[id_]
+        for _, columns in sorted(stored.items()):
             if columns.topic in plans:
                 keep = in_window(columns.log_time_ns, *request.window_ns)
                 parts[columns.topic].append(columns if keep is None else columns.rows(keep))
@@ -574,7 +561,7 @@ class ColumnarLog(DriveLog):
             kind, text = describe_damage(error)
             kind = "undecodable" if kind == "bad-chunk" else kind
             what = f"{len(rows)} messages cannot be decoded: {text}"
-            self._partial[c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
+            self._found[c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
             return None
         if decoder is not None and decoder.undecodable:
             key = (c, id_, span.index)

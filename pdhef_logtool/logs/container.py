@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from mcap.records import Attachment, Metadata
+from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -38,20 +40,24 @@ _RECORDS_A_CHECK = 256  # of the time that a walk takes
 
 @dataclass(frozen=True, slots=True)
 class ChannelRecord:
-    """One channel of a file. Several channels may carry the same topic.
-
-    ``type_name`` is in ROS 2 form for ROS messages; ``schema_name`` is as the file has it.
-    """
+    """One channel of a file. Several channels may carry the same topic."""
 
     id: int
     topic: str
-    type_name: str
     encoding: str  # "cdr" | "ros1" | "json" | "protobuf" | ...
-    schema_name: str
+    schema_name: str  # as the file has it
     schema_encoding: str  # "ros2msg" | "ros2idl" | "ros1msg" | "jsonschema" | "protobuf" | ""
     schema_data: bytes
     metadata: Mapping[str, str] = field(default_factory=dict)
     schema_id: int = 0  # in an MCAP file; 0: no schema
+
+    @property
+    def type_name(self) -> str:
+        """Name of the type; of ROS messages in ROS 2 form, ``pkg/msg/Type``, also for ``pkg/Type``."""
+        parts = self.schema_name.replace("::", "/").split("/")
+        if self.encoding not in ("cdr", "ros1"):
+            return self.schema_name
+        return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 and all(parts) else "/".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,10 +198,10 @@ class Wanted:
     end_ns: int | None = None
     above_bytes: int = 0
 
-    def has(self, topics: Iterable[str], first_ns: int, last_ns: int) -> bool:
-        """Return whether messages of these topics and log times are wanted."""
-        inside = (self.start_ns is None or last_ns >= self.start_ns) and (self.end_ns is None or first_ns < self.end_ns)
-        return inside and (self.topics is None or not self.topics.isdisjoint(topics))
+    def has(self, topics: Iterable[str], span: Span) -> bool:
+        """Return whether messages of these topics in a span are wanted."""
+        is_wanted = self.topics is None or not self.topics.isdisjoint(topics)
+        return is_wanted and span.overlaps(self.start_ns, self.end_ns)
 
 
 #: Of a log that is read as a whole.
@@ -234,7 +240,7 @@ class Container(ABC):
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
     size : bytes of the file. cut : whether the file ends before its time. meter : resource limits.
-    form : ``mcap``, ``rosbag1`` or ``sqlite3``.
+    kind : of a log with this file only, as :class:`~.drive_log.DriveLog` has it.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : remedy for a file of another format.
@@ -242,7 +248,7 @@ class Container(ABC):
     is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
     """
 
-    form = ""
+    kind = ""
     selective = False
     is_remote = False
     by_index = False
@@ -414,16 +420,27 @@ class FileContainer(Container):
         self.chunks.append(chunk)
         self.spans.append(replace(span, index=len(self.spans)))
 
-    def add_content(self, chunk: Any, claimed: Span | None, read: Callable[[], Block]) -> Block | None:
+    def extent(self, span: Span) -> tuple[int, int]:
+        """Return the bytes of the span's chunk, which has them as ``start`` and ``end``."""
+        chunk = self.chunks[span.index]
+        return chunk.start, chunk.end
+
+    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
+        """Decode one chunk; see :class:`Container`."""
+        del want
+        return self._decoded(self.chunks[span.index], declare=False)
+
+    @abstractmethod
+    def _decoded(self, chunk: Any, *, declare: bool) -> Block:
+        """Return the messages of a chunk; with ``declare``, add the channels that it declares."""
+
+    def add_content(self, chunk: Any, claimed: Span | None = None) -> Block | None:
         """Add a chunk by its content; return None if it is damaged, which is a loss.
 
-        Parameters
-        ----------
-        chunk : with ``start`` and ``end`` of its bytes. read : decodes it.
-        claimed : times and counts by its header and index, if these are known.
+        ``claimed`` : times and counts by its header and index, if these are known.
         """
         try:
-            block = read()
+            block = self._decoded(chunk, declare=True)
         except Exception as error:  # noqa: BLE001 (the boundary)
             kind, text = describe_damage(error)
             count = sum(claimed.counts.values()) or None if claimed else None
@@ -464,6 +481,21 @@ class FileContainer(Container):
     @abstractmethod
     def _finish(self) -> None:
         """Finish open records and check the file as a whole."""
+
+
+def span_of_indexes(indexes: Sequence[tuple[int, NDArray[Any]]]) -> Span:
+    """Return the span that message indexes describe: channel and log times [N] of each, in file order."""
+    indexes = [(id_, times) for id_, times in indexes if len(times)]
+    counts: Counter[int] = Counter()
+    for id_, its in indexes:
+        counts[id_] += len(its)
+    if not counts:
+        return Span(0, 0, 0, counts)
+    times = np.concatenate([its for _, its in indexes])
+    falls = times[1:] < times[:-1]
+    falls[np.cumsum([len(its) for _, its in indexes])[:-1] - 1] = False  # from an index to the next one
+    first, last = (min(int(ns), MAX_TIME_NS) for ns in (times.min(), times.max()))
+    return Span(0, first, last + 1, counts, ordered=not falls.any())
 
 
 def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:

@@ -115,19 +115,16 @@ class ChannelDecoder:
         """Decode the messages ``rows`` of a block: float64 [N] or [N, k], or int64 nanoseconds [N], by path."""
         self.undecodable = []
         partial: _Parts = []
-        left = every = np.arange(len(rows))
+        left = np.arange(len(rows))
         if self.schema.wire in ("cdr", "ros1"):
             left = self._read_records(block, rows, left, partial)
         if left.size or not partial:
             partial.append((left, self._read_singly(block, rows[left])))
-        if len(partial) == 1 and len(partial[0][0]) == len(rows):
-            order, columns = partial[0]
-            if order is every or np.all(order[1:] >= order[:-1]):
-                return columns
-            back = np.argsort(order)
-            return {path: column[back] for path, column in columns.items()}
         joined = {s.path: concatenate_columns([part[s.path] for _, part in partial]) for s in self.selections}
-        back = np.argsort(np.concatenate([part_rows for part_rows, _ in partial]), kind="stable")
+        order = np.concatenate([part_rows for part_rows, _ in partial])
+        if np.all(order[1:] >= order[:-1]):
+            return joined
+        back = np.argsort(order, kind="stable")
         return {path: column[back] for path, column in joined.items()}
 
     def _read_records(self, block: Block, rows: IntArray, left: IntArray, partial: _Parts) -> IntArray:
@@ -238,34 +235,17 @@ def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Calla
 
 def _affordable_bytes(schema: MessageSchema) -> float:
     """Return the largest message for which decoded objects fit the memory: 100 bytes per field of a byte or two."""
-    if schema.wire == "protobuf":
-        return schema.limits.chunk_bytes / 4
-    if schema.wire == "json":
-        return schema.limits.chunk_bytes / 16
-    return schema.limits.chunk_bytes / 128 * _bytes_an_object(schema.root)
+    if schema.wire in ("cdr", "ros1") and not _contains_objects(schema.root):
+        return math.inf
+    return schema.limits.chunk_bytes / {"protobuf": 4, "json": 16}.get(schema.wire, 128)
 
 
-def _bytes_an_object(node: Node) -> float:
-    """Return the fewest bytes of a ROS message that become an object, for arrays of objects."""
+def _contains_objects(node: Node) -> bool:
+    """Return whether a type has arrays of objects."""
     if isinstance(node, Struct):
-        return min((_bytes_an_object(m) for m in node.members.values()), default=math.inf)
-    if isinstance(node, Array) and (isinstance(node.item, Struct) or node.item == Scalar("string")):
-        size, objects = _least_size(node.item)
-        return min(max(size, 1) / objects, _bytes_an_object(node.item))
-    return math.inf
-
-
-def _least_size(node: Node) -> tuple[int, int]:
-    """Return the fewest bytes of a place, and the objects that it becomes."""
-    if isinstance(node, Struct):
-        parts = [_least_size(m) for m in node.members.values()]
-        return sum(size for size, _ in parts), 1 + sum(n for _, n in parts)
-    if isinstance(node, Array):
-        size, objects = _least_size(node.item) if node.length is not None else (4, 1)
-        return (size * node.length, objects * node.length) if node.length is not None else (size, objects)
-    if isinstance(node, Scalar) and node.kind != "string":
-        return np.dtype(node.code).itemsize, 0
-    return 4, 1
+        return any(map(_contains_objects, node.members.values()))
+    item = node.item if isinstance(node, Array) else None
+    return isinstance(item, Struct) or item == Scalar("string") or (item is not None and _contains_objects(item))
 
 
 def _most_columns(rows: int) -> int:
@@ -359,19 +339,15 @@ def _number(value: object) -> float:
 
 def _shape_of_values(values: Sequence[object]) -> tuple[str, int]:
     """Judge a place that the schema leaves open by its first value."""
-    for value in values:
-        if value is None:
-            continue
-        if isinstance(value, (list, tuple)):
-            return "array", 0
-        if isinstance(value, dict):
-            names = frozenset(value)
-            if any(names == set(pair) for pair in TIME_MEMBERS):
-                return "time", 0
-            if names in VECTOR_ORDERS:
-                return "vector", len(VECTOR_ORDERS[names])
-        return "scalar", 0
-    return "", 0
+    value = next((value for value in values if value is not None), None)
+    if isinstance(value, (list, tuple)):
+        return "array", 0
+    names = frozenset(value) if isinstance(value, dict) else frozenset()
+    if any(names == set(pair) for pair in TIME_MEMBERS):
+        return "time", 0
+    if names in VECTOR_ORDERS:
+        return "vector", len(VECTOR_ORDERS[names])
+    return "" if value is None else "scalar", 0
 
 
 def _column(shape: str, values: Sequence[object], width: int | None) -> NDArray[Any]:

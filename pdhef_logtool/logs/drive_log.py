@@ -7,7 +7,6 @@ capabilities: properties that are None by default.
 
 from __future__ import annotations
 
-import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 if TYPE_CHECKING:
@@ -193,13 +191,6 @@ class DriveLog(ABC):
         """
         del topic, most
         return []
-
-
-def nearest(name: str, names: Sequence[str], expected: str, where: object) -> MappingError:
-    """Return the error for a topic or field that is not among these names."""
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.3) or list(names[:5])
-    remedy = f"nearest: {', '.join(near)}" if near else "the log has no topics"
-    return MappingError(expected=expected, got=repr(name), where=str(where), remedy=remedy)
 
 
 def windows(

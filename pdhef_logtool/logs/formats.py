@@ -98,7 +98,7 @@ FORMATS = (
         is_general=True, is_text=True, libraries=(),
     ),
     LogFormat(
-        "a file of JSON lines", f"{__package__}.json_lines:open_json_lines", (".jsonl", ".ndjson"),
+        "a file of JSON lines", f"{__package__}.text_logs:open_json_lines", (".jsonl", ".ndjson"),
         is_general=True, is_text=True, named=(".json",), libraries=("polars",),
     ),
 )  # fmt: skip

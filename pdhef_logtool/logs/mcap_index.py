@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
+from typing import TypeAlias
 
 from isal.isal_zlib import crc32
 from mcap.exceptions import McapError
@@ -19,7 +20,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, Schem
 from mcap.stream_reader import StreamReader
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError
-from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC
+from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC, Span
 from pdhef_logtool.logs.recording_span import SILENCE_NS, STEP_BACK_NS
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 
@@ -28,21 +29,23 @@ TAIL_BYTES = 256 << 10
 _MOST_SUMMARY_BYTES = 64 << 20
 RECORD = struct.Struct("<BQ")  # opcode, size of the content
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
-_INDEX = struct.Struct("<BQHI")  # message index: opcode, size, channel, size of its pairs
+INDEX_RECORD = struct.Struct("<BQHI")  # opcode, size, channel, size of its pairs
 _PAIR = struct.Struct("<QQ")  # log time and offset of a message
 _UNREADABLE = (McapError, struct.error, ValueError, CutError)
 
 
 @dataclass(frozen=True, slots=True)
-class IndexedChunk:
-    """A chunk record in bytes [start, end), its message indexes up to ``index_end``, its first and last log time."""
+class Extent:
+    """Bytes [start, end) of a chunk record or a run of message records; message indexes follow up to ``index_end``."""
 
     start: int
     end: int
     index_end: int
-    first_ns: int
-    last_ns: int
-    counts: dict[int, int]
+    is_chunk: bool = True
+
+
+#: A chunk, with its times and counts.
+IndexedChunk: TypeAlias = tuple[Extent, Span]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +112,11 @@ def _index(summary: bytes, start: int, limits: ResourceLimits) -> McapIndex | No
     records = list(_records(summary, limits))
     schemas = {record.id: record for record in records if isinstance(record, Schema)}
     channels = {record.id: record for record in records if isinstance(record, Channel)}
-    chunks = sorted((_chunk(r) for r in records if isinstance(r, ChunkIndex)), key=lambda chunk: chunk.start)
+    chunks = sorted((_chunk(r) for r in records if isinstance(r, ChunkIndex)), key=lambda chunk: chunk[0].start)
     attachments = sorted((r.offset, r.offset + r.length) for r in records if isinstance(r, AttachmentIndex))
     counts: Counter[int] = Counter()
-    for chunk in chunks:
-        counts.update(chunk.counts)
+    for _, span in chunks:
+        counts.update(span.counts)
     agrees = any(
         +Counter(r.channel_message_counts) == counts
         and (r.message_count, r.chunk_count, r.attachment_count) == (counts.total(), len(chunks), len(attachments))
@@ -121,7 +124,7 @@ def _index(summary: bytes, start: int, limits: ResourceLimits) -> McapIndex | No
         if isinstance(r, Statistics)
     )
     declared = counts.keys() <= channels.keys() and len(channels) <= limits.channels
-    ascend = all(chunk.first_ns <= chunk.last_ns for chunk in chunks)
+    ascend = all(span.start_ns < span.end_ns for _, span in chunks)
     if not (agrees and declared and ascend and _apart(chunks, attachments, start)):
         return None
     return McapIndex(schemas, channels, tuple(chunks), tuple(attachments), _in_order(chunks))
@@ -135,7 +138,7 @@ def _chunk(record: ChunkIndex) -> IndexedChunk:
     places = [*(place for _, place in offsets), index_end]
     counts: dict[int, int] = {}
     for (id_, place), following in zip(offsets, places[1:], strict=True):
-        n, rest = divmod(following - place - _INDEX.size, _PAIR.size)
+        n, rest = divmod(following - place - INDEX_RECORD.size, _PAIR.size)
         if n < 0 or rest:
             raise ValueError("message indexes that do not follow each other")
         if n:
@@ -143,12 +146,12 @@ def _chunk(record: ChunkIndex) -> IndexedChunk:
     if not counts or places[0] != end:
         raise ValueError("a chunk without message indexes")
     first_ns, last_ns = (min(ns, MAX_TIME_NS) for ns in (record.message_start_time, record.message_end_time))
-    return IndexedChunk(record.chunk_start_offset, end, index_end, first_ns, last_ns, counts)
+    return Extent(record.chunk_start_offset, end, index_end), Span(0, first_ns, last_ns + 1, counts)
 
 
 def _apart(chunks: list[IndexedChunk], attachments: list[tuple[int, int]], limit: int) -> bool:
     """Return whether no two records overlap, and all end before the summary."""
-    extents = sorted([*((c.start, c.index_end) for c in chunks), *attachments])
+    extents = sorted([*((extent.start, extent.index_end) for extent, _ in chunks), *attachments])
     ends = [len(MCAP_MAGIC), *(end for _, end in extents)]
     return all(start >= end for (start, _), end in zip(extents, ends, strict=False)) and max(ends) <= limit
 
@@ -156,11 +159,11 @@ def _apart(chunks: list[IndexedChunk], attachments: list[tuple[int, int]], limit
 def _in_order(chunks: list[IndexedChunk]) -> bool:
     """Return whether the chunks' times are plausible for a sound recording."""
     newest: dict[int, int] = {}
-    for chunk in chunks:
-        if chunk.last_ns - chunk.first_ns >= SILENCE_NS or chunk.last_ns >= MAX_TIME_NS:
+    for _, span in chunks:
+        if span.end_ns - span.start_ns > SILENCE_NS or span.end_ns > MAX_TIME_NS:
             return False
-        for id_ in chunk.counts:
-            if chunk.first_ns < newest.get(id_, 0) - STEP_BACK_NS:
+        for id_ in span.counts:
+            if span.start_ns < newest.get(id_, 0) - STEP_BACK_NS:
                 return False
-            newest[id_] = max(newest.get(id_, 0), chunk.last_ns)
+            newest[id_] = max(newest.get(id_, 0), span.end_ns - 1)
     return True

@@ -12,7 +12,7 @@ from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -22,7 +22,7 @@ from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource
@@ -41,20 +41,17 @@ from pdhef_logtool.logs.container import (
     Wanted,
     block_from_lists,
     describe_damage,
+    span_of_indexes,
 )
-from pdhef_logtool.logs.mcap_index import FOOTER, RECORD, IndexedChunk, chunk_places, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
-from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray, Loss
 
 UintArray: TypeAlias = NDArray[np.uint64]
 
-_MESSAGE_RECORD = struct.Struct("<BQHIQ")
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, uncompressed CRC, length of the compression's name
-_INDEX_RECORD = struct.Struct("<BQHI")  # opcode, size, channel, bytes of the pairs
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
-_UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
 _CHUNK_HEAD_BYTES = RECORD.size + _CHUNK.size + _U64.size  # without the name of the compression
 _LONGEST_NAME = 4  # of a compression
@@ -75,37 +72,15 @@ _MESSAGE_BYTES = MESSAGE_HEAD.itemsize - RECORD.size
 _INDEX_PAIR = np.dtype([("log", "<u8"), ("offset", "<u8")])
 
 
-@dataclass(frozen=True, slots=True)
-class _Extent:
-    """Bytes [start, end) of a chunk record or a run of message records; message indexes follow up to ``index_end``."""
-
-    start: int
-    end: int
-    is_chunk: bool
-    index_end: int
-
-
-@dataclass(slots=True)
-class _Run:
-    """Consecutive unchunked messages in bytes [start, end)."""
-
-    start: int
-    end: int
-    first_ns: int = MAX_TIME_NS
-    last_ns: int = 0
-    counts: Counter[int] = field(default_factory=Counter)
-    ordered: bool = True  # whether no log time steps back
-
-
 class McapContainer(FileContainer):
     """One MCAP 1.0 file; its spans are chunks and runs of unchunked messages, in file order."""
 
-    form = "mcap"
+    kind = "mcap"
     magic = MCAP_MAGIC
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
     whole_chunks = True
-    chunks: list[_Extent]
+    chunks: list[Extent]
 
     def __init__(
         self,
@@ -124,7 +99,6 @@ class McapContainer(FileContainer):
             int, int
         ] = {}  # chunks and attachments of a remote file that are not wanted, from start to end
         self._indexed: list[int] | None = None  # places of the chunks that a damaged summary names
-        self._run: _Run | None = None
         self._closed = False
         self._data_end: tuple[int, int] | None = None  # extent of the record
         self._footer: int | None = None  # place of the record
@@ -141,7 +115,7 @@ class McapContainer(FileContainer):
         header_seen = False
         for offset in self._places():
             if offset in indexed:
-                self.position = self._add_indexed(indexed[offset])
+                self.position = self._add_indexed(*indexed[offset])
                 continue
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self._closed = True
@@ -154,7 +128,6 @@ class McapContainer(FileContainer):
                 if not header_seen:
                     raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
                 resume = places[n] if places[n] < size else self._next_chunk(offset)
-                self._end_run()
                 if resume is None:
                     self.lose_end(offset)
                     return
@@ -178,7 +151,7 @@ class McapContainer(FileContainer):
         if not header_seen:
             raise self.no_log("a header record after the magic bytes", "none")
 
-    def _indexed_places(self) -> dict[int, IndexedChunk | tuple[int, int]]:
+    def _indexed_places(self) -> dict[int, tuple[Extent, Span | None]]:
         """Return by their places the chunks, and attachments that are not read, that a sound summary describes.
 
         All parts of a remote file that are read are requested. Its message indexes are not examined.
@@ -193,52 +166,42 @@ class McapContainer(FileContainer):
             return {}
         self._schemas.update(index.schemas)
         self._raw_channels.update(index.channels)
-        places: dict[int, IndexedChunk | tuple[int, int]] = {chunk.start: chunk for chunk in index.chunks}
+        places: dict[int, tuple[Extent, Span | None]] = {extent.start: (extent, span) for extent, span in index.chunks}
         if not is_whole:
-            places |= {extent[0]: extent for extent in index.attachments}
+            places |= {start: (Extent(start, end, end), None) for start, end in index.attachments}
             topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
             unread = dict(index.attachments)
-            for chunk in index.chunks:
-                if not self._wanted.has([topics[id_] for id_ in chunk.counts], chunk.first_ns, chunk.last_ns):
-                    unread[chunk.start] = chunk.index_end
+            for extent, span in index.chunks:
+                if not self._wanted.has([topics[id_] for id_ in span.counts], span):
+                    unread[extent.start] = extent.index_end
             self._unread = dict(sorted(unread.items()))
             source.prefetch(zip([0, *self._unread.values()], [*self._unread, source.size], strict=True))
         return places
 
-    def _add_indexed(self, indexed: IndexedChunk | tuple[int, int]) -> int:
-        """Add a chunk or an attachment by its entry in the summary; return the start of the next record."""
-        self._end_run()
-        if not isinstance(indexed, IndexedChunk):
-            self._attachment_at.append(indexed)
-            return indexed[1]
-        extent, ordered = _Extent(indexed.start, indexed.end, True, indexed.index_end), self.source.is_remote
+    def _add_indexed(self, extent: Extent, span: Span | None) -> int:
+        """Add a chunk, or an attachment, by its entry in the summary; return the start of the next record."""
+        if span is None:
+            self._attachment_at.append((extent.start, extent.end))
+            return extent.end
+        ordered = self.source.is_remote
         if not ordered:
             named = self._span_by_indexes(extent)
             ordered = named is not None and named.ordered
-            if named is None or named.counts != indexed.counts:
+            if named is None or named.counts != span.counts:
                 self._lose_indexes(extent)
-        self.add_span(extent, Span(0, indexed.first_ns, indexed.last_ns + 1, indexed.counts, ordered))
-        return indexed.index_end
+        self.add_span(extent, replace(span, ordered=ordered))
+        return extent.index_end
 
-    def _indexes(self, extent: _Extent) -> list[tuple[int, UintArray, UintArray]] | None:
+    def _indexes(self, extent: Extent) -> list[tuple[int, UintArray, UintArray]] | None:
         """Return channel, log times [N] and offsets [N] of each message index of a chunk; None if one is malformed."""
         return _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
 
-    def _span_by_indexes(self, extent: _Extent) -> Span | None:
+    def _span_by_indexes(self, extent: Extent) -> Span | None:
         """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
         indexes = self._indexes(extent)
-        if indexes is None:
-            return None
-        counts = {id_: len(its) for id_, its, _ in indexes if len(its)}
-        if not counts:
-            return Span(0, 0, 0, counts)
-        times = np.concatenate([its for _, its, _ in indexes])
-        falls = times[1:] < times[:-1]
-        falls[np.cumsum([*counts.values()])[:-1] - 1] = False  # from a channel to the next one
-        first, last = (min(int(ns), MAX_TIME_NS) for ns in (times.min(), times.max()))
-        return Span(0, first, last + 1, counts, ordered=not falls.any())
+        return None if indexes is None else span_of_indexes([(id_, times) for id_, times, _ in indexes])
 
-    def _lose_indexes(self, extent: _Extent) -> None:
+    def _lose_indexes(self, extent: Extent) -> None:
         what = (
             f"the message indexes of the chunk at byte {extent.start} are damaged: its messages are found without them"
         )
@@ -246,15 +209,11 @@ class McapContainer(FileContainer):
 
     def _read_header(self, offset: int, length: int) -> None:
         self.meter.limits.check("metadata_bytes", length, "the header record")
-        payload = self.source.read(offset + RECORD.size, length)
         try:
-            (n,) = _U32.unpack_from(payload, 0)
-            self.profile = payload[_U32.size : _U32.size + n].decode()
-            (m,) = _U32.unpack_from(payload, _U32.size + n)
-        except (struct.error, UnicodeDecodeError) as error:
-            raise self.no_log("a header record with profile and library", "a malformed one") from error
-        if 2 * _U32.size + n + m > length:
-            raise self.no_log("a header record with profile and library", "a draft of the format before 1.0")
+            self.profile = _parsed(Header, self.source.read(offset + RECORD.size, length)).profile
+        except (struct.error, UnicodeDecodeError, McapError) as error:
+            got = "a malformed one, or a draft of the format before 1.0"
+            raise self.no_log("a header record with profile and library", got) from error
 
     def _next_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that a damaged summary names, or None."""
@@ -265,10 +224,9 @@ class McapContainer(FileContainer):
 
     def _record(self, opcode: int, start: int, end: int) -> int:
         """Handle one complete record that is no message; return the start of the next one."""
-        if opcode in _DECLARATIONS:  # also inside of a run: writers interleave them with the messages
+        if opcode in _DECLARATIONS:
             self._declare(opcode, self._payload(start, end))
             return end
-        self._end_run()
         if opcode == _OP_CHUNK:
             return self._add_chunk(start, end)
         if opcode == Opcode.ATTACHMENT:
@@ -276,10 +234,10 @@ class McapContainer(FileContainer):
         elif opcode == Opcode.DATA_END:
             self._data_end = (start, end)
         elif opcode == Opcode.METADATA:
-            Metadata.read(ReadDataStream(BytesIO(self._payload(start, end))))
+            _parsed(Metadata, self._payload(start, end))
             self._metadata_at.append((start, end))
         elif opcode == Opcode.STATISTICS and self._data_end:
-            self._statistics = Statistics.read(ReadDataStream(BytesIO(self._payload(start, end))))
+            self._statistics = _parsed(Statistics, self._payload(start, end))
         elif opcode == Opcode.FOOTER and self._data_end:
             self._footer = start
         elif opcode == _OP_MESSAGE_INDEX or (
@@ -299,10 +257,10 @@ class McapContainer(FileContainer):
         """Add a schema or channel record."""
         self.meter.limits.check("metadata_bytes", len(payload), "a declaration")
         if opcode == _OP_SCHEMA:
-            schema = Schema.read(ReadDataStream(BytesIO(payload)))
+            schema = _parsed(Schema, payload)
             self._schemas.setdefault(schema.id, schema)
             return
-        channel = Channel.read(ReadDataStream(BytesIO(payload)))
+        channel = _parsed(Channel, payload)
         if channel.id not in self._raw_channels:
             self.meter.limits.check("channels", len(self._raw_channels) + 1, f"channel {channel.id}")
             self._raw_channels[channel.id] = channel
@@ -319,43 +277,25 @@ class McapContainer(FileContainer):
     def _messages(self, offset: int) -> int:
         """Add the message records from here on with heads that are read ahead; return the start of the next record."""
         size = self.source.size
-        block, place = self.source.ahead(offset, min(_MESSAGE_RECORD.size, size - offset))
-        base = offset - place
-        last = min(len(block), size - base) - _MESSAGE_RECORD.size
-        if self._run is None or offset - self._run.start >= _UNCHUNKED_RUN_BYTES:
-            self._end_run()
-        run = self._run or _Run(offset, offset)
-        unpack, counts, first_ns, last_ns = _MESSAGE_RECORD.unpack_from, run.counts, run.first_ns, run.last_ns
-        while place <= last and block[place] == _OP_MESSAGE and base + place - run.start < _UNCHUNKED_RUN_BYTES:
-            _, length, channel, _, log_time = unpack(block, place)
+        block, place = self.source.ahead(offset, min(MESSAGE_HEAD.itemsize, size - offset))
+        base, last = offset - place, len(block) - MESSAGE_HEAD.itemsize
+        places = array("q")
+        while place <= last and block[place] == _OP_MESSAGE:
+            _, length = RECORD.unpack_from(block, place)
             end = place + RECORD.size + length
             if length < _MESSAGE_BYTES or base + end > size:
                 break
-            if log_time < first_ns:
-                first_ns = log_time
-            if log_time > last_ns:
-                last_ns = log_time
-            elif log_time < last_ns:
-                run.ordered = False
-            counts[channel] += 1
+            places.append(place)
             place = end
-        if base + place == offset:  # not even the first one is a message
-            end = offset + RECORD.size + int(RECORD.unpack(self.source.read(offset, RECORD.size))[1])
-            self._end_run()
+        if not places:
             self.lose_record(offset, SpanDamageError("a message record is too short"))
-            return end
-        run.end, run.first_ns, run.last_ns = base + place, first_ns, last_ns
-        self._run = run
-        return run.end
-
-    def _end_run(self) -> None:
-        """Add the run of unchunked messages that ends here."""
-        run, self._run = self._run, None
-        if run is not None:
-            first, last = min(run.first_ns, MAX_TIME_NS), min(run.last_ns, MAX_TIME_NS)
-            self.add_span(
-                _Extent(run.start, run.end, False, run.end), Span(0, first, last + 1, run.counts, run.ordered)
-            )
+            return offset + RECORD.size + int(RECORD.unpack(self.source.read(offset, RECORD.size))[1])
+        heads = _heads(block, np.array(places, dtype=np.int64))
+        times, counts = _held_times(heads["log"]), Counter(heads["channel"].tolist())
+        ordered = bool((times[1:] >= times[:-1]).all())
+        span = Span(0, int(times.min()), int(times.max()) + 1, counts, ordered)
+        self.add_span(Extent(offset, base + place, base + place, is_chunk=False), span)
+        return base + place
 
     def _add_chunk(self, start: int, end: int) -> int:
         """Add a chunk that no summary describes; return the end of its message indexes.
@@ -363,12 +303,12 @@ class McapContainer(FileContainer):
         Its content describes it. In a file without an end, message indexes that agree with the head of the chunk do.
         """
         index_end, size = end, self.source.size
-        while index_end + _INDEX_RECORD.size <= size:
+        while index_end + INDEX_RECORD.size <= size:
             opcode, length = RECORD.unpack(self.source.read(index_end, RECORD.size))
             if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or index_end + RECORD.size + length > size:
                 break  # one wrong bit makes an index a private record
             index_end += RECORD.size + length
-        extent = _Extent(start, end, True, index_end)
+        extent = Extent(start, end, index_end)
         first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
         claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, {})
         named = self._span_by_indexes(extent)
@@ -381,7 +321,7 @@ class McapContainer(FileContainer):
                 self.add_span(extent, claimed)
                 return index_end
         self._opened_chunks += 1
-        block = self.add_content(extent, claimed, lambda: self._decoded(extent, declare=True))
+        block = self.add_content(extent, claimed)
         if block is not None:
             held = block.counts
             missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
@@ -391,7 +331,6 @@ class McapContainer(FileContainer):
         return index_end
 
     def _finish(self) -> None:
-        self._end_run()
         if self._closed and not self._data_end:
             if not self.spans and all(loss.kind == "bad-record" for loss in self.lost):
                 raise self.no_log("an MCAP 1.0 file", "a draft of the format before 1.0")
@@ -415,14 +354,11 @@ class McapContainer(FileContainer):
         """Join channels and schemas once all are known."""
         for id_, channel in self._raw_channels.items():
             schema = self._schemas.get(channel.schema_id)
-            name = schema.name if schema else ""
-            is_ros = channel.message_encoding in ("cdr", "ros1")
             self.channels[id_] = ChannelRecord(
                 id=id_,
                 topic=channel.topic,
-                type_name=ros2_type_name(name) if is_ros else name,
                 encoding=channel.message_encoding,
-                schema_name=name,
+                schema_name=schema.name if schema else "",
                 schema_encoding=schema.encoding if schema else "",
                 schema_data=schema.data if schema else b"",
                 metadata=dict(channel.metadata),
@@ -451,7 +387,7 @@ class McapContainer(FileContainer):
             )
             self.lose("bad-data-crc", what)
 
-    def _has_crc(self, extent: _Extent) -> bool:
+    def _has_crc(self, extent: Extent) -> bool:
         """Return whether messages are in a chunk with a CRC."""
         if not extent.is_chunk:
             return False
@@ -476,23 +412,13 @@ class McapContainer(FileContainer):
             crc = crc32(self.source.read(offset, min(_CRC_BLOCK_BYTES, end - offset)), crc)
         return crc
 
-    def extent(self, span: Span) -> tuple[int, int]:
-        """Return the bytes of the span's record or records."""
-        extent = self.chunks[span.index]
-        return extent.start, extent.end
-
     def prefetch(self, spans: Iterable[Span]) -> None:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
         if self.source.is_remote:
             extents = (self.chunks[span.index] for span in spans)
             self.source.prefetch((extent.start, extent.index_end) for extent in extents)
 
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        """Decode one span."""
-        del want
-        return self._decoded(self.chunks[span.index])
-
-    def _decoded(self, extent: _Extent, *, declare: bool = False) -> Block:
+    def _decoded(self, extent: Extent, *, declare: bool) -> Block:
         """Return the messages of a chunk or run; with ``declare``, add the schemas and channels in it.
 
         The message indexes are used only if the chunk contains the messages that they name, and no others.
@@ -572,10 +498,10 @@ class McapContainer(FileContainer):
         """Return whether a record of a chunk declares kept channels only, as this file declares them."""
         try:
             if opcode == Opcode.CHANNEL:
-                channel = Channel.read(ReadDataStream(BytesIO(payload)))
+                channel = _parsed(Channel, payload)
                 return channel.id in kept and channel == self._raw_channels[channel.id]
             if opcode == Opcode.SCHEMA:
-                schema = Schema.read(ReadDataStream(BytesIO(payload)))
+                schema = _parsed(Schema, payload)
                 used = {self._raw_channels[id_].schema_id for id_ in kept}
                 return schema.id in used and schema == self._schemas[schema.id]
         except (struct.error, UnicodeDecodeError, ValueError, McapError):
@@ -603,8 +529,7 @@ class McapContainer(FileContainer):
     def _sound_records(self, extents: Iterable[tuple[int, int]], kind: Any) -> Iterator[Any]:
         for start, end in extents:
             try:
-                payload = self.source.read(start + RECORD.size, end - start - RECORD.size)
-                record = kind.read(ReadDataStream(BytesIO(payload)))
+                record = _parsed(kind, self.source.read(start + RECORD.size, end - start - RECORD.size))
             except Exception as error:  # noqa: BLE001 (the boundary)
                 self.lose_record(start, error)
                 continue
@@ -627,6 +552,11 @@ class McapContainer(FileContainer):
         self._attachment_at.append((start - RECORD.size, end))
 
 
+def _parsed(kind: Any, payload: bytes) -> Any:
+    """Return a record of a kind from its content."""
+    return kind.read(ReadDataStream(BytesIO(payload)))
+
+
 def _chunk_head(record: bytes, end: int) -> tuple[int, int, str, int, int]:
     """Return size, CRC, compression, and place and length of the stored bytes of the chunk record up to ``end``."""
     try:
@@ -645,13 +575,13 @@ def _message_indexes(record: bytes, offset: int) -> list[tuple[int, UintArray, U
     """Return channel, log times [N] and offsets [N] of each message index from a byte on; None if one is malformed."""
     indexes: list[tuple[int, UintArray, UintArray]] = []
     while offset < len(record):
-        if offset + _INDEX_RECORD.size > len(record):
+        if offset + INDEX_RECORD.size > len(record):
             return None
-        opcode, length, channel, n = _INDEX_RECORD.unpack_from(record, offset)
+        opcode, length, channel, n = INDEX_RECORD.unpack_from(record, offset)
         end = offset + RECORD.size + length
-        if opcode != _OP_MESSAGE_INDEX or n % _INDEX_PAIR.itemsize or offset + _INDEX_RECORD.size + n > end:
+        if opcode != _OP_MESSAGE_INDEX or n % _INDEX_PAIR.itemsize or offset + INDEX_RECORD.size + n > end:
             return None
-        pairs = np.frombuffer(record, _INDEX_PAIR, n // _INDEX_PAIR.itemsize, offset + _INDEX_RECORD.size)
+        pairs = np.frombuffer(record, _INDEX_PAIR, n // _INDEX_PAIR.itemsize, offset + INDEX_RECORD.size)
         indexes.append((channel, pairs["log"], pairs["offset"]))
         offset = end
     return indexes
@@ -667,15 +597,20 @@ def _indexed_messages(content: bytes, record: bytes, index_start: int) -> Block 
     return _gather_messages(content, offset)
 
 
+def _heads(content: bytes, offset: IntArray) -> NDArray[np.void]:
+    """Return the heads of messages at offsets [N]."""
+    # Gathered as plain bytes: NumPy copies structured items member by member.
+    plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
+    places = np.ndarray((len(content) - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))
+    return places[offset].view(MESSAGE_HEAD)
+
+
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
     """Read message headers at known ascending offsets; None if the content has other messages than these."""
     n = len(content)
     if offset.size == 0 or offset[0] < 0 or offset[-1] + MESSAGE_HEAD.itemsize > n:
         return None
-    # Gathered as plain bytes: NumPy copies structured items member by member.
-    plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
-    heads = np.ndarray((n - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))[offset]
-    heads = heads.view(MESSAGE_HEAD)
+    heads = _heads(content, offset)
     size = heads["size"].astype(np.int64)  # what does not fit is below 0
     if (heads["op"] != _OP_MESSAGE).any() or size.min() < _MESSAGE_BYTES or size.max() > n:
         return None

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import base64
 import difflib
+import functools
+import inspect
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -203,7 +204,7 @@ _BYTES_OF_TEXT = 32
 _PLACES_AN_ELEMENT = 8
 
 
-@lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=256)
 def ros_schema(
     type_name: str,
     encoding: str,
@@ -246,12 +247,7 @@ def ros_schema(
         base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
         if text.strip():
             text = _SEPARATOR.sub("=" * 80, text)
-            if encoding == "ros2idl":
-                from pdhef_logtool.logs.idl_parser import idl_types
-
-                types = idl_types(text)
-            else:
-                types = get_types_from_msg(text, type_name)
+            types = _idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
             store = get_typestore(Stores.EMPTY)
             try:
                 if referenced(types) - set(types):  # a distribution's types take long to load
@@ -269,6 +265,33 @@ def ros_schema(
                 store.register(types)
             root = _ros_root(store.fielddefs, type_name, limits)
     return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed)
+
+
+def _idl_types(text: str) -> Any:
+    """Return the types of an IDL text as rosbags has them; raises the errors of its parser."""
+    from rosbags.typesys.base import make_typesdict
+    from rosbags.typesys.idl import IDLParser
+
+    class QuickParser(IDLParser):
+        """Parses every rule once a place, where the plain one takes a hundred times as long for each bracket.
+
+        Products and shifts are refused: a few nested ones give a number that fills the memory, and the texts that ROS
+        generates contain none.
+        """
+
+        def __init__(self, text: str) -> None:
+            super().__init__(text)
+            for name, rule in inspect.getmembers(self, inspect.ismethod):
+                if list(inspect.signature(rule).parameters) == ["pos"]:
+                    setattr(self, name, functools.cache(rule))
+
+        def shift_expr(self, pos: int) -> Any:
+            return self.add_expr(pos)
+
+        def mult_expr(self, pos: int) -> Any:
+            return self.unary_expr(pos)
+
+    return make_typesdict(QuickParser(text).specification())
 
 
 def _store_of(distro: str) -> Any:
@@ -328,16 +351,8 @@ def json_schema(type_name: str, text: str, limits: ResourceLimits = DEFAULT_LIMI
     with parsing(what):
         limits.check("schema_bytes", len(text), what)
         document = json.loads(text)
-        root = _json_node(document, _Json(document, Unfolding(limits, what)), 1, (), 0)
+        root = _json_node(document, document, Unfolding(limits, what), 1, (), 0)
     return MessageSchema(type_name, "json", root, limits=limits)
-
-
-@dataclass(frozen=True, slots=True)
-class _Json:
-    """A JSON Schema that is being unfolded."""
-
-    document: Any
-    unfolding: Unfolding
 
 
 #: Scalars of JSON Schema by their type.
@@ -349,26 +364,29 @@ _JSON_SCALARS: dict[object, Scalar] = {
 }
 
 
-def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], depth: int) -> Node:
-    """Return a schema's tree; ``inside`` are the references that lead here: recursion is left open."""
-    if not isinstance(schema, dict) or depth > whole.unfolding.limits.schema_depth:
+def _json_node(
+    schema: Any, document: Any, unfolding: Unfolding, times: int, inside: tuple[str, ...], depth: int
+) -> Node:
+    """Return the tree of a part of a document; ``inside`` are the references that lead here: recursion is left open."""
+    if not isinstance(schema, dict) or depth > unfolding.limits.schema_depth:
         return Unknown()
-    whole.unfolding.enter(times, 0)
+    unfolding.enter(times, 0)
+    below = functools.partial(_json_node, document=document, unfolding=unfolding, inside=inside, depth=depth + 1)
     reference = schema.get("$ref")
     if isinstance(reference, str) and reference.startswith("#/"):
         if reference in inside:
             return Unknown()
-        return _json_node(_referenced(whole.document, reference), whole, times, (*inside, reference), depth + 1)
+        return below(_referenced(document, reference), times=times, inside=(*inside, reference))
     kind = _json_type(schema.get("type"))
     if kind == "object" or (kind is None and "properties" in schema):
         properties = schema.get("properties")
         if not isinstance(properties, dict) or not properties:
             return Unknown()
-        return Struct({k: _json_node(v, whole, times, inside, depth + 1) for k, v in properties.items()})
+        return Struct({k: below(v, times=times) for k, v in properties.items()})
     if kind == "array":
         least, most = schema.get("minItems"), schema.get("maxItems")
         length = least if isinstance(least, int) and least == most and least >= 0 else None
-        return Array(_json_node(schema.get("items"), whole, times * _listed(length), inside, depth + 1), length)
+        return Array(below(schema.get("items"), times=times * _listed(length)), length)
     return _JSON_SCALARS.get(kind, Unknown())
 
 
@@ -467,7 +485,8 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             return Selection(path, "dynamic", (steps,))
         node = _part(node, step)
     if node is None:
-        raise _no_such_path(schema, topic, path)
+        paths = [leaf.path for leaf in leaves(schema.root)]
+        raise nearest(path, paths, f"a field of {schema.type_name or 'the message'}", topic)
     if ending:
         # Records of ROS messages are read without their texts.
         is_text = isinstance(node, Unknown) or (isinstance(node, Scalar) and node.kind == "string")
@@ -512,18 +531,14 @@ def _select_array(node: Array, schema: MessageSchema, topic: str, path: str, ste
     return Selection(path, "array", (steps,), node.length)
 
 
-def _no_such_path(schema: MessageSchema, topic: str, path: str) -> MappingError:
-    paths = [leaf.path for leaf in leaves(schema.root)]
-    near = difflib.get_close_matches(path, paths, n=3, cutoff=0.4)
+def nearest(name: str, names: Sequence[str], expected: str, where: object) -> MappingError:
+    """Return the error for a topic or field that is not among these names."""
+    near = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
     if not near:
-        last = path.rsplit(".", 1)[-1]
-        near = [p for p in paths if p.rsplit(".", 1)[-1] == last][:3] or paths[:3]
-    return MappingError(
-        expected=f"a field of {schema.type_name or 'the message'}",
-        got=repr(path),
-        where=topic,
-        remedy=f"nearest: {', '.join(near)}" if near else "the type has no fields",
-    )
+        last = name.rsplit(".", 1)[-1]
+        near = [n for n in names if n.rsplit(".", 1)[-1] == last][:3] or list(names[:5])
+    remedy = f"nearest: {', '.join(near)}" if near else "there are none"
+    return MappingError(expected=expected, got=repr(name), where=str(where), remedy=remedy)
 
 
 def _no_number(schema: MessageSchema, topic: str, path: str, what: str) -> MappingError:

@@ -37,9 +37,6 @@ _REMEDY = "give the recording itself"
 _ONE_RECORDING = "name one recording; if the files are parts of one, --set folder=recording"
 #: First bytes of a Git LFS pointer, which is in a repository in place of a large file that was not fetched.
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
-#: Kinds of logs by container format, as a file and as a folder.
-_KINDS = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}
-_FOLDER_KINDS = {**_KINDS, "mcap": "rosbag2-mcap"}
 
 
 def open_log(
@@ -114,7 +111,7 @@ def _opened(file: LogFile, wanted: Wanted) -> DriveLog:
         ) from error
     if isinstance(opened, DriveLog):
         return opened
-    return ColumnarLog(path, _KINDS[opened.form], [opened], distro=opened.distro)
+    return ColumnarLog(path, opened.kind, [opened], distro=opened.distro)
 
 
 def log_metadata(path: LogPlace, limits: ResourceLimits = DEFAULT_LIMITS) -> dict[str, str]:
@@ -162,10 +159,9 @@ def _open_remote(file: LogFile, place: RemotePlace, wanted: Wanted) -> Container
 
             return McapContainer(source, place, file.meter, wanted)
         file = replace(file, path=source.path, release=source.close)
-        is_compressed = head.startswith(ZSTD_MAGIC)
-        if is_compressed or recognised_format(head, source.path.name) is not None:
+        if head.startswith(ZSTD_MAGIC) or recognised_format(head, source.path.name) is not None:
             source.fetch_whole()
-        return _open_compressed(file) if is_compressed else _open_plain(file)
+        return _open_file(file)
     except BaseException:
         source.close()
         raise
@@ -224,7 +220,8 @@ def _open_folder(file: LogFile) -> DriveLog:
     opened = _open_file(replace(file, path=logs[0], place=logs[0]))
     if isinstance(opened, DriveLog):
         return opened
-    return ColumnarLog(path, _FOLDER_KINDS[opened.form], [opened], distro=opened.distro)
+    kind = "rosbag2-mcap" if opened.kind == "mcap" else opened.kind
+    return ColumnarLog(path, kind, [opened], distro=opened.distro)
 
 
 def _read_metadata(path: Path, limits: ResourceLimits) -> Mapping[str, Any]:
@@ -257,7 +254,6 @@ def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
     per_message = _text(information.get("compression_mode")).lower() == "message"
     encodings = _declared_encodings(information)
     containers: list[Container] = []
-    forms: set[str] = set()
     lost: list[Loss] = []
     try:
         for name in map(_text, information["relative_file_paths"]):
@@ -278,7 +274,6 @@ def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
             except Exception as error:  # noqa: BLE001 (one file of several)
                 lost.append(Loss("bad-file", describe_damage(error)[1], str(file)))
                 continue
-            forms.add(container.form)
             containers.append(container)
             container.zstd_messages = per_message
             # A topics table may name cdr by default where the recorder used another format: do not decode it as CDR.
@@ -295,7 +290,7 @@ def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
         remedy = lost[0].what if lost else "metadata.yaml names no file"
         raise LogError(expected=what_is_a_log(), got="no readable storage file", where=str(path), remedy=remedy)
     distro = _text(information.get("ros_distro"))
-    kind = "rosbag2-sqlite3" if forms == {"sqlite3"} else "rosbag2-mcap"
+    kind = "rosbag2-mcap" if {c.kind for c in containers} != {"rosbag2-sqlite3"} else "rosbag2-sqlite3"
     custom = information.get("custom_data")
     about = {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
     return ColumnarLog(path, kind, containers, lost, distro or containers[0].distro, about)

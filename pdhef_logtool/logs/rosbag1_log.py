@@ -22,13 +22,13 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     FileContainer,
-    Span,
     SpanDamageError,
     block_from_lists,
+    span_of_indexes,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
-from pdhef_logtool.logs.type_names import ros2_type_name
+from pdhef_logtool.records.signals import IntArray
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
 _U32 = struct.Struct("<I")
@@ -47,16 +47,13 @@ class _Chunk:
     end: int
     compression: str
     size: int
-    counts: Counter[int] = field(default_factory=Counter)
-    first_ns: int = 0
-    last_ns: int = 0
-    ordered: bool = True  # whether no log time of a connection steps back
+    indexes: list[tuple[int, IntArray]] = field(default_factory=list)  # connection and log times
 
 
 class Rosbag1Container(FileContainer):
     """One ROS 1 bag of format 2.0, its connections as channels."""
 
-    form = "rosbag1"
+    kind = "rosbag1"
     profile = ""  # of ROS 1 messages beside ours of ROS 2
     magic = ROSBAG1_MAGIC
     magic_text = "'#ROSBAG V2.0' at its start"
@@ -141,10 +138,10 @@ class Rosbag1Container(FileContainer):
         self.chunks = []
         self.spans.clear()
         for chunk, span in zip(chunks_read, spans, strict=True):
-            if self._infos.get(chunk.start, chunk.counts) == chunk.counts:
+            if self._infos.get(chunk.start, span.counts) == span.counts:
                 self.add_span(chunk, span)
             else:
-                self._open_chunk(chunk)
+                self.add_content(chunk)
         if missing > 0 and not self.lost:
             self.lose("missing-messages", f"the bag's header names {chunks} chunks, {missing} of them are not there")
 
@@ -158,20 +155,14 @@ class Rosbag1Container(FileContainer):
         """Add the connection and the log times of an index record."""
         (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
         words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
-        if count:
-            times = words[:, 0] * 1_000_000_000 + words[:, 1]
-            first, last = int(times.min()), int(times.max())
-            chunk.first_ns = min(chunk.first_ns, first) if chunk.counts else first
-            chunk.last_ns = max(chunk.last_ns, last)
-            chunk.counts[connection] += count
-            chunk.ordered &= bool((times[1:] >= times[:-1]).all())
+        chunk.indexes.append((connection, words[:, 0] * 1_000_000_000 + words[:, 1]))
 
     def _declare_from_chunks(self) -> None:
         """Find connections that only the chunks declare, as in a bag without its index section."""
         for span in self.spans:
             if not set(span.counts) <= set(self.channels):
                 with contextlib.suppress(Exception):  # a read of the span reports the damage
-                    self._decode(self.chunks[span.index], declare=True)
+                    self._decoded(self.chunks[span.index], declare=True)
 
     def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
         inner = _header_fields(payload)
@@ -179,7 +170,6 @@ class Rosbag1Container(FileContainer):
         if id_ in self.channels:
             return
         self.meter.limits.check("channels", len(self.channels) + 1, f"connection {id_}")
-        type_name = inner["type"].decode()
         metadata: dict[str, str] = {
             name: inner[name].decode("utf-8", errors="replace")
             for name in ("callerid", "latching", "md5sum")
@@ -188,9 +178,8 @@ class Rosbag1Container(FileContainer):
         self.channels[id_] = ChannelRecord(
             id=id_,
             topic=fields["topic"].decode(),
-            type_name=ros2_type_name(type_name),
             encoding="ros1",
-            schema_name=type_name,
+            schema_name=inner["type"].decode(),
             schema_encoding="ros1msg",
             schema_data=inner.get("message_definition", b""),
             metadata=metadata,
@@ -202,26 +191,13 @@ class Rosbag1Container(FileContainer):
         if chunk is None:
             return
         self._found += 1
-        if not complete or not chunk.counts or chunk.counts.total() * _LEAST_MESSAGE_BYTES > chunk.size:
-            self._open_chunk(chunk)
+        span = span_of_indexes(chunk.indexes)
+        if not complete or not span.counts or sum(span.counts.values()) * _LEAST_MESSAGE_BYTES > chunk.size:
+            self.add_content(chunk)
         else:
-            self.add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts), chunk.ordered))
+            self.add_span(chunk, span)
 
-    def _open_chunk(self, chunk: _Chunk) -> None:
-        """Add a chunk by its content; a damaged chunk is a loss."""
-        self.add_content(chunk, None, lambda: self._decode(chunk, declare=True))
-
-    def extent(self, span: Span) -> tuple[int, int]:
-        """Return the bytes of the chunk's record."""
-        chunk = self.chunks[span.index]
-        return chunk.start, chunk.end
-
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        """Decode one chunk; see :class:`~pdhef_logtool.logs.container.Container`."""
-        del want
-        return self._decode(self.chunks[span.index], declare=False)
-
-    def _decode(self, chunk: _Chunk, declare: bool) -> Block:
+    def _decoded(self, chunk: _Chunk, *, declare: bool) -> Block:
         self.meter.limits.check("chunk_bytes", chunk.end - chunk.stored_start, "a chunk")
         stored = self.source.read(chunk.stored_start, chunk.end - chunk.stored_start)
         content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.limits)

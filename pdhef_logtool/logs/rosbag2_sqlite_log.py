@@ -25,7 +25,6 @@ from pdhef_logtool.logs.container import (
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
-from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.storage.files import scratch_folder
 
@@ -44,7 +43,7 @@ class SqliteContainer(Container):
     LogError : no SQLite file, or one without rosbag2's tables.
     """
 
-    form = "sqlite3"
+    kind = "rosbag2-sqlite3"
     selective = True  # rows of other topics are not read
     remedy = "is it a rosbag2 recording?"
 
@@ -53,6 +52,7 @@ class SqliteContainer(Container):
         super().__init__(shown_path or path, path.stat().st_size, meter)
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._ends: list[int] = []  # bytes of the rows up to the end of each page
+        self._times: list[tuple[IntArray, IntArray]] = []  # channels and times of each page
         self._late: LimitError | None = None
         self._db = self._connect(path)
         self.on_close(self._db.close)
@@ -119,7 +119,6 @@ class SqliteContainer(Container):
             self.channels[int(id_)] = ChannelRecord(
                 id=int(id_),
                 topic=str(name),
-                type_name=ros2_type_name(str(type_name)),
                 encoding=str(encoding),
                 schema_name=str(type_name),
                 schema_encoding=schema_encoding if text else "",
@@ -149,6 +148,7 @@ class SqliteContainer(Container):
             self.spans.append(Span(len(self.spans), int(stamps.min()), int(stamps.max()) + 1, counts, ordered))
             self._pages.append((int(ids[part[0]]), int(ids[part[-1]])))
             self._ends.append(int(ends[part[-1]]))
+            self._times.append((topics[part].copy(), stamps))
         if unknown := row_count - len(ids):
             what = f"{unknown} messages of topics that the database does not name, or without a time or data"
             self.lose("unknown-channel", what, count=unknown)
@@ -204,15 +204,8 @@ class SqliteContainer(Container):
 
     def times(self, span: Span) -> dict[int, IntArray]:
         """Return the log times of one page by channel."""
-        query = "SELECT topic_id, timestamp FROM messages WHERE id BETWEEN ? AND ? ORDER BY id"
-        try:
-            times: dict[int, list[int]] = {}
-            for topic, ns in self._db.execute(query, self._pages[span.index]):
-                if isinstance(ns, int):
-                    times.setdefault(topic, []).append(min(ns, MAX_TIME_NS))
-        except sqlite3.Error as error:
-            raise SpanDamageError(str(error)) from error
-        return {topic: np.array(its, dtype=np.int64) for topic, its in times.items()}
+        topics, times = self._times[span.index]
+        return {int(topic): times[topics == topic] for topic in np.unique(topics)}
 
 
 def _text(stored: bytes) -> str:

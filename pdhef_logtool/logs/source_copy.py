@@ -64,7 +64,7 @@ def register_channels(
     other, the ids of the first file are kept.
     """
     ids: dict[_Key, int] = {}
-    ids_by_content: dict[tuple[object, ...], int] = {}
+    ids_by_content: dict[str, int] = {}
     verbatim: set[_Key] = set()
     for c, container in enumerate(log.containers):
         same_file: set[int] = set()
@@ -76,14 +76,7 @@ def register_channels(
                 target = replace(channel, metadata={k: v for k, v in channel.metadata.items() if k in _TRANSPORT})
             if channel.encoding == "cdr" and not channel.schema_data:
                 target = _with_definition(target)
-            identity = (
-                target.topic,
-                target.schema_name,
-                target.schema_encoding,
-                target.schema_data,
-                target.encoding,
-                tuple(sorted(target.metadata.items())),
-            )
+            identity = str(replace(target, id=0, schema_id=0, metadata=dict(sorted(target.metadata.items()))))
             id_ = ids_by_content.get(identity)
             if id_ is None or id_ in same_file:  # two publishers of one file stay two channels
                 id_ = writer.add_channel(target)

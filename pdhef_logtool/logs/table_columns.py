@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections import Counter
@@ -12,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.clock_evidence import decades_too_short
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.table_clocks import (
     NAMED_UNITS,
@@ -30,6 +30,7 @@ from pdhef_logtool.logs.table_clocks import (
 )
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
@@ -44,15 +45,10 @@ _ALIKE = 0.01
 #: Share of steps that are not negative, of a column that may contain times.
 _ASCENDING_SHARE = 0.99
 
+#: Evidence of motion on the unit of a clock.
+_MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
-_UNITS = frozenset(
-    re.split(
-        ",",
-        "g,mg,m/s²,m/s^2,m/s2,m/s**2,m/s/s,mps2,m/s,m/sec,mps,km/h,kmh,kph,kmph,mph,kn,kt,kts,knots,deg,°,degree,degrees,"
-        "rad,radians,mrad,deg/s,°/s,dps,deg/sec,degps,rad/s,rad/sec,radps,mdps,rpm,1/min,u/min,/min,min-1,grad,grad/s,',"
-        "m,cm,mm,km,%,bar,pa,kpa,n,nm,v,mv,a,°c,degc,c,hz,kg,-,1",
-    )
-) | {*TIME_UNITS_NS}
+_UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS_NS}
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 _LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
 
@@ -183,9 +179,36 @@ def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
     """Return a clock with the power of ten that speed and positions show."""
     rows = np.flatnonzero(clock.stamps_ns != NO_TIME)
     columns = {snake(name): column for name, column in sheet.columns.items()}
-    decades = decades_too_short(columns, rows, clock.stamps_ns[rows])
+    decades = _decades_too_short(columns, rows, clock.stamps_ns[rows])
     note = f"{name}: speed and positions show times that are 10^{decades} as long: corrected"
     return rescaled(clock, decades, note) if decades else clock
+
+
+def _decades_too_short(columns: Mapping[str, Any], rows: IntArray, stamps: IntArray) -> int:
+    """Return n if times have to be multiplied by 10**n so that speed and path agree; 0 without evidence.
+
+    Units of speed, from m/s to km/h, shorten the ratio of the path to the integral by up to 0.56 decades.
+
+    Parameters
+    ----------
+    columns : numbers [N] by name in lower case; positions in degrees, speed in any usual unit.
+    rows, stamps : rows with a time [K], and their times [K] in ns.
+    """
+    latitude, longitude, speed = (
+        next((c for n, c in columns.items() if re.fullmatch(_MOTION[name], n) and isinstance(c, np.ndarray)), None)
+        for name in ("latitude", "longitude", "speed")
+    )
+    if latitude is None or longitude is None or speed is None:
+        return 0
+    used = np.isfinite(latitude[rows]) & np.isfinite(longitude[rows]) & (latitude[rows] != 0.0)
+    rows, stamps = rows[used], stamps[used]
+    # Long steps average the noise of the positions.
+    corners = rows[:: max(1, len(rows) // _MOTION["steps"])]
+    north, east = np.diff(latitude[corners]), np.diff(longitude[corners]) * np.cos(np.radians(latitude[corners[1:]]))
+    path_m = DEGREE_M * float(np.hypot(north, east).sum())
+    length = float(np.nansum(np.abs(speed[rows[1:]]) * np.diff(stamps) * 1e-9))
+    is_moving = _MOTION["shortest_path_m"] < path_m < _MOTION["longest_path_m"] and length > 0.0
+    return math.ceil(math.log10(path_m / length) - _MOTION["noise_decades"]) if is_moving else 0
 
 
 def _best_clocks(clocks: Mapping[str, Clock], grades: Mapping[str, int]) -> list[str]:

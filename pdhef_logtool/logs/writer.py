@@ -217,32 +217,31 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
                     remedy="give its definition",
                 ) from error
         encoder = CdrEncoder(topic, type_name, definition, constants or {})
-        channel = self.add_raw_channel(
-            topic,
-            schema_name=type_name,
-            schema_encoding="ros2msg",
-            schema_data=definition.encode(),
-            message_encoding="cdr",
-            metadata={},
-        )
+        channel = self.add_channel(ChannelRecord(-1, topic, "cdr", type_name, "ros2msg", definition.encode()))
         self._encoders[topic] = (channel, encoder)
 
     def add_channel(self, record: ChannelRecord) -> int:
-        """Add a channel as a file has it, with its ids where these are free, as :meth:`add_raw_channel`."""
-        return self.add_raw_channel(
-            record.topic,
-            schema_name=record.schema_name,
-            schema_encoding=record.schema_encoding,
-            schema_data=record.schema_data,
-            message_encoding=record.encoding,
-            metadata=record.metadata,
-            channel_id=record.id,
-            schema_id=record.schema_id,
-        )
+        """Add a channel and return its id; without name and encoding of the schema it has none.
 
-    def has_ids_of(self, channel_id: int, record: ChannelRecord) -> bool:
-        """Return whether a channel has the ids of a record, which a :class:`RawChunk` of its file needs."""
-        return channel_id == record.id and self._channels[channel_id].schema_id == record.schema_id
+        The ids are those of the record if these are free, otherwise others in ascending order.
+
+        Raises
+        ------
+        OutputError : there are too many channels.
+        """
+        schema = 0
+        if record.schema_name or record.schema_encoding:
+            schema = self._add_schema(record.schema_name, record.schema_encoding, record.schema_data, record.schema_id)
+        channel = Channel(
+            id=self._free_id(self._channels, record.id),
+            topic=record.topic,
+            message_encoding=record.encoding,
+            metadata=dict(record.metadata),
+            schema_id=schema,
+        )
+        self._channels[channel.id] = channel
+        self._emit_record(channel)
+        return channel.id
 
     def add_raw_channel(
         self,
@@ -253,30 +252,14 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         schema_data: bytes,
         message_encoding: str,
         metadata: Mapping[str, str],
-        channel_id: int | None = None,
-        schema_id: int = 0,
     ) -> int:
-        """Add a channel for :class:`RawMessage` and return its id; without name and encoding it has no schema.
+        """Add a channel for :class:`RawMessage`, as :meth:`add_channel`."""
+        schema = schema_name, schema_encoding, schema_data
+        return self.add_channel(ChannelRecord(-1, topic, message_encoding, *schema, metadata))
 
-        The ids are those named if these are free, otherwise others in ascending order.
-
-        Raises
-        ------
-        OutputError : there are too many channels.
-        """
-        schema = 0
-        if schema_name or schema_encoding:
-            schema = self._add_schema(schema_name, schema_encoding, schema_data, schema_id)
-        channel = Channel(
-            id=self._free_id(self._channels, channel_id),
-            topic=topic,
-            message_encoding=message_encoding,
-            metadata=dict(metadata),
-            schema_id=schema,
-        )
-        self._channels[channel.id] = channel
-        self._emit_record(channel)
-        return channel.id
+    def has_ids_of(self, channel_id: int, record: ChannelRecord) -> bool:
+        """Return whether a channel has the ids of a record, which a :class:`RawChunk` of its file needs."""
+        return channel_id == record.id and self._channels[channel_id].schema_id == record.schema_id
 
     def _add_schema(self, name: str, encoding: str, data: bytes, wanted: int) -> int:
         key = (name, encoding, data)
@@ -285,15 +268,15 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             return wanted
         if key in self._schema_ids and (held is not None or not wanted):
             return self._schema_ids[key]
-        schema = Schema(id=self._free_id(self._schemas, wanted or None), data=data, encoding=encoding, name=name)
+        schema = Schema(id=self._free_id(self._schemas, wanted or -1), data=data, encoding=encoding, name=name)
         self._schemas[schema.id] = schema
         self._schema_ids.setdefault(key, schema.id)
         self._emit_record(schema)
         return schema.id
 
-    def _free_id(self, taken: Mapping[int, object], wanted: int | None) -> int:
+    def _free_id(self, taken: Mapping[int, object], wanted: int) -> int:
         """Return the wanted id if it is free, otherwise the next above all ids, or a gap."""
-        if wanted is not None and 0 <= wanted <= _LARGEST_ID and wanted not in taken:
+        if 0 <= wanted <= _LARGEST_ID and wanted not in taken:
             return wanted
         above = max(taken, default=0) + 1
         if above <= _LARGEST_ID:
@@ -386,16 +369,13 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
     def _emit_chunk(self, chunk: RawChunk) -> None:
         channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
         start_ns, end_ns = int(log_time.min()), int(log_time.max())
-        chunk_start, chunk_length = self._emit_record(
-            Chunk(
-                compression=chunk.compression,
-                data=stored,
-                message_start_time=start_ns,
-                message_end_time=end_ns,
-                uncompressed_crc=chunk.crc,
-                uncompressed_size=chunk.size,
-            )
-        )
+        about: dict[str, Any] = {
+            "compression": chunk.compression,
+            "message_start_time": start_ns,
+            "message_end_time": end_ns,
+            "uncompressed_size": chunk.size,
+        }
+        chunk_start, chunk_length = self._emit_record(Chunk(data=stored, uncompressed_crc=chunk.crc, **about))
         index_at = self._at
         offsets: dict[int, int] = {}
         index = bytearray()
@@ -413,13 +393,10 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             ChunkIndex(
                 chunk_start_offset=chunk_start,
                 chunk_length=chunk_length,
-                message_start_time=start_ns,
-                message_end_time=end_ns,
                 message_index_offsets=offsets,
                 message_index_length=self._at - index_at,
-                compression=chunk.compression,
                 compressed_size=len(stored),
-                uncompressed_size=chunk.size,
+                **about,
             )
         )
         self._first_ns = start_ns if self._first_ns is None else min(self._first_ns, start_ns)
@@ -428,17 +405,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
     def attachment(self, record: Attachment) -> None:
         """Add a file."""
         start, length = self._emit_record(record)
-        self._attachment_indexes.append(
-            AttachmentIndex(
-                offset=start,
-                length=length,
-                create_time=record.create_time,
-                log_time=record.log_time,
-                data_size=len(record.data),
-                name=record.name,
-                media_type=record.media_type,
-            )
-        )
+        about = {name: getattr(record, name) for name in ("create_time", "log_time", "name", "media_type")}
+        index = AttachmentIndex(offset=start, length=length, data_size=len(record.data), **about)
+        self._attachment_indexes.append(index)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a record of key-value pairs."""

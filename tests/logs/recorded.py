@@ -1,13 +1,19 @@
-"""Helpers for the reader tests: fields that every log contains, and values decoded by an independent reader."""
+"""Helpers for the reader tests: contents of logs, by this and by independent readers, and writers of small logs."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from mcap.reader import make_reader
+from mcap.summary import Summary
+
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.writer import McapLogWriter
 
 
 def numeric_paths(log: DriveLog, topic: str) -> list[str]:
@@ -39,3 +45,57 @@ def attribute(message: Any, path: str) -> Any:
     for name in path.split("."):
         message = getattr(message, name)
     return message
+
+
+def counts_of(log: DriveLog) -> dict[str, int]:
+    """Number of messages of each topic that are read."""
+    return {topic: len(columns) for topic, columns in log.read({}, stamps=[t.name for t in log.topics]).items()}
+
+
+def fields_of(path: Path, topic: str, *fields: str) -> dict[str, Any]:
+    """Fields of a topic of a log."""
+    with closing(open_log(path)) as log:
+        return dict(log.read({topic: fields})[topic].fields)
+
+
+def summary_of(path: Path) -> Summary:
+    """Summary of an MCAP by another reader."""
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return summary
+
+
+def messages_of(path: Path, without: str = "") -> list[tuple[object, ...]]:
+    """Everything about every message of an MCAP by another reader, in order of log time, but for those of a topic."""
+    with path.open("rb") as file:
+        found = [row for row in make_reader(file, validate_crcs=True).iter_messages() if row[1].topic != without]
+    about = [(c.message_encoding, tuple(sorted(c.metadata.items()))) for _, c, _ in found]
+    schemas = [s and (s.name, s.encoding, s.data) for s, _, _ in found]
+    stamps = [(m.log_time, c.topic, m.data, m.publish_time, m.sequence) for _, c, m in found]
+    return [(*row, *of, schema) for row, of, schema in zip(stamps, about, schemas, strict=True)]
+
+
+def raw_channel(writer: McapLogWriter, topic: str, name: str = "", text: bytes = b"", message: str = "cdr") -> int:
+    """Add a channel with a ROS 2 definition, or without a schema."""
+    kind = "ros2msg" if name else ""
+    return writer.add_raw_channel(
+        topic, schema_name=name, schema_encoding=kind, schema_data=text, message_encoding=message, metadata={}
+    )
+
+
+def write_vectors(folder: Path, topic: str, count: int, storage: str = "sqlite3", compression: str = "") -> Path:
+    """Write a rosbag2 folder of vectors x = 0, 0.25, ... by the writer of another project."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, name = get_typestore(Stores.ROS2_HUMBLE), "geometry_msgs/msg/Vector3"
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if compression:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection(topic, name, typestore=store)
+        for i in range(count):
+            message = store.types[name](x=0.25 * i, y=0.0, z=0.0)
+            writer.write(connection, 1_700_000_000_000_000_000 + i, store.serialize_cdr(message, name))
+    return folder

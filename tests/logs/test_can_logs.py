@@ -221,26 +221,29 @@ def numbers_of(tables: Tables) -> list[int]:
     return frames_of(tables).data[:, :4].copy().view("<u4")[:, 0].tolist()
 
 
-def test_times_before_the_trigger_are_negative(tmp_path: Path) -> None:
-    objects = [blf_object(86, classic(256, b"\1"), 10**9 * t) for t in (-5, -1, 0, 3)]
-    tables = read(blf(tmp_path / "a.blf", container(b"".join(objects))))
-    assert ((frames_of(tables).stamps_ns - START_NS) // 10**9).tolist() == [-5, -1, 0, 3]
-
-
-def test_units_of_time_and_versions_of_headers(tmp_path: Path) -> None:
-    objects = [
-        blf_object(1, classic(256, b"\1"), 200_000, unit=1),
-        blf_object(1, classic(257, b"\2"), 3 * 10**9, version=2),
-        blf_object(96, bytes(48), 4 * 10**9),  # an event of another kind
-    ]
-    tables = read(blf(tmp_path / "a.blf", container(b"".join(objects))))
-    assert (frames_of(tables).stamps_ns - START_NS).tolist() == [2 * 10**9, 3 * 10**9]
+@pytest.mark.parametrize(
+    ("objects", "times_ns", "date"),
+    [
+        ([blf_object(86, classic(256, b"\1"), 10**9 * t) for t in (-5, -1, 0, 3)], [-5e9, -1e9, 0, 3e9], None),
+        (
+            [
+                blf_object(1, classic(256, b"\1"), 200_000, unit=1),
+                blf_object(1, classic(257, b"\2"), 3 * 10**9, version=2),
+                blf_object(96, bytes(48), 4 * 10**9),  # an event of another kind
+            ],
+            [2e9, 3e9],
+            None,
+        ),
+        ([numbered(3)], [0, 1e7, 2e7], (0,) * 8),
+    ],
+    ids=["before the trigger", "units and versions of headers", "without a date"],
+)
+def test_times_of_a_blf(
+    objects: list[bytes], times_ns: list[float], date: tuple[int, ...] | None, tmp_path: Path
+) -> None:
+    tables = read(blf(tmp_path / "a.blf", container(b"".join(objects)), **({"date": date} if date else {})))
+    assert (frames_of(tables).stamps_ns - (RELATIVE_NS if date else START_NS)).tolist() == times_ns
     assert tables.losses == []
-
-
-def test_a_file_without_a_date_counts_from_its_start(tmp_path: Path) -> None:
-    tables = read(blf(tmp_path / "a.blf", container(numbered(3)), date=(0,) * 8))
-    assert (frames_of(tables).stamps_ns - RELATIVE_NS).tolist() == [0, 10**7, 2 * 10**7]
 
 
 def test_can_fd_frames_with_data_behind_them(tmp_path: Path) -> None:
@@ -314,12 +317,23 @@ def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     assert [loss.kind for loss in tables.losses] == ["truncated"]
 
 
-def test_a_container_beyond_the_limits_is_a_loss_of_itself(tmp_path: Path) -> None:
-    bomb = container(bytes(1 << 20), size=3 << 30)
-    tables = read(blf(tmp_path / "a.blf", container(numbered(5)), bomb, container(numbered(5, first=5))))
+@pytest.mark.parametrize(
+    ("bad", "limits", "kind", "text"),
+    [
+        ([container(bytes(1 << 20), size=3 << 30)], {}, "over-budget", "budget="),
+        ([container(bytes(1 << 20))] * 6, {"table_bytes": 3 << 20}, "over-budget", "table bytes"),
+        ([container(numbered(5), size=100)], {}, "bad-chunk", "100 bytes"),
+    ],
+    ids=["beyond the limits", "together beyond the limits", "larger than it states"],
+)
+def test_a_container_that_harms_is_a_loss_of_itself(
+    bad: list[bytes], limits: dict[str, int], kind: str, text: str, tmp_path: Path
+) -> None:
+    path = blf(tmp_path / "a.blf", container(numbered(5)), *bad, container(numbered(5, first=5)))
+    with path.open("rb") as stream:
+        tables = open_blf(TableFile(stream, path.stat().st_size, "a.blf", replace(DEFAULT_LIMITS, **limits)))
     assert numbers_of(tables) == list(range(10))
-    assert [loss.kind for loss in tables.losses] == ["over-budget"]
-    assert "budget=" in tables.losses[0].what
+    assert any(loss.kind == kind and text in loss.what for loss in tables.losses)
 
 
 def test_many_damaged_places_are_counted(tmp_path: Path) -> None:
@@ -329,21 +343,6 @@ def test_many_damaged_places_are_counted(tmp_path: Path) -> None:
     assert numbers_of(tables) == list(range(5))
     assert len(tables.losses) < 30
     assert sum(loss.count or 1 for loss in tables.losses) == 50
-
-
-def test_all_containers_together_have_a_limit(tmp_path: Path) -> None:
-    path = blf(tmp_path / "a.blf", container(numbered(5)), *[container(bytes(1 << 20))] * 6)
-    limits = replace(DEFAULT_LIMITS, table_bytes=3 << 20)
-    with path.open("rb") as stream:
-        tables = open_blf(TableFile(stream, path.stat().st_size, "a.blf", limits))
-    assert numbers_of(tables) == list(range(5))
-    assert any(loss.kind == "over-budget" and "table bytes" in loss.what for loss in tables.losses)
-
-
-def test_a_container_that_is_larger_than_it_states_is_a_loss(tmp_path: Path) -> None:
-    tables = read(blf(tmp_path / "a.blf", container(numbered(5), size=100), container(numbered(5, first=5))))
-    assert numbers_of(tables) == list(range(5, 10))
-    assert "100 bytes" in tables.losses[0].what
 
 
 @pytest.mark.parametrize("data", [b"LOGG", b"LOGG" + bytes(200), b"LOGG" + b"\xff" * 200])

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from mcap.writer import CompressionType
+from recorded import summary_of
 
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.logs.container import Wanted
@@ -60,21 +61,19 @@ def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: P
     content = bytearray(path.read_bytes())
     content[_first_numbers(path)[message] + 3] ^= 1 << message % 8
     path.write_bytes(content)
-    log = open_log(path)
-    values = log.read({"/t": ["a", "b", "c"]})["/t"].fields
-    assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-data-crc", "lost")]
-    assert "it is unknown which" in log.lost[0].what
-    np.testing.assert_array_equal(values["b"], 0.5 * np.arange(N))  # readable values are returned
-    log.close()
+    with closing(open_log(path)) as log:
+        values = log.read({"/t": ["a", "b", "c"]})["/t"].fields
+        assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-data-crc", "lost")]
+        assert "it is unknown which" in log.lost[0].what
+        np.testing.assert_array_equal(values["b"], 0.5 * np.arange(N))  # readable values are returned
     assert _exit_code(path) == EXIT_PARTIAL
 
 
 @pytest.mark.parametrize("chunked", [True, False])
 def test_a_sound_log_whose_data_has_a_crc_is_covered_by_it(tmp_path: Path, chunked: bool) -> None:
     path = _log(tmp_path / "log.mcap", chunk_crcs=False, data_crc=True, chunked=chunked)
-    log = open_log(path)
-    assert log.lost == ()
-    log.close()
+    with closing(open_log(path)) as log:
+        assert log.lost == ()
     assert _exit_code(path) == EXIT_OK
 
 
@@ -92,28 +91,22 @@ def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp
             writer.add_message(channels[i // N], T0 + i * 10_000_000, b'{"a": %d}' % i, T0 + i * 10_000_000)
     with serving(**{"log.mcap": path.read_bytes()}) as server:
         place = RemotePlace(server.place("log.mcap"))
-        log = open_log(place, wanted=Wanted(frozenset({"/a"})))
-        assert [(loss.kind, loss.severity) for loss in log.lost] == [("unverified", "note")]
-        assert log.index is not None
-        assert len(log.read({"/a": ["a"]})["/a"]) == N
-        log.close()
-        log = open_log(place)  # all of it
-        log.read({"/a": ["a"], "/b": ["a"]})
-        assert log.lost == ()
-        log.close()
+        with closing(open_log(place, wanted=Wanted(frozenset({"/a"})))) as log:
+            assert [(loss.kind, loss.severity) for loss in log.lost] == [("unverified", "note")]
+            assert log.index is not None
+            assert len(log.read({"/a": ["a"]})["/a"]) == N
+        with closing(open_log(place)) as log:  # all of it
+            log.read({"/a": ["a"], "/b": ["a"]})
+            assert log.lost == ()
 
 
 def test_damage_of_a_summary_is_a_note(tmp_path: Path) -> None:
     path = _log(tmp_path / "log.mcap", chunk_crcs=True, data_crc=False)
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
     content = bytearray(path.read_bytes())
-    last = struct.pack("<Q", summary.chunk_indexes[-1].chunk_start_offset)
+    last = struct.pack("<Q", summary_of(path).chunk_indexes[-1].chunk_start_offset)
     content[content.rindex(last)] ^= 4  # where the last chunk begins, which a near log does not ask the index
     path.write_bytes(content)
-    log = open_log(path)
-    assert len(log.read({"/t": ["a"]})["/t"]) == N
-    assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-summary-crc", "note")]
-    log.close()
+    with closing(open_log(path)) as log:
+        assert len(log.read({"/t": ["a"]})["/t"]) == N
+        assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-summary-crc", "note")]
     assert _exit_code(path) == EXIT_OK

@@ -1,8 +1,10 @@
-"""Chunks that a full copy keeps unchanged, and chunks that it copies message by message."""
+"""Full copies: every message, attachment and metadata record of the source; chunks that stay unchanged, and others."""
 
 from __future__ import annotations
 
 import struct
+from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,10 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
+from recorded import decoded_by_rosbags, messages_of, raw_channel, summary_of
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.container import RawChunk
+from pdhef_logtool.logs.container import ChannelRecord, RawChunk
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
@@ -47,16 +50,15 @@ def _write(path: Path, n: int = 600, *, compression=CompressionType.ZSTD, chunk_
 
 def _annotate(source: Path | ColumnarLog, target: Path, leave_out=lambda _: False, batches: bool = True, window=()):
     """Copy with a topic of ours beside it, which begins before and ends behind the source."""
-    log = open_log(source) if isinstance(source, Path) else source
-    with McapLogWriter(target, profile=source_profile(log)) as writer:
-        channels = register_channels(writer, log, leave_out=leave_out)
-        writer.add_topic("/ours", "std_msgs/msg/Float64")
-        stamps = T0 - 50_000_000 + np.arange(7000) * 100_000
-        ours = [TopicBatch("/ours", stamps, stamps, {"data": np.arange(7000.0)})] if batches else []
-        items = list(iterate_copy(log, channels, *window))
-        writer.write(ours, items)
-    lost = log.lost
-    log.close()
+    with closing(open_log(source) if isinstance(source, Path) else source) as log:
+        with McapLogWriter(target, profile=source_profile(log)) as writer:
+            channels = register_channels(writer, log, leave_out=leave_out)
+            writer.add_topic("/ours", "std_msgs/msg/Float64")
+            stamps = T0 - 50_000_000 + np.arange(7000) * 100_000
+            ours = [TopicBatch("/ours", stamps, stamps, {"data": np.arange(7000.0)})] if batches else []
+            items = list(iterate_copy(log, channels, *window))
+            writer.write(ours, items)
+        lost = log.lost
     return items, lost
 
 
@@ -65,22 +67,8 @@ def _chunks(path: Path) -> list[Chunk]:
         return [r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)]
 
 
-def _messages(path: Path, without: str = "/ours") -> list[tuple[object, ...]]:
-    with path.open("rb") as stream:
-        return [
-            (
-                c.topic,
-                c.message_encoding,
-                tuple(c.metadata.items()),
-                s and (s.name, s.encoding, s.data),
-                m.log_time,
-                m.publish_time,
-                m.sequence,
-                m.data,
-            )
-            for s, c, m in make_reader(stream, validate_crcs=True).iter_messages()
-            if c.topic != without
-        ]
+def _messages(path: Path) -> list[tuple[object, ...]]:
+    return messages_of(path, without="/ours")
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
@@ -94,11 +82,9 @@ def test_chunks_are_taken_over_bit_for_bit(tmp_path: Path, compression: Compress
     copied = [c for c in _chunks(target) if c in _chunks(source)]  # data, size, CRC, compression and both times
     assert copied == _chunks(source)
     assert _messages(target) == _messages(source)
-    with target.open("rb") as stream:
-        reader = make_reader(stream)
-        summary = reader.get_summary()
-        ours = [m.log_time for _, _, m in reader.iter_messages(topics="/ours")]
+    ours = [m[0] for m in messages_of(target) if m[1] == "/ours"]
     assert ours == (T0 - 50_000_000 + np.arange(7000) * 100_000).tolist()
+    summary = summary_of(target)
     statistics = summary.statistics
     assert (statistics.message_count, statistics.channel_count) == (7600, 4)
     assert statistics.channel_message_counts == {1: 200, 2: 200, 3: 200, 4: 7000}
@@ -118,22 +104,20 @@ def test_every_message_is_found_through_the_copied_indexes(tmp_path: Path) -> No
             with source.open("rb") as a, target.open("rb") as b:
                 expected = [m.data for _, _, m in make_reader(a).iter_messages(topics=topic, **options)]
                 assert [m.data for _, _, m in make_reader(b).iter_messages(topics=topic, **options)] == expected
-    log = open_log(target)
-    assert sum(t.messages for t in log.topics) == 7600
-    container = log.containers[0]
-    assert isinstance(container, McapContainer)
-    for span in container.spans:
-        # These counts are read from the chunk's index only; the load visits every message.
-        block = container.load(span)
-        ids, counts = np.unique(block.channel, return_counts=True)
-        assert dict(zip(ids.tolist(), counts.tolist(), strict=True)) == span.counts
-    log.close()
+    with closing(open_log(target)) as log:
+        assert sum(t.messages for t in log.topics) == 7600
+        container = log.containers[0]
+        assert isinstance(container, McapContainer)
+        for span in container.spans:
+            # These counts are read from the chunk's index only; the load visits every message.
+            block = container.load(span)
+            ids, counts = np.unique(block.channel, return_counts=True)
+            assert dict(zip(ids.tolist(), counts.tolist(), strict=True)) == span.counts
 
 
 def _damage_chunk(path: Path, number: int) -> tuple[int, int]:
     """Flip a byte inside the compressed records of a chunk; returns the log times it held as [start, end)."""
-    with path.open("rb") as stream:
-        index = sorted(make_reader(stream).get_summary().chunk_indexes, key=lambda c: c.chunk_start_offset)[number]
+    index = sorted(summary_of(path).chunk_indexes, key=lambda c: c.chunk_start_offset)[number]
     data = bytearray(path.read_bytes())
     data[index.chunk_start_offset + index.chunk_length - 100] ^= 0x40
     path.write_bytes(data)
@@ -149,7 +133,7 @@ def test_a_damaged_chunk_is_dropped_and_said(tmp_path: Path, compression: Compre
     items, lost = _annotate(source, target)
     assert [(x.kind, x.start_ns, x.end_ns) for x in lost] == [("bad-chunk", start, end)]
     assert all(isinstance(item, RawChunk) for item in items)
-    assert _messages(target) == [m for m in intact if not start <= m[4] < end]  # type: ignore[operator]
+    assert _messages(target) == [m for m in intact if not start <= m[0] < end]  # type: ignore[operator]
     assert _messages(target) != intact
 
 
@@ -159,7 +143,7 @@ def test_chunks_that_hold_what_is_left_out_are_taken_apart(tmp_path: Path) -> No
     items, lost = _annotate(source, target, leave_out=lambda topic: topic == "/old")
     assert lost == ()
     assert all(isinstance(item, RawMessage) for item in items)
-    assert _messages(target) == [m for m in _messages(source) if m[0] != "/old"]
+    assert _messages(target) == [m for m in _messages(source) if m[1] != "/old"]
 
 
 def test_a_window_takes_apart_only_the_chunks_at_its_ends(tmp_path: Path) -> None:
@@ -170,7 +154,7 @@ def test_a_window_takes_apart_only_the_chunks_at_its_ends(tmp_path: Path) -> Non
     kinds = ["chunk" if isinstance(item, RawChunk) else "message" for item in items]
     inside = [c for c in _chunks(source) if c.message_start_time >= window[0] and c.message_end_time < window[1]]
     assert kinds.count("chunk") == len(inside) >= 2
-    assert _messages(target) == [m for m in _messages(source) if window[0] <= m[4] < window[1]]  # type: ignore[operator]
+    assert _messages(target) == [m for m in _messages(source) if window[0] <= m[0] < window[1]]  # type: ignore[operator]
 
 
 def _split(tmp_path: Path, swap: bool) -> ColumnarLog:
@@ -180,17 +164,7 @@ def _split(tmp_path: Path, swap: bool) -> ColumnarLog:
         path = tmp_path / f"{k}.mcap"
         with McapLogWriter(path) as writer:
             names = ["/b", "/a"] if swap and k else ["/a", "/b"]
-            ids = {
-                name: writer.add_raw_channel(
-                    name,
-                    schema_name=f"own/msg/{name[1].upper()}",
-                    schema_encoding="ros2msg",
-                    schema_data=TEXT,
-                    message_encoding="cdr",
-                    metadata={},
-                )
-                for name in names
-            }
+            ids = {name: raw_channel(writer, name, f"own/msg/{name[1].upper()}", TEXT) for name in names}
             times = T0 + 10**9 * k + np.arange(100)
             writer.write(
                 [], [RawMessage(ids["/b" if i % 2 else "/a"], int(t), 0, i, b"x") for i, t in enumerate(times)]
@@ -207,16 +181,14 @@ def test_split_files_keep_their_chunks_while_their_ids_agree(tmp_path: Path, swa
     assert [type(item) for item in items[1:]] == ([RawMessage] * 100 if swap else [RawChunk])
     expected = _messages(tmp_path / "0.mcap") + _messages(tmp_path / "1.mcap")
     assert _messages(target) == expected
-    with target.open("rb") as stream:
-        assert len(make_reader(stream).get_summary().channels) == 3
+    assert len(summary_of(target).channels) == 3
 
 
 def test_two_publishers_of_a_topic_stay_two_channels(tmp_path: Path) -> None:
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     _write(source, extra=("/d", "/d"))
     _annotate(source, target, batches=False)
-    with target.open("rb") as stream:
-        topics = [channel.topic for channel in make_reader(stream).get_summary().channels.values()]
+    topics = [channel.topic for channel in summary_of(target).channels.values()]
     assert sorted(topics) == ["/a", "/b", "/c", "/d", "/d", "/ours"]
     assert _messages(target) == _messages(source)
 
@@ -242,15 +214,12 @@ def test_overlapping_chunks_keep_the_order_of_the_file(tmp_path: Path) -> None:
 
 
 def test_ids_that_are_taken_are_replaced(tmp_path: Path) -> None:
-    channel = {"schema_encoding": "ros2msg", "schema_data": TEXT, "message_encoding": "cdr", "metadata": {}}
     target = tmp_path / "x.mcap"
     with McapLogWriter(target) as writer:
         asked = (("/a", "A", 0, 2), ("/b", "A", 0, 2), ("/c", "B", 4, 2), ("/d", "A", 5, 7), ("/e", "A", 6, 2))
         for topic, schema, channel_id, schema_id in asked:
-            writer.add_raw_channel(topic, schema_name=schema, channel_id=channel_id, schema_id=schema_id, **channel)
-    with target.open("rb") as stream:
-        channels = make_reader(stream).get_summary().channels.values()
-    ids = {c.topic: (c.id, c.schema_id) for c in channels}
+            writer.add_channel(ChannelRecord(channel_id, topic, "cdr", schema, "ros2msg", TEXT, schema_id=schema_id))
+    ids = {c.topic: (c.id, c.schema_id) for c in summary_of(target).channels.values()}
     assert ids == {"/a": (0, 2), "/b": (1, 2), "/c": (4, 3), "/d": (5, 7), "/e": (6, 2)}
 
 
@@ -265,5 +234,63 @@ def test_an_index_that_omits_a_message_does_not_hide_it(tmp_path: Path) -> None:
     source.write_bytes(data)
     items, _ = _annotate(source, target, batches=False)
     assert isinstance(items[0], RawChunk)
-    with target.open("rb") as stream:
-        assert len(list(make_reader(stream).iter_messages())) == 30
+    assert len(_messages(target)) == 30
+
+
+# ---- full copies of recordings ----
+
+
+def _copy_all(source: Path, target: Path) -> None:
+    with closing(open_log(source)) as log, McapLogWriter(target, profile=source_profile(log)) as writer:
+        channels = register_channels(writer, log)
+        writer.write([], iterate_copy(log, channels))
+        for a in log.attachments():
+            writer.attachment(a)
+        for m in log.metadata_records():
+            writer.metadata(m.name, m.metadata)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "data/drives/comma2k19_segment.mcap",
+        "data/drives/faulty/revs_250lm_a_disorder.mcap",
+        "reader_corpus/plotjuggler_pj-mcap-server/test_unsupported_encoding.mcap",
+        "reader_corpus/rerun/foxglove_log.mcap",
+    ],
+)
+def test_copies_of_recordings_equal_their_sources(shared_dir: Path, tmp_path: Path, name: str) -> None:
+    _copy_all(shared_dir / name, tmp_path / "copy.mcap")
+    copied, original = messages_of(tmp_path / "copy.mcap"), messages_of(shared_dir / name)
+    assert len(copied) == len(original)
+    assert [m[0] for m in copied] == [m[0] for m in original]
+    # The other reader leaves the order of equal log times open.
+    assert Counter(copied) == Counter(original)
+
+
+def test_a_database_copy_keeps_bytes_and_definitions(shared_dir: Path, tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
+
+    source = shared_dir / "data/drives/lunda_v40"
+    _copy_all(source, tmp_path / "copy.mcap")
+    with AnyReader([source]) as reader:
+        expected = [(stamp, c.topic, c.msgtype, bytes(data)) for c, stamp, data in reader.messages()]
+    copied = [(m[0], m[1], m[-1][0], m[2]) for m in messages_of(tmp_path / "copy.mcap")]  # type: ignore[index]
+    assert sorted(copied) == sorted(expected)
+    assert len(decoded_by_rosbags([tmp_path / "copy.mcap"])["/vbox/slip"]) == 2396
+
+
+@pytest.mark.parametrize(
+    "name", ["reader_corpus/plotjuggler/tilt_laser.bag", "reader_corpus/foxglove_rosbag1/example-bz2.bag"]
+)
+def test_a_copy_of_a_bag_keeps_its_messages(shared_dir: Path, tmp_path: Path, name: str) -> None:
+    from rosbags.highlevel import AnyReader
+
+    _copy_all(shared_dir / name, tmp_path / "copy.mcap")
+    with AnyReader([shared_dir / name]) as reader:
+        expected = [(stamp, c.topic, bytes(data)) for c, stamp, data in reader.messages()]
+    assert sorted((m[0], m[1], m[2]) for m in messages_of(tmp_path / "copy.mcap")) == sorted(expected)
+    with closing(open_log(shared_dir / name)) as bag, closing(open_log(tmp_path / "copy.mcap")) as copy:
+        assert copy.topics == bag.topics
+        assert {t.encoding for t in copy.topics} == {"ros1"}
+        assert [copy.fields(t.name) for t in copy.topics] == [bag.fields(t.name) for t in bag.topics]

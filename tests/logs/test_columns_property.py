@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from recorded import raw_channel
 
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
@@ -139,24 +141,18 @@ def test_columns_equal_the_independent_deserialiser(
         payloads.append(bytes(store.serialize_cdr(message, "own/msg/T0")))
     path = tmp_path_factory.mktemp("columns") / "x.mcap"
     with McapLogWriter(path) as writer:
-        channel = writer.add_raw_channel(
-            "/t", schema_name="own/msg/T0", schema_encoding="ros2msg", schema_data=text.encode(),
-            message_encoding="cdr", metadata={},
-        )  # fmt: skip
-        other = writer.add_raw_channel(
-            "/o", schema_name="", schema_encoding="", schema_data=b"", message_encoding="octets", metadata={}
-        )
+        channel = raw_channel(writer, "/t", "own/msg/T0", text.encode())
+        other = raw_channel(writer, "/o", message="octets")
         for first in range(0, n, 8):  # a chunk each; the layout changes in the middle of one
             part = enumerate(payloads[first : first + 8], first)
             raws = [(RawMessage(channel, T0 + i, T0, i, p), RawMessage(other, T0 + i, T0, i, p[:i])) for i, p in part]
             writer.write([], [message for pair in raws for message in pair])
     messages = [store.deserialize_cdr(p, "own/msg/T0") for p in payloads]
-    log = open_log(path)
-    assert len(log.containers[0].spans) == 5  # type: ignore[attr-defined]
-    paths = list(_numeric_paths(types, "T0"))
-    read = log.read({"/t": paths})["/t"].fields
-    assert log.lost == ()
-    log.close()
+    with closing(open_log(path)) as log:
+        assert len(log.containers[0].spans) == 5  # type: ignore[attr-defined]
+        paths = list(_numeric_paths(types, "T0"))
+        read = log.read({"/t": paths})["/t"].fields
+        assert log.lost == ()
     for path_ in paths:
         column, values = read[path_], [_expected(m, path_) for m in messages]
         if column.ndim == 1:
@@ -176,13 +172,8 @@ def _with_payloads(path: Path, payload_bytes: int, own_chunks: bool) -> None:
     name = "std_msgs/msg/Float64"
     noise = np.random.default_rng(0).bytes(payload_bytes)
     with McapLogWriter(path) as writer:
-        channel = writer.add_raw_channel(
-            "/x", schema_name=name, schema_encoding="ros2msg", schema_data=message_definition(name).encode(),
-            message_encoding="cdr", metadata={},
-        )  # fmt: skip
-        image = writer.add_raw_channel(
-            "/image", schema_name="", schema_encoding="", schema_data=b"", message_encoding="octets", metadata={}
-        )
+        channel = raw_channel(writer, "/x", name, message_definition(name).encode())
+        image = raw_channel(writer, "/image", message="octets")
         numbers = [RawMessage(channel, T0 + i, T0, i, b"\0\1\0\0" + np.float64(i).tobytes()) for i in range(200)]
         images = [RawMessage(image, T0 + i, T0, i, noise) for i in range(200)] if payload_bytes else []
         if own_chunks:
@@ -193,12 +184,11 @@ def _with_payloads(path: Path, payload_bytes: int, own_chunks: bool) -> None:
 
 
 def _peak_bytes(path: Path) -> int:
-    log = open_log(path)
-    tracemalloc.start()
-    read = log.read({"/x": ["data"]})["/x"].fields["data"]
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    log.close()
+    with closing(open_log(path)) as log:
+        tracemalloc.start()
+        read = log.read({"/x": ["data"]})["/x"].fields["data"]
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
     np.testing.assert_array_equal(read, np.arange(200.0))
     return peak
 
@@ -215,18 +205,17 @@ def test_chunks_without_a_mapped_topic_are_not_even_decompressed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _with_payloads(tmp_path / "x.mcap", 300_000, own_chunks=True)
-    log = open_log(tmp_path / "x.mcap")
-    decompressed: list[int] = []
-    content = McapContainer.chunk_content
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        decompressed: list[int] = []
+        content = McapContainer.chunk_content
 
-    def counting(self: McapContainer, start: int, end: int) -> bytes:
-        found = content(self, start, end)
-        decompressed.append(len(found))
-        return found
+        def counting(self: McapContainer, start: int, end: int) -> bytes:
+            found = content(self, start, end)
+            decompressed.append(len(found))
+            return found
 
-    monkeypatch.setattr(McapContainer, "chunk_content", counting)
-    log.read({"/x": ["data"]})
-    assert decompressed == [200 * (31 + 12)]
-    log.read({"/image": []})
-    assert sum(decompressed[1:]) == 200 * (31 + 300_000)
-    log.close()
+        monkeypatch.setattr(McapContainer, "chunk_content", counting)
+        log.read({"/x": ["data"]})
+        assert decompressed == [200 * (31 + 12)]
+        log.read({"/image": []})
+        assert sum(decompressed[1:]) == 200 * (31 + 300_000)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from recorded import fields_of
 
 from pdhef_logtool.logs.decoding import NO_TIME_NS
 from pdhef_logtool.logs.open_log import open_log
@@ -37,11 +39,7 @@ def _read_json(path: Path, messages: Sequence[object], schema: object, fields: S
     text = "" if schema is None else json.dumps(schema)
     encoding = "" if schema is None else "jsonschema"
     _write_raw(path, [json.dumps(m).encode() for m in messages], "json", "T", encoding, text)
-    log = open_log(path)
-    try:
-        return dict(log.read({"/t": fields})["/t"].fields)
-    finally:
-        log.close()
+    return fields_of(path, "/t", *fields)
 
 
 def _rosbags_store() -> Any:
@@ -67,10 +65,9 @@ def test_json_without_a_schema_takes_its_fields_from_the_first_message(tmp_path:
     read = _read_json(tmp_path / "x.mcap", messages, None, ["speed", "pos"])
     np.testing.assert_array_equal(read["speed"], [1, 2])
     np.testing.assert_array_equal(read["pos"], [[1, 2, 3], [np.nan] * 3])
-    log = open_log(tmp_path / "x.mcap")
-    kinds = {f.path: f.kind for f in log.fields("/t")}
-    assert kinds == {"speed": "number", "pos.x": "number", "pos.y": "number", "pos.z": "number", "name": "string"}
-    log.close()
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        kinds = {f.path: f.kind for f in log.fields("/t")}
+        assert kinds == {"speed": "number", "pos.x": "number", "pos.y": "number", "pos.z": "number", "name": "string"}
 
 
 def test_json_times_are_nanoseconds_and_missing_ones_are_marked(tmp_path: Path) -> None:
@@ -89,13 +86,12 @@ def test_places_that_a_json_schema_leaves_open_are_found_in_the_messages(tmp_pat
 
 def test_a_json_message_that_is_no_json_is_counted(tmp_path: Path) -> None:
     _write_raw(tmp_path / "x.mcap", [b'{"a": 1}', b"{", b'{"a": 3}'], "json", "T", "", "")
-    log = open_log(tmp_path / "x.mcap")
-    for start in (None, T0 + 1):  # a second read must not count it twice
-        read = log.read({"/t": ["a"]}, start)["/t"].fields["a"]
-        np.testing.assert_array_equal(read, [1, np.nan, 3] if start is None else [np.nan, 3])
-        (loss,) = log.lost
-        assert (loss.kind, loss.count, loss.severity) == ("undecodable", 1, "lost")
-    log.close()
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        for start in (None, T0 + 1):  # a second read must not count it twice
+            read = log.read({"/t": ["a"]}, start)["/t"].fields["a"]
+            np.testing.assert_array_equal(read, [1, np.nan, 3] if start is None else [np.nan, 3])
+            (loss,) = log.lost
+            assert (loss.kind, loss.count, loss.severity) == ("undecodable", 1, "lost")
 
 
 def test_a_cut_payload_costs_only_its_own_message(tmp_path: Path) -> None:
@@ -104,24 +100,22 @@ def test_a_cut_payload_costs_only_its_own_message(tmp_path: Path) -> None:
     full = [bytes(store.serialize_cdr(store.types[name](x=float(i), y=0.0, z=0.0), name)) for i in range(5)]
     payloads = [*full[:2], full[2][:11], *full[3:]]
     _write_raw(tmp_path / "x.mcap", payloads, "cdr", name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0])
-    log = open_log(tmp_path / "x.mcap")
-    np.testing.assert_array_equal(log.read({"/t": ["x"]})["/t"].fields["x"], [0, 1, np.nan, 3, 4])
-    assert [(loss.kind, loss.count) for loss in log.lost] == [("undecodable", 1)]
-    log.close()
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        np.testing.assert_array_equal(log.read({"/t": ["x"]})["/t"].fields["x"], [0, 1, np.nan, 3, 4])
+        assert [(loss.kind, loss.count) for loss in log.lost] == [("undecodable", 1)]
 
 
 def test_listed_fields_follow_the_schema(tmp_path: Path) -> None:
     store = _rosbags_store()
     name = "nav_msgs/msg/Odometry"
     _write_raw(tmp_path / "x.mcap", [], "cdr", name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0])
-    log = open_log(tmp_path / "x.mcap")
-    kinds = {f.path: f.kind for f in log.fields("/t")}
-    assert kinds["header.stamp"] == "time"
-    assert kinds["header.frame_id"] == "string"
-    assert kinds["twist.twist.angular.z"] == "number"
-    assert kinds["pose.covariance[]"] == "number"  # 36 elements: more than are listed
-    assert "header.stamp.sec" not in kinds
-    log.close()
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        kinds = {f.path: f.kind for f in log.fields("/t")}
+        assert kinds["header.stamp"] == "time"
+        assert kinds["header.frame_id"] == "string"
+        assert kinds["twist.twist.angular.z"] == "number"
+        assert kinds["pose.covariance[]"] == "number"  # 36 elements: more than are listed
+        assert "header.stamp.sec" not in kinds
 
 
 @pytest.mark.parametrize(
@@ -140,31 +134,26 @@ def test_listed_fields_follow_the_schema(tmp_path: Path) -> None:
 def test_a_wrong_path_names_the_nearest(tmp_path: Path, path: str, problem: str) -> None:
     with McapLogWriter(tmp_path / "x.mcap") as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu")
-    log = open_log(tmp_path / "x.mcap")
-    with pytest.raises(MappingError, match=problem):
+    with closing(open_log(tmp_path / "x.mcap")) as log, pytest.raises(MappingError, match=problem):
         log.read({"/imu": [path]})
-    log.close()
 
 
 def test_a_wrong_topic_names_the_nearest(tmp_path: Path) -> None:
     with McapLogWriter(tmp_path / "x.mcap") as writer:
         writer.add_topic("/vehicle/imu", "sensor_msgs/msg/Imu")
-    log = open_log(tmp_path / "x.mcap")
-    with pytest.raises(MappingError, match="nearest: /vehicle/imu"):
+    with closing(open_log(tmp_path / "x.mcap")) as log, pytest.raises(MappingError, match="nearest: /vehicle/imu"):
         log.read({"/vehicle/imv": ["x"]})
-    log.close()
 
 
 def test_an_empty_window_has_columns_of_the_right_shape(tmp_path: Path) -> None:
     with McapLogWriter(tmp_path / "x.mcap") as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu")
-    log = open_log(tmp_path / "x.mcap")
-    columns = log.read({"/imu": ["header.stamp", "orientation", "orientation_covariance", "angular_velocity.z"]})[
-        "/imu"
-    ]
-    assert (log.start_ns, log.end_ns, len(columns)) == (0, 0, 0)
-    assert columns.fields["header.stamp"].dtype == np.int64
-    assert columns.fields["orientation"].shape == (0, 4)
-    assert columns.fields["orientation_covariance"].shape == (0, 9)
-    assert columns.fields["angular_velocity.z"].shape == (0,)
-    log.close()
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        columns = log.read({"/imu": ["header.stamp", "orientation", "orientation_covariance", "angular_velocity.z"]})[
+            "/imu"
+        ]
+        assert (log.start_ns, log.end_ns, len(columns)) == (0, 0, 0)
+        assert columns.fields["header.stamp"].dtype == np.int64
+        assert columns.fields["orientation"].shape == (0, 4)
+        assert columns.fields["orientation_covariance"].shape == (0, 9)
+        assert columns.fields["angular_velocity.z"].shape == (0,)

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from pdhef_logtool.logs.definitions import read_definitions
 from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.schema_files import message_definition
+from pdhef_logtool.logs.schema_files import message_definition, schema_file
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import MappingError, UsageError
@@ -83,6 +83,14 @@ def test_definitions_of_a_folder_of_a_package_or_a_workspace(tmp_path: Path, lay
     log = open_log(path, msgs=root)
     assert [f.path for f in log.fields("/car") if f.kind == "number"] == ["inner.angle_rad"]
     np.testing.assert_allclose(log.read({"/car": ["inner.angle_rad"]})["/car"].fields["inner.angle_rad"], [0, 0.1, 0.2])
+
+
+def test_own_definition_keeps_its_units_and_carries_its_contained_types() -> None:
+    name = "pdhef_msgs/msg/VehicleStateEstimate"
+    text = message_definition(name)
+    assert text.startswith(schema_file(f"{name}.msg").read_text(encoding="utf-8").rstrip())
+    assert "MSG: std_msgs/Header" in text
+    assert "MSG: builtin_interfaces/Time" in text
 
 
 def test_common_packages_are_shipped(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from io import BytesIO
 from pathlib import Path
 
@@ -117,10 +118,9 @@ def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz: Path, tmp_
     (tmp_path / "drive.npz.zst").write_bytes(zstandard.compress(npz.read_bytes()))
     expected = open_log(npz).read({"imu": ["yaw_rate"]})["imu"]
     for place in (tmp_path / "drive.npz.zst", tmp_path):
-        log = open_log(place)
-        found = log.read({"imu": ["yaw_rate"]})["imu"]
-        np.testing.assert_array_equal(found.fields["yaw_rate"], expected.fields["yaw_rate"])
-        log.close()
+        with closing(open_log(place)) as log:
+            found = log.read({"imu": ["yaw_rate"]})["imu"]
+            np.testing.assert_array_equal(found.fields["yaw_rate"], expected.fields["yaw_rate"])
 
 
 @pytest.mark.usefixtures("_installed")
@@ -191,13 +191,12 @@ def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, t
         )
         assert {m["metric"] for m in report["metrics"]} >= {"d2"}
         assert (folder / "report.html").stat().st_size > 10_000
-        annotated = open_log(folder / "annotated.mcap")
-        assert {t.name for t in annotated.topics} == {"/pdhef/log"} | {
-            f"/pdhef/{name}/{kind}"
-            for name in ("phy_ukf", "zero", "reference")
-            for kind in ("state", "odometry", "plot", "path")
-        }  # fmt: skip
-        annotated.close()
+        with closing(open_log(folder / "annotated.mcap")) as annotated:
+            assert {t.name for t in annotated.topics} == {"/pdhef/log"} | {
+                f"/pdhef/{name}/{kind}"
+                for name in ("phy_ukf", "zero", "reference")
+                for kind in ("state", "odometry", "plot", "path")
+            }  # fmt: skip
 
 
 @pytest.mark.usefixtures("_installed")

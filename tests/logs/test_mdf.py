@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
 from pdhef_logtool.logs.table_file import TableFile, Tables
-from pdhef_logtool.records.errors import LogError, PdhefError
+from pdhef_logtool.records.errors import LogError
 from tests.command_line import called
 
 asammdf = pytest.importorskip("asammdf")
@@ -58,6 +59,11 @@ def contents(path: Path) -> Contents:
         rows = {t.name: slice(0, len(t.stamps_ns)) for t in read.tables}
         columns = {f"{t.name}.{f.path}": t.load(f.path, rows[t.name]) for t in read.tables for f in t.fields}
     return Contents(read, columns, {t.name: t.stamps_ns for t in read.tables})
+
+
+def of_bytes(folder: Path, data: bytes) -> Contents:
+    (folder / "a.mf4").write_bytes(data)
+    return contents(folder / "a.mf4")
 
 
 def written(path: Path, signals: Sequence[Any], version: str = "4.10", start: dt.datetime = START) -> Path:
@@ -215,16 +221,8 @@ def test_a_file_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None
 
 def test_links_beyond_the_end_are_a_loss(tmp_path: Path) -> None:
     data = imu()
-    (tmp_path / "a.mf4").write_bytes(patched(data, block(data, b"CN", 0) + 24, len(data) + 64))
-    read = contents(tmp_path / "a.mf4")
+    read = of_bytes(tmp_path, patched(data, block(data, b"CN", 0) + 24, len(data) + 64))
     assert "1 blocks are beyond the end of the file" in read.losses()
-
-
-@pytest.mark.parametrize("offset", [1000, 2**31, 12])
-def test_a_channel_outside_of_its_record_is_not_read(offset: int, tmp_path: Path) -> None:
-    (tmp_path / "a.mf4").write_bytes(imu(offset=offset))
-    with pytest.raises(PdhefError, match=r"with times.*AccY is outside of its record"):
-        open_log(tmp_path / "a.mf4")
 
 
 # ---- conversions ----
@@ -362,17 +360,9 @@ def test_rows_with_an_invalid_time_are_a_loss(tmp_path: Path) -> None:
     samples = np.zeros(N, [("t", "<f8"), ("a", "<f8"), ("i", "u1")])
     samples["t"], samples["a"], samples["i"] = TIME_S, AY, np.arange(N) % 5 == 0
     channels = [Ch("time", kind=2, sync=1, flags=2), Ch("AccY", 8)]
-    (tmp_path / "a.mf4").write_bytes(mdf4(channels, samples.tobytes(), N, 16, invalid_bytes=1))
-    read = contents(tmp_path / "a.mf4")
+    read = of_bytes(tmp_path, mdf4(channels, samples.tobytes(), N, 16, invalid_bytes=1))
     np.testing.assert_array_equal(read.columns["IMU.AccY"], AY[np.arange(N) % 5 != 0])
     assert [loss.count for loss in read.read.losses] == [N // 5]
-
-
-def test_an_invalidation_bit_outside_of_its_record_is_not_read(tmp_path: Path) -> None:
-    channels = [TIME, Ch("AccY", 8, flags=2, invalid_bit=2**20)]
-    (tmp_path / "a.mf4").write_bytes(mdf4(channels, bytes(17 * N), N, 16, invalid_bytes=1))
-    with pytest.raises(LogError, match="AccY is outside of its record"):
-        contents(tmp_path / "a.mf4")
 
 
 # ---- times ----
@@ -408,11 +398,10 @@ def test_offsets_of_a_utc_start_are_not_applied_twice(tmp_path: Path) -> None:
 def test_a_master_that_is_no_time_is_no_clock(sync: int, what: str, tmp_path: Path) -> None:
     samples = np.column_stack([TIME_S, AY]).tobytes()
     distance = Ch("s", kind=2, sync=sync)
-    (tmp_path / "a.mf4").write_bytes(mdf4([distance, Ch("AccY", 8)], samples, N, 16))
     with pytest.raises(LogError, match=f"its master is {what}, no time"):
-        contents(tmp_path / "a.mf4")
-    (tmp_path / "b.mf4").write_bytes(mdf4([distance, Ch("AccY", 8), TIME], samples, N, 16))
-    np.testing.assert_array_equal(contents(tmp_path / "b.mf4").columns["IMU.AccY"], AY)
+        of_bytes(tmp_path, mdf4([distance, Ch("AccY", 8)], samples, N, 16))
+    read = of_bytes(tmp_path, mdf4([distance, Ch("AccY", 8), TIME], samples, N, 16))
+    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY)
 
 
 # ---- bus logging of newer loggers ----
@@ -486,30 +475,53 @@ def test_frames_of_newer_loggers(
     assert [bytes(row[np.isfinite(row)].astype(np.uint8)) for row in data] == frames
 
 
-def test_data_of_variable_length_outside_of_their_block_are_a_loss(tmp_path: Path) -> None:
-    data = can_file([DLC], {"dlc": [8, 2, 8, 2]}, SHORT, True)
-    at = block(data, b"DT") + 24 + 12
-    (tmp_path / "a.mf4").write_bytes(patched(data, at, 2**40))
-    with pytest.raises(LogError, match="data of a frame are missing"):
-        contents(tmp_path / "a.mf4")
-
-
 # ---- files that are made to harm ----
 
 
-@pytest.mark.parametrize(("kind", "number", "link"), [(b"CN", 1, 0), (b"CN", 0, 1), (b"DG", 0, 0), (b"CG", 0, 0)])
-def test_links_in_a_circle_are_one_line(kind: bytes, number: int, link: int, tmp_path: Path) -> None:
+def circle(kind: bytes, number: int, link: int) -> bytes:
     data = imu()
-    at = block(data, kind, number)
-    (tmp_path / "a.mf4").write_bytes(patched(data, at + 24 + 8 * link, block(data, kind)))
-    with pytest.raises(LogError, match="circle"):
-        contents(tmp_path / "a.mf4")
+    return patched(data, block(data, kind, number) + 24 + 8 * link, block(data, kind))
 
 
-def test_a_file_without_its_header_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "a.mf4").write_bytes(imu().replace(b"##HD", b"##XX"))
-    with pytest.raises(LogError, match="a block HD at byte 64"):
-        contents(tmp_path / "a.mf4")
+def far_data() -> bytes:
+    data = can_file([DLC], {"dlc": [8, 2, 8, 2]}, SHORT, True)
+    return patched(data, block(data, b"DT") + 24 + 12, 2**40)
+
+
+def many_rows() -> bytes:
+    clock = Ch("time", kind=3, sync=1, bits=0, linear=(0.0, 0.01))
+    return mdf4([clock, Ch("n", kind=6, bits=0, data_type=0)], b"", 2**40, 0)
+
+
+def many_channels() -> bytes:
+    return mdf4([TIME, *(Ch(f"c{i}", 8) for i in range(DEFAULT_LIMITS.schema_leaves))], bytes(16), 1, 16)
+
+
+HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
+    **{
+        f"circle {of}": (partial(circle, *of), "circle")
+        for of in ((b"CN", 1, 0), (b"CN", 0, 1), (b"DG", 0, 0), (b"CG", 0, 0))
+    },
+    "no header": (lambda: imu().replace(b"##HD", b"##XX"), "a block HD at byte 64"),
+    "data of a frame": (far_data, "data of a frame are missing"),
+    "packed": (lambda: imu(packed=(2**40,)), "table bytes"),
+    "rows": (many_rows, "table bytes"),
+    "channels": (many_channels, "schema leaves"),
+    "bit of invalid samples": (
+        lambda: mdf4([TIME, Ch("AccY", 8, flags=2, invalid_bit=2**20)], bytes(17 * N), N, 16, invalid_bytes=1),
+        "AccY is outside of its record",
+    ),
+    **{
+        f"offset {of}": (partial(imu, offset=of), "with times.*AccY is outside of its record")
+        for of in (1000, 2**31, 12)
+    },
+}
+
+
+@pytest.mark.parametrize(("make", "match"), HARMFUL.values(), ids=HARMFUL)
+def test_a_file_that_is_made_to_harm_is_one_line(make: Callable[[], bytes], match: str, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=match):
+        of_bytes(tmp_path, make())
 
 
 def test_groups_of_version_3_in_a_circle_are_one_line(tmp_path: Path) -> None:
@@ -522,20 +534,6 @@ def test_groups_of_version_3_in_a_circle_are_one_line(tmp_path: Path) -> None:
         contents(path)
 
 
-def test_claimed_sizes_are_compared_with_the_limits_first(tmp_path: Path) -> None:
-    (tmp_path / "a.mf4").write_bytes(imu(packed=(2**40,)))
-    with pytest.raises(LogError, match="table bytes"):
-        contents(tmp_path / "a.mf4")
-    clock = Ch("time", kind=3, sync=1, bits=0, linear=(0.0, 0.01))
-    (tmp_path / "b.mf4").write_bytes(mdf4([clock, Ch("n", kind=6, bits=0, data_type=0)], b"", 2**40, 0))
-    with pytest.raises(LogError, match="table bytes"):
-        contents(tmp_path / "b.mf4")
-    channels = [TIME, *(Ch(f"c{i}", 8) for i in range(DEFAULT_LIMITS.schema_leaves))]
-    (tmp_path / "c.mf4").write_bytes(mdf4(channels, bytes(16), 1, 16))
-    with pytest.raises(LogError, match="schema leaves"):
-        contents(tmp_path / "c.mf4")
-
-
 def test_an_unfinished_file_with_several_lists_of_data_is_one_line(tmp_path: Path) -> None:
     data = bytearray(written(tmp_path / "a.mf4", [signal("ay", AY)]).read_bytes())
     group = block(bytes(data), b"DG")
@@ -543,9 +541,8 @@ def test_an_unfinished_file_with_several_lists_of_data_is_one_line(tmp_path: Pat
     for following in (lists[1], 0):
         data += struct.pack("<4s4xQQQIIQ", b"##DL", 48, 1, following, 0, 0, 0)[:48]
     data[:8], data[60:62] = b"UnFinMF ", struct.pack("<H", 0b10000)
-    (tmp_path / "a.mf4").write_bytes(patched(bytes(data), group + 24 + 16, lists[0]))
     with pytest.raises(LogError, match="several lists of data"):
-        contents(tmp_path / "a.mf4")
+        of_bytes(tmp_path, patched(bytes(data), group + 24 + 16, lists[0]))
 
 
 def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(

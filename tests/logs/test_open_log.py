@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from collections import Counter
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zstandard
+from recorded import write_vectors
 
+from pdhef_logtool import inspect_log
+from pdhef_logtool.logs import mcap_log
 from pdhef_logtool.logs.container import Block
 from pdhef_logtool.logs.open_log import is_log_folder, open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError
-from tests.mcap_files import mcap_writer
+from tests.mcap_files import copied, mcap_writer
 
 T0 = 1_700_000_000_000_000_000
 VALUES = np.arange(40) * 0.25
@@ -29,50 +33,31 @@ def _mcap(path: Path, values: np.ndarray = VALUES, start_ns: int = T0) -> Path:
     return path
 
 
-def _rosbag2(folder: Path, storage: str, *, compression: str | None = None) -> Path:
-    """Write a rosbag2 folder with the writer of another project."""
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    name = "geometry_msgs/msg/Vector3"
-    plugin = StoragePlugin.SQLITE3 if storage == "sqlite3" else StoragePlugin.MCAP
-    writer = Writer(folder, version=9, storage_plugin=plugin)
-    if compression:
-        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
-    with writer:
-        connection = writer.add_connection("/v", name, typestore=store)
-        for i, value in enumerate(VALUES):
-            message = store.types[name](x=float(value), y=0.0, z=0.0)
-            writer.write(connection, T0 + i, store.serialize_cdr(message, name))
-    return folder
-
-
 def _values(path: Path, topic: str, field: str) -> np.ndarray:
-    log = open_log(path)
-    try:
+    with closing(open_log(path)) as log:
         assert log.lost == ()
         return log.read({topic: [field]})[topic].fields[field]
-    finally:
-        log.close()
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n"
 
 
 @pytest.mark.parametrize(
-    ("content", "got"),
+    ("content", "got", "suffix"),
     [
-        (b"", "empty file"),
-        (b"time,ay\n0,1\n", "none of these"),
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n", "git lfs pull"),
-        (b"\x89MCAP0\r\n", "header"),
-        (b"#ROSBAG V2.0\n", "bag header"),
-        (b"SQLite format 3\0", "."),
-        (b"\x28\xb5\x2f\xfdgarbage", "."),
-        (b"\x89MCAP0\r\n" + b"\xff" * 60, "."),
-        (b"#ROSBAG V2.0\n" + b"\xff" * 60, "bag header"),
+        *((LFS, "git lfs pull", suffix) for suffix in (".mcap", ".csv", ".vbo", ".asc", ".mat")),
+        (b"", "empty file", ".mcap"),
+        (b"time,ay\n0,1\n", "none of these", ".mcap"),
+        (b"\x89MCAP0\r\n", "header", ".mcap"),
+        (b"#ROSBAG V2.0\n", "bag header", ".mcap"),
+        (b"SQLite format 3\0", ".", ".mcap"),
+        (b"\x28\xb5\x2f\xfdgarbage", ".", ".mcap"),
+        (b"\x89MCAP0\r\n" + b"\xff" * 60, ".", ".mcap"),
+        (b"#ROSBAG V2.0\n" + b"\xff" * 60, "bag header", ".mcap"),
     ],
 )
-def test_what_is_no_log_is_one_clear_line(tmp_path: Path, content: bytes, got: str) -> None:
-    path = tmp_path / "drive.mcap"
+def test_what_is_no_log_is_one_clear_line(tmp_path: Path, content: bytes, got: str, suffix: str) -> None:
+    path = tmp_path / f"drive{suffix}"
     path.write_bytes(content)
     with pytest.raises(LogError, match=got) as error:
         open_log(path)
@@ -81,23 +66,7 @@ def test_what_is_no_log_is_one_clear_line(tmp_path: Path, content: bytes, got: s
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".vbo", ".asc", ".mat"])
-def test_a_pointer_of_git_lfs_is_named_by_any_suffix(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"drive{suffix}"
-    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n")
-    with pytest.raises(LogError, match="git lfs pull"):
-        open_log(path)
-
-
-def test_a_database_without_the_tables_of_rosbag2_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "notes.db3"
-    with sqlite3.connect(path) as db:
-        db.execute("CREATE TABLE notes (text TEXT)")
-    with pytest.raises(LogError, match="tables 'topics' and 'messages'"):
-        open_log(path)
-
-
-def test_missing_paths_and_folders_without_one_log_are_refused(tmp_path: Path) -> None:
+def test_missing_paths_folders_without_one_log_and_other_databases_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="no such file"):
         open_log(tmp_path / "missing.mcap")
     with pytest.raises(LogError, match="folder without a log"):
@@ -106,17 +75,20 @@ def test_missing_paths_and_folders_without_one_log_are_refused(tmp_path: Path) -
     _mcap(tmp_path / "b.mcap")
     with pytest.raises(LogError, match="2 logs"):
         open_log(tmp_path)
+    with sqlite3.connect(tmp_path / "notes.db3") as db:
+        db.execute("CREATE TABLE notes (text TEXT)")
+    with pytest.raises(LogError, match="tables 'topics' and 'messages'"):
+        open_log(tmp_path / "notes.db3")
 
 
 @pytest.mark.parametrize(
-    ("storage", "compression"), [("sqlite3", None), ("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", None)]
+    ("storage", "compression"), [("sqlite3", ""), ("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", "")]
 )
-def test_rosbag2_folders_of_another_writer_read_right(tmp_path: Path, storage: str, compression: str | None) -> None:
-    folder = _rosbag2(tmp_path / "bag", storage, compression=compression)
+def test_rosbag2_folders_of_another_writer_read_right(tmp_path: Path, storage: str, compression: str) -> None:
+    folder = write_vectors(tmp_path / "bag", "/v", len(VALUES), storage, compression)
     assert is_log_folder(folder)
-    log = open_log(folder)
-    assert log.kind == f"rosbag2-{storage}"
-    log.close()
+    with closing(open_log(folder)) as log:
+        assert log.kind == f"rosbag2-{storage}"
     np.testing.assert_array_equal(_values(folder, "/v", "x"), VALUES)
 
 
@@ -129,12 +101,11 @@ def test_a_compressed_file_opens_and_a_cut_one_gives_its_beginning(tmp_path: Pat
     expected = _values(plain, "/imu", "angular_velocity.z")
     np.testing.assert_array_equal(_values(path, "/imu", "angular_velocity.z"), expected)
     path.write_bytes(compressed[: len(compressed) * 2 // 3])
-    log = open_log(path)
-    read = log.read({"/imu": ["angular_velocity.z"]})["/imu"].fields["angular_velocity.z"]
-    assert 0 < len(read) < len(expected)
-    np.testing.assert_array_equal(read, expected[: len(read)])
-    assert any(loss.kind == "truncated" and str(path) == loss.where for loss in log.lost)
-    log.close()
+    with closing(open_log(path)) as log:
+        read = log.read({"/imu": ["angular_velocity.z"]})["/imu"].fields["angular_velocity.z"]
+        assert 0 < len(read) < len(expected)
+        np.testing.assert_array_equal(read, expected[: len(read)])
+        assert any(loss.kind == "truncated" and str(path) == loss.where for loss in log.lost)
 
 
 def test_a_split_folder_with_a_missing_file_says_so_and_reads_the_rest(tmp_path: Path, shared_dir: Path) -> None:
@@ -144,10 +115,9 @@ def test_a_split_folder_with_a_missing_file_says_so_and_reads_the_rest(tmp_path:
         file.chmod(0o644)
     folder.chmod(0o755)
     (folder / "revs_250lm_a_split_1.mcap").unlink()
-    log = open_log(folder)
-    assert sum(t.messages for t in log.topics) == 39_999 + 40_001
-    assert [(loss.kind, loss.severity) for loss in log.lost] == [("missing-file", "lost")]
-    log.close()
+    with closing(open_log(folder)) as log:
+        assert sum(t.messages for t in log.topics) == 39_999 + 40_001
+        assert [(loss.kind, loss.severity) for loss in log.lost] == [("missing-file", "lost")]
 
 
 @pytest.mark.parametrize("text", ["", "a: [", "rosbag2_bagfile_information: 3", "- 1"])
@@ -159,7 +129,7 @@ def test_a_broken_metadata_file_is_one_clear_line(tmp_path: Path, text: str) -> 
 
 def _database_with_pending_writes(folder: Path) -> Path:
     """Leave a database as a recorder that was killed leaves it: rows in the write-ahead log only."""
-    source = _rosbag2(folder / "bag", "sqlite3") / "bag.db3"
+    source = write_vectors(folder / "bag", "/v", len(VALUES)) / "bag.db3"
     path = folder / "killed" / "killed.db3"
     path.parent.mkdir()
     live = folder / "live.db3"
@@ -200,3 +170,64 @@ def test_a_chunk_costs_the_same_however_many_there_are(tmp_path: Path, monkeypat
     with closing(open_log(tmp_path / "many.mcap")) as log:
         assert len(log.read({"/a": ["x"]})["/a"].fields["x"]) == 300
     assert 300 <= asked <= 2 * 300
+
+
+# ---- a command decompresses each chunk of a log once, whatever else the chunks contain ----
+
+#: A JSON payload that is larger than the cached part of a chunk.
+LARGE = b'{"size": %d, "pixels": "' + b"x" * 20_000 + b'"}'
+
+
+@pytest.fixture
+def mixed(sample_logs_dir: Path, tmp_path: Path) -> Path:
+    """A drive with an image after every 50th message, in the same chunks."""
+    path = tmp_path / "mixed.mcap"
+    with mcap_writer(path, profile="ros2", chunk_size=400_000) as writer:
+        image = writer.register_channel("/camera", "json", 0)
+        for i, message in enumerate(copied(sample_logs_dir / "dlc.mcap", writer)):
+            if i % 50 == 0:
+                writer.add_message(image, message.log_time, LARGE % i, message.publish_time)
+    return path
+
+
+def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: Counter[bytes] = Counter()
+    decompress = mcap_log.decompress
+
+    def counted(compression: str, stored: memoryview, *rest: object) -> bytes:
+        opened[bytes(stored[:4000])] += 1
+        return decompress(compression, stored, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(mcap_log, "decompress", counted)
+    inspection = inspect_log(mixed)
+    assert inspection.signals
+    assert len(opened) > 3
+    # One more time for the example message of a topic without a schema.
+    assert sorted(opened.values())[-2:] in ([1, 1], [1, 2])
+
+
+def test_large_payloads_are_read_again_when_they_are_requested(mixed: Path) -> None:
+    with closing(open_log(mixed)) as log:
+        small = next(t.name for t in log.topics if t.name != "/camera" and log.fields(t.name))
+        path = next(f.path for f in log.fields(small) if f.kind == "number")
+        before = log.read({small: [path]}, stamps=["/camera"])
+        images = log.read({"/camera": ["size"]})["/camera"]
+        after = log.read({small: [path]})[small]
+    np.testing.assert_array_equal(images.fields["size"], np.arange(len(images)) * 50)
+    np.testing.assert_array_equal(before["/camera"].log_time_ns, images.log_time_ns)
+    np.testing.assert_array_equal(before[small].fields[path], after.fields[path])
+
+
+def test_expected_fields_are_those_of_a_plain_read(mixed: Path) -> None:
+    with closing(open_log(mixed)) as log, closing(open_log(mixed)) as plain:
+        requests = {t.name: [f.path for f in log.fields(t.name) if f.kind == "number"][:3] for t in log.topics}
+        requests = {topic: paths for topic, paths in requests.items() if paths}
+        log.expect({topic: paths[:1] for topic, paths in requests.items()})
+        middle = (log.start_ns + log.end_ns) // 2
+        for window in ((log.start_ns, middle), (middle, log.end_ns), (None, None)):
+            for fields in ({t: p[:1] for t, p in requests.items()}, requests):
+                kept, read = log.read(fields, *window), plain.read(fields, *window)
+                for topic, columns in read.items():
+                    np.testing.assert_array_equal(kept[topic].log_time_ns, columns.log_time_ns)
+                    for path, values in columns.fields.items():
+                        np.testing.assert_array_equal(kept[topic].fields[path], values)

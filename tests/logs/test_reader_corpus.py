@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from recorded import numeric_paths
+from recorded import counts_of, numeric_paths
 
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
@@ -49,8 +49,7 @@ def test_every_recording_ends_as_catalogued_and_every_field_decodes(shared_dir: 
     for entry in catalogue:
         outcome, counts = "must-be-rejected", entry["messages"]
         with contextlib.suppress(LogError), closing(open_log(root / entry["file"])) as log:
-            stamps = log.read({}, stamps=[t.name for t in log.topics])
-            counts = {topic: len(columns) for topic, columns in stamps.items()}
+            counts = counts_of(log)
             assert counts == {t.name: t.messages for t in log.topics}
             outcome = "truncated" if any(loss.severity == "lost" for loss in log.lost) else "ok"
             problems += _field_problems(log, entry["file"])
@@ -71,65 +70,28 @@ def test_every_recording_ends_as_catalogued_and_every_field_decodes(shared_dir: 
 def test_a_channel_that_cannot_be_decoded_spoils_no_other(
     shared_dir: Path, file: str, broken: str | None, healthy: str | None
 ) -> None:
-    log = open_log(shared_dir / "reader_corpus" / file)
-    undecodable = [t.name for t in log.topics if not log.fields(t.name)]
-    assert undecodable
-    assert broken is None or broken in undecodable
-    for topic in undecodable:
-        with pytest.raises(MappingError, match=topic):
-            log.read({topic: ["x"]})
-    for topic in {t.name for t in log.topics} - set(undecodable):
-        assert healthy is None or topic == healthy
-        assert len(log.read({topic: numeric_paths(log, topic)})[topic]) > 0
-    log.close()
+    with closing(open_log(shared_dir / "reader_corpus" / file)) as log:
+        undecodable = [t.name for t in log.topics if not log.fields(t.name)]
+        assert undecodable
+        assert broken is None or broken in undecodable
+        for topic in undecodable:
+            with pytest.raises(MappingError, match=topic):
+                log.read({topic: ["x"]})
+        for topic in {t.name for t in log.topics} - set(undecodable):
+            assert healthy is None or topic == healthy
+            assert len(log.read({topic: numeric_paths(log, topic)})[topic]) > 0
 
 
 def test_a_database_that_its_folder_declares_in_another_format_is_not_decoded_as_cdr(shared_dir: Path) -> None:
     folder = shared_dir / "reader_corpus" / "ros2_rosbag2/rosbag2_tests/resources/sqlite3/wrong_rmw_test"
-    log = open_log(folder)
-    assert {t.encoding for t in log.topics} == {"wrong_format"}
-    with pytest.raises(MappingError, match="wrong_format"):
-        log.read({"/test_topic": ["bool_value"]})
-    log.close()
+    with closing(open_log(folder)) as log:
+        assert {t.encoding for t in log.topics} == {"wrong_format"}
+        with pytest.raises(MappingError, match="wrong_format"):
+            log.read({"/test_topic": ["bool_value"]})
 
 
 def test_definitions_behind_a_short_separator_are_read(shared_dir: Path) -> None:
-    log = open_log(shared_dir / "reader_corpus" / "plotjuggler_pj-mcap-server/test_embedded_timestamp.mcap")
-    assert {"header.sec", "header.nanosec", "value"} <= {f.path for f in log.fields("/stamped/value")}
-    log.close()
-
-
-def test_protobuf_of_another_writer_reads_as_its_own_library_reads_it(shared_dir: Path) -> None:
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-    from mcap.reader import make_reader
-
-    path = shared_dir / "reader_corpus" / "rerun/foxglove_log.mcap"
-    stamps, levels = [], []
-    with path.open("rb") as file:
-        for schema, _, message in make_reader(file).iter_messages():
-            assert schema is not None
-            pool = descriptor_pool.DescriptorPool()
-            for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
-                pool.Add(proto)
-            parsed = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name)).FromString(message.data)
-            stamps.append(parsed.timestamp.ToNanoseconds())
-            levels.append(parsed.level)
-    log = open_log(path)
-    columns = log.read({"/text_log": ["timestamp", "level"]})["/text_log"]
-    assert columns.fields["timestamp"].tolist() == stamps
-    assert columns.fields["level"].tolist() == levels
-    assert len(set(levels)) > 1
-    log.close()
-
-
-def test_publish_time_is_kept_apart_from_log_time(shared_dir: Path) -> None:
-    from mcap.reader import make_reader
-
-    path = shared_dir / "reader_corpus" / "plotjuggler_pj-mcap-server/test_publish_vs_log_time.mcap"
-    with path.open("rb") as file:
-        expected = [(m.log_time, m.publish_time) for _, _, m in make_reader(file).iter_messages()]
-    log = open_log(path)
-    (columns,) = log.read({}, stamps=[t.name for t in log.topics]).values()
-    assert list(zip(columns.log_time_ns.tolist(), columns.publish_time_ns.tolist(), strict=True)) == expected
-    assert any(a != b for a, b in expected)
-    log.close()
+    with closing(
+        open_log(shared_dir / "reader_corpus" / "plotjuggler_pj-mcap-server/test_embedded_timestamp.mcap")
+    ) as log:
+        assert {"header.sec", "header.nanosec", "value"} <= {f.path for f in log.fields("/stamped/value")}

@@ -6,6 +6,7 @@ import ctypes
 import socket
 import sys
 import tempfile
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -71,9 +72,8 @@ def test_time_and_memory_of_a_reader_are_limited_by_the_budget(tmp_path: Path) -
 
 
 def test_a_column_that_ends_its_reader_is_a_loss_and_the_others_are_read(tmp_path: Path) -> None:
-    log = open_log(_file(tmp_path, "nothing"))
-    columns = log.read({"t": ["good", "segv", "bad", "better"]})["t"].fields
-    log.close()
+    with closing(open_log(_file(tmp_path, "nothing"))) as log:
+        columns = log.read({"t": ["good", "segv", "bad", "better"]})["t"].fields
     assert columns["good"].tolist() == columns["better"].tolist() == [0, 1, 2, 3, 4]
     assert np.isnan(columns["segv"]).all()
     assert np.isnan(columns["bad"]).all()
@@ -89,17 +89,15 @@ def test_a_reader_is_silent_and_its_folder_is_removed(
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     open_log(_file(tmp_path, "print")).close()
-    log = open_log(_file(tmp_path, "leave"))
-    assert log.read({"t": ["good"]})["t"].fields["good"][0] == 2  # the folder had this file, and its output
-    assert len(list(temporary.glob("pdhef-*/left_behind"))) == 1
-    log.close()
+    with closing(open_log(_file(tmp_path, "leave"))) as log:
+        assert log.read({"t": ["good"]})["t"].fields["good"][0] == 2  # the folder had this file, and its output
+        assert len(list(temporary.glob("pdhef-*/left_behind"))) == 1
     assert not list(temporary.iterdir())
     assert capfd.readouterr() == ("", "")
 
 
 def test_slices_of_a_column_are_those_of_the_reader(tmp_path: Path) -> None:
-    log = open_log(_file(tmp_path, "nothing"))
-    part = log.read({"t": ["good"]}, 10**18 + 10, 10**18 + 40)["t"]
-    log.close()
+    with closing(open_log(_file(tmp_path, "nothing"))) as log:
+        part = log.read({"t": ["good"]}, 10**18 + 10, 10**18 + 40)["t"]
     assert part.fields["good"].tolist() == [1, 2, 3]
     assert (part.log_time_ns - 10**18).tolist() == [10, 20, 30]

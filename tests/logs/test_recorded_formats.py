@@ -24,39 +24,38 @@ cornering_stiffness_n_per_rad = 70000.0
 [tyres.rear]
 cornering_stiffness_n_per_rad = 70000.0
 """
-#: Fields, with scales and latencies, of speed, a_x, a_y, yaw rate, steering, and v_x and v_y of the ground truth.
+#: Fields, with scales and latencies.
 _Table = dict[str, tuple[str, str | list[str], float, float]]
-_SPEED, _AX, _AY, _YAW, _WHEEL = "speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "steering_wheel_rad"
-_VX, _VY = "truth.vx_m_s", "truth.vy_m_s"
-_SLIP = "/reference/slip"
-V40_MCAP: _Table = {
-    _SPEED: (_SLIP, "lng_vel_kmh", KMH, 0.0),
-    _AX: ("/imu/data", "linear_acceleration.x", 1.0, 0.0),
-    _AY: ("/imu/data", "linear_acceleration.y", 1.0, 0.0),
-    _YAW: ("/imu/data", "angular_velocity.z", 1.0, 0.0),
-    _WHEEL: ("/can/steering", "steering_wheel_angle_deg", DEG, 0.0),
-    _VX: (_SLIP, "lng_vel_kmh", KMH, 0.0),
-    _VY: (_SLIP, "lat_vel_kmh", KMH, 0.0),
-}
-V40_VBO: _Table = {
-    _SPEED: ("vbox", "Lng_Vel", KMH, 0.0),
-    _AX: ("vbox", "X_Accel", G, 0.0),
-    _AY: ("vbox", "Y_Accel", G, 0.0),
-    _YAW: ("vbox", "YawRate", -DEG, 0.0),
-    _WHEEL: ("vbox", "SteerAng", DEG, 0.0),
-    _VX: ("vbox", "Lng_Vel", KMH, 0.0),
-    _VY: ("vbox", "Lat_Vel", KMH, 0.0),
-}
-V40_MF4: _Table = {
-    _SPEED: ("GNSS_10_Hz", "GNSS_Speed", KMH, 0.06),
-    _AX: ("IMU_100_Hz", "IMU_AccX", G, 0.0),
-    _AY: ("IMU_100_Hz", "IMU_AccY", G, 0.0),
-    _YAW: ("IMU_100_Hz", "IMU_YawRate", -DEG, 0.0),
-    _WHEEL: ("CAN", "CAN_SteeringWheelAngle", DEG, 0.006),
-    _VX: ("reference", "REF_VelLong", KMH, 0.0),
-    _VY: ("reference", "REF_VelLat", KMH, 0.0),
-}
-_GNSS: _Table = {_SPEED: ("/gnss/velocity", ["twist.linear.x", "twist.linear.y"], 1.0, 0.0)}
+_WHEEL = "steering_wheel_rad"
+#: Speed, a_x, a_y, yaw rate, steering, and v_x and v_y of the ground truth.
+_NAMES = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", _WHEEL, "truth.vx_m_s", "truth.vy_m_s")
+
+
+def _table(*rows: tuple[str, str, float, float]) -> _Table:
+    return dict(zip(_NAMES, rows, strict=True))
+
+
+V40_MCAP = _table(
+    ("/reference/slip", "lng_vel_kmh", KMH, 0.0),
+    ("/imu/data", "linear_acceleration.x", 1.0, 0.0),
+    ("/imu/data", "linear_acceleration.y", 1.0, 0.0),
+    ("/imu/data", "angular_velocity.z", 1.0, 0.0),
+    ("/can/steering", "steering_wheel_angle_deg", DEG, 0.0),
+    ("/reference/slip", "lng_vel_kmh", KMH, 0.0),
+    ("/reference/slip", "lat_vel_kmh", KMH, 0.0),
+)
+_OF_VBO = ("Lng_Vel", "X_Accel", "Y_Accel", "YawRate", "SteerAng", "Lng_Vel", "Lat_Vel")
+V40_VBO = _table(*(("vbox", n, f, 0.0) for n, f in zip(_OF_VBO, (KMH, G, G, -DEG, DEG, KMH, KMH), strict=True)))
+V40_MF4 = _table(
+    ("GNSS_10_Hz", "GNSS_Speed", KMH, 0.06),
+    ("IMU_100_Hz", "IMU_AccX", G, 0.0),
+    ("IMU_100_Hz", "IMU_AccY", G, 0.0),
+    ("IMU_100_Hz", "IMU_YawRate", -DEG, 0.0),
+    ("CAN", "CAN_SteeringWheelAngle", DEG, 0.006),
+    ("reference", "REF_VelLong", KMH, 0.0),
+    ("reference", "REF_VelLat", KMH, 0.0),
+)
+_GNSS: _Table = {"speed_m_s": ("/gnss/velocity", ["twist.linear.x", "twist.linear.y"], 1.0, 0.0)}
 
 
 def _scores(log: Path, table: _Table, car: Path) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -132,9 +133,8 @@ def test_indexes_say_whether_a_chunk_must_be_looked_at(back_s: int, tmp_path: Pa
             ns = T0 + i * S // 100 - (back_s * S if i >= 1000 else 0)
             for id_ in ids if i % 10 == 0 else ids[:1]:
                 writer.add_message(id_, ns, b"{}", ns)
-    log = open_log(path)
-    (container,) = log.containers
-    (span,) = container.spans
-    assert span.ordered == (back_s == 0)
-    assert [loss.kind for loss in log.lost] == ([] if back_s == 0 else ["time-jump"])
-    log.close()
+    with closing(open_log(path)) as log:
+        (container,) = log.containers
+        (span,) = container.spans
+        assert span.ordered == (back_s == 0)
+        assert [loss.kind for loss in log.lost] == ([] if back_s == 0 else ["time-jump"])

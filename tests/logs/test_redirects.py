@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +93,8 @@ def test_a_redirect_on_the_same_host_is_followed(server: CountingServer) -> None
     with serving(**server.files) as other:
         for to in ("/dlc.mcap", server.place("dlc.mcap"), other.place("dlc.mcap")):
             server.fault = _redirecting(to)
-            log = open_log(RemotePlace(f"{server.place('away.mcap')}?{len(to)}"))
-            assert log.lost == ()
-            log.close()
+            with closing(open_log(RemotePlace(f"{server.place('away.mcap')}?{len(to)}"))) as log:
+                assert log.lost == ()
 
 
 def _exit_code(*arguments: object) -> int:

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import random
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.logs import remote_copy, remote_source
+from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
@@ -54,11 +55,8 @@ def _all_of(log: DriveLog) -> list[tuple[object, ...]]:
 
 
 def _read(place: Path | RemotePlace) -> list[tuple[object, ...]]:
-    log = open_log(place)
-    try:
+    with closing(open_log(place)) as log:
         return _all_of(log)
-    finally:
-        log.close()
 
 
 def _place(server: CountingServer, name: str) -> RemotePlace:
@@ -73,8 +71,7 @@ def _place(server: CountingServer, name: str) -> RemotePlace:
 def test_any_split_gives_the_same_bytes_and_none_twice(reads: list[tuple[int, int]], order: random.Random) -> None:
     data = random.Random(1).randbytes(400_000)
     with serving(x=data) as server:
-        source = RemoteSource(_place(server, "x"))
-        try:
+        with closing(RemoteSource(_place(server, "x"))) as source:
             source.prefetch([(at, at + n) for at, n in reads if order.random() < 0.5])
             order.shuffle(reads)
             for at, n in reads:
@@ -82,8 +79,6 @@ def test_any_split_gives_the_same_bytes_and_none_twice(reads: list[tuple[int, in
             source.fetch_whole()
             assert source.path.read_bytes() == data
             assert source.fetch(0, len(data)) == data
-        finally:
-            source.close()
         assert server.twice() == 0
         assert all(r.end - r.start <= remote_source.MOST_RANGE_BYTES for r in server.requests)
 
@@ -142,14 +137,11 @@ def test_a_damaged_log_loses_the_same(tmp_path: Path, sample_logs_dir: Path, spo
     file = tmp_path / "damaged.mcap"
     file.write_bytes(spoil((sample_logs_dir / "dlc.mcap").read_bytes()))
     with serving(**{file.name: file.read_bytes()}) as server:
-        first = open_log(_place(server, file.name), wanted=NOTHING_YET)
-        log = open_log(_place(server, file.name), wanted=Wanted(frozenset({"/imu/data"})))
-        first.close()
-        local = open_log(file)
-        assert _all_of(log) == _all_of(local)
-        assert any(True for _ in local.lost)
-        log.close()
-        local.close()
+        with closing(open_log(_place(server, file.name), wanted=NOTHING_YET)):
+            log = open_log(_place(server, file.name), wanted=Wanted(frozenset({"/imu/data"})))
+        with closing(log), closing(open_log(file)) as local:
+            assert _all_of(log) == _all_of(local)
+            assert local.lost
         assert server.twice() == 0
 
 
@@ -200,11 +192,10 @@ def test_a_later_command_fetches_no_byte_again(served: CountingServer, sample_lo
 
 def test_copies_in_use_stay_and_the_others_are_removed(served: CountingServer, monkeypatch: pytest.MonkeyPatch) -> None:
     served.files["again.mcap"] = served.files["dlc.mcap"]
-    log = open_log(_place(served, "dlc.mcap"))
-    monkeypatch.setattr(remote_copy, "CACHE_BYTES", 0)
-    _read(_place(served, "again.mcap"))
-    assert [path.name for path in _copies()] == ["dlc.mcap"]
-    log.close()
+    with closing(open_log(_place(served, "dlc.mcap"))):
+        monkeypatch.setattr(remote_source, "CACHE_BYTES", 0)
+        _read(_place(served, "again.mcap"))
+        assert [path.name for path in _copies()] == ["dlc.mcap"]
     assert _copies() == []
 
 
@@ -273,14 +264,12 @@ def test_a_changed_object_is_an_error(tmp_path: Path, sample_logs_dir: Path, wit
     data = (tmp_path / "apart.mcap").read_bytes()
     with serving(**{"apart.mcap": data}) as server:
         server.without = frozenset(without_headers)
-        log = open_log(_place(server, "apart.mcap"), wanted=NOTHING_YET)
-        server.files["apart.mcap"] = data[:-1000]
-        with pytest.raises(SourceError, match=r"expected the object that was opened, got another one"):
-            log.read({"/camera": ["data"]})
-        log.close()
-        log = open_log(_place(server, "apart.mcap"))  # the copy of the former object is not used again
-        assert log.lost
-        log.close()
+        with closing(open_log(_place(server, "apart.mcap"), wanted=NOTHING_YET)) as log:
+            server.files["apart.mcap"] = data[:-1000]
+            with pytest.raises(SourceError, match=r"expected the object that was opened, got another one"):
+                log.read({"/camera": ["data"]})
+        with closing(open_log(_place(server, "apart.mcap"))) as log:  # the copy of the former object is not used again
+            assert log.lost
 
 
 def test_nobody_answers() -> None:
@@ -318,9 +307,8 @@ def test_nothing_secret_is_shown(served: CountingServer) -> None:
     assert str(place) == served.place("dlc.mcap")
     assert place.identity == served.place("dlc.mcap") + "?part=1"
     assert "hunter2" not in repr(find_logs([secret]))
-    log = open_log(secret)
-    assert "hunter2" not in repr((log.path, log.lost))
-    log.close()
+    with closing(open_log(secret)) as log:
+        assert "hunter2" not in repr((log.path, log.lost))
     assert served.requests[0].headers["Authorization"].startswith("Basic ")
     served.fault = status(500)
     with pytest.raises(SourceError) as raised:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -45,12 +46,11 @@ def test_same_log_and_a_changed_one(store: S3Store, sample_logs_dir: Path) -> No
     url = f"{store.url}/a b/dlc+1.mcap"
     asked = {"/imu/data": ["angular_velocity.z"]}
     local, first = open_log(file), open_log(url, wanted=Wanted(frozenset()))
-    there = open_log(url, wanted=Wanted(frozenset(asked)))
-    first.close()
-    (a,), (b,) = local.read(asked).values(), there.read(asked).values()
-    assert a.fields["angular_velocity.z"].tobytes() == b.fields["angular_velocity.z"].tobytes()
-    assert local.topics == there.topics
-    there.close()
+    with closing(open_log(url, wanted=Wanted(frozenset(asked)))) as there:
+        first.close()
+        (a,), (b,) = local.read(asked).values(), there.read(asked).values()
+        assert a.fields["angular_velocity.z"].tobytes() == b.fields["angular_velocity.z"].tobytes()
+        assert local.topics == there.topics
     local.close()
     (log,) = find_logs([url])
     known = identity_of(log)

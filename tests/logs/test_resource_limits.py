@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, Meter, ResourceLimits
@@ -42,46 +44,26 @@ def test_every_default_is_tested() -> None:
 
 @pytest.mark.parametrize(
     ("size", "stored", "limit"),
-    [
-        (2 * MIB, MIB, None),
-        (MIB, 1, None),
-        (2 * MIB, 100, "chunk ratio"),
-        (1024 * MIB, 1024 * MIB, "chunk bytes"),
-        (2 * MIB, 0, "chunk ratio"),
-    ],
+    [(2, 1, ""), (1, 1 / MIB, ""), (2, 100 / MIB, "chunk ratio"), (1024, 1024, "chunk bytes"), (2, 0, "chunk ratio")],
 )
-def test_small_parts_may_unfold_as_they_like(size: int, stored: int, limit: str | None) -> None:
-    if limit is None:
-        DEFAULT_LIMITS.check_unpacked(size, stored, "a chunk")
-    else:
-        with pytest.raises(LimitError, match=limit):
-            DEFAULT_LIMITS.check_unpacked(size, stored, "a chunk")
+def test_small_parts_may_unfold_as_they_like(size: int, stored: float, limit: str) -> None:
+    with pytest.raises(LimitError, match=limit) if limit else nullcontext():
+        DEFAULT_LIMITS.check_unpacked(size * MIB, round(stored * MIB), "a chunk")
 
 
-@pytest.mark.parametrize(("size", "stored", "is_sound"), [(100, 1, True), (600, 1, False), (600, 20, True)])
-def test_tables_may_be_as_large_as_their_file_gives_reason_for(size: int, stored: int, is_sound: bool) -> None:
-    if is_sound:
+@pytest.mark.parametrize(("size", "stored", "limit"), [(100, 1, ""), (600, 1, "table bytes"), (600, 20, "")])
+def test_tables_may_be_as_large_as_their_file_gives_reason_for(size: int, stored: int, limit: str) -> None:
+    with pytest.raises(LimitError, match=limit) if limit else nullcontext():
         DEFAULT_LIMITS.check_table(size * MIB, stored * MIB, "a file")
-    else:
-        with pytest.raises(LimitError, match="table bytes"):
-            DEFAULT_LIMITS.check_table(size * MIB, stored * MIB, "a file")
 
 
 @pytest.mark.parametrize(
     ("count", "stored", "limit"),
-    [
-        (60_000, 1, None),
-        (100_000, 100_000, None),
-        (100_000, 1000, "messages per byte"),
-        (10_000_000, 1 << 30, "chunk messages"),
-    ],
+    [(60_000, 1, ""), (10**5, 10**5, ""), (10**5, 1000, "messages per byte"), (10**7, 1 << 30, "chunk messages")],
 )
-def test_many_messages_need_bytes(count: int, stored: int, limit: str | None) -> None:
-    if limit is None:
+def test_many_messages_need_bytes(count: int, stored: int, limit: str) -> None:
+    with pytest.raises(LimitError, match=limit) if limit else nullcontext():
         DEFAULT_LIMITS.check_messages(count, stored)
-    else:
-        with pytest.raises(LimitError, match=limit):
-            DEFAULT_LIMITS.check_messages(count, stored)
 
 
 def test_time_grows_with_what_is_read_and_counts_again_each_time(monkeypatch: pytest.MonkeyPatch) -> None:

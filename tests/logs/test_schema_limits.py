@@ -2,6 +2,7 @@
 
 import json
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ _HEAD, _TAIL = "module p { module msg { module A_Constants { ", " }; struct A { 
 def _schema(encoding: str, text: str | bytes, name: str = "p/msg/A", example: bytes | None = None) -> MessageSchema:
     data = text if isinstance(text, bytes) else text.encode()
     wire = {"ros1msg": "ros1", "jsonschema": "json", "": "json", "protobuf": "protobuf"}.get(encoding, "cdr")
-    return channel_schema(ChannelRecord(1, "/t", name, wire, name, encoding, data), example=example)
+    return channel_schema(ChannelRecord(1, "/t", wire, name, encoding, data), example=example)
 
 
 def _columns(schema: MessageSchema, path: str, *messages: bytes) -> tuple[np.ndarray, list[int]]:
@@ -101,7 +102,7 @@ def test_a_schema_that_costs_too_much_is_refused_in_time(case: str) -> None:
 
 
 def test_higher_limits_read_what_is_sound_and_large() -> None:
-    channel = ChannelRecord(1, "/t", "p/msg/A", "cdr", "A", "ros2msg", b"string[4000] x\n")
+    channel = ChannelRecord(1, "/t", "cdr", "p/msg/A", "ros2msg", b"string[4000] x\n")
     with pytest.raises(SchemaError, match="--set budget"):
         channel_schema(channel)
     assert len(list(leaves(channel_schema(channel, limits=DEFAULT_LIMITS.times(2.0)).root))) == 1
@@ -179,15 +180,25 @@ def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_
             schema = writer.register_schema(topic, encoding, text)
             channel = writer.register_channel(topic, messages, schema)
             writer.add_message(channel, 5, b'{"x": 1}', 5)
-    log = open_log(path)
-    assert [len(log.fields(topic)) for topic in ("/bomb", "/bomb", "/sound", "/other")] == [0, 0, 1, 0]
-    (loss,) = log.lost
-    assert (loss.kind, loss.where, loss.severity) == ("bad-schema", "/bomb", "lost")
-    log.close()
+    with closing(open_log(path)) as log:
+        assert [len(log.fields(topic)) for topic in ("/bomb", "/bomb", "/sound", "/other")] == [0, 0, 1, 0]
+        (loss,) = log.lost
+        assert (loss.kind, loss.where, loss.severity) == ("bad-schema", "/bomb", "lost")
 
 
 @pytest.mark.parametrize(
-    "name", ["../../x", "p/msg/../../../x", "/etc/x", "p/msg/T\n", "p/T", "", "p/msg/", "sensor_msgs/msg/Imu/../Imu"]
+    "name",
+    [
+        "../../x",
+        "p/msg/../../../x",
+        "/etc/x",
+        "p/msg/T\n",
+        "p/T",
+        "",
+        "no_such/msg/Type",
+        "p/msg/",
+        "sensor_msgs/msg/Imu/../Imu",
+    ],
 )
 def test_a_type_name_becomes_no_path(name: str) -> None:
     with pytest.raises(KeyError):
@@ -198,7 +209,7 @@ def test_a_type_without_a_definition_is_no_loss() -> None:
     with pytest.raises(NoSchemaError):
         _schema("", b"", "p/msg/Nowhere", None)
     with pytest.raises(NoSchemaError):
-        channel_schema(ChannelRecord(1, "/t", "p/msg/Nowhere", "cdr", "x", "", b""))
+        channel_schema(ChannelRecord(1, "/t", "cdr", "p/msg/Nowhere", "", b""))
 
 
 _TEXTS = {

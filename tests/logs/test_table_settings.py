@@ -13,10 +13,10 @@ import pytest
 
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.logs.json_lines import open_json_lines
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError
 from pdhef_logtool.logs.table_file import TableFile, TableSettings
+from pdhef_logtool.logs.text_logs import open_json_lines
 from pdhef_logtool.mapping.choosing import tables_for
 from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_to_toml
 from pdhef_logtool.records.errors import LogError, MappingFileError

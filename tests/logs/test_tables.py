@@ -402,29 +402,6 @@ def test_durations_and_times_of_day_are_times(kind: pa.DataType, tmp_path: Path)
 
 # ------------------------------------------------------------------------------------------------ MAT
 
-MAT = {
-    "t": TIME_S,
-    "ay_mps2": AY[:, None],
-    "wheels_kmh": np.stack([SPEED] * 4, axis=1),
-    "other": np.arange(7.0),
-    "name": "a drive",
-    "gnss": {"time": TIME_S[::10], "speed": SPEED[::10], "inner": {"lat": SPEED[::10]}},
-}
-
-
-@pytest.mark.parametrize(("wrong", "size"), [(1, 10**6), (99, 8)])
-def test_an_element_that_no_writer_makes_does_not_reach_scipy(wrong: int, size: int, tmp_path: Path) -> None:
-    """SciPy ends the process where an element inside of a struct is longer than the struct."""
-    path = tmp_path / "a.mat"
-    savemat(path, {"d": {"t": TIME_S, "ay": AY}, "e": {"t": TIME_S, "ay": AY}})
-    data = bytearray(path.read_bytes())
-    at = data.index(TIME_S.astype("<f8").tobytes())
-    data[at - 8 : at] = wrong.to_bytes(4, "little") + size.to_bytes(4, "little")
-    path.write_bytes(data)
-    with closing(open_log(path)) as log:
-        assert [t.name for t in log.topics] == ["e"]
-        assert [loss.kind for loss in log.lost] == ["bad-variable"]
-
 
 def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", {"t": TIME_S, "ay": AY, "speed": SPEED}, do_compression=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from recorded import decoded_by_rosbags
+from recorded import attribute, decoded_by_rosbags
 
 from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.open_log import open_log
@@ -42,106 +43,45 @@ def _store() -> Any:
 STORE = _store()
 
 
-def _message(type_name: str, **members: Any) -> Any:
-    return STORE.types[type_name](**members)
+#: Fields of a type: the width of an array, 0 for a number, or the members of a vector.
+FIELDS: dict[str, dict[str, int | str]] = {
+    "nav_msgs/msg/Odometry": {
+        "pose.pose.position": "xyz", "pose.pose.orientation": "wxyz", "pose.covariance": 36,
+        "twist.twist.linear": "xyz", **{f"twist.twist.angular.{axis}": 0 for axis in "xyz"},
+    },
+    ESTIMATE: {
+        **dict.fromkeys(("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2", "sideslip_std_rad"), 0),
+        **dict.fromkeys(("network_trust", "r_scale", "nis", "friction", "mixture_weight"), 0), "covariance": 9,
+    },
+}  # fmt: skip
 
 
-def _header(stamp: int, frame: str) -> Any:
-    time = _message("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
-    return _message("std_msgs/msg/Header", stamp=time, frame_id=frame)
-
-
-def _vector(values: Any, type_name: str = "geometry_msgs/msg/Vector3") -> Any:
-    return _message(type_name, x=float(values[0]), y=float(values[1]), z=float(values[2]))
-
-
-def _quaternion(wxyz: Any) -> Any:
-    w, x, y, z = (float(v) for v in wxyz)
-    return _message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
-
-
-def _encoded(type_name: str, fields: dict[str, np.ndarray], constants: dict[str, Any]) -> bytes:
-    encoder = CdrEncoder("/t", type_name, message_definition(type_name), constants)
-    return encoder.encode(1, fields).tobytes()
-
-
-def _serialised(message: Any, type_name: str) -> bytes:
-    return bytes(STORE.serialize_cdr(message, type_name, little_endian=True))
-
-
+@pytest.mark.parametrize("name", FIELDS)
 @_settings
-@given(
-    stamp=_stamps,
-    frame=_texts,
-    child=_texts,
-    values=hnp.arrays(np.float64, 13, elements=_floats),
-    covariance=hnp.arrays(np.float64, 36, elements=_floats),
-)
-def test_odometry_bytes_equal_an_independent_serialiser(
-    stamp: int, frame: str, child: str, values: np.ndarray, covariance: np.ndarray
+@given(stamp=_stamps, frame=_texts, flags=st.tuples(*[st.booleans()] * 2), data=st.data())
+def test_bytes_are_those_of_an_independent_serialiser(
+    name: str, stamp: int, frame: str, flags: tuple[bool, bool], data: st.DataObject
 ) -> None:
-    name = "nav_msgs/msg/Odometry"
-    pose = _message(
-        "geometry_msgs/msg/Pose",
-        position=_vector(values[:3], "geometry_msgs/msg/Point"),
-        orientation=_quaternion(values[3:7]),
-    )
-    twist = _message("geometry_msgs/msg/Twist", linear=_vector(values[7:10]), angular=_vector(values[10:13]))
-    message = _message(
-        name,
-        header=_header(stamp, frame),
-        child_frame_id=child,
-        pose=_message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
-        twist=_message("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
-    )
-    fields = {
-        "header.stamp": np.array([stamp]),
-        "pose.pose.position": values[None, :3],
-        "pose.pose.orientation": values[None, 3:7],
-        "pose.covariance": covariance[None, :],
-        "twist.twist.linear": values[None, 7:10],
-        "twist.twist.angular.x": values[10:11],
-        "twist.twist.angular.y": values[11:12],
-        "twist.twist.angular.z": values[12:13],
-    }
-    constants = {"header.frame_id": frame, "child_frame_id": child}
-    assert _encoded(name, fields, constants) == _serialised(message, name)
-
-
-@_settings
-@given(
-    stamp=_stamps,
-    frame=_texts,
-    values=hnp.arrays(np.float64, 20, elements=_floats),
-    flags=st.tuples(*[st.booleans()] * 2),
-    reason=st.integers(0, 2**32 - 1),
-)
-def test_own_message_bytes_equal_an_independent_serialiser(
-    stamp: int, frame: str, values: np.ndarray, flags: tuple[bool, bool], reason: int
-) -> None:
-    names = [
-        *("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"),
-        *("sideslip_std_rad", "network_trust", "r_scale", "nis", "friction", "mixture_weight"),
-    ]
-    scalars = dict(zip(names, values[:11].tolist(), strict=True))
-    message = _message(
-        ESTIMATE,
-        header=_header(stamp, frame),
-        **scalars,
-        covariance=values[11:],
-        valid=flags[0],
-        diverged=flags[1],
-        reason=reason,
-    )
-    fields: dict[str, np.ndarray] = {
-        "header.stamp": np.array([stamp]),
-        **{name: np.array([v]) for name, v in scalars.items()},
-        "covariance": values[None, 11:],
-        "valid": np.array([flags[0]]),
-        "diverged": np.array([flags[1]]),
-        "reason": np.array([reason], dtype=np.uint32),
-    }
-    assert _encoded(ESTIMATE, fields, {"header.frame_id": frame}) == _serialised(message, ESTIMATE)
+    fields, constants = {"header.stamp": np.array([stamp])}, {"header.frame_id": frame}
+    if name == ESTIMATE:
+        fields |= {"valid": np.array(flags[:1]), "diverged": np.array(flags[1:])}
+        fields["reason"] = np.array([data.draw(st.integers(0, 2**32 - 1))], dtype=np.uint32)
+    else:
+        constants["child_frame_id"] = data.draw(_texts)
+    for path, shape in FIELDS[name].items():
+        width = len(shape) if isinstance(shape, str) else shape
+        fields[path] = data.draw(hnp.arrays(np.float64, (1, width) if width else 1, elements=_floats))
+    encoded = CdrEncoder("/t", name, message_definition(name), constants).encode(1, fields).tobytes()
+    message = STORE.deserialize_cdr(encoded, name)
+    assert bytes(STORE.serialize_cdr(message, name, little_endian=True)) == encoded
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(stamp, 10**9)
+    for path, text in constants.items():
+        assert attribute(message, path) == text
+    for path, values in fields.items():
+        shape, part = FIELDS[name].get(path, 0), attribute(message, path)
+        if path != "header.stamp":
+            found = [getattr(part, axis) for axis in shape] if isinstance(shape, str) else part
+            np.testing.assert_array_equal(np.ravel(found), values.ravel())
 
 
 @st.composite
@@ -168,26 +108,25 @@ def test_what_is_written_is_read_back_by_this_and_by_other_readers(tmp_path: Pat
         for topic in ("/a", "/b"):
             writer.add_topic(topic, "sensor_msgs/msg/Imu", constants={"header.frame_id": topic})
         writer.write(batches)
-    log = open_log(path)
-    read = log.read({b.topic: ["header.stamp", "linear_acceleration"] for b in batches})
-    theirs = decoded_by_rosbags([path])
-    with path.open("rb") as file:
-        raw = list(make_reader(file, validate_crcs=True).iter_messages())
-    assert [m.log_time for _, _, m in raw] == sorted(m.log_time for _, _, m in raw)
-    for batch in batches:
-        columns, n = read[batch.topic], len(batch.log_time_ns)
-        np.testing.assert_array_equal(columns.log_time_ns, batch.log_time_ns)
-        np.testing.assert_array_equal(columns.publish_time_ns, batch.publish_time_ns)
-        np.testing.assert_array_equal(columns.fields["header.stamp"], batch.fields["header.stamp"])
-        written = batch.fields["linear_acceleration"]
-        np.testing.assert_array_equal(columns.fields["linear_acceleration"].reshape(n, 3), written)
-        decoded = [m.linear_acceleration for _, m in theirs.get(batch.topic, [])]
-        np.testing.assert_array_equal(np.array([[m.x, m.y, m.z] for m in decoded]).reshape(n, 3), written)
-        of_topic = [m for _, c, m in raw if c.topic == batch.topic]
-        assert [m.sequence for m in of_topic] == list(range(n))
-        assert [m.publish_time for m in of_topic] == batch.publish_time_ns.tolist()
-    assert log.lost == ()
-    log.close()
+    with closing(open_log(path)) as log:
+        read = log.read({b.topic: ["header.stamp", "linear_acceleration"] for b in batches})
+        theirs = decoded_by_rosbags([path])
+        with path.open("rb") as file:
+            raw = list(make_reader(file, validate_crcs=True).iter_messages())
+        assert [m.log_time for _, _, m in raw] == sorted(m.log_time for _, _, m in raw)
+        for batch in batches:
+            columns, n = read[batch.topic], len(batch.log_time_ns)
+            np.testing.assert_array_equal(columns.log_time_ns, batch.log_time_ns)
+            np.testing.assert_array_equal(columns.publish_time_ns, batch.publish_time_ns)
+            np.testing.assert_array_equal(columns.fields["header.stamp"], batch.fields["header.stamp"])
+            written = batch.fields["linear_acceleration"]
+            np.testing.assert_array_equal(columns.fields["linear_acceleration"].reshape(n, 3), written)
+            decoded = [m.linear_acceleration for _, m in theirs.get(batch.topic, [])]
+            np.testing.assert_array_equal(np.array([[m.x, m.y, m.z] for m in decoded]).reshape(n, 3), written)
+            of_topic = [m for _, c, m in raw if c.topic == batch.topic]
+            assert [m.sequence for m in of_topic] == list(range(n))
+            assert [m.publish_time for m in of_topic] == batch.publish_time_ns.tolist()
+        assert log.lost == ()
 
 
 def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
