@@ -12,8 +12,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping.candidates import Field, anchors_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
-from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields
-from pdhef_logtool.mapping.path import PLACES, path_speed, path_velocity
+from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
 

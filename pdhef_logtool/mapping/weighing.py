@@ -25,13 +25,23 @@ from pdhef_logtool.mapping.candidates import (
     triad_of,
 )
 from pdhef_logtool.mapping.evidence import Fit, fit, ratio
-from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields, agree, mean_of
+from pdhef_logtool.mapping.fields import (
+    BY_DRIVING,
+    CLEAR,
+    SLOW_M_S,
+    Fields,
+    Gain,
+    Unit,
+    agree,
+    decide_units,
+    mean_of,
+    path_velocity,
+    posterior,
+)
 from pdhef_logtool.mapping.gnss_signals import has_heading
 from pdhef_logtool.mapping.ground_speed import axes_of
 from pdhef_logtool.mapping.naming import words_of
-from pdhef_logtool.mapping.path import path_velocity
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.mapping.units import BY_DRIVING, Gain, Unit, decide_units, posterior
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
