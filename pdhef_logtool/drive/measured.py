@@ -44,6 +44,7 @@ class Measured:
     ----------
     speed_name : the column used as the speed. topics : topics of the signals, by name.
     scales : scales of the mapping, by name. open_signs : groups of signals with an undocumented common sign.
+    has_truth : whether ground truth at the CG is available.
     """
 
     columns: Mapping[str, FloatArray]
@@ -52,6 +53,7 @@ class Measured:
     topics: Mapping[str, str]
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     open_signs: tuple[tuple[str, ...], ...] = ()
+    has_truth: bool = False
 
     @property
     def positions(self) -> tuple[str, str]:
@@ -112,14 +114,14 @@ def measure(
     """
     columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
-    of_truth = {} if mapping is None else {f"truth.{n}": s for n, s in mapping.truth.items()}
-    sources = {**({} if mapping is None else mapping.signals), **of_truth}
+    sources = {} if mapping is None else mapping.by_subject
     related = measured_relations(columns, speed_name, _known(vehicle))
     # Two quantities of ground truth from the same field agree trivially.
-    read = [[(of_truth[n].topic, of_truth[n].paths) for n in r.powers if n in of_truth] for r in related]
+    of_truth = {n: (s.topic, s.paths) for n, s in sources.items() if n.startswith("truth.")}
+    read = [[of_truth[n] for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    open_signs = () if mapping is None else tuple(map(tuple, mapping.open_signs))
-    return Measured(columns, speed_name, tuple(related), topics, {n: s.scale for n, s in sources.items()}, open_signs)
+    open_signs, scales = () if mapping is None else mapping.open_signs, {n: s.scale for n, s in sources.items()}
+    return Measured(columns, speed_name, tuple(related), topics, scales, open_signs, derived is not None)
 
 
 def drive_columns(

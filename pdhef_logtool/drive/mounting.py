@@ -8,46 +8,23 @@ the sensor's axes to these; its correlation, gain and error decide whether the m
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from collections.abc import Mapping as Mapped
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.check_table import result
-from pdhef_logtool.drive.checks import check_drive, misread_channels
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
-from pdhef_logtool.drive.delays import LateSensor, late_sensors
-from pdhef_logtool.drive.frames import (
-    IS_GRAVITY_M_S2,
-    angle_deg,
-    nearest_step,
-    rotation_text,
-    upright_check,
-)
-from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
+from pdhef_logtool.drive.frames import IS_GRAVITY_M_S2, angle_deg, nearest_step, rotation_text
+from pdhef_logtool.drive.measured import Measured
 from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
-from pdhef_logtool.drive.truth import (
-    LatencyEstimate,
-    TruthPlan,
-    TruthTrack,
-    booked_on_the_late,
-    channel_of,
-    derive_truth,
-    estimate_truth_latency,
-    plan_truth,
-)
-from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.mapping_file import entries_of
-from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
+from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
@@ -119,7 +96,7 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
         return None
     f = np.stack([columns[n] for n in ACCELERATIONS], axis=1)
     w = np.stack([columns[n] for n in RATES], axis=1)
-    named = _named_rows(mapping, accelerations, rates)
+    named = named_rows(mapping, accelerations, rates)
     speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
     references = yaw_references(columns, speed_name)
     ups = _ups(f, w, named)
@@ -159,7 +136,7 @@ def _parts_agree(whole: _Turn, parts: Sequence[_Turn | None]) -> bool:
     return agree and (len(fitted) == len(parts) or whole.correlation >= ASKEW_CORRELATION)
 
 
-def _named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | None) -> FloatArray:
+def named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | None) -> FloatArray:
     """Return the rows [3, 3] of the sensor's axes that a mapping reads, 0 where it lacks one."""
     named = np.zeros((3, 3))
     for i, (name, triad) in enumerate(zip(MOUNTED, (accelerations, accelerations, rates), strict=True)):
@@ -326,224 +303,6 @@ def _parts_of(turn: _Turn) -> list[tuple[float, FloatArray]]:
 
 
 # ------------------------------------------------------------------------------------- into the mapping
-
-
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """The first minutes of a log as its mapping reads them, with the IMU rotated to the car's axes if that is certain.
-
-    ``vehicle``: from the vehicle file, or the default car. ``corrected``: checks for the changes of a recognised
-    mapping.
-    """
-
-    mapping: Mapping
-    channels: MappedChannels
-    measured: Measured
-    vehicle: VehicleParameters
-    truth: TruthTrack | None
-    truth_plan: TruthPlan | None
-    latency: LatencyEstimate | None
-    triads: tuple[Triad | None, Triad | None] = (None, None)
-    mounting: Mounting | None = None
-    force: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
-    corrected: tuple[Check, ...] = ()
-
-    @property
-    def mounted(self) -> tuple[Check, ...]:
-        """Checks of the axes that the IMU's signals are read from."""
-        by_drive = [] if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
-        is_open = self.mapping.origin == "auto" and not (self.mounting is not None and self.mounting.confident)
-        upright = upright_check(_named_rows(self.mapping, *self.triads), self.force) if is_open else None
-        return (*by_drive, *([] if upright is None else [upright]))
-
-    @property
-    def is_mounted(self) -> bool:
-        """Whether the drive confirms that the IMU is read from the right axes."""
-        return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
-
-    @cached_property
-    def checks(self) -> tuple[Check, ...]:
-        """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
-        drive_checks = self._drive_checks(self.channels.truth, self.truth, self.latency, self.measured)
-        return (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
-
-    @cached_property
-    def sensor_checks(self) -> tuple[Check, ...]:
-        """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
-        if not self.channels.truth:
-            return self.checks
-        measured = measure(self.channels.signals, {}, None, self.vehicle, self.mapping)
-        return (*self.mounted, *self._drive_checks({}, None, None, measured))
-
-    def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
-        """Return the channels that must not be used, with the reason. Ground truth does not decide about sensors.
-
-        Parameters
-        ----------
-        waived : names of checks that are ignored. is_causal : no sensor is refused because of later samples.
-        """
-        by_everything = misread_channels(self.checks, waived)
-        refused = {n: why for n, why in by_everything.items() if n.startswith("truth.")}
-        return refused if is_causal else refused | misread_channels(self.sensor_checks, waived)
-
-    def _drive_checks(
-        self,
-        truth: Mapped[str, Channel],
-        derived: TruthTrack | None,
-        latency: LatencyEstimate | None,
-        measured: Measured,
-    ) -> tuple[Check, ...]:
-        return check_drive(
-            self.channels.signals,
-            truth,
-            derived,
-            self.vehicle,
-            latency=latency,
-            late=self.late,
-            mounting_is_known=self.is_mounted,
-            measured=measured,
-        )
-
-    @cached_property
-    def late(self) -> tuple[LateSensor, ...]:
-        """Sensors with late time stamps, from the signals alone."""
-        return late_sensors(self.channels.signals)
-
-    def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
-        """Yield the mapping's undecided checks that the drive does not decide either."""
-        passed = {c.name for c in drive_checks if c.verdict == "passed"} - {
-            f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
-        }
-        doubts = [c for c in self.mapping.checks if "unit" in c.evidence or "share" in c.evidence]
-        doubted = {c.name.removesuffix(".candidate") for c in doubts}
-        for check in self.mapping.checks:
-            signal = check.name.removesuffix(".candidate")
-            # Without a known radius, rim speeds in m/s and in rad/s look alike. v_y has the unit of its v_x.
-            unit = f"{signal.replace('truth.vy', 'truth.vx')}.unit"
-            is_resolved = unit in passed and not signal.startswith("wheel") and "a share" not in check.evidence
-            if f"{signal}.sign" not in passed or (signal in doubted and not is_resolved):
-                yield check
-
-
-def survey_log(
-    log: DriveLog,
-    mapping: Mapping,
-    clocks: dict[str, ClockModel],
-    span_ns: tuple[int, int],
-    vehicle: VehicleParameters | None = None,
-    *,
-    rescale: bool = True,
-) -> Survey:
-    """Read a span of a log and find the mounting of its IMU and a wrong unit or sign.
-
-    A recognised mapping is corrected where that is certain, with a note; a mapping file is only checked.
-
-    Parameters
-    ----------
-    vehicle : of the drive; None uses the default car.
-    rescale : whether to search for a wrong unit or sign.
-    """
-    vehicle = vehicle or default_vehicle()
-    triads = find_triads(log, mapping)
-    extra: dict[str, SignalSource] = {}
-    for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
-        extra |= {} if triad is None else triad.components(names)
-    channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
-    truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
-    truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
-    measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
-    # The inputs of an estimator must not depend on ground truth: a mounting from ground truth is only checked.
-    mounting = find_mounting(measured.without_truth(), triads, mapping)
-    blind = mounting is not None and mounting.confident
-    if not blind and truth is not None:
-        mounting = find_mounting(measured, triads, mapping)
-    force = _mean_force(channels)
-    channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
-    measured = measured.without(extra)
-    corrected: list[Check] = []
-    if mounting is not None and mapping.origin == "auto" and blind and not mounting.is_as_named:
-        note = f"{mounting.text}, and is read so: {mounting.evidence}"
-        signals = turned_signals(mapping, mounting, triads)
-        corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
-        mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
-        channels = read_signals(log, mapping, clocks, *span_ns)
-        mounting = replace(mounting, named=mounting.rows)
-        measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
-    latency = truth_latency(channels, truth)
-    survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, force, tuple(corrected)
-    )
-    return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
-
-
-def _mean_force(channels: MappedChannels) -> FloatArray:
-    """Return the mean acceleration [3] in the sensor's axes; NaN without a component."""
-    components = [channels.signals.get(n) for n in ACCELERATIONS]
-    return np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
-
-
-def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
-    """Return the survey with undocumented signs decided, or with one wrong unit or sign corrected.
-
-    A correction must be certain. Documented units and signs are corrected
-    without ground truth, and each such correction is a failed check.
-    """
-    mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
-    probable = measured.posterior(mounting_is_known=is_mounted)
-    turned = [n for g in measured.open_signs if probable.turned(g[0]) >= CERTAIN for n in g]
-    factors = dict.fromkeys(turned, (-1.0, "its sign is not documented, and the drive shows it"))
-    if not turned:
-        measured = replace(measured, open_signs=()).without_truth()
-        factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
-    sections, notes = {"truth.": dict(mapping.truth), "": dict(mapping.signals)}, list(mapping.notes)
-    checks = list(survey.corrected)
-    for name, (factor, evidence) in factors.items():
-        section = sections[name[:6] if name.startswith("truth.") else ""]
-        source = section.get(name.removeprefix("truth."))
-        if source is not None:
-            section[source.name] = scaled_source(source, factor)
-            notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
-            checks += [] if turned else [_corrected(name, section[source.name], notes[-1])]
-    if len(notes) == len(mapping.notes):
-        return survey
-    scaled = replace(mapping, signals=sections[""], truth=sections["truth."], notes=tuple(notes), open_signs=())
-    again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
-    # A failing sensor resembles a wrong unit of another one, but only a right correction leaves no contradiction.
-    failed = [check.name for check in again.checks if check.verdict == "failed"]
-    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis")) for n in failed)
-    return survey if is_bad else replace(again, corrected=(*checks, *again.corrected))
-
-
-def _corrected(name: str, source: SignalSource, note: str) -> Check:
-    return result("SIGNAL.corrected", "failed", name, evidence=note, entries=entries_of(source, "field", "scale"))
-
-
-def scaled_source(source: SignalSource, factor: float) -> SignalSource:
-    """Return a source with scale and offset multiplied by a factor, without its valid range."""
-
-    def times(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        return tuple(v * factor for v in value) if isinstance(value, tuple) else value * factor
-
-    # A valid range in the wrong unit would drop correct values.
-    return replace(source, scale=times(source.scale), offset=times(source.offset), valid_min=None, valid_max=None)
-
-
-def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:
-    """Return the latency of ground truth relative to the gyro, or of the gyro; None if one is missing."""
-    gyro = channels.signals.get("yaw_rate_rad_s")
-    if truth is None or gyro is None or not len(gyro):
-        return None
-    rate = channels.truth.get("yaw_rate_rad_s") or channel_of(truth, "yaw_rate_rad_s")
-    if not len(rate):
-        return None
-    latency = estimate_truth_latency(gyro, rate)
-    speed = channels.signals.get("speed_m_s")
-    other = None
-    if speed is not None and speed.source.split(".")[0] != gyro.source.split(".")[0]:
-        vx = channel_of(truth, "vx_m_s")
-        other = estimate_truth_latency(speed, vx) if min(len(speed), len(vx)) >= 2 else None
-    return booked_on_the_late(latency, other)
 
 
 def turned_signals(

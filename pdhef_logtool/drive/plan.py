@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, has_imu, no_alignment, plan_alignment
+from pdhef_logtool.drive.delays import LatencyEstimate
 from pdhef_logtool.drive.model_file import Sensors, clocks_of
-from pdhef_logtool.drive.mounting import survey_log
-from pdhef_logtool.drive.truth import LatencyEstimate, TruthPlan, dependent_signals
+from pdhef_logtool.drive.survey import survey_log
+from pdhef_logtool.drive.truth import TruthPlan, dependent_signals
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, Mapping, clock_key, fit_clocks
 from pdhef_logtool.records.checks import Check

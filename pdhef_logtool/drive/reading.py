@@ -22,7 +22,7 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import (
-    ChosenMapping,
+    AutoMapping,
     ClockModel,
     Mapping,
     check_mapping,
@@ -91,7 +91,7 @@ class Drive:
     car: Car
     options: ReadOptions
     plan: DrivePlan
-    chosen: ChosenMapping
+    chosen: AutoMapping
     notes: list[str]
     friction: FrictionSource
     earlier: Sensors | None

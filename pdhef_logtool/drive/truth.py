@@ -1,4 +1,4 @@
-"""Ground truth on its own clock: quantities, their derivations from the mapped channels, and the latency.
+"""Ground truth on its own clock: quantities, their derivations from the mapped channels.
 
 Derivations (``TruthTrack.derivation`` contains the ones in use):
 
@@ -23,7 +23,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import median_known
-from pdhef_logtool.drive.correlation import GAP_PERIODS, find_shift, on_common_grid, shift_error
+from pdhef_logtool.drive.correlation import GAP_PERIODS
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.geometry import (
@@ -39,12 +39,6 @@ from pdhef_logtool.records.tracks import StateTrack, make_track
 
 #: Half window of the smoothing derivative. A cubic over ±0.2 s passes 1 Hz with 1 % loss.
 DIFFERENTIATION_HALF_S = 0.2
-#: Search range of the latency.
-MAX_LATENCY_S = 0.5
-#: Largest standard error of a reliable latency.
-MAX_LATENCY_ERROR_S = 0.005
-#: Ground truth cannot lead the gyro by more than this: the gyro's stamps are late.
-LATE_GYRO_S = 0.005
 #: Two channels are the same if this share of their samples agrees to ``SAME_RELATIVE``.
 SAME_SHARE = 0.99
 SAME_RELATIVE = 1e-6
@@ -131,24 +125,6 @@ class TruthTrack:
     track: StateTrack
     max_gap_s: float
     derivation: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class LatencyEstimate:
-    """Delay of the ground truth after the sensors.
-
-    ``latency_s`` is 0 unless ``reliable``. ``identical``: the ground-truth yaw rate is the gyro's own channel, so that
-    the latency is 0 by construction and gives no information about the other truth channels. ``reason`` is for the
-    report. ``gyro_delay_s``: delay of the gyro's stamps; if it is not 0, the ground-truth latency is 0.
-    """
-
-    latency_s: float
-    correlation: float
-    std_error_s: float
-    reliable: bool
-    identical: bool
-    reason: str
-    gyro_delay_s: float = 0.0
 
 
 def plan_truth(
@@ -301,69 +277,6 @@ def channel_of(truth: TruthTrack, name: str) -> Channel:
     return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[finite])
 
 
-def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
-    """Return the latency, with a negative one attributed to the gyro.
-
-    Ground truth cannot show a motion before it happens. If it leads the gyro, the gyro's stamps are late. If a speed
-    sensor of another topic is equally late, all sensors agree, and the ground-truth clock is early.
-
-    Parameters
-    ----------
-    latency : gyro against ground-truth yaw rate. speed : speed sensor of another topic against ground-truth v_x.
-    """
-    leads = -latency.latency_s
-    if not latency.reliable or leads <= max(LATE_GYRO_S, 3.0 * latency.std_error_s):
-        return latency
-    if (
-        speed is not None
-        and speed.reliable
-        and abs(speed.latency_s - latency.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
-    ):
-        return replace(latency, reason=f"{latency.reason}; the speed sensor is late by as much")
-    reason = f"the gyro is {leads * 1e3:.1f} ms late against ground truth, which leads no motion"
-    return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
-
-
-def estimate_truth_latency(
-    sensor_yaw_rate: Channel, truth_yaw_rate: Channel, *, max_error_s: float = MAX_LATENCY_ERROR_S
-) -> LatencyEstimate:
-    """Estimate the ground-truth latency against the gyro by cross-correlation of detrended yaw rates.
-
-    Both are sampled on a common grid, linear trends removed; the correlation coefficient is computed at each shift
-    within ± ``MAX_LATENCY_S`` over the samples that both have, and its peak refined by a parabola.
-    Reliable: correlation of at least 0.8, standard error of at most ``max_error_s``, peak inside the range.
-
-    Parameters
-    ----------
-    sensor_yaw_rate, truth_yaw_rate : on their own clocks. Do not pass an estimator's output: its lag, which the metrics
-        show, would be attributed to the ground truth.
-    """
-    if _same_share(sensor_yaw_rate, truth_yaw_rate) >= SAME_SHARE:
-        return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the ground-truth yaw rate is the gyro's channel")
-
-    def refuse(reason: str, correlation: float = 0.0, error: float = float("inf")) -> LatencyEstimate:
-        return LatencyEstimate(0.0, correlation, error, False, False, reason)
-
-    if min(len(sensor_yaw_rate), len(truth_yaw_rate)) < 2:
-        return refuse("too few samples")
-    grid = on_common_grid(
-        sensor_yaw_rate.stamps_ns, sensor_yaw_rate.values, truth_yaw_rate.stamps_ns, truth_yaw_rate.values
-    )
-    if grid.both * grid.step_s < 4.0 * MAX_LATENCY_S:
-        return refuse("less than two seconds in common")
-    shift = find_shift(grid, MAX_LATENCY_S)
-    if not np.isfinite(shift.correlation):
-        return refuse("no yaw motion")
-    error = shift_error(grid, shift.shift_s)
-    if not shift.inside:
-        return refuse("no peak within the range searched", shift.correlation, error)
-    if shift.correlation < 0.8:
-        return refuse("gyro and ground-truth yaw rate correlate too little", shift.correlation, error)
-    if error > max_error_s:
-        return refuse("too little yaw motion", shift.correlation, error)
-    return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against ground-truth yaw rate")
-
-
 def dependent_signals(
     signals_channels: Mapping[str, Channel], truth_channels: Mapping[str, Channel], *, role: str = "input"
 ) -> dict[str, str]:
@@ -386,7 +299,7 @@ def dependent_signals(
             channel = signals_channels[signal]
             if truth.values.ndim != 1 or channel.values.ndim != 1 or channel.unit != truth.unit:
                 continue
-            share = _same_share(channel, truth)
+            share = same_share(channel, truth)
             if share >= SAME_SHARE:
                 dependent[name] = (
                     f"{truth.source} equals the {role} {signal} ({channel.source}) on {share:.1%} of its samples"
@@ -732,10 +645,10 @@ def _lateral_acceleration(
     return np.full(source.stamps_ns.shape[0], np.nan)
 
 
-# ---- latency and dependence ----
+# ---- dependence ----
 
 
-def _same_share(a: Channel, b: Channel) -> float:
+def same_share(a: Channel, b: Channel) -> float:
     """Return the share of equal values at common stamps, or by index for equal lengths; 0 with too few samples."""
     _, i, j = np.intersect1d(a.stamps_ns, b.stamps_ns, assume_unique=True, return_indices=True)
     shares = [0.0]

@@ -9,7 +9,6 @@ from pdhef_logtool.mapping.channels import merge_losses as merge_losses
 from pdhef_logtool.mapping.channels import read_signals as read_signals
 from pdhef_logtool.mapping.checking import check_mapping as check_mapping
 from pdhef_logtool.mapping.checking import resolve_mapping as resolve_mapping
-from pdhef_logtool.mapping.choosing import ChosenMapping as ChosenMapping
 from pdhef_logtool.mapping.choosing import choose_mapping as choose_mapping
 from pdhef_logtool.mapping.choosing import tables_for as tables_for
 from pdhef_logtool.mapping.clocks import ClockModel as ClockModel

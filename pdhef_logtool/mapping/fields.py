@@ -175,8 +175,8 @@ def posterior(units: Sequence[Sequence[Unit]], gains: Sequence[Gain]) -> FloatAr
     applies = total = np.exp(-np.sum(energies, axis=0))
     for gain in gains:
         off, variance = math.log(abs(gain.gain)), gain.sigma**2
-        for factor, spread, power in zip(factors, spreads, gain.powers, strict=True):
-            off, variance = off + power * np.log(factor), variance + (power * spread) ** 2
+        for factor, width, power in zip(factors, spreads, gain.powers, strict=True):
+            off, variance = off + power * np.log(factor), variance + (power * width) ** 2
         density = (1.0 - gain.broken) * np.exp(-(off**2) / (2.0 * variance)) / np.sqrt(2.0 * np.pi * variance)
         applies, total = applies * density, total * (density + 0.25 * gain.broken)
     return np.asarray(applies / total.sum())

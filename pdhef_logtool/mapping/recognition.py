@@ -23,7 +23,7 @@ from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
 from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
-from pdhef_logtool.mapping.weighing import Weighed, weigh
+from pdhef_logtool.mapping.weighing import Weighing, weigh
 from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
@@ -84,7 +84,7 @@ class Ambiguity:
 
 @dataclass(frozen=True, slots=True)
 class AutoMapping:
-    """A recognised mapping and its open points.
+    """A recognised or given mapping and its open points.
 
     Attributes
     ----------
@@ -198,7 +198,7 @@ def auto_map(
     _map_gnss(draft, topics, vendors)
     _speed_of_receiver(draft)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
-    mapping = replace(mapping, checks=weighed.checks, open_signs=weighed.open_signs)
+    mapping = replace(mapping, checks=tuple(weighed.checks), open_signs=weighed.open_signs)
     candidates = weighed.candidates
     if decoded is not None:
         mapping = decoded.as_mapped(mapping)
@@ -281,7 +281,7 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 # ------------------------------------------------------------------------------------------------ candidates
 
 
-def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
+def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighing:
     """Take candidates for signals without a well-known type."""
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
     # A measured steering angle has priority over a command, regardless of its type.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -207,6 +207,18 @@ class Mapping:
         yield from self.truth.values()
         if self.quality is not None:
             yield self.quality.as_source()
+
+    @property
+    def by_subject(self) -> dict[str, SignalSource]:
+        """Signals by name, and ground truth by ``truth.NAME``."""
+        return {**self.signals, **{f"truth.{name}": source for name, source in self.truth.items()}}
+
+    def with_sources(self, changed: dict[str, SignalSource], notes: Iterable[str] = ()) -> Mapping:
+        """Return the mapping with other sources, named as in :attr:`by_subject`, and further notes."""
+        every = self.by_subject | changed
+        truth = {n.removeprefix("truth."): s for n, s in every.items() if n.startswith("truth.")}
+        signals = {n: s for n, s in every.items() if not n.startswith("truth.")}
+        return replace(self, signals=signals, truth=truth, notes=(*self.notes, *notes))
 
     @property
     def topics(self) -> tuple[str, ...]:

@@ -11,8 +11,7 @@ import pytest
 from pdhef_logtool.drive.checks import delay_checks
 from pdhef_logtool.drive.correlation import has_peak_within, on_common_grid
 from pdhef_logtool.drive.delays import late_sensors
-from pdhef_logtool.drive.mounting import survey_log
-from pdhef_logtool.drive.proposals import mapping_proposals
+from pdhef_logtool.drive.survey import mapping_proposals, survey_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks
 from pdhef_logtool.records.signals import WHEELS, Channel

@@ -12,13 +12,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
+from pdhef_logtool.drive.delays import estimate_truth_latency
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.truth import (
     channel_of,
     dependent_signals,
     derive_truth,
     differentiate,
-    estimate_truth_latency,
     plan_truth,
     truth_at,
     valid_as_a_whole,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.delays import LatencyEstimate
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.recorded import read_recorded
-from pdhef_logtool.drive.truth import LatencyEstimate
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping.choosing import auto_map

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
-from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.mapping_file import mapping_from_dict

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
-from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.mapping import AutoMapping, SignalSource, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_values
 from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_from_dict, mapping_to_toml
