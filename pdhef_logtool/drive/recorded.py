@@ -33,8 +33,8 @@ _LATE = "samples arrived much later than their neighbours: they were not waited 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
-    """A drive as its plan reads it from the log.
+class WholeDrive:
+    """A drive in memory, as its plan reads it from the log.
 
     Attributes
     ----------
@@ -44,17 +44,33 @@ class Recorded:
     signals_sha256, truth_sha256 : hashes of the channels' content; None without samples.
     """
 
+    name: str
     plan: DrivePlan
     signals: Signals
     truth: StateTrack | None
-    losses: tuple[Loss, ...]
-    ledger: tuple[SampleCount, ...]
-    changes: tuple[SensorChange, ...]
-    signals_sha256: str | None
-    truth_sha256: str | None
+    log_start_ns: int
+    changes: tuple[SensorChange, ...] = ()
+    losses: tuple[Loss, ...] = ()
+    ledger: tuple[SampleCount, ...] = ()
+    signals_sha256: str | None = None
+    truth_sha256: str | None = None
+
+    def __repr__(self) -> str:
+        return f"<WholeDrive {self.name}: {self.seconds:.1f} s, with{'out' * (self.truth is None)} ground truth>"
+
+    @property
+    def seconds(self) -> float:
+        """Time from first to last stamp."""
+        return float(self.signals.stamps_ns[-1] - self.signals.stamps_ns[0]) * 1e-9
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last stamp in seconds from the log's start."""
+        stamps = self.signals.stamps_ns
+        return float(stamps[0] - self.log_start_ns) * 1e-9, float(stamps[-1] - self.log_start_ns) * 1e-9
 
 
-def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = ()) -> Recorded:
+def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (), name: str = "") -> WholeDrive:
     """Read the slice of a plan once, align it and derive the ground truth; ``unchanged`` sensors are not corrected."""
     from pdhef_logtool.drive.sensor_faults import without_faults  # loads the compiler
 
@@ -74,24 +90,12 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
     losses = merge_losses([part.losses, *map(_gaps, channels), late, _impossible(aligned)])
     truth = None
     if plan.truth is not None:
-        at_stamps = truth_at(
-            derive_truth(part.truth, plan=plan.truth),
-            signals.stamps_ns,
-            plan.truth_latency_s,
-            standstill_m_s=plan.vehicle.standstill_m_s,
-        )
+        derived, standstill = derive_truth(part.truth, plan=plan.truth), plan.vehicle.standstill_m_s
+        at_stamps = truth_at(derived, signals.stamps_ns, plan.truth_latency_s, standstill_m_s=standstill)
         truth = replace(at_stamps, measured_speed_m_s=_measured_speed(signals))
-    mapping = plan.mapping
-    return Recorded(
-        plan=plan,
-        signals=signals,
-        truth=truth,
-        losses=losses,
-        ledger=sample_ledger(log, plan, part.counts),
-        changes=changes,
-        signals_sha256=channels_sha256(part.signals, mapping.signals),
-        truth_sha256=channels_sha256(part.truth, mapping.truth),
-    )
+    ledger = sample_ledger(log, plan, part.counts)
+    hashes = (channels_sha256(part.signals, plan.mapping.signals), channels_sha256(part.truth, plan.mapping.truth))
+    return WholeDrive(name, plan, signals, truth, log.start_ns, changes, losses, ledger, *hashes)
 
 
 def _measured_speed(signals: Signals) -> FloatArray:
@@ -143,15 +147,8 @@ def _gaps(channel: Channel) -> list[Loss]:
         return []
     steps = np.diff(stamps)
     least = max(TOLD_GAP_S * 1e9, TOLD_GAP_PERIODS * float(np.median(steps)))
+    text, at = "no samples for {:.2f} s", stamps.tolist()
     return [
-        Loss(
-            "gap",
-            f"no samples for {steps[i] * 1e-9:.2f} s",
-            channel.source,
-            int(stamps[i]),
-            int(stamps[i + 1]),
-            1,
-            "note",
-        )
+        Loss("gap", text.format(steps[i] * 1e-9), channel.source, at[i], at[i + 1], 1, "note")
         for i in np.flatnonzero(steps > least)
     ]
