@@ -15,12 +15,21 @@ from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.evidence import Pieces, Seen
-from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_heading, receiver_signals
-from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, Axes, length_of, twist_axes
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
-from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
+from pdhef_logtool.mapping.navigation import (
+    NEVER_NEGATIVE,
+    RAW_COURSE,
+    Axes,
+    gnss_signals,
+    has_heading,
+    length_of,
+    named_gnss,
+    navigation_truth,
+    receiver_signals,
+    twist_axes,
+)
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighing, weigh

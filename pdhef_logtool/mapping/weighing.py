@@ -38,9 +38,8 @@ from pdhef_logtool.mapping.fields import (
     path_velocity,
     posterior,
 )
-from pdhef_logtool.mapping.gnss_signals import has_heading
-from pdhef_logtool.mapping.ground_speed import axes_of
 from pdhef_logtool.mapping.naming import words_of
+from pdhef_logtool.mapping.navigation import axes_of, has_heading
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdhef_logtool.mapping.gnss_signals import receiver_signals
+from pdhef_logtool.mapping.navigation import receiver_signals
 from pdhef_logtool.mapping.recognition import auto_map
 from tests.fake_drive_log import FakeLog, FakeTopic
 
