@@ -29,8 +29,8 @@ from pdhef_logtool.drive.columns import (
     moving_at,
 )
 from pdhef_logtool.drive.delays import LatencyEstimate, LateSensor
-from pdhef_logtool.drive.frames import IS_GRAVITY_M_S2
 from pdhef_logtool.drive.measured import Measured
+from pdhef_logtool.drive.mounting import IS_GRAVITY_M_S2
 from pdhef_logtool.drive.relation_checks import relation_checks
 from pdhef_logtool.drive.relations import CG_VY, GAIN_RANGE, SAME_RANGE, gentle_at, position_factors
 from pdhef_logtool.drive.sensor_changes import SensorChange

@@ -8,21 +8,24 @@ the sensor's axes to these; its correlation, gain and error decide whether the m
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.check_table import result
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
-from pdhef_logtool.drive.frames import IS_GRAVITY_M_S2, angle_deg, nearest_step, rotation_text
 from pdhef_logtool.drive.measured import Measured
 from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
+from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping, SignalSource
+from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.mapping_file import entries_of
-from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
@@ -52,6 +55,143 @@ ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
 SIGN_CORRELATION = 0.5
 #: The same for a left-handed sensor: the wheels' difference changes its sign when a car understeers strongly.
 HAND_CORRELATION = 0.8
+#: Words for the axes of a rate, x first.
+_RATE_WORDS = ("roll", "pitch", "yaw")
+#: Temporary names of the components; they differ from all signal names.
+ACCELERATIONS = tuple(f"triad.acceleration.{axis}" for axis in "xyz")
+RATES = tuple(f"triad.rate.{axis}" for axis in "xyz")
+#: Rows of a mounting: forward and left from the accelerometer, up from the gyro.
+MOUNTED = ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
+#: A mean acceleration in this range is gravity.
+IS_GRAVITY_M_S2 = (0.75 * GRAVITY_M_S2, 1.25 * GRAVITY_M_S2)
+#: Largest angle between the mean gravity of a drive and the car's vertical.
+TILT_DEG = 15.0
+
+
+# ------------------------------------------------------------------------------------------------ fields of an IMU
+
+
+@dataclass(frozen=True, slots=True)
+class Triad:
+    """Three fields of one message, x first, and their common factor to SI."""
+
+    source: SignalSource
+    paths: tuple[str, str, str]
+    unit: float
+
+    def components(self, names: tuple[str, ...]) -> dict[str, SignalSource]:
+        """Return the three fields as separate sources."""
+        return {
+            n: replace(self.source, name=n, field=p, scale=self.unit, offset=0.0, valid_min=None, valid_max=None)
+            for n, p in zip(names, self.paths, strict=True)
+        }
+
+    def row(self, source: SignalSource) -> FloatArray:
+        """Return the direction [3] of a mapped signal in the triad's axes."""
+        scales = source.scale if isinstance(source.scale, tuple) else (source.scale,) * len(source.paths)
+        row = np.zeros(3)
+        for path, scale in zip(source.paths, scales, strict=True):
+            row[self.paths.index(path)] += scale / self.unit
+        return row
+
+    def turned(self, source: SignalSource, row: FloatArray) -> SignalSource:
+        """Return the source of a signal in a direction [3] of the triad; a single field if the direction is an axis."""
+        used = [i for i in range(3) if abs(row[i]) > 1e-9]
+        scales = tuple(float(np.round(row[i], 6)) * self.unit for i in used)
+        if len(used) == 1:
+            return replace(source, field=self.paths[used[0]], scale=scales[0])
+        return replace(source, field=tuple(self.paths[i] for i in used), scale=scales)
+
+
+def find_triads(log: DriveLog, mapping: Mapping) -> tuple[Triad | None, Triad | None]:
+    """Return the triads of accelerations and of rates with an axis in the mapping; None for a missing triad."""
+    triads = [_triad(log, mapping, names) for names in (("ay_m_s2", "ax_m_s2"), ("yaw_rate_rad_s",))]
+    return triads[0], triads[1]
+
+
+def _triad(log: DriveLog, mapping: Mapping, names: tuple[str, ...]) -> Triad | None:
+    sources = [mapping.signals[n] for n in names if n in mapping.signals]
+    if not sources or any(s.can_signal is not None for s in sources):
+        return None
+    first = sources[0]
+    fields = log.fields(first.topic)
+    for paths in _siblings(first.paths):
+        inside = all(s.topic == first.topic and s.stamp == first.stamp and set(s.paths) <= set(paths) for s in sources)
+        if inside and all(has_path(fields, p) for p in paths):
+            scales = first.scale if isinstance(first.scale, tuple) else (first.scale,)
+            unit = float(np.linalg.norm(scales))
+            # Rows of a rotation have length 1, so that the length of the scales is the unit.
+            return Triad(first, paths, unit)
+    return None
+
+
+def _siblings(paths: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
+    """Yield possible triples of paths that contain a path."""
+    path = paths[0]
+    if index := re.fullmatch(r"(.*)\[(\d+)\]", path):
+        start = int(index[2]) - int(index[2]) % 3
+        yield f"{index[1]}[{start}]", f"{index[1]}[{start + 1}]", f"{index[1]}[{start + 2}]"
+    leaf = path.rfind(".") + 1
+    for word in _RATE_WORDS:
+        position = path.lower().find(word, leaf)
+        if position >= 0:
+            written = [w.capitalize() if path[position].isupper() else w for w in _RATE_WORDS]
+            a, b, c = (path[:position] + w + path[position + len(word) :] for w in written)
+            yield a, b, c
+    for position in range(len(path) - 1, leaf - 1, -1):
+        if path[position] in "xyzXYZ":
+            axes = "XYZ" if path[position].isupper() else "xyz"
+            a, b, c = (path[:position] + axis + path[position + 1 :] for axis in axes)
+            yield a, b, c
+
+
+# ------------------------------------------------------------------------------------------------ rotations
+
+
+def angles_deg(rotation: FloatArray) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of a sensor rotation [3, 3], in the order yaw, pitch, roll."""
+    m = rotation
+    pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
+    if abs(m[2, 0]) > 1.0 - 1e-6:  # gimbal lock: roll and yaw are not separable
+        return 0.0, math.degrees(pitch), math.degrees(math.atan2(-m[0, 1], m[1, 1]))
+    roll, yaw = math.atan2(m[2, 1], m[2, 2]), math.atan2(m[1, 0], m[0, 0])
+    return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
+
+
+def rotation_text(rotation: FloatArray) -> str:
+    """Return a sensor's rotation as text."""
+    roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in angles_deg(rotation))
+    return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg"
+
+
+def nearest_step(rotation: FloatArray) -> FloatArray:
+    """Return the nearest rotation [3, 3] by multiples of 90 degrees."""
+    rows = np.eye(3)[list(permutations(range(3)))]
+    steps = np.concatenate([rows * np.array(signs)[:, None] for signs in product((1.0, -1.0), repeat=3)]) + 0.0
+    steps = steps[np.linalg.det(steps) > 0.0]
+    return np.asarray(steps[np.argmax(np.sum(steps * rotation, axis=(1, 2)))])
+
+
+def upright_check(named: FloatArray, force: FloatArray) -> Check | None:
+    """Report that gravity, the mean acceleration [3], is not upward in the axes that a mapping names.
+
+    ``named``: rows [3, 3] of forward, left and the yaw axis in the sensor's axes. The result is None without forward or
+    left, and if the sensor subtracts gravity.
+    """
+    up, size = np.cross(named[0], named[1]), float(np.linalg.norm(force))
+    least = math.cos(math.radians(2.0 * TILT_DEG)) * size
+    if not up.any() or not IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1] or up @ force > least:
+        return None
+    along = int(np.argmax(np.abs(force)))
+    axis = f"{'-' if force[along] < 0.0 else '+'}{'xyz'[along]}"
+    evidence = f"gravity is along {axis} of the accelerometer, not along its vertical: its axes are not the car's"
+    remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
+    return Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy)
+
+
+def angle_deg(cosine: float) -> float:
+    """Return the angle of a cosine, deg; rounding may exceed 1."""
+    return math.degrees(math.acos(float(np.clip(cosine, -1.0, 1.0))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

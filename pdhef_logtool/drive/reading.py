@@ -11,9 +11,8 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import CHANGE_SUFFIX, change_checks
 from pdhef_logtool.drive.friction import FrictionFrom, FrictionSource, friction_source
-from pdhef_logtool.drive.model_file import CLOCK_START_S, Sensors, is_device_clock, with_earlier_drive
 from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
-from pdhef_logtool.drive.plan import DrivePlan, plan_drive
+from pdhef_logtool.drive.plan import CLOCK_START_S, DrivePlan, Sensors, is_device_clock, plan_drive, with_earlier_drive
 from pdhef_logtool.drive.recorded import WholeDrive as WholeDrive
 from pdhef_logtool.drive.recorded import read_recorded
 from pdhef_logtool.logs.container import Wanted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Collection
 from collections.abc import Mapping as Mapped
@@ -11,12 +12,12 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import correct_signals
 from pdhef_logtool.drive.alignment import align
-from pdhef_logtool.drive.channel_hash import channels_sha256
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
 from pdhef_logtool.drive.truth import derive_truth, truth_at
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, clock_key, merge_losses, read_signals
+from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings, without_impossible
 from pdhef_logtool.records.signals import Channel, FloatArray, Loss, Signals
@@ -96,6 +97,23 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
     ledger = sample_ledger(log, plan, part.counts)
     hashes = (channels_sha256(part.signals, plan.mapping.signals), channels_sha256(part.truth, plan.mapping.truth))
     return WholeDrive(name, plan, signals, truth, log.start_ns, changes, losses, ledger, *hashes)
+
+
+def channels_sha256(channels: Mapped[str, Channel], sources: Mapped[str, SignalSource]) -> str | None:
+    """Return the hash of names, stamps on the log's clock and values in SI units; None without samples.
+
+    Stamps are hashed before the latency of a source is subtracted, because mapping files and cars may change the
+    latency of the same drive. Arrival times are not hashed.
+    """
+    total = hashlib.sha256()
+    full = [(name, channel) for name, channel in sorted(channels.items()) if len(channel)]
+    for name, channel in full:
+        stamps_ns = channel.stamps_ns + round(sources[name].latency_s * 1e9)
+        # -0.0 and 0.0 are one value.
+        values = np.ascontiguousarray(channel.values + 0.0, dtype="<f8")
+        total.update(name.encode() + b"\0" + hashlib.sha256(stamps_ns.astype("<i8").data).digest())
+        total.update(hashlib.sha256(values.data).digest())
+    return total.hexdigest() if full else None
 
 
 def _measured_speed(signals: Signals) -> FloatArray:

@@ -26,15 +26,25 @@ from pdhef_logtool.drive.checks import (
     sideslip_offset,
 )
 from pdhef_logtool.drive.delays import LATE_GYRO_S, LatencyEstimate, LateSensor, late_sensors, truth_latency
-from pdhef_logtool.drive.frames import upright_check
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.mounting import Mounting, find_mounting, mounting_checks, named_rows, turned_signals
+from pdhef_logtool.drive.mounting import (
+    ACCELERATIONS,
+    MOUNTED,
+    RATES,
+    Mounting,
+    Triad,
+    find_mounting,
+    find_triads,
+    mounting_checks,
+    named_rows,
+    turned_signals,
+    upright_check,
+)
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.truth import TruthPlan, TruthTrack, derive_truth, plan_truth
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
 from pdhef_logtool.mapping.mapping_file import entries_of
-from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 

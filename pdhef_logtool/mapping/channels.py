@@ -122,9 +122,9 @@ def gate_mask(
     if gate_stamps_ns.shape[0] == 0:
         return np.zeros(stamps_ns.shape[0], np.bool_)
     passes = np.zeros(gate_values.shape[0], np.bool_)
-    if gate.minimum is not None or gate.maximum is not None:
-        low = -np.inf if gate.minimum is None else gate.minimum
-        high = np.inf if gate.maximum is None else gate.maximum
+    if gate.min is not None or gate.max is not None:
+        low = -np.inf if gate.min is None else gate.min
+        high = np.inf if gate.max is None else gate.max
         passes |= (gate_values >= low) & (gate_values <= high)
     if gate.values:
         passes |= np.isin(gate_values, np.asarray(gate.values))

@@ -259,7 +259,8 @@ class _Instrument:
         """Direction of the path, counter-clockwise from east, rad [M]; NaN at low speed."""
         read = {(self.topic, path): seen for path, seen in self.seen.items()}
         velocity = path_velocity(_on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read)))
-        return np.full(0, np.nan) if velocity is None else _direction(*velocity)
+        nothing = np.full(len(self.pieces.starts) * self.pieces.cells_a_piece, np.nan)
+        return nothing if velocity is None else _direction(*velocity)
 
     @property
     def over_ground(self) -> list[SignalSource]:

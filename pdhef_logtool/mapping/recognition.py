@@ -842,6 +842,6 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
     # 0 is any fix; 2 is a ground-based augmented fix, which receivers report for RTK.
     lowest = 2.0 if "rtk" in _words(fix.name) and bool((status == 2.0).any()) else 0.0
     draft.quality = QualityGate(
-        topic=fix.name, field="status.status", minimum=lowest, stamp=stamp_path_of(draft.log.fields(fix.name))
+        topic=fix.name, field="status.status", min=lowest, stamp=stamp_path_of(draft.log.fields(fix.name))
     )
     draft.notes.append(f"ground truth is used where {fix.name}.status.status is at least {lowest:g}")

@@ -123,12 +123,12 @@ class CanSettings:
 
 @dataclass(frozen=True, slots=True)
 class QualityGate:
-    """Condition for the use of ground truth: the field is in [``minimum``, ``maximum``] or one of ``values``."""
+    """Condition for the use of ground truth: the field is in [``min``, ``max``] or one of ``values``."""
 
     topic: str
     field: str
-    minimum: float | None = None
-    maximum: float | None = None
+    min: float | None = None
+    max: float | None = None
     values: tuple[float, ...] = ()
     stamp: str = AUTO_STAMP
     stamp_unit: StampUnit = "ros"
@@ -143,9 +143,9 @@ class QualityGate:
     def describe(self) -> str:
         """Return the gate's condition in words."""
         parts = []
-        if self.minimum is not None or self.maximum is not None:
-            low = "-inf" if self.minimum is None else f"{self.minimum:g}"
-            high = "inf" if self.maximum is None else f"{self.maximum:g}"
+        if self.min is not None or self.max is not None:
+            low = "-inf" if self.min is None else f"{self.min:g}"
+            high = "inf" if self.max is None else f"{self.max:g}"
             parts.append(f"in [{low}, {high}]")
         if self.values:
             parts.append("one of " + ", ".join(f"{v:g}" for v in self.values))

@@ -212,7 +212,7 @@ def test_gate_agrees_with_a_search_by_hand(seed: int) -> None:
     stamps = np.sort(rng.integers(0, 100, 30))
     gate_stamps = np.sort(rng.integers(0, 100, rng.integers(0, 12)))
     values = rng.choice([np.nan, 1.0, 2.0, 3.0, 4.0], gate_stamps.shape[0])
-    gate = QualityGate("/g", "f", minimum=2.5, maximum=3.5, values=(1.0,))
+    gate = QualityGate("/g", "f", min=2.5, max=3.5, values=(1.0,))
     got = gate_mask(stamps, gate_stamps, values, gate, hold_ns=15)
     for stamp, keep in zip(stamps, got, strict=True):
         before = [i for i, g in enumerate(gate_stamps) if g <= stamp]

@@ -169,8 +169,8 @@ def mappings(draw: st.DrawFn) -> Mapping:
         quality = QualityGate(
             topic="/gate" + draw(texts),
             field=draw(texts),
-            minimum=draw(st.sampled_from([None, -1.5])),
-            maximum=draw(st.sampled_from([None, 4.0])),
+            min=draw(st.sampled_from([None, -1.5])),
+            max=draw(st.sampled_from([None, 4.0])),
             values=tuple(draw(st.lists(numbers, min_size=1, max_size=3))),
             stamp=draw(texts),
             latency_s=draw(numbers),
