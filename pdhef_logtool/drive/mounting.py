@@ -12,10 +12,8 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations, product
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.check_table import result
@@ -27,9 +25,7 @@ from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.signals import BoolArray, FloatArray
-
-ComplexArray: TypeAlias = npt.NDArray[np.complex128]
+from pdhef_logtool.records.signals import FloatArray
 
 #: Below this mean acceleration, the sensor's software has subtracted gravity.
 COMPENSATED_M_S2 = 3.0
@@ -250,13 +246,13 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
-    mounting = Mounting(_snapped(best), named, best.evidence, _is_shown(best, hand, measured), hand)
-    if not mounting.confident or mounting.is_as_named:
-        return mounting
     parts = [
         _turned(f, hand * w, np.where(part, speed, np.nan), best.rotation[2], references) for part in halves(len(speed))
     ]
-    return replace(mounting, confident=_parts_agree(best, parts))
+    is_shown = _is_shown(best, hand, measured)
+    mounting = Mounting(_snapped(best, parts), named, best.evidence, is_shown, hand)
+    is_sure = mounting.is_as_named or _parts_agree(best, parts)
+    return replace(mounting, confident=is_shown and is_sure)
 
 
 def _is_shown(turn: _Turn, hand: float, measured: Measured) -> bool:
@@ -290,7 +286,7 @@ class _Turn:
     """A rotation for one choice of the vertical, with its fit to the drive.
 
     ``sign``: correlation of the yaw rate with another measurement, 0 without one. ``along``: the speed alone shows
-    which way is forward. ``f``, ``driven``, ``rate``, ``use``: data of the fit.
+    which way is forward. ``rate``: yaw rate.
     """
 
     rotation: FloatArray
@@ -301,10 +297,7 @@ class _Turn:
     along: bool
     fits: bool
     evidence: str
-    f: FloatArray
-    driven: ComplexArray
     rate: FloatArray
-    use: BoolArray
 
 
 def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
@@ -373,7 +366,7 @@ def _turned(
     )
     fits = correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG
     along = _along(rotation[0] @ f[use].T, driven[use].real)
-    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence, f, driven, rate, use)
+    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence, rate)
 
 
 def _along(measured: FloatArray, driven: FloatArray) -> bool:
@@ -392,54 +385,31 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
     return best, said
 
 
-def _snapped(turn: _Turn) -> FloatArray:
+def _snapped(whole: _Turn, parts: Sequence[_Turn | None]) -> FloatArray:
     """Return the nearest multiple of 90 degrees, with the remaining tilt and yaw if both parts of the drive agree."""
-    rotation = turn.rotation
-    step = nearest_step(rotation)
-    rest = rotation @ step.T
-    is_precise = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
-    if not is_precise or turn.samples < ASKEW_SAMPLES:
+    step = nearest_step(whole.rotation)
+    known = [p.rotation @ step.T for p in parts if p is not None]
+    is_precise = whole.correlation >= ASKEW_CORRELATION and whole.error_deg <= ASKEW_ERROR_DEG
+    if not is_precise or whole.samples < ASKEW_SAMPLES or len(known) < 2:
         return step
-    parts = _parts_of(turn)
-    yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
-    angles = [abs(yaw) - math.copysign(left, yaw * left) for left, _ in parts]
-    is_turned = all(a > TURNED_DEG for a in angles) and abs(yaw) > max(TURNED_DEG, 3.0 * turn.error_deg)
+    rest = whole.rotation @ step.T
+    yaw, *yaws = (math.degrees(math.atan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])) for r in (rest, *known))
+    angles = [math.copysign(y, y * yaw) for y in yaws]
+    is_turned = all(a > TURNED_DEG for a in angles) and abs(yaw) > max(TURNED_DEG, 3.0 * whole.error_deg)
     is_turned &= abs(angles[0] - angles[1]) < max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw))
     # One of the parts may be a hill.
-    first, second = (step @ rotation.T @ up for _, up in parts)
-    *tilts, apart = (angle_deg(float(x)) for x in (rest[2, 2], first[2], second[2], first @ second))
+    *tilts, apart = (
+        angle_deg(float(x)) for x in (rest[2, 2], known[0][2, 2], known[1][2, 2], known[0][2] @ known[1][2])
+    )
     if min(tilts) > TURNED_DEG and apart < PARTS_AGREE_DEG:
         from scipy.spatial.transform import Rotation
 
         level_only = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest[2]])[0].as_matrix()
-        return rotation if is_turned else np.asarray(level_only @ step)
+        return whole.rotation if is_turned else np.asarray(level_only @ step)
     if not is_turned:
         return step
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ step)
-
-
-def _parts_of(turn: _Turn) -> list[tuple[float, FloatArray]]:
-    """Return, for two parts of the drive, the yaw (deg) that the fit leaves and up [3] in the axes of the rotation.
-
-    Steady sideslip rotates the acceleration by an angle that grows with lateral acceleration and curvature. Roll and
-    pitch change the gains of both axes. Each has a regressor; grade and crossfall are part of the constant. The yaw is
-    NaN if the part does not separate them. Up is the force at zero acceleration.
-    """
-    axes, driven = turn.f @ turn.rotation.T, turn.driven
-    z, ones = axes[:, 0] + 1j * axes[:, 1], np.ones(len(axes))
-    matrix = np.stack([driven, driven.conj(), 1j * derivative(turn.rate), driven.imag**2, turn.rate**2, ones], axis=1)
-    level = np.stack([driven.real, driven.imag, ones], axis=1)
-    parts = []
-    for part in halves(len(z)):
-        usable = turn.use & part & np.isfinite(matrix).all(axis=1) & np.isfinite(z)
-        size = np.maximum(np.linalg.norm(matrix[usable], axis=0), 1e-9)
-        is_long = independent_samples(int(np.count_nonzero(usable))) >= ASKEW_SAMPLES / 2.0
-        is_separable = is_long and np.linalg.cond(matrix[usable] / size) <= WELL_CONDITIONED
-        gain = np.linalg.lstsq(matrix[usable] / size, z[usable], rcond=None)[0][0] if is_separable else np.nan
-        up = np.linalg.lstsq(level[usable], axes[usable], rcond=None)[0][2] if is_long else np.zeros(3)
-        parts.append((math.degrees(float(np.angle(gain))), up / max(float(np.linalg.norm(up)), 1e-9)))
-    return parts
 
 
 # ------------------------------------------------------------------------------------- into the mapping
