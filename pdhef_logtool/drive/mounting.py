@@ -388,18 +388,18 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
 def _snapped(whole: _Turn, parts: Sequence[_Turn | None]) -> FloatArray:
     """Return the nearest multiple of 90 degrees, with the remaining tilt and yaw if both parts of the drive agree."""
     step = nearest_step(whole.rotation)
-    known = [p.rotation @ step.T for p in parts if p is not None]
+    rests = [p.rotation @ step.T for p in parts if p is not None]
     is_precise = whole.correlation >= ASKEW_CORRELATION and whole.error_deg <= ASKEW_ERROR_DEG
-    if not is_precise or whole.samples < ASKEW_SAMPLES or len(known) < 2:
+    if not is_precise or whole.samples < ASKEW_SAMPLES or len(rests) < 2:
         return step
     rest = whole.rotation @ step.T
-    yaw, *yaws = (math.degrees(math.atan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])) for r in (rest, *known))
+    yaw, *yaws = (math.degrees(math.atan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])) for r in (rest, *rests))
     angles = [math.copysign(y, y * yaw) for y in yaws]
     is_turned = all(a > TURNED_DEG for a in angles) and abs(yaw) > max(TURNED_DEG, 3.0 * whole.error_deg)
     is_turned &= abs(angles[0] - angles[1]) < max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw))
     # One of the parts may be a hill.
     *tilts, apart = (
-        angle_deg(float(x)) for x in (rest[2, 2], known[0][2, 2], known[1][2, 2], known[0][2] @ known[1][2])
+        angle_deg(float(x)) for x in (rest[2, 2], rests[0][2, 2], rests[1][2, 2], rests[0][2] @ rests[1][2])
     )
     if min(tilts) > TURNED_DEG and apart < PARTS_AGREE_DEG:
         from scipy.spatial.transform import Rotation

@@ -165,8 +165,8 @@ def _gaps(channel: Channel) -> list[Loss]:
         return []
     steps = np.diff(stamps)
     least = max(TOLD_GAP_S * 1e9, TOLD_GAP_PERIODS * float(np.median(steps)))
-    text, at = "no samples for {:.2f} s", stamps.tolist()
+    text, times = "no samples for {:.2f} s", stamps.tolist()
     return [
-        Loss("gap", text.format(steps[i] * 1e-9), channel.source, at[i], at[i + 1], 1, "note")
+        Loss("gap", text.format(steps[i] * 1e-9), channel.source, times[i], times[i + 1], 1, "note")
         for i in np.flatnonzero(steps > least)
     ]

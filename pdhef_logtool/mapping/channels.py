@@ -234,8 +234,8 @@ class _Reading:
             late = np.concatenate([[False], stamps[1:] < np.maximum.accumulate(stamps)[:-1]])
             order = np.argsort(stamps, kind="stable")
             repeated = np.concatenate([[False], stamps[order][1:] == stamps[order][:-1]])
-            of_kinds = (("out-of-order", times[late]), ("duplicate-stamp", times[order[repeated]]))
-            self.losses += [dropped(kind, where, at) for kind, at in of_kinds if at.size]
+            lost = {"out-of-order": times[late], "duplicate-stamp": times[order[repeated]]}
+            self.losses += [dropped(kind, where, lost_ns) for kind, lost_ns in lost.items() if lost_ns.size]
         if clock.unusable:
             what = f"log time is used instead of {source.stamp}: {clock.unusable}"
             self.losses.append(Loss("log-time-serves", what, where, severity="note"))
@@ -253,9 +253,10 @@ class _Reading:
             return Channel(source.name, unit, source.label, empty, empty, np.empty(shape))
         key = (clock_key(source), source.latency_s)
         if key not in self.measured:  # channels of one topic share their stamps
-            at = times.stamps_ns - np.int64(round(source.latency_s * 1e9))
+            measured_ns = times.stamps_ns - np.int64(round(source.latency_s * 1e9))
             is_known = self.clocks.get(key[0], ClockModel()).delay_known
-            self.measured[key] = at, np.maximum(times.log_time_ns if is_known else times.stamps_ns, at)
+            arrived_ns = np.maximum(times.log_time_ns if is_known else times.stamps_ns, measured_ns)
+            self.measured[key] = measured_ns, arrived_ns
         values = si_values(topic, source)
         if not times.usable.all():
             values = values[times.usable]
@@ -263,10 +264,10 @@ class _Reading:
         clean = clean_samples(*self.measured[key], values, valid_min=low, valid_max=high)
         lost = {"nan": clean.nan_at, "out-of-range": clean.out_of_range_at}
         count.update({"read": len(topic), "bad-stamp": int(np.count_nonzero(~times.usable))})
-        count.update({kind: at.shape[0] for kind, at in lost.items()})
+        count.update({kind: rows.shape[0] for kind, rows in lost.items()})
         count.update({"repeated": clean.same, "duplicate-stamp": clean.other})
         where = f"{source.name} ({source.label})"
-        self.losses += [dropped(kind, where, times.log_time_ns[at]) for kind, at in lost.items() if at.shape[0]]
+        self.losses += [dropped(kind, where, times.log_time_ns[rows]) for kind, rows in lost.items() if rows.size]
         return Channel(source.name, unit, source.label, clean.stamps_ns, clean.arrival_ns, clean.values)
 
     def gated(self, gate: QualityGate, truth: dict[str, Channel], start_ns: int, end_ns: int) -> dict[str, Channel]:

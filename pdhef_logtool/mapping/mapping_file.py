@@ -35,13 +35,15 @@ _STEERING = ("steer_rad", "steering_wheel_rad")
 RESERVED_NAMES = ("truth", "sensors", "reference")
 
 Kind = TypeVar("Kind", SignalSource, QualityGate, CanSettings)
-_STRICT = ConfigDict(extra="forbid", strict=True, str_min_length=1, allow_inf_nan=False, defer_build=True)
 #: Classes that check the entries of a record.
 _CHECKED: dict[type, Any] = {
-    kind: dataclass(kind, frozen=True, config=_STRICT) for kind in (SignalSource, QualityGate, CanSettings)
+    kind: dataclass(
+        kind,
+        frozen=True,
+        config=ConfigDict(extra="forbid", strict=True, str_min_length=1, allow_inf_nan=False, defer_build=True),
+    )
+    for kind in (SignalSource, QualityGate, CanSettings)
 }
-#: Largest identifier of a frame.
-_ID_MASK = (1 << 29) - 1
 
 
 def _record(kind: type[Kind], raw: object, where: str, problems: list[str], **more: object) -> Kind | None:
@@ -51,8 +53,8 @@ def _record(kind: type[Kind], raw: object, where: str, problems: list[str], **mo
         return None
     problems += [unknown(name, [f.name for f in fields(kind)], where) for name in more.keys() & raw.keys()]
     table = {key: tuple(v) if isinstance(v, list) else v for key, v in raw.items()}
-    found = checked(_CHECKED[kind], {**table, **more}, where, problems)
-    record = None if found is None else kind(**{f.name: getattr(found, f.name) for f in fields(kind)})
+    entries = checked(_CHECKED[kind], {**table, **more}, where, problems)
+    record = None if entries is None else kind(**{f.name: getattr(entries, f.name) for f in fields(kind)})
     if record is not None and (problem := _problem_of(record)):
         problems.append(f"{where}: {problem}")
         return None
@@ -62,8 +64,8 @@ def _record(kind: type[Kind], raw: object, where: str, problems: list[str], **mo
 def _problem_of(record: SignalSource | QualityGate | CanSettings) -> str:
     """Return which entries of a record contradict one another; empty without a contradiction."""
     if isinstance(record, CanSettings):
-        if not 1 <= record.id_mask <= _ID_MASK:
-            return f"id_mask should be from 1 to {_ID_MASK}"
+        if not 1 <= record.id_mask <= (most := CanSettings(()).id_mask):
+            return f"id_mask should be from 1 to {most}"
         return "" if (record.bus is None) == (not record.bus_field) else "bus and bus_field belong together"
     if record.clock == "device" and record.stamp in RECORDER_STAMPS:
         return f'clock = "device" needs a stamp of the device, not "{record.stamp}"'
@@ -224,13 +226,16 @@ def _shape_problem(source: SignalSource) -> str:
     # Sum of several fields: one component of a sensor with rotated axes.
     elif fields_ > 1 and not (isinstance(source.scale, tuple) and len(scales) == fields_):
         problem = f"{name} is the sum of its fields, each times its scale: scale must have {fields_} entries"
-    from_can = [f for f in source.paths if f.startswith(CAN_PREFIX)]
-    if not problem and from_can and (columns > 1 or fields_ > 1):
+    return problem or _problem_of_frames(source)
+
+
+def _problem_of_frames(source: SignalSource) -> str:
+    from_can, columns = [f for f in source.paths if f.startswith(CAN_PREFIX)], source.columns
+    if from_can and (columns > 1 or len(source.paths) > 1):
         what = "is a vector" if columns > 1 else "has several fields"
-        return f"{name} {what}: CAN signals of different frames have no common stamp"
-    if not problem and any(f.count(".") != 1 for f in from_can):
-        return f"field must be {CAN_PREFIX}<message>.<signal>"
-    return problem
+        return f"{source.name} {what}: CAN signals of different frames have no common stamp"
+    is_wrong = any(f.count(".") != 1 for f in from_can)
+    return f"field must be {CAN_PREFIX}<message>.<signal>" if is_wrong else ""
 
 
 def contradictions(mapping: Mapping) -> list[str]:
@@ -385,7 +390,7 @@ def _can_lines(can: CanSettings) -> list[str]:
     lines = ["[can]", f"dbc = {_toml(files)}", *_lines(can, names)]
     if can.bus is not None:
         lines.append(f"bus = {can.bus}")
-    if can.id_mask != _ID_MASK:
+    if can.id_mask != CanSettings(()).id_mask:
         lines.append(f"id_mask = {can.id_mask:#x}")
     return lines
 

@@ -56,7 +56,6 @@ Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.
 NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative: in reverse it has the wrong sign"
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
-_POSITION_ACCURACY = "gnss_position_accuracy_m"
 #: Ground truth with one of these contains a heading, or motion that needs one.
 HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
 #: Course of a single antenna in addition to a heading from two antennas: a sensor, even of a ground-truth instrument.
@@ -202,8 +201,8 @@ def receiver_signals(
             }
             if "position_covariance_type" in receiver.has:  # 1 sigma: the root of the mean variance east and north
                 squared = tuple(f"{base}position_covariance[{i}]" for i in (0, 4))
-                accuracy = SignalSource(_POSITION_ACCURACY, topic, squared, stamp, (0.5, 0.5), combine="root")
-                sources[_POSITION_ACCURACY] = accuracy
+                accuracy = SignalSource("gnss_position_accuracy_m", topic, squared, stamp, (0.5, 0.5), combine="root")
+                sources[accuracy.name] = accuracy
             return sources
     return {}
 
@@ -214,17 +213,17 @@ def receiver_signals(
 class _Instrument:
     """A topic with the fields of a navigation system or receiver by their names.
 
-    ``known``: a source that is mapped already, with a unit that the drive shows.
+    ``mapped``: a source that is mapped already, with a unit that the drive shows.
     """
 
-    def __init__(self, log: DriveLog, topic: TopicInfo, known: SignalSource | None = None) -> None:
+    def __init__(self, log: DriveLog, topic: TopicInfo, mapped: SignalSource | None = None) -> None:
         self.log, self.topic, self.fields = log, topic.name, log.fields(topic.name, quiet=True)
         self.stamp = stamp_path_of(self.fields)
         numbers = (f for f in self.fields if f.kind == "number")
         named = ((f.path, meaning_of(topic.name, topic.type_name, f.path, f.unit)) for f in numbers)
         self.meanings = {path: meaning for path, meaning in named if meaning is not None}
-        if known is not None and known.topic == topic.name and isinstance(known.scale, float):
-            units = {p: replace(self.meanings[p], scale=known.scale) for p in known.paths if p in self.meanings}
+        if mapped is not None and mapped.topic == topic.name and isinstance(mapped.scale, float):
+            units = {p: replace(self.meanings[p], scale=mapped.scale) for p in mapped.paths if p in self.meanings}
             self.meanings |= units
         first = {m.quantity: path for path, m in reversed(self.meanings.items())}
         self.places = {name: self.source(name, first[q]) for name, q in _PLACES.items() if q in first}

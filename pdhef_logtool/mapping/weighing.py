@@ -240,20 +240,27 @@ class Weighing:
         if first.unit_known or first.fixed:
             return first.meaning.quantity
         mean = mean_of([f.seen.cells for f in wheels])
-        times, sigma = self._per_turning(mean), BY_DRIVING
+        times, sigma, by = self._per_turning(mean), BY_DRIVING, "a_y ≈ v r"
         if speed is not None:
-            times, sigma = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS
-        beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
-        in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
-        best, reason, doubt = _likeliest_unit(times, sigma, "a_y ≈ v r" if speed is None else "the speed", in_si=in_si)
+            times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
+        likely: Sequence[Unit] = WHEEL_UNITS[:1]
+        reasons: list[str] = []
+        if times is None or not times > 0.0:
+            doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
+        else:
+            beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
+            in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
+            units = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in WHEEL_UNITS]
+            likely, reasons = _likely(units, times, sigma, POSSIBLE), [f"{times:.4g} of it is 1 m/s by {by}"]
+            doubt = f"it could be {' or '.join(u.name for u in likely[1:])} as well" if likely[1:] else ""
         if times is not None and not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
         for item in wheels:
-            item.factors = ((best.name, best.factor / (USUAL_RADIUS_M if best.spread else 1.0)),)
+            item.factors = ((likely[0].name, likely[0].factor / (USUAL_RADIUS_M if likely[0].spread else 1.0)),)
             item.unit_known = not doubt
-            item.reasons += [reason] if reason else []
+            item.reasons += reasons
             item.doubts += [doubt] if doubt else []
-        return best.quantity
+        return likely[0].quantity
 
     def _per_turning(self, speed: FloatArray) -> float | None:
         """Return how much of a speed [M] in another unit is 1 m/s by a_y ≈ v r; None if the drive does not show it."""
@@ -295,8 +302,7 @@ class Weighing:
             return _steering_by_range(item, kinds, relation)
         metres = abs(relation.slope)
         ways = [Unit(u, f / USUAL_LENGTH_M[k], k, 0.7) for k in kinds for u, f in item.units]
-        shares = posterior([ways], [Gain((1,), metres, BY_DRIVING, 1e-3)])
-        likely = [ways[i] for i in np.argsort(-shares) if shares[i] >= LIKELY * shares.max()]
+        likely = _likely(ways, metres, BY_DRIVING, LIKELY, broken=1e-3)
         name, unit = likely[0].quantity, likely[0].name
         usual = metres * likely[0].factor
         low, high = _STEERING_M[name]
@@ -488,16 +494,10 @@ def truth_topic(weighable: Sequence[Field]) -> str:
     return best[1]
 
 
-def _likeliest_unit(times: float | None, sigma: float, by: str, *, in_si: bool) -> tuple[Unit, str, str]:
-    """Return the likeliest unit of wheel speeds if ``times`` of it are 1 m/s, the reason and the doubt."""
-    if times is None or not times > 0.0:
-        doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
-        return WHEEL_UNITS[0], "", doubt
-    units = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in WHEEL_UNITS]
-    shares = posterior([units], [Gain((1,), times, sigma)])
-    best, *others = (units[i] for i in np.argsort(-shares) if shares[i] >= POSSIBLE * shares.max())
-    doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
-    return best, f"{times:.4g} of it is 1 m/s by {by}", doubt
+def _likely(units: Sequence[Unit], gain: float, sigma: float, least: float, broken: float = 0.01) -> Sequence[Unit]:
+    """Return the likely units of a field with this gain, the likeliest first; ``least``: share of the highest one."""
+    shares = posterior([units], [Gain((1,), gain, sigma, broken)])
+    return [units[i] for i in np.argsort(-shares) if shares[i] >= least * shares.max()]
 
 
 def _truth_name(item: Field) -> str:
