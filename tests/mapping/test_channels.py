@@ -10,6 +10,7 @@ from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.mapping import (
     Mapping,
     QualityGate,
@@ -19,6 +20,7 @@ from pdhef_logtool.mapping import (
     gate_mask,
     read_signals,
 )
+from pdhef_logtool.mapping.channels import si_values
 from pdhef_logtool.records.signals import Channel, Loss
 
 T0 = 1_700_000_000_000_000_000
@@ -245,3 +247,28 @@ def test_a_gate_that_falls_silent_holds_for_two_of_its_periods() -> None:
     mapping = replace(base, truth={"vx_m_s": vx}, quality=QualityGate("/status", "mode", values=(4.0,)))
     _, truth, _ = read_all(log, mapping)
     np.testing.assert_array_equal(truth["vx_m_s"].stamps_ns, stamps[:51])
+
+
+N = 4
+
+
+def columns(**fields: np.ndarray) -> Columns:
+    times = np.arange(N, dtype=np.int64)
+    return Columns("/a", times, times, fields)
+
+
+@pytest.mark.parametrize(
+    ("name", "raw", "shape"),
+    [
+        ("enu_velocity_m_s", np.ones((N, 2)), (N, 3)),
+        ("quat_wxyz", np.ones((N, 3)), (N, 4)),
+        ("enu_velocity_m_s", np.ones(N), (N, 3)),
+        ("speed_m_s", np.ones((N, 3)), (N,)),
+    ],
+)
+def test_what_is_not_the_signal_s_shape_is_missing_at_every_sample(
+    name: str, raw: np.ndarray, shape: tuple[int, ...]
+) -> None:
+    values = si_values(columns(v=raw), SignalSource(name, "/a", "v"))
+    assert values.shape == shape
+    assert np.isnan(values).all()

@@ -144,18 +144,11 @@ def test_two_truths_are_said_and_the_one_with_a_pose_is_taken() -> None:
 @pytest.mark.parametrize(
     ("name", "role"),
     [
-        ("/wheel/odometry", "speed"),
-        ("/vehicle/odom", "speed"),
-        ("/can/odom", "speed"),
-        ("/oxts/odometry", "truth"),
-        ("/ground_truth/state", "truth"),
-        ("/vicon/car", "truth"),
-        ("/odometry/filtered", "neither"),
-        ("/localization/kinematic_state", "neither"),
-        ("/something", "neither"),
-        ("/ground/odometry", "speed"),
+        ("/wheel/odometry", "speed"), ("/vehicle/odom", "speed"), ("/can/odom", "speed"), ("/oxts/odometry", "truth"),
+        ("/ground_truth/state", "truth"), ("/vicon/car", "truth"), ("/odometry/filtered", "neither"),
+        ("/localization/kinematic_state", "neither"), ("/something", "neither"), ("/ground/odometry", "speed"),
     ],
-)
+)  # fmt: skip
 def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
     auto = found({name: odometry()})
     assert ("speed_m_s" in auto.mapping.signals) == (role == "speed")
