@@ -136,17 +136,13 @@ class _Draft:
         seen = self.values(topic, covariance)
         return seen.shape[0] > 0 and bool((seen == -1.0).all())
 
-    def take(
-        self,
-        into: _Sources,
-        name: str,
-        topic: str,
-        path: str | tuple[str, ...],
-        scale: float = 1.0,
-        offset: float = 0.0,
-    ) -> None:
-        """Add a source for a signal or a truth channel."""
-        into[name] = SignalSource(name, topic, path, stamp_path_of(self.log.fields(topic)), scale, offset)
+    def take(self, into: _Sources, name: str, topic: str, path: str, scale: float = 1.0, offset: float = 0.0) -> None:
+        """Add a source of one field for a signal or a truth channel."""
+        into[name] = SignalSource(name, topic, path, self.stamp(topic), scale, offset)
+
+    def stamp(self, topic: str) -> str:
+        """Return the path of a topic's measurement time."""
+        return stamp_path_of(self.log.fields(topic))
 
     def doubt(self, subject: str, candidates: tuple[str, ...], chosen: str | None, reason: str) -> None:
         """Note an ambiguity."""
@@ -614,9 +610,8 @@ def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     if not measured:
-        draft.notes.append(
-            f"{FROM_COMMAND} {chosen.name}, not from a measured angle: actuator lag and steering play are missing"
-        )
+        lacks = "actuator lag and steering play are missing"
+        draft.notes.append(f"{FROM_COMMAND} {chosen.name}, not from a measured angle: {lacks}")
     draft.take(draft.signals, "steer_rad", chosen.name, _FIELDS["steering"][_type(chosen)])
 
 
@@ -652,9 +647,8 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     path = _FIELDS["speed"][kind] if kind in _FIELDS["speed"] else _twist(chosen, "linear", "x")
     draft.take(draft.signals, "speed_m_s", chosen.name, path)
     if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
-        draft.notes.append(
-            f"{chosen.name} contains a lateral velocity, which is not used: its name does not suggest ground truth"
-        )
+        why = "its name does not suggest ground truth"
+        draft.notes.append(f"{chosen.name} contains a lateral velocity, which is not used: {why}")
 
 
 def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
@@ -715,12 +709,8 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     if axes in ("east, north", "north, east") or (receives and axes != "body"):
         return _take_earth_velocity(draft, chosen, axes, is_body=is_body)
     if axes == "not ahead":
-        draft.doubt(
-            "ground-truth velocity frame",
-            (f"{chosen.name} as body velocity",),
-            chosen.name,
-            "the type's convention is the body frame, although x is mostly not the direction of travel",
-        )
+        why = "the type's convention is the body frame, although x is mostly not the direction of travel"
+        draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
         values = draft.values(chosen.name, full)
@@ -743,9 +733,9 @@ def _take_earth_velocity(draft: _Draft, chosen: TopicInfo, axes: str, *, is_body
     why = "x is not the direction of travel" if axes == "not ahead" else "it has the direction of its path"
     draft.doubt("ground-truth velocity frame", readings, readings[1], why)
     paths = tuple(_twist(chosen, "linear", a) for a in ("yxz" if is_down else "xyz"))
-    draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
-    if is_down:
-        draft.truth["enu_velocity_m_s"] = replace(draft.truth["enu_velocity_m_s"], scale=(1.0, 1.0, -1.0))
+    scale = (1.0, 1.0, -1.0) if is_down else 1.0
+    name, stamp = "enu_velocity_m_s", draft.stamp(chosen.name)
+    draft.truth[name] = SignalSource(name, chosen.name, paths, stamp, scale)
     rates = draft.values(chosen.name, _twist(chosen, "angular", "z"))
     if is_body and _span(rates) > 0.0:
         draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
@@ -816,7 +806,7 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
         return
     norms = np.linalg.norm(np.stack([draft.values(chosen.name, path) for path in paths]), axis=0)
     if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < 0.01)):
-        draft.take(draft.truth, "quat_wxyz", chosen.name, paths)
+        draft.truth["quat_wxyz"] = SignalSource("quat_wxyz", chosen.name, paths, draft.stamp(chosen.name))
 
 
 def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
@@ -831,7 +821,7 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
         draft.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it gives no sideslip")
     for name, path in (("yaw_rad", "heading"), ("course_rad", "course")):
         if path in given:
-            draft.take(draft.truth, name, fix.name, path, scale=-1.0, offset=np.pi / 2.0)
+            draft.take(draft.truth, name, fix.name, path, -1.0, np.pi / 2.0)
     if "heading" in given:
         draft.notes.append(
             f"ground-truth yaw comes from {fix.name}.heading: it is one only with two antennas or an INS"
@@ -841,7 +831,5 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
         return
     # 0 is any fix; 2 is a ground-based augmented fix, which receivers report for RTK.
     lowest = 2.0 if "rtk" in _words(fix.name) and bool((status == 2.0).any()) else 0.0
-    draft.quality = QualityGate(
-        topic=fix.name, field="status.status", min=lowest, stamp=stamp_path_of(draft.log.fields(fix.name))
-    )
+    draft.quality = QualityGate(fix.name, "status.status", min=lowest, stamp=draft.stamp(fix.name))
     draft.notes.append(f"ground truth is used where {fix.name}.status.status is at least {lowest:g}")
