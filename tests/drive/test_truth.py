@@ -118,16 +118,12 @@ def sources(stamps, d: Drive) -> dict[str, dict]:
         },
         "ecef velocity without position": {"ecef_velocity_m_s": v_ecef, "quat_wxyz": quat(ECEF * turn)},
         "ecef velocity, lat, yaw": {
-            "lat_deg": lat,
-            "lon_deg": lon,
-            "alt_m": alt,
-            "ecef_velocity_m_s": v_ecef,
-            "yaw_rad": wrapped,
+            "lat_deg": lat, "lon_deg": lon, "alt_m": alt, "ecef_velocity_m_s": v_ecef, "yaw_rad": wrapped,
         },
         "position, yaw": {"x_m": d.x, "y_m": d.y, "yaw_rad": wrapped},
         "lat lon, yaw": {"lat_deg": lat, "lon_deg": lon, "alt_m": alt, "yaw_rad": wrapped},
         "ecef position, quat": {"ecef_position_m": ecef, "quat_wxyz": quat(turn)},
-    }
+    }  # fmt: skip
 
 
 KINDS = tuple(sources(*drive(1.0)))

@@ -105,13 +105,9 @@ def test_what_is_dropped_is_counted_and_named() -> None:
     mapping = imu_mapping(valid_min=-50.0, valid_max=50.0)
     signals, _, losses = read_all(log, mapping)
     assert {k: (x.count, x.severity) for k, x in losses.items()} == {
-        "nan ay_m_s2": (2, "lost"),
-        "out-of-range ay_m_s2": (3, "note"),
-        "nan yaw_rate_rad_s": (1, "lost"),
-        "duplicate-stamp /imu": (1, "note"),
-        "bad-stamp /imu": (1, "lost"),
-        "out-of-order /imu": (1, "note"),
-    }
+        "nan ay_m_s2": (2, "lost"), "out-of-range ay_m_s2": (3, "note"), "nan yaw_rate_rad_s": (1, "lost"),
+        "duplicate-stamp /imu": (1, "note"), "bad-stamp /imu": (1, "lost"), "out-of-order /imu": (1, "note"),
+    }  # fmt: skip
     assert losses["nan ay_m_s2"].start_ns == topic.log_time_ns[3]
     assert losses["nan ay_m_s2"].end_ns == topic.log_time_ns[7] + 1
     assert len(signals["ay_m_s2"]) == 200 - 2 - 3 - 1 - 1

@@ -194,18 +194,10 @@ NAV_PVT = ("vel_n", "vel_e", "g_speed", "h_acc", "s_acc", "fix_type", "lat", "lo
         (("track", "speed", "err_track", "err_horz"), {"gnss_position_accuracy_m": ("err_horz", 0.5)}),
     ],
     ids=[
-        "NAV-PVT",
-        "NAV-PVT camel case",
-        "NAV-VELNED",
-        "BESTVEL",
-        "PVTGeodetic",
-        "VelNed",
-        "PosLlh",
-        "NAV-POSLLH",
-        "VBO",
-        "GPSFix",
+        "NAV-PVT", "NAV-PVT camel case", "NAV-VELNED", "BESTVEL", "PVTGeodetic", "VelNed", "PosLlh", "NAV-POSLLH",
+        "VBO", "GPSFix",
     ],
-)
+)  # fmt: skip
 @pytest.mark.parametrize("base", ["", "receiver.solution."])
 def test_messages_of_receivers_are_recognised_below_any_struct(fields, signals, base):
     found = receiver_signals("/gps", "log_time", [f"{base}{name}" for name in fields])

@@ -155,12 +155,8 @@ def test_repeated_channel_groups_of_an_mdf_are_runs_if_one_follows_the_other(sta
     mdf = asammdf.MDF(version="4.10")
     rate = 0.2 * np.sin(S)
     columns = {
-        "ax": np.cos(S),
-        "ay": 15.0 * rate,
-        "yaw_rate": rate,
-        "steering_angle": 0.1 * np.sin(S),
-        "speed": 15.0 + S,
-    }
+        "ax": np.cos(S), "ay": 15.0 * rate, "yaw_rate": rate, "steering_angle": 0.1 * np.sin(S), "speed": 15.0 + S,
+    }  # fmt: skip
     for start in (0.0, start_s):
         mdf.append([asammdf.Signal(v, S + start, name=n) for n, v in columns.items()], acq_name="Fast", comment="Fast")
     path = mdf.save(tmp_path / "a.mf4")
