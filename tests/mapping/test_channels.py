@@ -11,16 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.logs.drive_log import Columns
-from pdhef_logtool.mapping import (
-    Mapping,
-    QualityGate,
-    SignalSource,
-    clean_samples,
-    fit_clocks,
-    gate_mask,
-    read_signals,
-)
-from pdhef_logtool.mapping.channels import si_values
+from pdhef_logtool.mapping import Mapping, QualityGate, SignalSource, fit_clocks, read_signals
+from pdhef_logtool.mapping.channels import clean_samples, gate_mask, si_values
 from pdhef_logtool.records.signals import Channel, Loss
 
 T0 = 1_700_000_000_000_000_000

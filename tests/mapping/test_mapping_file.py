@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.mapping import VECTOR_COLUMNS, Mapping, QualityGate, SignalSource, load_mapping, mapping_to_toml
+from pdhef_logtool.mapping import Mapping, QualityGate, SignalSource, load_mapping, mapping_to_toml
+from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
 
