@@ -109,16 +109,8 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     MappingFileError : Entries are wrong, unknown, missing or contradict one another.
     """
     sections = (
-        "signals",
-        "truth",
-        "truth_quality",
-        "estimates",
-        "can",
-        "fill_recognised",
-        "recorder",
-        "rate_hz",
-        "group",
-    )
+        "signals", "truth", "truth_quality", "estimates", "can", "fill_recognised", "recorder", "rate_hz", "group",
+    )  # fmt: skip
     problems = [unknown(key, sections) for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
