@@ -47,10 +47,9 @@ _CONVENTIONS = (
     ("degrees counter-clockwise from east", math.radians(1.0), 0.0),
     ("radians counter-clockwise from east", 1.0, 0.0),
 )
-#: Tolerance of its ratio to the speed from positions.
-NEAR_PATH = 0.08
-#: Speed over ground over that along the path if the axes are the earth's; share of the time that a body moves ahead.
-SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
+#: Tolerance of the ratio of a velocity to the speed from positions; speed over ground over that along the path if the
+#: axes are the earth's; share of the time that a body moves ahead.
+NEAR_PATH, SAME_STEPS, AHEAD_SHARE = 0.08, (0.7, 1.4), 0.6
 #: Axes of the x and y of a velocity; empty if the drive does not show them, "not ahead" if they are not the body's.
 Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.

@@ -243,24 +243,17 @@ class Weighing:
         times, sigma, by = self._per_turning(mean), BY_DRIVING, "a_y ≈ v r"
         if speed is not None:
             times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
-        likely: Sequence[Unit] = WHEEL_UNITS[:1]
-        reasons: list[str] = []
-        if times is None or not times > 0.0:
-            doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
-        else:
-            beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
-            in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
-            units = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in WHEEL_UNITS]
-            likely, reasons = _likely(units, times, sigma, POSSIBLE), [f"{times:.4g} of it is 1 m/s by {by}"]
-            doubt = f"it could be {' or '.join(u.name for u in likely[1:])} as well" if likely[1:] else ""
+        beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
+        in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
+        best, reasons, doubt = _unit_of_wheels(times, sigma, by, in_si=in_si)
         if times is not None and not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
         for item in wheels:
-            item.factors = ((likely[0].name, likely[0].factor / (USUAL_RADIUS_M if likely[0].spread else 1.0)),)
+            item.factors = ((best.name, best.factor / (USUAL_RADIUS_M if best.spread else 1.0)),)
             item.unit_known = not doubt
             item.reasons += reasons
             item.doubts += [doubt] if doubt else []
-        return likely[0].quantity
+        return best.quantity
 
     def _per_turning(self, speed: FloatArray) -> float | None:
         """Return how much of a speed [M] in another unit is 1 m/s by a_y ≈ v r; None if the drive does not show it."""
@@ -492,6 +485,17 @@ def truth_topic(weighable: Sequence[Field]) -> str:
         if worth > best[0] and (fields[0].role != "sensor" or worth >= 1.5 or fields[0].fixed):
             best = (worth, name)
     return best[1]
+
+
+def _unit_of_wheels(times: float | None, sigma: float, by: str, *, in_si: bool) -> tuple[Unit, list[str], str]:
+    """Return the likeliest unit of wheel speeds if ``times`` of it are 1 m/s, the reasons and the doubt."""
+    if times is None or not times > 0.0:
+        doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
+        return WHEEL_UNITS[0], [], doubt
+    units = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in WHEEL_UNITS]
+    best, *others = _likely(units, times, sigma, POSSIBLE)
+    doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
+    return best, [f"{times:.4g} of it is 1 m/s by {by}"], doubt
 
 
 def _likely(units: Sequence[Unit], gain: float, sigma: float, least: float, broken: float = 0.01) -> Sequence[Unit]:
