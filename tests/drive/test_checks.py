@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping as Mapped
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,22 +14,31 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks import sideslip_offset
+from pdhef_logtool.drive.checks import check_drive, sideslip_offset
 from pdhef_logtool.drive.columns import columns_on_grid
 from pdhef_logtool.drive.delays import LatencyEstimate, booked_on_the_late, truth_latency
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.relation_checks import relation_checks
 from pdhef_logtool.drive.relations import BIAS_RAD_S, GAIN_RANGE, compare
-from pdhef_logtool.drive.truth import derive_truth
+from pdhef_logtool.drive.truth import TruthTrack, derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks, load_mapping, read_signals
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel
-from tests.drive.checked import checks_of
 from truthsim.drive import simulate_drive, write_drive
 
 T0 = 1_700_000_000_000_000_000
 MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
+
+
+def checks_of(
+    signals: Mapped[str, Channel],
+    truth: Mapped[str, Channel] | None = None,
+    derived: TruthTrack | None = None,
+    vehicle: VehicleParameters | None = None,
+    **options: Any,
+) -> tuple[Check, ...]:
+    return check_drive(measure(signals, truth, derived, vehicle), vehicle, **options)
 
 
 def channel(name: str, time_s: np.ndarray, values: np.ndarray) -> Channel:

@@ -18,8 +18,7 @@ from pdhef_logtool.drive.checks import misread_channels
 from pdhef_logtool.records.signals import Channel
 from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
 from studies.pages import write_toml
-from tests.drive.checked import checks_of
-from tests.drive.test_checks import drive
+from tests.drive.test_checks import checks_of, drive
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

@@ -16,8 +16,7 @@ from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
-from tests.drive.checked import checks_of
-from tests.drive.test_checks import drive
+from tests.drive.test_checks import checks_of, drive
 
 VEHICLE = default_vehicle().model_copy(update={"mass_kg": default_vehicle().mass_kg + 1.0})
 TEXT = "truth.vy_m_s against the rear axle of the vehicle file"
