@@ -22,11 +22,10 @@ from pdhef_logtool.drive.relations import (
     direction_rate,
     measured_relations,
 )
-from pdhef_logtool.drive.truth import TruthTrack, channel_of
+from pdhef_logtool.drive.truth import TruthTrack, channel_of, derive_truth
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import GNSS, GNSS_POSITION, WHEELS, Channel, FloatArray
-from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
@@ -136,7 +135,7 @@ def drive_columns(
         if "vy_m_s" in truth and "truth.vy_m_s" in channels:
             channels[CG_VY] = channels["truth.vy_m_s"]
         channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
-        channels |= _pose_velocity(truth, derived.track)
+        channels |= _pose_velocity(truth)
         if "yaw_rad" in truth:
             heading = truth["yaw_rad"].take(np.isfinite(truth["yaw_rad"].values))
             channels[TURNING] = replace(heading, values=np.unwrap(heading.values))
@@ -172,20 +171,14 @@ def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
     return metres | {n: replace(speed, name=n, values=speed.values * side(course.values)) for n, side in sides}
 
 
-def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str, Channel]:
+def _pose_velocity(truth: Mapping[str, Channel]) -> dict[str, Channel]:
     """Return body velocities from positions and heading of one topic; empty without them."""
-    pose = [truth[n] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth]
-    finite = np.isfinite(track.yaw_rad)
-    stamps = pose[0].stamps_ns if pose else np.empty(0, np.int64)
-    topics = {c.source.split(".")[0] for c in pose}
-    if not {"x_m", "y_m"} <= truth.keys() or len(topics) > 1 or not finite.any() or stamps.size < 3:
+    pose = {n: truth[n] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth}
+    if not {"x_m", "y_m"} < pose.keys() or len({c.source.split(".")[0] for c in pose.values()}) > 1:
         return {}
-    yaw = np.interp(stamps, track.stamps_ns[finite], np.unwrap(track.yaw_rad[finite]))
-    y_m = np.interp(stamps, truth["y_m"].stamps_ns, truth["y_m"].values)  # single samples may be missing
-    vx, vy, rate = (np.gradient(c, (stamps - stamps[0]) * 1e-9) for c in (truth["x_m"].values, y_m, yaw))
-    ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx
-    columns = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
-    return {n: Channel(n, "", "pose", stamps, stamps, v) for n, v in columns.items()}
+    derived = derive_truth(pose)
+    names = {"pose_vx_m_s": "vx_m_s", "pose_vy_m_s": "vy_m_s", "heading_rate_rad_s": "yaw_rate_rad_s"}
+    return {f"truth.{n}": channel_of(derived, of) for n, of in names.items()}
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:

@@ -403,7 +403,7 @@ def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
     references: _Sources = {}
     if _has_pose(draft, twist):
         for axis in "xy":
-            draft.take(references, f"{axis}_m", twist.name, _join(_FIELDS["pose"][_type(twist)], f"position.{axis}"))
+            draft.take(references, f"{axis}_m", twist.name, _pose(twist, f"position.{axis}"))
     elif fix := next((t for t in topics if _has_fix(draft, t)), None):
         for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude")):
             draft.take(references, name, fix.name, path)
@@ -518,7 +518,7 @@ def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     needed += [table[kind] for table in (_FIELDS["steering"], _FIELDS["speed"]) if kind in table][:1]
     either = list(_IMU_PATHS) if kind in IMU_TYPES else []
     either += [_twist(topic, "linear", "x")] if kind in TWIST_FIELDS else []
-    either += [_join(_FIELDS["pose"][kind], "position.x")] if kind in _FIELDS["pose"] else []
+    either += [_pose(topic, "position.x")] if kind in _FIELDS["pose"] else []
     fields = log.fields(topic.name) if needed or either else ()
     return all(has_path(fields, p) for p in needed) and (not either or any(has_path(fields, p) for p in either))
 
@@ -539,8 +539,8 @@ def _is_truth(topic: TopicInfo) -> bool:
     return bool(_words(topic.name) & (TRUTH_WORDS | NAVIGATION_WORDS))
 
 
-def _join(prefix: str, path: str) -> str:
-    return f"{prefix}.{path}" if prefix else path
+def _pose(topic: TopicInfo, part: str) -> str:
+    return f"{_FIELDS['pose'][_type(topic)]}.{part}".removeprefix(".")
 
 
 def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen]:
@@ -563,7 +563,7 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
         paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
     if kind in _FIELDS["pose"]:
         parts = [*(f"position.{a}" for a in "xy"), *(f"orientation.{a}" for a in "xyzw")]
-        paths += [_join(_FIELDS["pose"][kind], part) for part in parts]
+        paths += [_pose(topic, part) for part in parts]
     if kind in FIX_TYPES:
         paths += ["latitude", "longitude", "altitude", "status.status", "heading", "course"]
     return [*paths, *(table[kind] for table in (TWIST_COVARIANCES, _FIELDS["pose_covariance"]) if kind in table)]
@@ -751,9 +751,7 @@ def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:
     v = np.concatenate([draft.values(topic.name, forward), draft.values(topic.name, left)])
     if v.shape[0] and (v == 0.0).all() and _type(topic) in _FIELDS["pose"]:
         # Converters from fixes to odometry leave the twist at zero while the pose changes.
-        x = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.x"))
-        y = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.y"))
-        return not (_span(x) > 1.0 or _span(y) > 1.0)
+        return all(_span(draft.values(topic.name, _pose(topic, f"position.{a}"))) <= 1.0 for a in "xy")
     return True
 
 
@@ -768,16 +766,13 @@ def _span(values: FloatArray) -> float:
 
 
 def _has_pose(draft: _Draft, topic: TopicInfo) -> bool:
-    if _type(topic) not in _FIELDS["pose"] or draft.is_disowned(
-        topic.name, _FIELDS["pose_covariance"].get(_type(topic), "")
-    ):
+    kind = _type(topic)
+    if kind not in _FIELDS["pose"] or draft.is_disowned(topic.name, _FIELDS["pose_covariance"].get(kind, "")):
         return False
-    base = _FIELDS["pose"][_type(topic)]
-    if not all(draft.is_given(topic.name, _join(base, f"position.{a}")) for a in "xy"):
-        return False
-        # A pose that stays at the origin is a filler.
-    xy = np.concatenate([draft.values(topic.name, _join(base, f"position.{a}")) for a in "xy"])
-    return xy.shape[0] == 0 or bool((xy != 0.0).any())
+    paths = [_pose(topic, f"position.{a}") for a in "xy"]
+    # A pose that stays at the origin is a filler.
+    xy = np.concatenate([draft.values(topic.name, path) for path in paths])
+    return all(draft.is_given(topic.name, path) for path in paths) and (xy.shape[0] == 0 or bool((xy != 0.0).any()))
 
 
 def _has_fix(draft: _Draft, topic: TopicInfo) -> bool:
@@ -798,10 +793,9 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
     if _type(chosen) in FIX_TYPES:
         _map_fix(draft, chosen, alone=velocity is None)
         return
-    base = _FIELDS["pose"][_type(chosen)]
     for name, axis in (("x_m", "x"), ("y_m", "y")):
-        draft.take(draft.truth, name, chosen.name, _join(base, f"position.{axis}"))
-    paths = tuple(_join(base, f"orientation.{a}") for a in "wxyz")
+        draft.take(draft.truth, name, chosen.name, _pose(chosen, f"position.{axis}"))
+    paths = tuple(_pose(chosen, f"orientation.{a}") for a in "wxyz")
     if not all(draft.is_given(chosen.name, path) for path in paths):  # the log's own definition decides
         return
     norms = np.linalg.norm(np.stack([draft.values(chosen.name, path) for path in paths]), axis=0)
