@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 from pdhef_logtool.drive.survey import survey_log
+from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import AutoMapping, SignalSource, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_values
+from pdhef_logtool.mapping.joints import joint_names
 from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_from_dict, mapping_to_toml
 from pdhef_logtool.mapping.navigation import receiver_signals
 from pdhef_logtool.records.errors import MappingFileError
@@ -263,3 +268,34 @@ def test_an_instrument_that_is_ground_truth_is_no_sensor():
 def test_a_heading_of_two_antennas_is_never_mapped_by_itself():
     fields = (*NAV_PVT, "heading")
     assert "gnss_heading_rad" not in auto_map(_log(gps__pvt=("vendor_msgs/msg/Pvt", fields))).mapping.signals
+
+
+def write(path: Path, *, ros1: bool) -> Path:
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    types: Any = store.types
+    time = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+
+    header = types["std_msgs/msg/Header"](stamp=time, frame_id="", **({"seq": 0} if ros1 else {}))
+    values = np.array([0.1, 0.2])
+    joints = types["sensor_msgs/msg/JointState"](
+        header=header, name=["left_steer", "right_steer"], position=values, velocity=values, effort=values
+    )
+    with Writer1(path) if ros1 else Writer2(path, version=8) as writer:
+        name = "sensor_msgs/msg/JointState"
+        connection = writer.add_connection("/joint_states", name, typestore=store)
+        data = store.serialize_ros1(joints, name) if ros1 else store.serialize_cdr(joints, name)
+        for i in range(3):
+            writer.write(connection, START + i * 10_000_000, data)
+    return path
+
+
+@pytest.mark.parametrize("name", ["log.bag", "log"])
+def test_joints_of_real_messages(tmp_path: Path, name: str) -> None:
+    log = open_log(write(tmp_path / name, ros1=name.endswith(".bag")))
+    (topic,) = (t for t in log.topics if t.name == "/joint_states")
+    assert joint_names(log, topic) == ("left_steer", "right_steer")
+    log.close()
