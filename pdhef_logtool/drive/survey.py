@@ -212,7 +212,7 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
     # A failing sensor resembles a wrong unit of another one, but only a right correction leaves no contradiction.
     failed = [check.name for check in again.checks if check.verdict == "failed"]
     is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis")) for n in failed)
-    checks = [] if turned else [_corrected(p.subject, p.source, f"{p.subject}: {p.evidence}") for p in proposals]
+    checks = [] if turned else [_corrected(p.subject, p.source, f"{p.subject} is {p.evidence}") for p in proposals]
     return survey if is_bad else replace(again, corrected=(*survey.corrected, *checks, *again.corrected))
 
 
