@@ -45,7 +45,7 @@ class CarModel(Record):
     calibrated : whether the residual is relative to the calibrated car; otherwise to the vehicle file.
     truth : source, :data:`GROUND_TRUTH`, :data:`ESTIMATED`, or both; empty if the sensors alone were used.
     evidence : in one line. drives : that were used.
-    sensors : as :class:`pdhef_logtool.drive.model_file.Sensors`; None without.
+    sensors : as :class:`pdhef_logtool.drive.plan.Sensors`; None without.
     """
 
     format: Literal["pdhef-model"] = "pdhef-model"

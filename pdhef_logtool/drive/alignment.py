@@ -377,17 +377,9 @@ def _plan_channel(  # positional: one call
     else:
         method = "hold" if is_input else "next"
     delay_s, late_limit_s = _survey_delay(channel)
-    return ChannelPlan(
-        name=channel.name,
-        target=target,
-        scale=scale,
-        method=method,
-        period_s=period,
-        delay_s=delay_s,
-        late_limit_s=late_limit_s,
-        max_gap_s=_max_gap_s(period),
-        clock="stamp" if delay_s > MAX_PREDICTION_S else "arrival",
-    )
+    clock: Clock = "stamp" if delay_s > MAX_PREDICTION_S else "arrival"
+    times = (period, delay_s, late_limit_s, _max_gap_s(period))
+    return ChannelPlan(channel.name, target, scale, method, *times, clock)
 
 
 def _on_one_clock(channel: Channel, grid: Channel) -> bool:

@@ -28,16 +28,15 @@ from pdhef_logtool.drive.columns import (
     median_known,
     moving_at,
 )
-from pdhef_logtool.drive.delays import LateSensor
-from pdhef_logtool.drive.frames import IS_GRAVITY_M_S2
-from pdhef_logtool.drive.measured import Measured, measure
+from pdhef_logtool.drive.delays import LatencyEstimate, LateSensor
+from pdhef_logtool.drive.measured import Measured
+from pdhef_logtool.drive.mounting import IS_GRAVITY_M_S2
 from pdhef_logtool.drive.relation_checks import relation_checks
 from pdhef_logtool.drive.relations import CG_VY, GAIN_RANGE, SAME_RANGE, gentle_at, position_factors
 from pdhef_logtool.drive.sensor_changes import SensorChange
-from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.running_mean import running_mean
-from pdhef_logtool.records.signals import SIGNAL_UNITS, WHEELS, BoolArray, Channel, FloatArray
+from pdhef_logtool.records.signals import SIGNAL_UNITS, WHEELS, BoolArray, FloatArray
 
 CHANGE_SUFFIX = ".change"
 #: If a check of one of these aspects fails, the channel is not the signal that it is mapped to.
@@ -83,7 +82,7 @@ class CheckedDrive:
     measured : columns [N] on one grid, SI, by signal; names of ground truth begin with ``truth.``.
     vehicle : from the file, or the default vehicle (``has_file`` False).
     latency : of ground truth against the gyro, or of the gyro. late : late sensors, detected without ground truth.
-    has_truth : whether ground truth at the CG is available. related : checks of signals by their relations.
+    related : checks of signals by their relations.
     """
 
     measured: Measured
@@ -91,7 +90,6 @@ class CheckedDrive:
     has_file: bool
     latency: LatencyEstimate | None
     late: Sequence[LateSensor]
-    has_truth: bool
     related: tuple[Check, ...]
 
     @property
@@ -113,7 +111,7 @@ class CheckedDrive:
     @cached_property
     def errors(self) -> SensorErrors:
         """The errors of the sensors by ground truth; unknown without it, or if it is wrong."""
-        return sensor_errors(self.columns) if self.has_truth and not self.wrong & _TRUTH else SensorErrors()
+        return sensor_errors(self.columns) if self.measured.has_truth and not self.wrong & _TRUTH else SensorErrors()
 
 
 # ------------------------------------------------------------------------------------------------ IMU
@@ -258,7 +256,7 @@ def _gyro(drive: CheckedDrive) -> Iterator[Check]:
     (gain, std), latency, file = drive.errors.gyro_gain, drive.latency, drive.vehicle.sensors.yaw_rate_gain
     if not math.isnan(gain) and "yaw_rate_rad_s" not in drive.wrong:
         yield judge("yaw_rate_rad_s.gain", gain / file, std, gain=gain)
-    if drive.has_truth and latency is not None and latency.reliable and not latency.identical:
+    if drive.measured.has_truth and latency is not None and latency.reliable and not latency.identical:
         late_s, error_s, delay_s = latency.gyro_delay_s - latency.latency_s, latency.std_error_s, latency.gyro_delay_s
         yield judge("yaw_rate_rad_s.delay", 1e3 * delay_s, late_ms=1e3 * late_s, std_ms=1e3 * error_s, delay_s=delay_s)
 
@@ -293,7 +291,7 @@ def change_checks(changes: Iterable[SensorChange], start_ns: int) -> list[Check]
 def _sideslip_of_truth(drive: CheckedDrive) -> Iterator[Check]:
     """Check that ground-truth heading and velocity are consistent, and that sideslip is 0 on straights."""
     columns = drive.columns
-    if not drive.has_truth or not {"truth.vx_m_s", "truth.vy_m_s"} <= columns.keys():
+    if not drive.measured.has_truth or not {"truth.vx_m_s", "truth.vy_m_s"} <= columns.keys():
         return
     sideslip = _sideslip(columns)
     finite = moving_at(np.hypot(columns["truth.vx_m_s"], columns["truth.vy_m_s"])) & np.isfinite(sideslip)
@@ -437,30 +435,24 @@ FUNCTIONS: tuple[Callable[[CheckedDrive], Iterable[Check]], ...] = (
 
 
 def check_drive(
-    signals: Mapping[str, Channel],
-    truth: Mapping[str, Channel] | None = None,
-    derived: TruthTrack | None = None,
+    measured: Measured,
     vehicle: VehicleParameters | None = None,
     *,
     latency: LatencyEstimate | None = None,
     late: Sequence[LateSensor] = (),
     mounting_is_known: bool = False,
-    measured: Measured | None = None,
 ) -> tuple[Check, ...]:
     """Return the checks of mapped signals, of ground truth and of the vehicle file.
 
     Parameters
     ----------
-    signals, truth : by name, SI, as mapped. derived : ground truth at the CG.
     vehicle : from a file; None or the default car without a file.
     latency : of ground truth against the gyro, or of the gyro. late : late sensors, detected without ground truth.
     mounting_is_known : the mounting of the IMU is confirmed.
-    measured : result of :func:`~pdhef_logtool.drive.measured.measure` for the channels; computed by default.
     """
-    measured = measure(signals, truth, derived, vehicle) if measured is None else measured
     related = relation_checks(measured, mounting_is_known=mounting_is_known)
     file, has_file = vehicle or default_vehicle(), vehicle not in (None, default_vehicle())
-    drive = CheckedDrive(measured, file, has_file, latency, late, derived is not None, related)
+    drive = CheckedDrive(measured, file, has_file, latency, late, related)
     unique: dict[str, Check] = {}
     for check in (check for function in FUNCTIONS for check in function(drive)):
         if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:

@@ -1,4 +1,4 @@
-"""Sensors with late time stamps relative to one another, detected without ground truth.
+"""Delays: of ground truth against the gyro, and of sensors relative to one another without ground truth.
 
 No sensor shows a motion before it happens. Of two sensors that follow one motion, the later one is late if their shift
 is larger than for correct sensors. Only the difference of the rear wheel speeds follows the gyro without a delay. Other
@@ -7,15 +7,29 @@ pairs also differ by sideslip, pitch and the vehicle's response; they detect onl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from pdhef_logtool.drive.columns import GRID_S, columns_on_grid, derivative
-from pdhef_logtool.drive.correlation import CommonGrid, find_shift, has_peak_within, shift_error, without_trend
-from pdhef_logtool.drive.truth import MAX_LATENCY_S
+from pdhef_logtool.drive.correlation import (
+    CommonGrid,
+    find_shift,
+    has_peak_within,
+    on_common_grid,
+    shift_error,
+    without_trend,
+)
+from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, channel_of, same_share
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
+#: Search range of the latency.
+MAX_LATENCY_S = 0.5
+#: Largest standard error of a reliable latency.
+MAX_LATENCY_ERROR_S = 0.005
+#: Ground truth cannot lead the gyro by more than this: the gyro's stamps are late.
+LATE_GYRO_S = 0.005
 #: Plausible delay of the second of two correct signals relative to the first, s. On simulated and recorded drives the
 #: delay of the wheels after the gyro is -10 to 24 ms, of a_y after v r 0 to 132 ms, of v-dot after a_x -121 to 11 ms,
 #: of the yaw rate after the steering 16 to 152 ms.
@@ -25,10 +39,28 @@ SPEED_AFTER_A_X_S = (-0.2, 0.12)
 YAW_RATE_AFTER_STEERING_S = (-0.02, 0.45)
 #: Largest standard error of a shift, and how many standard errors the shift must be outside the plausible range.
 MAX_SHIFT_ERROR_S, SURE = 0.015, 4.0
-#: Least correlation at the shift: wheels and gyro differ where the car slides. The second value is for exact pairs.
-LEAST_CORRELATION = (0.9, 0.95)
+#: Least correlation at the shift: of ground truth; of sensors, which differ where the car slides; of exact pairs.
+LEAST_CORRELATION = (0.8, 0.9, 0.95)
 #: A peak in the plausible range with this share of the highest correlation may be the right one.
 AS_HIGH = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyEstimate:
+    """Delay of the ground truth after the sensors.
+
+    ``latency_s`` is 0 unless ``reliable``. ``identical``: the ground-truth yaw rate is the gyro's own channel, so that
+    the latency is 0 by construction and gives no information about the other truth channels. ``reason`` is for the
+    report. ``gyro_delay_s``: delay of the gyro's stamps; if it is not 0, the ground-truth latency is 0.
+    """
+
+    latency_s: float
+    correlation: float
+    std_error_s: float
+    reliable: bool
+    identical: bool
+    reason: str
+    gyro_delay_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,25 +73,105 @@ class LateSensor:
     evidence: str
 
 
+def lag_of(
+    grid: CommonGrid, least_correlation: float = LEAST_CORRELATION[0], max_error_s: float = MAX_LATENCY_ERROR_S
+) -> LatencyEstimate:
+    """Return the delay of the second signal of a grid after the first, by the peak of their cross-correlation.
+
+    Reliable: a peak inside ± ``MAX_LATENCY_S``, of at least this correlation, with at most this standard error.
+    """
+    shift = find_shift(grid, MAX_LATENCY_S)
+    if not math.isfinite(shift.correlation):
+        return LatencyEstimate(0.0, 0.0, math.inf, False, False, "no motion")
+    error_s = shift_error(grid, shift.shift_s)
+    problems = (
+        (not shift.inside, "no peak within the range searched"),
+        (shift.correlation < least_correlation, "the two signals correlate too little"),
+        (error_s > max_error_s, "too little motion"),
+    )
+    lacks = next((reason for is_true, reason in problems if is_true), "")
+    return LatencyEstimate(0.0 if lacks else shift.shift_s, shift.correlation, error_s, not lacks, False, lacks)
+
+
+def estimate_truth_latency(
+    sensor_yaw_rate: Channel, truth_yaw_rate: Channel, *, max_error_s: float = MAX_LATENCY_ERROR_S
+) -> LatencyEstimate:
+    """Estimate the ground-truth latency against the gyro by cross-correlation of detrended yaw rates.
+
+    Parameters
+    ----------
+    sensor_yaw_rate, truth_yaw_rate : on their own clocks. Do not pass an estimator's output: its lag, which the metrics
+        show, would be attributed to the ground truth.
+    """
+    if same_share(sensor_yaw_rate, truth_yaw_rate) >= SAME_SHARE:
+        return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the ground-truth yaw rate is the gyro's channel")
+    a, b, grid = sensor_yaw_rate, truth_yaw_rate, None
+    if min(len(a), len(b)) > 1:
+        grid = on_common_grid(a.stamps_ns, a.values, b.stamps_ns, b.values)
+    if grid is None or grid.both * grid.step_s < 4.0 * MAX_LATENCY_S:
+        return LatencyEstimate(0.0, 0.0, math.inf, False, False, "less than two seconds in common")
+    lag = lag_of(grid, max_error_s=max_error_s)
+    return replace(lag, reason="gyro against ground-truth yaw rate") if lag.reliable else lag
+
+
+def truth_latency(
+    signals: Mapping[str, Channel], truths: Mapping[str, Channel], truth: TruthTrack | None
+) -> LatencyEstimate | None:
+    """Return the latency of ground truth relative to the gyro, or of the gyro; None if one is missing."""
+    gyro = signals.get("yaw_rate_rad_s")
+    if truth is None or gyro is None or not len(gyro):
+        return None
+    rate = truths.get("yaw_rate_rad_s") or channel_of(truth, "yaw_rate_rad_s")
+    if not len(rate):
+        return None
+    latency = estimate_truth_latency(gyro, rate)
+    speed = signals.get("speed_m_s")
+    other = None
+    if speed is not None and speed.source.split(".")[0] != gyro.source.split(".")[0]:
+        vx = channel_of(truth, "vx_m_s")
+        other = estimate_truth_latency(speed, vx) if min(len(speed), len(vx)) >= 2 else None
+    return booked_on_the_late(latency, other)
+
+
+def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
+    """Return the latency, with a negative one attributed to the gyro.
+
+    Ground truth cannot show a motion before it happens. If it leads the gyro, the gyro's stamps are late. If a speed
+    sensor of another topic is equally late, all sensors agree, and the ground-truth clock is early.
+
+    Parameters
+    ----------
+    latency : gyro against ground-truth yaw rate. speed : speed sensor of another topic against ground-truth v_x.
+    """
+    leads = -latency.latency_s
+    if not latency.reliable or leads <= max(LATE_GYRO_S, 3.0 * latency.std_error_s):
+        return latency
+    if (
+        speed is not None
+        and speed.reliable
+        and abs(speed.latency_s - latency.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
+    ):
+        return replace(latency, reason=f"{latency.reason}; the speed sensor is late by as much")
+    reason = f"the gyro is {leads * 1e3:.1f} ms late against ground truth, which leads no motion"
+    return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
+
+
 def late_sensors(signals: Mapping[str, Channel]) -> tuple[LateSensor, ...]:
     """Return the sensors with late stamps; pairs that do not show a delay are ignored."""
     late: dict[str, LateSensor] = {}
     for pair in _pairs(columns_on_grid(signals)):
         grid = CommonGrid(GRID_S, without_trend(pair.first), without_trend(pair.second))
-        shift, (low, high) = find_shift(grid, MAX_LATENCY_S), pair.plausible_s
-        if not shift.inside or shift.correlation < LEAST_CORRELATION[pair.exact]:
-            continue
-        error_s = shift_error(grid, shift.shift_s)
-        beyond_s = max(low - shift.shift_s, shift.shift_s - high)
+        lag = lag_of(grid, LEAST_CORRELATION[1 + pair.exact], MAX_SHIFT_ERROR_S)
+        (low, high), shift_s, error_s = pair.plausible_s, lag.latency_s, lag.std_error_s
+        beyond_s = max(low - shift_s, shift_s - high)
         # A sine also correlates with itself a period later.
-        if error_s > min(MAX_SHIFT_ERROR_S, beyond_s / SURE) or has_peak_within(
-            grid, low, high, AS_HIGH * shift.correlation
-        ):
+        is_late = lag.reliable and error_s <= beyond_s / SURE
+        if not is_late or has_peak_within(grid, low, high, AS_HIGH * lag.correlation):
             continue
-        name = pair.names[shift.shift_s >= low]
-        late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift.shift_s, error_s, low, high))
+        name = pair.names[shift_s >= low]
+        late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift_s, error_s, low, high))
         evidence = f"{pair.text} by {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
-        delay_s = abs(shift.shift_s) if pair.exact else beyond_s
+        delay_s = abs(shift_s) if pair.exact else beyond_s
         wheels = tuple(n for n in signals if n.startswith("wheel_speed_")) if name.startswith("wheel_speed_") else ()
         sensor = LateSensor(wheels or (name,), delay_s, pair.exact, evidence)
         late.setdefault(sensor.names[0], sensor)

@@ -296,27 +296,26 @@ def _together(names: Sequence[str]) -> str:
     return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(shown)
 
 
+@cache
 def units_of(name: str) -> list[tuple[float, str]]:
     """Return the correction factors for the units in which a signal may be recorded, each with its text."""
-    to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
-    km_h, mph = 3.6, 0.44704
-    of_speeds = [(1.0 / km_h, "is in km/h"), (km_h, "was converted from km/h twice")]
-    of_speeds += [(mph, "is in mph"), (1.0 / mph, "was converted from mph twice")]
-    if name in ("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad", "yaw_rad"):
-        return to_radians
-    if name == "steer_rad":
-        return [*to_radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")]
-    if name == "steering_wheel_rad":
-        return [*to_radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")]
-    if name in ("ax_m_s2", "ay_m_s2"):
-        return [(G_M_S2, "is in g"), (1.0 / G_M_S2, "was converted from g twice")]
-    if name in ("vx_m_s", "vy_m_s", "speed_m_s"):
-        return [*of_speeds, (1e-3, "is in mm/s")]
-    if name.startswith("wheel_speed") and name.endswith("_rad_s"):
-        return [(2.0 * np.pi / 60.0, "is in rpm"), (1.0 / TYPICAL_WHEEL_RADIUS_M, "is in m/s")]
-    if name.startswith("wheel_speed"):
-        return [*of_speeds, (TYPICAL_WHEEL_RADIUS_M, "is in rad/s")]
-    return []
+
+    def both_ways(unit: str, factor: float, inverse: float) -> list[tuple[float, str]]:
+        return [(factor, f"is in {unit}"), (inverse, f"was converted from {unit} twice")]
+
+    radians, g = both_ways("degrees", DEGREE, 1.0 / DEGREE), both_ways("g", G_M_S2, 1.0 / G_M_S2)
+    speeds = [*both_ways("km/h", 1.0 / 3.6, 3.6), *both_ways("mph", 0.44704, 1.0 / 0.44704)]
+    units = {
+        **dict.fromkeys(("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad", "yaw_rad"), radians),
+        "steer_rad": [*radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")],
+        "steering_wheel_rad": [*radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")],
+        **dict.fromkeys(("ax_m_s2", "ay_m_s2"), g),
+        **{key: [*speeds, (1e-3, "is in mm/s")] for key in ("vx_m_s", "vy_m_s", "speed_m_s")},
+        "wheel_rad_s": [(2.0 * np.pi / 60.0, "is in rpm"), (1.0 / TYPICAL_WHEEL_RADIUS_M, "is in m/s")],
+        "wheel_m_s": [*speeds, (TYPICAL_WHEEL_RADIUS_M, "is in rad/s")],
+    }
+    wheels = "wheel_rad_s" if name.endswith("_rad_s") else "wheel_m_s"
+    return units.get(wheels if name.startswith("wheel_speed") else name, [])
 
 
 def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:

@@ -22,11 +22,10 @@ from pdhef_logtool.drive.relations import (
     direction_rate,
     measured_relations,
 )
-from pdhef_logtool.drive.truth import TruthTrack, channel_of
+from pdhef_logtool.drive.truth import TruthTrack, channel_of, derive_truth
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import GNSS, GNSS_POSITION, WHEELS, Channel, FloatArray
-from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
@@ -44,6 +43,7 @@ class Measured:
     ----------
     speed_name : the column used as the speed. topics : topics of the signals, by name.
     scales : scales of the mapping, by name. open_signs : groups of signals with an undocumented common sign.
+    has_truth : whether ground truth at the CG is available.
     """
 
     columns: Mapping[str, FloatArray]
@@ -52,6 +52,7 @@ class Measured:
     topics: Mapping[str, str]
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     open_signs: tuple[tuple[str, ...], ...] = ()
+    has_truth: bool = False
 
     @property
     def positions(self) -> tuple[str, str]:
@@ -112,14 +113,14 @@ def measure(
     """
     columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
-    of_truth = {} if mapping is None else {f"truth.{n}": s for n, s in mapping.truth.items()}
-    sources = {**({} if mapping is None else mapping.signals), **of_truth}
+    sources = {} if mapping is None else mapping.by_subject
     related = measured_relations(columns, speed_name, _known(vehicle))
     # Two quantities of ground truth from the same field agree trivially.
-    read = [[(of_truth[n].topic, of_truth[n].paths) for n in r.powers if n in of_truth] for r in related]
+    of_truth = {n: (s.topic, s.paths) for n, s in sources.items() if n.startswith("truth.")}
+    read = [[of_truth[n] for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    open_signs = () if mapping is None else tuple(map(tuple, mapping.open_signs))
-    return Measured(columns, speed_name, tuple(related), topics, {n: s.scale for n, s in sources.items()}, open_signs)
+    open_signs, scales = () if mapping is None else mapping.open_signs, {n: s.scale for n, s in sources.items()}
+    return Measured(columns, speed_name, tuple(related), topics, scales, open_signs, derived is not None)
 
 
 def drive_columns(
@@ -134,7 +135,7 @@ def drive_columns(
         if "vy_m_s" in truth and "truth.vy_m_s" in channels:
             channels[CG_VY] = channels["truth.vy_m_s"]
         channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
-        channels |= _pose_velocity(truth, derived.track)
+        channels |= _pose_velocity(truth)
         if "yaw_rad" in truth:
             heading = truth["yaw_rad"].take(np.isfinite(truth["yaw_rad"].values))
             channels[TURNING] = replace(heading, values=np.unwrap(heading.values))
@@ -170,20 +171,14 @@ def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
     return metres | {n: replace(speed, name=n, values=speed.values * side(course.values)) for n, side in sides}
 
 
-def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str, Channel]:
+def _pose_velocity(truth: Mapping[str, Channel]) -> dict[str, Channel]:
     """Return body velocities from positions and heading of one topic; empty without them."""
-    pose = [truth[n] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth]
-    finite = np.isfinite(track.yaw_rad)
-    stamps = pose[0].stamps_ns if pose else np.empty(0, np.int64)
-    topics = {c.source.split(".")[0] for c in pose}
-    if not {"x_m", "y_m"} <= truth.keys() or len(topics) > 1 or not finite.any() or stamps.size < 3:
+    pose = {n: truth[n] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth}
+    if not {"x_m", "y_m"} < pose.keys() or len({c.source.split(".")[0] for c in pose.values()}) > 1:
         return {}
-    yaw = np.interp(stamps, track.stamps_ns[finite], np.unwrap(track.yaw_rad[finite]))
-    y_m = np.interp(stamps, truth["y_m"].stamps_ns, truth["y_m"].values)  # single samples may be missing
-    vx, vy, rate = (np.gradient(c, (stamps - stamps[0]) * 1e-9) for c in (truth["x_m"].values, y_m, yaw))
-    ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx
-    columns = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
-    return {n: Channel(n, "", "pose", stamps, stamps, v) for n, v in columns.items()}
+    derived = derive_truth(pose)
+    names = {"pose_vx_m_s": "vx_m_s", "pose_vy_m_s": "vy_m_s", "heading_rate_rad_s": "yaw_rate_rad_s"}
+    return {f"truth.{n}": channel_of(derived, of) for n, of in names.items()}
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:

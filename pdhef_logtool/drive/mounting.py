@@ -8,48 +8,24 @@ the sensor's axes to these; its correlation, gain and error decide whether the m
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
-from collections.abc import Mapping as Mapped
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TypeAlias
+from dataclasses import dataclass, replace
+from itertools import permutations, product
 
 import numpy as np
-import numpy.typing as npt
 
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.check_table import result
-from pdhef_logtool.drive.checks import check_drive, misread_channels
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
-from pdhef_logtool.drive.delays import LateSensor, late_sensors
-from pdhef_logtool.drive.frames import (
-    IS_GRAVITY_M_S2,
-    angle_deg,
-    nearest_step,
-    rotation_text,
-    upright_check,
-)
-from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
+from pdhef_logtool.drive.measured import Measured
 from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
-from pdhef_logtool.drive.truth import (
-    LatencyEstimate,
-    TruthPlan,
-    TruthTrack,
-    booked_on_the_late,
-    channel_of,
-    derive_truth,
-    estimate_truth_latency,
-    plan_truth,
-)
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping import Mapping, SignalSource
+from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.mapping_file import entries_of
-from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
-
-ComplexArray: TypeAlias = npt.NDArray[np.complex128]
+from pdhef_logtool.records.signals import FloatArray
 
 #: Below this mean acceleration, the sensor's software has subtracted gravity.
 COMPENSATED_M_S2 = 3.0
@@ -75,6 +51,143 @@ ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
 SIGN_CORRELATION = 0.5
 #: The same for a left-handed sensor: the wheels' difference changes its sign when a car understeers strongly.
 HAND_CORRELATION = 0.8
+#: Words for the axes of a rate, x first.
+_RATE_WORDS = ("roll", "pitch", "yaw")
+#: Temporary names of the components; they differ from all signal names.
+ACCELERATIONS = tuple(f"triad.acceleration.{axis}" for axis in "xyz")
+RATES = tuple(f"triad.rate.{axis}" for axis in "xyz")
+#: Rows of a mounting: forward and left from the accelerometer, up from the gyro.
+MOUNTED = ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
+#: A mean acceleration in this range is gravity.
+IS_GRAVITY_M_S2 = (0.75 * GRAVITY_M_S2, 1.25 * GRAVITY_M_S2)
+#: Largest angle between the mean gravity of a drive and the car's vertical.
+TILT_DEG = 15.0
+
+
+# ------------------------------------------------------------------------------------------------ fields of an IMU
+
+
+@dataclass(frozen=True, slots=True)
+class Triad:
+    """Three fields of one message, x first, and their common factor to SI."""
+
+    source: SignalSource
+    paths: tuple[str, str, str]
+    unit: float
+
+    def components(self, names: tuple[str, ...]) -> dict[str, SignalSource]:
+        """Return the three fields as separate sources."""
+        return {
+            n: replace(self.source, name=n, field=p, scale=self.unit, offset=0.0, valid_min=None, valid_max=None)
+            for n, p in zip(names, self.paths, strict=True)
+        }
+
+    def row(self, source: SignalSource) -> FloatArray:
+        """Return the direction [3] of a mapped signal in the triad's axes."""
+        scales = source.scale if isinstance(source.scale, tuple) else (source.scale,) * len(source.paths)
+        row = np.zeros(3)
+        for path, scale in zip(source.paths, scales, strict=True):
+            row[self.paths.index(path)] += scale / self.unit
+        return row
+
+    def turned(self, source: SignalSource, row: FloatArray) -> SignalSource:
+        """Return the source of a signal in a direction [3] of the triad; a single field if the direction is an axis."""
+        used = [i for i in range(3) if abs(row[i]) > 1e-9]
+        scales = tuple(float(np.round(row[i], 6)) * self.unit for i in used)
+        if len(used) == 1:
+            return replace(source, field=self.paths[used[0]], scale=scales[0])
+        return replace(source, field=tuple(self.paths[i] for i in used), scale=scales)
+
+
+def find_triads(log: DriveLog, mapping: Mapping) -> tuple[Triad | None, Triad | None]:
+    """Return the triads of accelerations and of rates with an axis in the mapping; None for a missing triad."""
+    triads = [_triad(log, mapping, names) for names in (("ay_m_s2", "ax_m_s2"), ("yaw_rate_rad_s",))]
+    return triads[0], triads[1]
+
+
+def _triad(log: DriveLog, mapping: Mapping, names: tuple[str, ...]) -> Triad | None:
+    sources = [mapping.signals[n] for n in names if n in mapping.signals]
+    if not sources or any(s.can_signal is not None for s in sources):
+        return None
+    first = sources[0]
+    fields = log.fields(first.topic)
+    for paths in _siblings(first.paths):
+        inside = all(s.topic == first.topic and s.stamp == first.stamp and set(s.paths) <= set(paths) for s in sources)
+        if inside and all(has_path(fields, p) for p in paths):
+            scales = first.scale if isinstance(first.scale, tuple) else (first.scale,)
+            unit = float(np.linalg.norm(scales))
+            # Rows of a rotation have length 1, so that the length of the scales is the unit.
+            return Triad(first, paths, unit)
+    return None
+
+
+def _siblings(paths: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
+    """Yield possible triples of paths that contain a path."""
+    path = paths[0]
+    if index := re.fullmatch(r"(.*)\[(\d+)\]", path):
+        start = int(index[2]) - int(index[2]) % 3
+        yield f"{index[1]}[{start}]", f"{index[1]}[{start + 1}]", f"{index[1]}[{start + 2}]"
+    leaf = path.rfind(".") + 1
+    for word in _RATE_WORDS:
+        position = path.lower().find(word, leaf)
+        if position >= 0:
+            written = [w.capitalize() if path[position].isupper() else w for w in _RATE_WORDS]
+            a, b, c = (path[:position] + w + path[position + len(word) :] for w in written)
+            yield a, b, c
+    for position in range(len(path) - 1, leaf - 1, -1):
+        if path[position] in "xyzXYZ":
+            axes = "XYZ" if path[position].isupper() else "xyz"
+            a, b, c = (path[:position] + axis + path[position + 1 :] for axis in axes)
+            yield a, b, c
+
+
+# ------------------------------------------------------------------------------------------------ rotations
+
+
+def angles_deg(rotation: FloatArray) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of a sensor rotation [3, 3], in the order yaw, pitch, roll."""
+    m = rotation
+    pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
+    if abs(m[2, 0]) > 1.0 - 1e-6:  # gimbal lock: roll and yaw are not separable
+        return 0.0, math.degrees(pitch), math.degrees(math.atan2(-m[0, 1], m[1, 1]))
+    roll, yaw = math.atan2(m[2, 1], m[2, 2]), math.atan2(m[1, 0], m[0, 0])
+    return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
+
+
+def rotation_text(rotation: FloatArray) -> str:
+    """Return a sensor's rotation as text."""
+    roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in angles_deg(rotation))
+    return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg"
+
+
+def nearest_step(rotation: FloatArray) -> FloatArray:
+    """Return the nearest rotation [3, 3] by multiples of 90 degrees."""
+    rows = np.eye(3)[list(permutations(range(3)))]
+    steps = np.concatenate([rows * np.array(signs)[:, None] for signs in product((1.0, -1.0), repeat=3)]) + 0.0
+    steps = steps[np.linalg.det(steps) > 0.0]
+    return np.asarray(steps[np.argmax(np.sum(steps * rotation, axis=(1, 2)))])
+
+
+def upright_check(named: FloatArray, force: FloatArray) -> Check | None:
+    """Report that gravity, the mean acceleration [3], is not upward in the axes that a mapping names.
+
+    ``named``: rows [3, 3] of forward, left and the yaw axis in the sensor's axes. The result is None without forward or
+    left, and if the sensor subtracts gravity.
+    """
+    up, size = np.cross(named[0], named[1]), float(np.linalg.norm(force))
+    least = math.cos(math.radians(2.0 * TILT_DEG)) * size
+    if not up.any() or not IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1] or up @ force > least:
+        return None
+    along = int(np.argmax(np.abs(force)))
+    axis = f"{'-' if force[along] < 0.0 else '+'}{'xyz'[along]}"
+    evidence = f"gravity is along {axis} of the accelerometer, not along its vertical: its axes are not the car's"
+    remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
+    return Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy)
+
+
+def angle_deg(cosine: float) -> float:
+    """Return the angle of a cosine, deg; rounding may exceed 1."""
+    return math.degrees(math.acos(float(np.clip(cosine, -1.0, 1.0))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +232,7 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
         return None
     f = np.stack([columns[n] for n in ACCELERATIONS], axis=1)
     w = np.stack([columns[n] for n in RATES], axis=1)
-    named = _named_rows(mapping, accelerations, rates)
+    named = named_rows(mapping, accelerations, rates)
     speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
     references = yaw_references(columns, speed_name)
     ups = _ups(f, w, named)
@@ -133,13 +246,13 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
-    mounting = Mounting(_snapped(best), named, best.evidence, _is_shown(best, hand, measured), hand)
-    if not mounting.confident or mounting.is_as_named:
-        return mounting
     parts = [
         _turned(f, hand * w, np.where(part, speed, np.nan), best.rotation[2], references) for part in halves(len(speed))
     ]
-    return replace(mounting, confident=_parts_agree(best, parts))
+    is_shown = _is_shown(best, hand, measured)
+    mounting = Mounting(_snapped(best, parts), named, best.evidence, is_shown, hand)
+    is_sure = mounting.is_as_named or _parts_agree(best, parts)
+    return replace(mounting, confident=is_shown and is_sure)
 
 
 def _is_shown(turn: _Turn, hand: float, measured: Measured) -> bool:
@@ -159,7 +272,7 @@ def _parts_agree(whole: _Turn, parts: Sequence[_Turn | None]) -> bool:
     return agree and (len(fitted) == len(parts) or whole.correlation >= ASKEW_CORRELATION)
 
 
-def _named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | None) -> FloatArray:
+def named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | None) -> FloatArray:
     """Return the rows [3, 3] of the sensor's axes that a mapping reads, 0 where it lacks one."""
     named = np.zeros((3, 3))
     for i, (name, triad) in enumerate(zip(MOUNTED, (accelerations, accelerations, rates), strict=True)):
@@ -173,7 +286,7 @@ class _Turn:
     """A rotation for one choice of the vertical, with its fit to the drive.
 
     ``sign``: correlation of the yaw rate with another measurement, 0 without one. ``along``: the speed alone shows
-    which way is forward. ``f``, ``driven``, ``rate``, ``use``: data of the fit.
+    which way is forward. ``rate``: yaw rate.
     """
 
     rotation: FloatArray
@@ -184,10 +297,7 @@ class _Turn:
     along: bool
     fits: bool
     evidence: str
-    f: FloatArray
-    driven: ComplexArray
     rate: FloatArray
-    use: BoolArray
 
 
 def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
@@ -256,7 +366,7 @@ def _turned(
     )
     fits = correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG
     along = _along(rotation[0] @ f[use].T, driven[use].real)
-    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence, f, driven, rate, use)
+    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence, rate)
 
 
 def _along(measured: FloatArray, driven: FloatArray) -> bool:
@@ -275,275 +385,34 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
     return best, said
 
 
-def _snapped(turn: _Turn) -> FloatArray:
+def _snapped(whole: _Turn, parts: Sequence[_Turn | None]) -> FloatArray:
     """Return the nearest multiple of 90 degrees, with the remaining tilt and yaw if both parts of the drive agree."""
-    rotation = turn.rotation
-    step = nearest_step(rotation)
-    rest = rotation @ step.T
-    is_precise = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
-    if not is_precise or turn.samples < ASKEW_SAMPLES:
+    step = nearest_step(whole.rotation)
+    rests = [p.rotation @ step.T for p in parts if p is not None]
+    is_precise = whole.correlation >= ASKEW_CORRELATION and whole.error_deg <= ASKEW_ERROR_DEG
+    if not is_precise or whole.samples < ASKEW_SAMPLES or len(rests) < 2:
         return step
-    parts = _parts_of(turn)
-    yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
-    angles = [abs(yaw) - math.copysign(left, yaw * left) for left, _ in parts]
-    is_turned = all(a > TURNED_DEG for a in angles) and abs(yaw) > max(TURNED_DEG, 3.0 * turn.error_deg)
+    rest = whole.rotation @ step.T
+    yaw, *yaws = (math.degrees(math.atan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])) for r in (rest, *rests))
+    angles = [math.copysign(y, y * yaw) for y in yaws]
+    is_turned = all(a > TURNED_DEG for a in angles) and abs(yaw) > max(TURNED_DEG, 3.0 * whole.error_deg)
     is_turned &= abs(angles[0] - angles[1]) < max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw))
     # One of the parts may be a hill.
-    first, second = (step @ rotation.T @ up for _, up in parts)
-    *tilts, apart = (angle_deg(float(x)) for x in (rest[2, 2], first[2], second[2], first @ second))
+    *tilts, apart = (
+        angle_deg(float(x)) for x in (rest[2, 2], rests[0][2, 2], rests[1][2, 2], rests[0][2] @ rests[1][2])
+    )
     if min(tilts) > TURNED_DEG and apart < PARTS_AGREE_DEG:
         from scipy.spatial.transform import Rotation
 
         level_only = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest[2]])[0].as_matrix()
-        return rotation if is_turned else np.asarray(level_only @ step)
+        return whole.rotation if is_turned else np.asarray(level_only @ step)
     if not is_turned:
         return step
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ step)
 
 
-def _parts_of(turn: _Turn) -> list[tuple[float, FloatArray]]:
-    """Return, for two parts of the drive, the yaw (deg) that the fit leaves and up [3] in the axes of the rotation.
-
-    Steady sideslip rotates the acceleration by an angle that grows with lateral acceleration and curvature. Roll and
-    pitch change the gains of both axes. Each has a regressor; grade and crossfall are part of the constant. The yaw is
-    NaN if the part does not separate them. Up is the force at zero acceleration.
-    """
-    axes, driven = turn.f @ turn.rotation.T, turn.driven
-    z, ones = axes[:, 0] + 1j * axes[:, 1], np.ones(len(axes))
-    matrix = np.stack([driven, driven.conj(), 1j * derivative(turn.rate), driven.imag**2, turn.rate**2, ones], axis=1)
-    level = np.stack([driven.real, driven.imag, ones], axis=1)
-    parts = []
-    for part in halves(len(z)):
-        usable = turn.use & part & np.isfinite(matrix).all(axis=1) & np.isfinite(z)
-        size = np.maximum(np.linalg.norm(matrix[usable], axis=0), 1e-9)
-        is_long = independent_samples(int(np.count_nonzero(usable))) >= ASKEW_SAMPLES / 2.0
-        is_separable = is_long and np.linalg.cond(matrix[usable] / size) <= WELL_CONDITIONED
-        gain = np.linalg.lstsq(matrix[usable] / size, z[usable], rcond=None)[0][0] if is_separable else np.nan
-        up = np.linalg.lstsq(level[usable], axes[usable], rcond=None)[0][2] if is_long else np.zeros(3)
-        parts.append((math.degrees(float(np.angle(gain))), up / max(float(np.linalg.norm(up)), 1e-9)))
-    return parts
-
-
 # ------------------------------------------------------------------------------------- into the mapping
-
-
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """The first minutes of a log as its mapping reads them, with the IMU rotated to the car's axes if that is certain.
-
-    ``vehicle``: from the vehicle file, or the default car. ``corrected``: checks for the changes of a recognised
-    mapping.
-    """
-
-    mapping: Mapping
-    channels: MappedChannels
-    measured: Measured
-    vehicle: VehicleParameters
-    truth: TruthTrack | None
-    truth_plan: TruthPlan | None
-    latency: LatencyEstimate | None
-    triads: tuple[Triad | None, Triad | None] = (None, None)
-    mounting: Mounting | None = None
-    force: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
-    corrected: tuple[Check, ...] = ()
-
-    @property
-    def mounted(self) -> tuple[Check, ...]:
-        """Checks of the axes that the IMU's signals are read from."""
-        by_drive = [] if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
-        is_open = self.mapping.origin == "auto" and not (self.mounting is not None and self.mounting.confident)
-        upright = upright_check(_named_rows(self.mapping, *self.triads), self.force) if is_open else None
-        return (*by_drive, *([] if upright is None else [upright]))
-
-    @property
-    def is_mounted(self) -> bool:
-        """Whether the drive confirms that the IMU is read from the right axes."""
-        return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
-
-    @cached_property
-    def checks(self) -> tuple[Check, ...]:
-        """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
-        drive_checks = self._drive_checks(self.channels.truth, self.truth, self.latency, self.measured)
-        return (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
-
-    @cached_property
-    def sensor_checks(self) -> tuple[Check, ...]:
-        """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
-        if not self.channels.truth:
-            return self.checks
-        measured = measure(self.channels.signals, {}, None, self.vehicle, self.mapping)
-        return (*self.mounted, *self._drive_checks({}, None, None, measured))
-
-    def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
-        """Return the channels that must not be used, with the reason. Ground truth does not decide about sensors.
-
-        Parameters
-        ----------
-        waived : names of checks that are ignored. is_causal : no sensor is refused because of later samples.
-        """
-        by_everything = misread_channels(self.checks, waived)
-        refused = {n: why for n, why in by_everything.items() if n.startswith("truth.")}
-        return refused if is_causal else refused | misread_channels(self.sensor_checks, waived)
-
-    def _drive_checks(
-        self,
-        truth: Mapped[str, Channel],
-        derived: TruthTrack | None,
-        latency: LatencyEstimate | None,
-        measured: Measured,
-    ) -> tuple[Check, ...]:
-        return check_drive(
-            self.channels.signals,
-            truth,
-            derived,
-            self.vehicle,
-            latency=latency,
-            late=self.late,
-            mounting_is_known=self.is_mounted,
-            measured=measured,
-        )
-
-    @cached_property
-    def late(self) -> tuple[LateSensor, ...]:
-        """Sensors with late time stamps, from the signals alone."""
-        return late_sensors(self.channels.signals)
-
-    def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
-        """Yield the mapping's undecided checks that the drive does not decide either."""
-        passed = {c.name for c in drive_checks if c.verdict == "passed"} - {
-            f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
-        }
-        doubts = [c for c in self.mapping.checks if "unit" in c.evidence or "share" in c.evidence]
-        doubted = {c.name.removesuffix(".candidate") for c in doubts}
-        for check in self.mapping.checks:
-            signal = check.name.removesuffix(".candidate")
-            # Without a known radius, rim speeds in m/s and in rad/s look alike. v_y has the unit of its v_x.
-            unit = f"{signal.replace('truth.vy', 'truth.vx')}.unit"
-            is_resolved = unit in passed and not signal.startswith("wheel") and "a share" not in check.evidence
-            if f"{signal}.sign" not in passed or (signal in doubted and not is_resolved):
-                yield check
-
-
-def survey_log(
-    log: DriveLog,
-    mapping: Mapping,
-    clocks: dict[str, ClockModel],
-    span_ns: tuple[int, int],
-    vehicle: VehicleParameters | None = None,
-    *,
-    rescale: bool = True,
-) -> Survey:
-    """Read a span of a log and find the mounting of its IMU and a wrong unit or sign.
-
-    A recognised mapping is corrected where that is certain, with a note; a mapping file is only checked.
-
-    Parameters
-    ----------
-    vehicle : of the drive; None uses the default car.
-    rescale : whether to search for a wrong unit or sign.
-    """
-    vehicle = vehicle or default_vehicle()
-    triads = find_triads(log, mapping)
-    extra: dict[str, SignalSource] = {}
-    for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
-        extra |= {} if triad is None else triad.components(names)
-    channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
-    truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
-    truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
-    measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
-    # The inputs of an estimator must not depend on ground truth: a mounting from ground truth is only checked.
-    mounting = find_mounting(measured.without_truth(), triads, mapping)
-    blind = mounting is not None and mounting.confident
-    if not blind and truth is not None:
-        mounting = find_mounting(measured, triads, mapping)
-    force = _mean_force(channels)
-    channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
-    measured = measured.without(extra)
-    corrected: list[Check] = []
-    if mounting is not None and mapping.origin == "auto" and blind and not mounting.is_as_named:
-        note = f"{mounting.text}, and is read so: {mounting.evidence}"
-        signals = turned_signals(mapping, mounting, triads)
-        corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
-        mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
-        channels = read_signals(log, mapping, clocks, *span_ns)
-        mounting = replace(mounting, named=mounting.rows)
-        measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
-    latency = truth_latency(channels, truth)
-    survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, force, tuple(corrected)
-    )
-    return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
-
-
-def _mean_force(channels: MappedChannels) -> FloatArray:
-    """Return the mean acceleration [3] in the sensor's axes; NaN without a component."""
-    components = [channels.signals.get(n) for n in ACCELERATIONS]
-    return np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
-
-
-def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
-    """Return the survey with undocumented signs decided, or with one wrong unit or sign corrected.
-
-    A correction must be certain. Documented units and signs are corrected
-    without ground truth, and each such correction is a failed check.
-    """
-    mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
-    probable = measured.posterior(mounting_is_known=is_mounted)
-    turned = [n for g in measured.open_signs if probable.turned(g[0]) >= CERTAIN for n in g]
-    factors = dict.fromkeys(turned, (-1.0, "its sign is not documented, and the drive shows it"))
-    if not turned:
-        measured = replace(measured, open_signs=()).without_truth()
-        factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
-    sections, notes = {"truth.": dict(mapping.truth), "": dict(mapping.signals)}, list(mapping.notes)
-    checks = list(survey.corrected)
-    for name, (factor, evidence) in factors.items():
-        section = sections[name[:6] if name.startswith("truth.") else ""]
-        source = section.get(name.removeprefix("truth."))
-        if source is not None:
-            section[source.name] = scaled_source(source, factor)
-            notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
-            checks += [] if turned else [_corrected(name, section[source.name], notes[-1])]
-    if len(notes) == len(mapping.notes):
-        return survey
-    scaled = replace(mapping, signals=sections[""], truth=sections["truth."], notes=tuple(notes), open_signs=())
-    again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
-    # A failing sensor resembles a wrong unit of another one, but only a right correction leaves no contradiction.
-    failed = [check.name for check in again.checks if check.verdict == "failed"]
-    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis")) for n in failed)
-    return survey if is_bad else replace(again, corrected=(*checks, *again.corrected))
-
-
-def _corrected(name: str, source: SignalSource, note: str) -> Check:
-    return result("SIGNAL.corrected", "failed", name, evidence=note, entries=entries_of(source, "field", "scale"))
-
-
-def scaled_source(source: SignalSource, factor: float) -> SignalSource:
-    """Return a source with scale and offset multiplied by a factor, without its valid range."""
-
-    def times(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        return tuple(v * factor for v in value) if isinstance(value, tuple) else value * factor
-
-    # A valid range in the wrong unit would drop correct values.
-    return replace(source, scale=times(source.scale), offset=times(source.offset), valid_min=None, valid_max=None)
-
-
-def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:
-    """Return the latency of ground truth relative to the gyro, or of the gyro; None if one is missing."""
-    gyro = channels.signals.get("yaw_rate_rad_s")
-    if truth is None or gyro is None or not len(gyro):
-        return None
-    rate = channels.truth.get("yaw_rate_rad_s") or channel_of(truth, "yaw_rate_rad_s")
-    if not len(rate):
-        return None
-    latency = estimate_truth_latency(gyro, rate)
-    speed = channels.signals.get("speed_m_s")
-    other = None
-    if speed is not None and speed.source.split(".")[0] != gyro.source.split(".")[0]:
-        vx = channel_of(truth, "vx_m_s")
-        other = estimate_truth_latency(speed, vx) if min(len(speed), len(vx)) >= 2 else None
-    return booked_on_the_late(latency, other)
 
 
 def turned_signals(

@@ -11,18 +11,17 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import CHANGE_SUFFIX, change_checks
 from pdhef_logtool.drive.friction import FrictionFrom, FrictionSource, friction_source
-from pdhef_logtool.drive.model_file import CLOCK_START_S, Sensors, is_device_clock, with_earlier_drive
 from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
-from pdhef_logtool.drive.plan import DrivePlan, plan_drive
-from pdhef_logtool.drive.recorded import Recorded, read_recorded
-from pdhef_logtool.drive.sensor_changes import SensorChange
+from pdhef_logtool.drive.plan import CLOCK_START_S, DrivePlan, Sensors, is_device_clock, plan_drive, with_earlier_drive
+from pdhef_logtool.drive.recorded import WholeDrive as WholeDrive
+from pdhef_logtool.drive.recorded import read_recorded
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, Logs, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import (
-    ChosenMapping,
+    AutoMapping,
     ClockModel,
     Mapping,
     check_mapping,
@@ -35,42 +34,12 @@ from pdhef_logtool.mapping import (
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
-from pdhef_logtool.records.signals import GNSS_POSITION, Loss, Signals
+from pdhef_logtool.records.signals import GNSS_POSITION, Loss
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
-from pdhef_logtool.records.tracks import StateTrack
 
 Tell = Callable[[str], None]
 #: Returns the mapping to read with, from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WholeDrive:
-    """A drive in memory: signals [N], and the ground truth [N] at their stamps (None for a log without it).
-
-    ``changes`` : of the sensors in mid-drive; the signals are corrected for them.
-    """
-
-    name: str
-    plan: DrivePlan
-    signals: Signals
-    truth: StateTrack | None
-    log_start_ns: int
-    changes: tuple[SensorChange, ...] = ()
-
-    def __repr__(self) -> str:
-        return f"<WholeDrive {self.name}: {self.seconds:.1f} s, with{'out' * (self.truth is None)} ground truth>"
-
-    @property
-    def seconds(self) -> float:
-        """Time from first to last stamp."""
-        return float(self.signals.stamps_ns[-1] - self.signals.stamps_ns[0]) * 1e-9
-
-    @property
-    def span_s(self) -> tuple[float, float]:
-        """First and last stamp in seconds from the log's start."""
-        stamps = self.signals.stamps_ns
-        return float(stamps[0] - self.log_start_ns) * 1e-9, float(stamps[-1] - self.log_start_ns) * 1e-9
 
 
 @dataclass(slots=True, eq=False)
@@ -91,13 +60,13 @@ class Drive:
     car: Car
     options: ReadOptions
     plan: DrivePlan
-    chosen: ChosenMapping
+    chosen: AutoMapping
     notes: list[str]
     friction: FrictionSource
     earlier: Sensors | None
     _tell: Tell
     remarks: list[str] = field(default_factory=list)
-    _recorded: Recorded | None = None
+    _recorded: WholeDrive | None = None
     _sha256: str = ""
     _state: tuple[tuple[int, int, int], ...] = ()
 
@@ -201,14 +170,13 @@ class Drive:
         recorded = self.recorded()
         if not len(recorded.signals):
             raise no_samples(self.path)
-        signals, truth = self.friction.fill(recorded.signals, recorded.truth), recorded.truth
-        return WholeDrive(self.name, self.plan, signals, truth, self.log.start_ns, recorded.changes)
+        return replace(recorded, signals=self.friction.fill(recorded.signals, recorded.truth))
 
-    def recorded(self) -> Recorded:
+    def recorded(self) -> WholeDrive:
         """Return the drive as recorded, which may be empty."""
         if self._recorded is None or self._recorded.plan is not self.plan:
             unchanged = [n.removesuffix(CHANGE_SUFFIX) for n in self.options.waived]
-            self._recorded = read_recorded(self.log, self.plan, unchanged)
+            self._recorded = read_recorded(self.log, self.plan, unchanged, self.name)
             changes = (*self._recorded.changes, *self._recorded.from_truth)
             for check in change_checks(changes, self.log.start_ns):
                 if (text := _failed_text(check)) not in self.notes:

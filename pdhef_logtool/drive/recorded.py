@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Collection
 from collections.abc import Mapping as Mapped
@@ -11,13 +12,13 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import correct_signals
 from pdhef_logtool.drive.alignment import align
-from pdhef_logtool.drive.channel_hash import channels_sha256
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
 from pdhef_logtool.drive.truth import derive_truth, truth_at
 from pdhef_logtool.drive.truth_steps import steps_from_truth
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, clock_key, merge_losses, read_signals
+from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings, without_impossible
 from pdhef_logtool.records.signals import Channel, FloatArray, Loss, Signals
@@ -34,8 +35,8 @@ _LATE = "samples arrived much later than their neighbours: they were not waited 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
-    """A drive as its plan reads it from the log.
+class WholeDrive:
+    """A drive in memory, as its plan reads it from the log.
 
     Attributes
     ----------
@@ -46,18 +47,34 @@ class Recorded:
     signals_sha256, truth_sha256 : hashes of the channels' content; None without samples.
     """
 
+    name: str
     plan: DrivePlan
     signals: Signals
     truth: StateTrack | None
-    losses: tuple[Loss, ...]
-    ledger: tuple[SampleCount, ...]
-    changes: tuple[SensorChange, ...]
-    from_truth: tuple[SensorChange, ...]
-    signals_sha256: str | None
-    truth_sha256: str | None
+    log_start_ns: int
+    changes: tuple[SensorChange, ...] = ()
+    from_truth: tuple[SensorChange, ...] = ()
+    losses: tuple[Loss, ...] = ()
+    ledger: tuple[SampleCount, ...] = ()
+    signals_sha256: str | None = None
+    truth_sha256: str | None = None
+
+    def __repr__(self) -> str:
+        return f"<WholeDrive {self.name}: {self.seconds:.1f} s, with{'out' * (self.truth is None)} ground truth>"
+
+    @property
+    def seconds(self) -> float:
+        """Time from first to last stamp."""
+        return float(self.signals.stamps_ns[-1] - self.signals.stamps_ns[0]) * 1e-9
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last stamp in seconds from the log's start."""
+        stamps = self.signals.stamps_ns
+        return float(stamps[0] - self.log_start_ns) * 1e-9, float(stamps[-1] - self.log_start_ns) * 1e-9
 
 
-def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = ()) -> Recorded:
+def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (), name: str = "") -> WholeDrive:
     """Read the slice of a plan once, align it and derive the ground truth; ``unchanged`` sensors are not corrected."""
     from pdhef_logtool.drive.sensor_faults import without_faults  # loads the compiler
 
@@ -77,25 +94,30 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
     losses = merge_losses([part.losses, *map(_gaps, channels), late, _impossible(aligned)])
     truth = None
     if plan.truth is not None:
-        at_stamps = truth_at(
-            derive_truth(part.truth, plan=plan.truth),
-            signals.stamps_ns,
-            plan.truth_latency_s,
-            standstill_m_s=plan.vehicle.standstill_m_s,
-        )
+        derived, standstill = derive_truth(part.truth, plan=plan.truth), plan.vehicle.standstill_m_s
+        at_stamps = truth_at(derived, signals.stamps_ns, plan.truth_latency_s, standstill_m_s=standstill)
         truth = replace(at_stamps, measured_speed_m_s=_measured_speed(signals))
-    mapping = plan.mapping
-    return Recorded(
-        plan=plan,
-        signals=signals,
-        truth=truth,
-        losses=losses,
-        ledger=sample_ledger(log, plan, part.counts),
-        changes=changes,
-        from_truth=() if truth is None else steps_from_truth(signals, truth),
-        signals_sha256=channels_sha256(part.signals, mapping.signals),
-        truth_sha256=channels_sha256(part.truth, mapping.truth),
-    )
+    ledger = sample_ledger(log, plan, part.counts)
+    hashes = (channels_sha256(part.signals, plan.mapping.signals), channels_sha256(part.truth, plan.mapping.truth))
+    from_truth = () if truth is None else steps_from_truth(signals, truth)
+    return WholeDrive(name, plan, signals, truth, log.start_ns, changes, from_truth, losses, ledger, *hashes)
+
+
+def channels_sha256(channels: Mapped[str, Channel], sources: Mapped[str, SignalSource]) -> str | None:
+    """Return the hash of names, stamps on the log's clock and values in SI units; None without samples.
+
+    Stamps are hashed before the latency of a source is subtracted, because mapping files and cars may change the
+    latency of the same drive. Arrival times are not hashed.
+    """
+    total = hashlib.sha256()
+    full = [(name, channel) for name, channel in sorted(channels.items()) if len(channel)]
+    for name, channel in full:
+        stamps_ns = channel.stamps_ns + round(sources[name].latency_s * 1e9)
+        # -0.0 and 0.0 are one value.
+        values = np.ascontiguousarray(channel.values + 0.0, dtype="<f8")
+        total.update(name.encode() + b"\0" + hashlib.sha256(stamps_ns.astype("<i8").data).digest())
+        total.update(hashlib.sha256(values.data).digest())
+    return total.hexdigest() if full else None
 
 
 def _measured_speed(signals: Signals) -> FloatArray:
@@ -147,15 +169,8 @@ def _gaps(channel: Channel) -> list[Loss]:
         return []
     steps = np.diff(stamps)
     least = max(TOLD_GAP_S * 1e9, TOLD_GAP_PERIODS * float(np.median(steps)))
+    text, times = "no samples for {:.2f} s", stamps.tolist()
     return [
-        Loss(
-            "gap",
-            f"no samples for {steps[i] * 1e-9:.2f} s",
-            channel.source,
-            int(stamps[i]),
-            int(stamps[i + 1]),
-            1,
-            "note",
-        )
+        Loss("gap", text.format(steps[i] * 1e-9), channel.source, times[i], times[i + 1], 1, "note")
         for i in np.flatnonzero(steps > least)
     ]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -98,6 +99,25 @@ MOST = {
 SHARE, WHEEL_SHARE = 0.95, 0.5
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pace:
+    """The speed [N] of a drive by its column, and where the car moves, and moves gently."""
+
+    columns: Mapping[str, FloatArray]
+    name: str
+    speed: FloatArray
+    moving: BoolArray
+    gentle: BoolArray
+
+    @classmethod
+    def of(cls, columns: Mapping[str, FloatArray], name: str) -> _Pace:
+        """Return the pace by a column."""
+        speed, yaw = columns[name], columns.get("yaw_rate_rad_s")
+        moving = _moving(columns, speed)
+        return cls(columns, name, speed, moving, moving if yaw is None else gentle_at(yaw * speed, moving))
+
+
+@np.errstate(divide="ignore", invalid="ignore")
 def measured_relations(
     columns: Mapping[str, FloatArray], speed_name: str | None, vehicle: VehicleParameters | None = None
 ) -> list[Relation]:
@@ -109,25 +129,21 @@ def measured_relations(
     speed_name : the column used as the speed. vehicle : of a file; None without a file.
     """
     relations = list(_limits(columns))
-    speed = None if speed_name is None else columns[speed_name]
     of_path = {} if any(map(is_misscaled, position_factors(columns))) else columns
     for prefix in ("", "truth."):
         pace_name = f"{prefix}vx_m_s" if f"{prefix}vx_m_s" in columns else speed_name
-        pace = None if pace_name is None else columns[pace_name]
-        if pace_name is not None and pace is not None:
-            relations += _motion(columns, prefix, pace_name, pace)
-    if speed_name is not None and speed is not None:
-        relations += _steering(columns, speed_name, speed, vehicle)
-        relations += _speeds(columns, speed_name, speed)
-        relations += _wheel_differences(columns, speed_name, speed)
-        relations += _courses(of_path, speed)
+        if pace_name is not None:
+            relations += _motion(columns, prefix, pace_name)
+    if speed_name is not None:
+        pace = _Pace.of(columns, speed_name)
+        relations += [*_steering(pace, vehicle), *_speeds(pace), *_wheel_differences(pace), *_courses(of_path, pace)]
     relations += _poses(of_path)
     rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S, BIAS_RAD_S)
     lateral = ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2, BIAS_M_S2)
     for other, name, expected, moves, bias in (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), lateral):
         if name in columns and other in columns:
-            text = f"{other} against {name}"
-            sides, everywhere = (columns[name], columns[other]), np.ones(columns[name].shape[0], np.bool_)
+            text, everywhere = f"{other} against {name}", np.ones(columns[name].shape[0], np.bool_)
+            sides = columns[name], columns[other]
             relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves, bias=bias)
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
     agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
@@ -205,30 +221,26 @@ def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
             yield Relation(text, {name: 1}, 1.0, ratio, (0.0, 1.0), samples, signless=True, most_energy=2 * MOST_ENERGY)
 
 
-def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:
+def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str) -> Iterator[Relation]:
     """Relate the accelerations to speed and yaw rate, of the sensors or of ground truth."""
-    relations: list[Relation] = []
+    pace = columns[pace_name]
     moving = _moving(columns, pace)
     yaw, left, forward = (columns.get(f"{prefix}{n}") for n in ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"))
-    if yaw is not None and left is not None:
+    turns = None if yaw is None else yaw * pace
+    if turns is not None and left is not None:
         powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
-        text = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed"
-        turns, gentle = yaw * pace, gentle_at(yaw * pace, moving)
-        relations += compare(
-            text, powers, turns, left, moving, GAIN_RANGE, moves=MOVES_M_S2, gentle=gentle, bias=BIAS_M_S2
-        )
+        text, gentle = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed", gentle_at(turns, moving)
+        moves = MOVES_M_S2
+        yield from compare(text, powers, turns, left, moving, GAIN_RANGE, moves=moves, gentle=gentle, bias=BIAS_M_S2)
     if forward is not None:
         powers = {f"{prefix}ax_m_s2": 1, pace_name: -1}
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
-        with np.errstate(invalid="ignore"):
-            straight = moving if yaw is None else moving & (np.abs(yaw * pace) < STRAIGHT_M_S2)
-        if yaw is not None and not moving_at(pace).any():  # unknown unit
-            straight = gentle_at(yaw * pace, moving)
+        straight = moving if turns is None else moving & (np.abs(turns) < STRAIGHT_M_S2)
+        if turns is not None and not moving_at(pace).any():  # unknown unit
+            straight = gentle_at(turns, moving)
         # Pitch changes a_x at constant speed, and noise changes the derivative of a GNSS speed.
-        moves = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
-        reference = derivative(pace)
-        relations += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=moves, either=False)
-    return relations
+        least = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
+        yield from compare(text, powers, derivative(pace), forward, straight, GAIN_RANGE, moves=least, either=False)
 
 
 def _best(either: list[Relation]) -> list[Relation]:
@@ -257,10 +269,9 @@ def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
     return moving_at(speed, 0.0) if is_driven else moving
 
 
-def _lengths(
-    columns: Mapping[str, FloatArray], speed: FloatArray, vehicle: VehicleParameters | None
-) -> tuple[tuple[float, float], tuple[float, float]]:
+def _lengths(pace: _Pace, vehicle: VehicleParameters | None) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the plausible effective wheelbases by road-wheel and by steering-wheel angle, m."""
+    columns, speed = pace.columns, pace.speed
     if vehicle is None:
         finite = np.abs(speed[np.isfinite(speed)])
         is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, 0.9) < FULL_SIZE_M_S[1]
@@ -276,74 +287,58 @@ def _lengths(
     return (low, high), (low * vehicle.steering_ratio, high * vehicle.steering_ratio)
 
 
-def _steering(
-    columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray, vehicle: VehicleParameters | None
-) -> list[Relation]:
-    relations: list[Relation] = []
+def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relation]:
+    columns, speed, gentle = pace.columns, pace.speed, pace.gentle
     yaw = columns.get("yaw_rate_rad_s")
     if yaw is None:
-        return relations
-    moving = _moving(columns, speed)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        curvature = yaw / speed
-    gentle = gentle_at(yaw * speed, moving)
+        return
     driven = yaw[gentle & np.isfinite(yaw)]
     is_turning = driven.size > 0 and bool(driven.std() > max(MOVES_RAD_S, abs(driven.mean())))  # to both sides
-    for name, lengths in zip(("steer_rad", "steering_wheel_rad"), _lengths(columns, speed, vehicle), strict=True):
+    for name, lengths in zip(("steer_rad", "steering_wheel_rad"), _lengths(pace, vehicle), strict=True):
         steer, typical = columns.get(name), float(np.sqrt(lengths[0] * lengths[1]))
         if steer is None:
             continue
-        powers = {name: 1, "yaw_rate_rad_s": -1, speed_name: 1}
-        either = [
-            replace(r, typical=typical, moves=r.correlation == 0.0 and is_turning)  # a dead sensor
-            for use in (moving, gentle)
-            for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
-        ]
+        powers, text = {name: 1, "yaw_rate_rad_s": -1, pace.name: 1}, f"{name} against yaw_rate_rad_s / speed"
+        either = [r for use in (pace.moving, gentle) for r in compare(text, powers, yaw / speed, steer, use, lengths)]
+        either = [replace(r, typical=typical, moves=r.correlation == 0.0 and is_turning) for r in either]  # dead sensor
         # Sliding front tyres break the relation at large angles, and noise breaks it at small ones.
-        relations += _best(either)
+        yield from _best(either)
         if "ay_m_s2" in columns:
-            powers = {"ay_m_s2": 1, name: -1, speed_name: -2}
-            text = f"ay_m_s2 against {name} x speed^2"
+            powers, text = {"ay_m_s2": 1, name: -1, pace.name: -2}, f"ay_m_s2 against {name} x speed^2"
             inverse = (1.0 / lengths[1], 1.0 / lengths[0])
             lateral = compare(text, powers, steer * speed**2, columns["ay_m_s2"], gentle, inverse)
-            relations += [replace(r, typical=1.0 / typical) for r in lateral]
-    return relations
+            yield from (replace(r, typical=1.0 / typical) for r in lateral)
 
 
-def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
+def _speeds(pace: _Pace) -> Iterator[Relation]:
     """Relate wheel speeds and ground-truth speeds to the speed: their ratio needs no manoeuvre."""
     wanted = {f"wheel_speed_{w}_m_s": WHEEL_RANGE for w in WHEELS}
     wanted |= {f"wheel_speed_{w}_rad_s": WHEEL_PER_RADIAN_RANGE for w in WHEELS}
     of_paths = ("truth.position_speed_m_s", GNSS_PATH[1])
     wanted |= dict.fromkeys(("truth.vx_m_s", *of_paths), SAME_RANGE)
-    relations = []
-    moving = _moving(columns, speed)
-    # Near the limit, wheel speeds differ from the speed of the car.
-    gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
-    for name, expected in wanted.items():
-        column = columns.get(name)
-        if column is None or name == speed_name:
-            continue
+    speed = pace.speed
+    for name in (n for n in wanted if n in pace.columns and n != pace.name):
+        column = pace.columns[name]
         if name.startswith("wheel"):
-            column = np.where(np.isfinite(_scaled_to(column, speed, moving)), column, np.nan)
-        use = gentle & np.isfinite(column)
-        if independent_samples(int(np.count_nonzero(use))) < MIN_SAMPLES:
-            use = moving & np.isfinite(column)
-        samples = independent_samples(int(np.count_nonzero(use)))
-        if samples < MIN_SAMPLES:
+            column = np.where(np.isfinite(_scaled_to(column, pace)), column, np.nan)
+        # Near the limit, wheel speeds differ from the speed of the car.
+        uses = [where & np.isfinite(column) for where in (pace.gentle, pace.moving)]
+        counts = [independent_samples(int(np.count_nonzero(use))) for use in uses]
+        use, samples = next(((u, s) for u, s in zip(uses, counts, strict=True) if s >= MIN_SAMPLES), (None, 0.0))
+        if use is None:
             continue
         ratios = column[use] / speed[use]
-        powers = {speed_name: -1} | ({} if name == GNSS_PATH[1] else {name: 1})
+        powers = {pace.name: -1} | ({} if name == GNSS_PATH[1] else {name: 1})
         blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
-        gain, signless = float(np.median(ratios)), name in of_paths
-        text = f"{name} over {speed_name}"
-        relations.append(Relation(text, powers, 1.0, gain, expected, samples, signless=signless, blocks=blocks))
-    of_wheels = any(n.startswith("wheel") and n.endswith("_rad_s") for n in columns) and speed_name == "wheel_speeds"
+        gain, signless, text = float(np.median(ratios)), name in of_paths, f"{name} over {pace.name}"
+        yield Relation(text, powers, 1.0, gain, wanted[name], samples, signless=signless, blocks=blocks)
+    of_wheels = (
+        any(n.startswith("wheel") and n.endswith("_rad_s") for n in pace.columns) and pace.name == "wheel_speeds"
+    )
     fast = speed[np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)]
     if (samples := independent_samples(fast.size)) >= 2.0 * MIN_SAMPLES:
-        text, ahead = f"{speed_name} at speeds too high for reversing", float(np.sign(np.median(fast)))
-        relations.append(Relation(text, {speed_name: 1}, 1.0, ahead, (0.0, np.inf), samples))
-    return relations
+        text, ahead = f"{pace.name} at speeds too high for reversing", float(np.sign(np.median(fast)))
+        yield Relation(text, {pace.name: 1}, 1.0, ahead, (0.0, np.inf), samples)
 
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
@@ -351,7 +346,7 @@ def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) ->
     references = [
         (n, columns[n]) for n in (COURSE_RATE, GNSS_COURSE_RATE, GNSS_PATH[0], "truth.yaw_rate_rad_s") if n in columns
     ]
-    return references + ([] if speed_name is None else _axle_differences(columns, columns[speed_name]))
+    return references + ([] if speed_name is None else _axle_differences(_Pace.of(columns, speed_name)))
 
 
 def steering_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
@@ -360,51 +355,41 @@ def steering_references(columns: Mapping[str, FloatArray], speed_name: str | Non
     return [(f"{n} x speed", columns[n] * columns[str(speed_name)]) for n in steers]
 
 
-def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[tuple[str, FloatArray]]:
+def _axle_differences(pace: _Pace) -> list[tuple[str, FloatArray]]:
     """Return the speed difference (right minus left) of each axle, scaled to the speed to remove radii and units."""
-    moving = _moving(columns, speed)
     differences = []
     for unit in ("m_s", "rad_s"):
         for axle in ("r", "f"):
-            pair = [columns.get(f"wheel_speed_{axle}{side}_{unit}") for side in "lr"]
-            scaled = [_scaled_to(w, speed, moving) for w in pair if w is not None]
+            pair = [pace.columns.get(f"wheel_speed_{axle}{side}_{unit}") for side in "lr"]
+            scaled = [_scaled_to(w, pace) for w in pair if w is not None]
             if len(scaled) == 2:
                 differences.append((f"wheel speeds {axle}r - {axle}l", scaled[1] - scaled[0]))
     return differences
 
 
-def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
+def _wheel_differences(pace: _Pace) -> Iterator[Relation]:
     """Relate yaw rate and a_y to the speed differences of the axles, which have no mounting error."""
-    moving = _moving(columns, speed)
-    pairs = _axle_differences(columns, speed)
-    gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
-    relations = []
-    for name, factor, powers in (
-        ("yaw_rate_rad_s", np.ones_like(speed), {"yaw_rate_rad_s": -1, speed_name: 1}),
-        ("ay_m_s2", speed, {"ay_m_s2": -1, speed_name: 2}),
-    ):
-        if name in columns:
-            either = [
-                r
-                for text, difference in pairs
-                for r in compare(
-                    f"{text} against {name}", powers, columns[name], factor * difference, moving, TRACK_M, gentle=gentle
-                )
-            ]
-            relations += _best(either)
-    return relations
+    pairs = _axle_differences(pace)
+    for name, power in (("yaw_rate_rad_s", 1), ("ay_m_s2", 2)):
+        powers, factor, either = {name: -1, pace.name: power}, pace.speed ** (power - 1), list[Relation]()
+        for text, difference in pairs if name in pace.columns else ():
+            sides = pace.columns[name], factor * difference
+            said = f"{text} against {name}"
+            either += compare(said, powers, *sides, pace.moving, TRACK_M, gentle=pace.gentle)
+        yield from _best(either)
 
 
-def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> FloatArray:
+def _scaled_to(wheel: FloatArray, pace: _Pace) -> FloatArray:
     """Return a wheel's speed [N], scaled to the speed of the car; NaN where the wheel spins or locks."""
-    use = moving & np.isfinite(wheel) & np.isfinite(speed)
+    speed = pace.speed
+    use = pace.moving & np.isfinite(wheel) & np.isfinite(speed)
     ratio = float(np.median(wheel[use] / speed[use])) if use.any() else 0.0
     if ratio == 0.0:
         return np.full(wheel.shape[0], np.nan)
     return np.where(np.abs(wheel / ratio - speed) <= SPIN_SHARE * np.abs(speed), wheel / ratio, np.nan)
 
 
-def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
+def _courses(columns: Mapping[str, FloatArray], pace: _Pace) -> Iterator[Relation]:
     """Relate the yaw rates to the course rates of the ground truth, and of a GNSS receiver's velocity and positions."""
     # Positions of a receiver are too noisy to show that something does not turn.
     paths: tuple[tuple[str, dict[str, int], float | None], ...] = (
@@ -412,27 +397,21 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
         (GNSS_COURSE_RATE, {}, MOVES_RAD_S),
         (GNSS_PATH[0], {"gnss_longitude_deg": -1}, None),
     )
-    relations, moving = [], _moving(columns, speed)
-    for path, signs, moves in paths:
-        if path not in columns:
-            continue
-        course = columns[path]
-        turnings = [course]
+    for path, signs, moves in (p for p in paths if p[0] in columns):
+        turnings = [columns[path]]
         if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin, the sideslip changes as well
-            turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
+            turnings.append(columns[path] - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
         for name in (n for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns):
             text = f"{name} against the turning of the {'course' if path == GNSS_COURSE_RATE else 'path'} over ground"
-            yaw, gentle = columns[name], gentle_at(columns[name] * speed, moving)
-            either = [
-                r
-                for turning in turnings
-                for r in compare(
-                    text, {name: 1, **signs}, turning, yaw, moving, GAIN_RANGE, moves=moves, gentle=gentle,
-                    bias=BIAS_RAD_S,
-                )
-            ]  # fmt: skip
-            relations += _best(either)
-    return relations
+            yaw, powers, either = columns[name], {name: 1, **signs}, list[Relation]()
+            limits: dict[str, Any] = {
+                "moves": moves,
+                "gentle": gentle_at(yaw * pace.speed, pace.moving),
+                "bias": BIAS_RAD_S,
+            }
+            for turning in turnings:
+                either += compare(text, powers, turning, yaw, pace.moving, GAIN_RANGE, **limits)
+            yield from _best(either)
 
 
 def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
@@ -509,8 +488,7 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     relations = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving, SIDESLIP_RANGE)
     if is_known:
         return relations
-    with np.errstate(divide="ignore", invalid="ignore"):
-        curvature, ratio = rate / vx, vy / vx  # linear in a wrong v_y, unlike the angle
+    curvature, ratio = rate / vx, vy / vx  # linear in a wrong v_y, unlike the angle
     sideslip = columns.get("truth.sideslip_rad", ratio)
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
@@ -540,8 +518,7 @@ def _axle_sideslips(
     if not used.any() or expected[used].std() < 0.25 * slip[used].std():
         return []
     if subject == "truth.sideslip_rad":
-        with np.errstate(divide="ignore", invalid="ignore"):
-            expected /= speed
+        expected /= speed
     low, high = KNOWN_SIDESLIP
     # Files without a position of ground truth imply the CG, but it may be at any axle.
     high *= max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))

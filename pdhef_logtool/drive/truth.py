@@ -1,4 +1,4 @@
-"""Ground truth on its own clock: quantities, their derivations from the mapped channels, and the latency.
+"""Ground truth on its own clock: quantities, their derivations from the mapped channels.
 
 Derivations (``TruthTrack.derivation`` contains the ones in use):
 
@@ -16,14 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import median_known
-from pdhef_logtool.drive.correlation import GAP_PERIODS, find_shift, on_common_grid, shift_error
+from pdhef_logtool.drive.correlation import GAP_PERIODS
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.geometry import (
@@ -39,12 +39,6 @@ from pdhef_logtool.records.tracks import StateTrack, make_track
 
 #: Half window of the smoothing derivative. A cubic over ±0.2 s passes 1 Hz with 1 % loss.
 DIFFERENTIATION_HALF_S = 0.2
-#: Search range of the latency.
-MAX_LATENCY_S = 0.5
-#: Largest standard error of a reliable latency.
-MAX_LATENCY_ERROR_S = 0.005
-#: Ground truth cannot lead the gyro by more than this: the gyro's stamps are late.
-LATE_GYRO_S = 0.005
 #: Two channels are the same if this share of their samples agrees to ``SAME_RELATIVE``.
 SAME_SHARE = 0.99
 SAME_RELATIVE = 1e-6
@@ -59,22 +53,11 @@ _SCORED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
 _FRICTION = "friction"
 _AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
 _AY_UNKNOWN = "not scored: needs a mapped a_y, or an attitude with roll and the car's roll gradient"
+_MOVED = "moved to the CG"
 _CHUNK = 4096
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
 _NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FRD_TO_FLU = np.diag([1.0, -1.0, -1.0])
-
-VelocitySource: TypeAlias = Literal[
-    "body velocity",
-    "v_x and sideslip",
-    "velocity and heading",
-    "position and heading",
-    "v_x, course and yaw",
-    "v_x alone",
-    "ground speed and sideslip",
-    "ground speed alone",
-    "none",
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +88,13 @@ class TruthPlan:
     Attributes
     ----------
     base : channel that provides the stamps of the ground truth. period_s : its median period.
+    velocity : derivation of the body velocity.
     max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
     position_m : measurement point of the ground truth from the CG, ISO 8855. roll_gradient_rad_per_m_s2 : of the car.
     """
 
     base: str
-    velocity: VelocitySource
+    velocity: str
     used: frozenset[str]
     period_s: float
     max_gap_s: Mapping[str, float]
@@ -131,24 +115,6 @@ class TruthTrack:
     track: StateTrack
     max_gap_s: float
     derivation: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class LatencyEstimate:
-    """Delay of the ground truth after the sensors.
-
-    ``latency_s`` is 0 unless ``reliable``. ``identical``: the ground-truth yaw rate is the gyro's own channel, so that
-    the latency is 0 by construction and gives no information about the other truth channels. ``reason`` is for the
-    report. ``gyro_delay_s``: delay of the gyro's stamps; if it is not 0, the ground-truth latency is 0.
-    """
-
-    latency_s: float
-    correlation: float
-    std_error_s: float
-    reliable: bool
-    identical: bool
-    reason: str
-    gyro_delay_s: float = 0.0
 
 
 def plan_truth(
@@ -178,18 +144,9 @@ def plan_truth(
     source, base = _velocity_source(has, survey, origin)
     periods = {name: float(np.median(np.diff(c.stamps_ns))) * 1e-9 for name, c in survey.items()}
     gaps = {name: GAP_PERIODS * p if max_gap_s is None else max_gap_s for name, p in periods.items()}
-    plan = TruthPlan(
-        base=base,
-        velocity=source,
-        used=has,
-        period_s=periods[base],
-        max_gap_s=gaps,
-        half_window=max(2, round(DIFFERENTIATION_HALF_S / periods[base])),
-        origin=origin,
-        attitude=None,
-        position_m=truth_position_m,
-        roll_gradient_rad_per_m_s2=roll_gradient_rad_per_m_s2,
-    )
+    half_window = max(2, round(DIFFERENTIATION_HALF_S / periods[base]))
+    place, gradient = truth_position_m, roll_gradient_rad_per_m_s2
+    plan = TruthPlan(base, source, has, periods[base], gaps, half_window, origin, None, place, gradient)
     if "quat_wxyz" not in has:
         return plan
     return replace(plan, attitude=_find_attitude(_Source(survey, plan)))
@@ -221,33 +178,15 @@ def derive_truth(
     if plan is None:
         return TruthTrack(track=make_track("truth", np.empty(0, dtype=np.int64)), max_gap_s=0.0)
     source = _Source(truth_channels, plan)
-    says: dict[str, str] = {}
-    x_m, y_m, yaw = _pose(source, says)
-    rate = _yaw_rate(source, yaw, says)
-    vx, vy = _body_velocity(source, says)
-    vx, vy, moved = _velocity_to_cg(plan, vx, vy, rate, says)
-    beta = _sideslip(source, vx, vy, moved, says)
-    ay = _lateral_acceleration(source, vx, vy, rate, says)
+    columns = dict(zip(("x_m", "y_m", "yaw_rad"), _pose(source), strict=True))
+    rate = columns["yaw_rate_rad_s"] = _yaw_rate(source, columns["yaw_rad"])
+    vx, vy = _velocity_at_cg(source, *_body_velocity(source), rate)
+    columns |= {"vx_m_s": vx, "vy_m_s": vy, "sideslip_rad": _sideslip(source, vx, vy)}
+    columns |= {"ay_m_s2": _lateral_acceleration(source, vx, vy, rate), _FRICTION: source.column(_FRICTION)}
     if _FRICTION in source:
-        says[_FRICTION] = source.name(_FRICTION)
-    px, py, _ = plan.position_m
-    if (px, py) != (0.0, 0.0) and np.isfinite(yaw).any():
-        x_m = x_m - (np.cos(yaw) * px - np.sin(yaw) * py)
-        y_m = y_m - (np.sin(yaw) * px + np.cos(yaw) * py)
-    track = make_track(
-        "truth",
-        source.stamps_ns,
-        vx_m_s=vx,
-        vy_m_s=vy,
-        yaw_rate_rad_s=rate,
-        sideslip_rad=beta,
-        ay_m_s2=ay,
-        x_m=x_m,
-        y_m=y_m,
-        yaw_rad=yaw,
-        friction=source.column(_FRICTION),
-    )
-    return TruthTrack(track=track, max_gap_s=plan.max_gap_s[plan.base], derivation=says)
+        source.says[_FRICTION] = source.name(_FRICTION)
+    track = make_track("truth", source.stamps_ns, **columns)
+    return TruthTrack(track, plan.max_gap_s[plan.base], source.says)
 
 
 def truth_at(
@@ -301,69 +240,6 @@ def channel_of(truth: TruthTrack, name: str) -> Channel:
     return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[finite])
 
 
-def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
-    """Return the latency, with a negative one attributed to the gyro.
-
-    Ground truth cannot show a motion before it happens. If it leads the gyro, the gyro's stamps are late. If a speed
-    sensor of another topic is equally late, all sensors agree, and the ground-truth clock is early.
-
-    Parameters
-    ----------
-    latency : gyro against ground-truth yaw rate. speed : speed sensor of another topic against ground-truth v_x.
-    """
-    leads = -latency.latency_s
-    if not latency.reliable or leads <= max(LATE_GYRO_S, 3.0 * latency.std_error_s):
-        return latency
-    if (
-        speed is not None
-        and speed.reliable
-        and abs(speed.latency_s - latency.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
-    ):
-        return replace(latency, reason=f"{latency.reason}; the speed sensor is late by as much")
-    reason = f"the gyro is {leads * 1e3:.1f} ms late against ground truth, which leads no motion"
-    return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
-
-
-def estimate_truth_latency(
-    sensor_yaw_rate: Channel, truth_yaw_rate: Channel, *, max_error_s: float = MAX_LATENCY_ERROR_S
-) -> LatencyEstimate:
-    """Estimate the ground-truth latency against the gyro by cross-correlation of detrended yaw rates.
-
-    Both are sampled on a common grid, linear trends removed; the correlation coefficient is computed at each shift
-    within ± ``MAX_LATENCY_S`` over the samples that both have, and its peak refined by a parabola.
-    Reliable: correlation of at least 0.8, standard error of at most ``max_error_s``, peak inside the range.
-
-    Parameters
-    ----------
-    sensor_yaw_rate, truth_yaw_rate : on their own clocks. Do not pass an estimator's output: its lag, which the metrics
-        show, would be attributed to the ground truth.
-    """
-    if _same_share(sensor_yaw_rate, truth_yaw_rate) >= SAME_SHARE:
-        return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the ground-truth yaw rate is the gyro's channel")
-
-    def refuse(reason: str, correlation: float = 0.0, error: float = float("inf")) -> LatencyEstimate:
-        return LatencyEstimate(0.0, correlation, error, False, False, reason)
-
-    if min(len(sensor_yaw_rate), len(truth_yaw_rate)) < 2:
-        return refuse("too few samples")
-    grid = on_common_grid(
-        sensor_yaw_rate.stamps_ns, sensor_yaw_rate.values, truth_yaw_rate.stamps_ns, truth_yaw_rate.values
-    )
-    if grid.both * grid.step_s < 4.0 * MAX_LATENCY_S:
-        return refuse("less than two seconds in common")
-    shift = find_shift(grid, MAX_LATENCY_S)
-    if not np.isfinite(shift.correlation):
-        return refuse("no yaw motion")
-    error = shift_error(grid, shift.shift_s)
-    if not shift.inside:
-        return refuse("no peak within the range searched", shift.correlation, error)
-    if shift.correlation < 0.8:
-        return refuse("gyro and ground-truth yaw rate correlate too little", shift.correlation, error)
-    if error > max_error_s:
-        return refuse("too little yaw motion", shift.correlation, error)
-    return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against ground-truth yaw rate")
-
-
 def dependent_signals(
     signals_channels: Mapping[str, Channel], truth_channels: Mapping[str, Channel], *, role: str = "input"
 ) -> dict[str, str]:
@@ -386,7 +262,7 @@ def dependent_signals(
             channel = signals_channels[signal]
             if truth.values.ndim != 1 or channel.values.ndim != 1 or channel.unit != truth.unit:
                 continue
-            share = _same_share(channel, truth)
+            share = same_share(channel, truth)
             if share >= SAME_SHARE:
                 dependent[name] = (
                     f"{truth.source} equals the {role} {signal} ({channel.source}) on {share:.1%} of its samples"
@@ -404,16 +280,14 @@ def _first(has: frozenset[str], *names: str) -> str | None:
     return next((n for n in names if n in has), None)
 
 
-def _velocity_source(
-    has: frozenset[str], survey: Mapping[str, Channel], origin: Origin | None
-) -> tuple[VelocitySource, str]:
+def _velocity_source(has: frozenset[str], survey: Mapping[str, Channel], origin: Origin | None) -> tuple[str, str]:
     velocity = _first(has, "enu_velocity_m_s", "ecef_velocity_m_s")
     # Without a position on Earth, east and north of an ECEF velocity are unknown, and a yaw cannot be applied.
     placeless = velocity == "ecef_velocity_m_s" and origin is None
     heading = _first(has - {"yaw_rad"} if placeless else has, "yaw_rad", "quat_wxyz")
     position = _first(has & (frozenset({"ecef_position_m"}) | _pairs(has)), "x_m", "ecef_position_m", "lat_deg")
     ground = velocity or position
-    choices: tuple[tuple[object, VelocitySource, str | None], ...] = (
+    choices: tuple[tuple[object, str, str | None], ...] = (
         ({"vx_m_s", "vy_m_s"} <= has, "body velocity", "vx_m_s"),
         ({"vx_m_s", "sideslip_rad"} <= has, "v_x and sideslip", "vx_m_s"),
         (heading, "velocity and heading", velocity),
@@ -477,11 +351,12 @@ def _forward_share(rotation: FloatArray, velocity: FloatArray) -> float:
 
 
 class _Source:
-    """The truth channels of a window, as columns on the base channel's stamps."""
+    """The truth channels as columns on the base channel's stamps. ``says``: the derivation of each quantity so far."""
 
     def __init__(self, channels: Mapping[str, Channel], plan: TruthPlan) -> None:
         self.plan = plan
         self._channels = channels
+        self.says: dict[str, str] = {}
         base = channels.get(plan.base)
         self.stamps_ns: IntArray = np.empty(0, dtype=np.int64) if base is None else base.stamps_ns
 
@@ -491,6 +366,11 @@ class _Source:
     def name(self, channel: str) -> str:
         """Topic and field of a channel, for the report."""
         return self._channels[channel].source if channel in self._channels else channel
+
+    @property
+    def unknown(self) -> FloatArray:
+        """A column [N] of NaN."""
+        return np.full(self.stamps_ns.shape[0], np.nan)
 
     def column(self, name: str) -> FloatArray:
         """Return a channel at the base stamps, [N] or [N, k]; NaN in gaps."""
@@ -551,6 +431,12 @@ class _Source:
             matrix = self._from_ecef() @ matrix
         return np.asarray(matrix, dtype=np.float64)
 
+    @property
+    def attitude_text(self) -> str:
+        """The quaternion with its convention, for the report."""
+        attitude = self.plan.attitude
+        return self.name("quat_wxyz") + (f", read as {attitude.body} to {attitude.frame}" if attitude else "")
+
     def derivative(self, values: FloatArray, *, angle: bool = False) -> FloatArray:
         """Differentiate a column [N] by time."""
         gap_ns = round(self.plan.max_gap_s[self.plan.base] * 1e9)
@@ -603,139 +489,130 @@ def differentiate(
 # ---- derivation ----
 
 
-def _pose(source: _Source, says: dict[str, str]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    position = source.position()
-    origin = source.plan.origin
-    if {"x_m", "y_m"} <= source.plan.used:
+def _pose(source: _Source) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return x, y and yaw at the CG; without yaw, at the measurement point."""
+    position, plan, says = source.position(), source.plan, source.says
+    if {"x_m", "y_m"} <= plan.used:
         says["position_m"] = f"{source.name('x_m')} and {source.name('y_m')}"
-    elif origin is not None:
+    elif plan.origin is not None:
         name = "ecef_position_m" if "ecef_position_m" in source else "lat_deg"
         says["position_m"] = f"{source.name(name)} in a local ENU frame at its first sample"
-    attitude = source.plan.attitude
+    yaw = source.unknown
     if "yaw_rad" in source:
         yaw = source.column("yaw_rad")
         says["yaw_rad"] = source.name("yaw_rad")
-    elif attitude is not None and source.reference == "ENU":
-        rotation = source.rotation(attitude)
+    elif plan.attitude is not None and source.reference == "ENU":
+        rotation = source.rotation(plan.attitude)
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-        says["yaw_rad"] = f"{source.name('quat_wxyz')}, read as {attitude.body} to {attitude.frame}"
-    else:
-        yaw = np.full(source.stamps_ns.shape[0], np.nan)
-    return position[:, 0], position[:, 1], yaw
+        says["yaw_rad"] = source.attitude_text
+    x_m, y_m, (px, py, _) = position[:, 0], position[:, 1], plan.position_m
+    if (px, py) != (0.0, 0.0) and np.isfinite(yaw).any():
+        x_m = x_m - (np.cos(yaw) * px - np.sin(yaw) * py)
+        y_m = y_m - (np.sin(yaw) * px + np.cos(yaw) * py)
+    return x_m, y_m, yaw
 
 
-def _yaw_rate(source: _Source, yaw: FloatArray, says: dict[str, str]) -> FloatArray:
+def _yaw_rate(source: _Source, yaw: FloatArray) -> FloatArray:
     if "yaw_rate_rad_s" in source:
-        says["yaw_rate_rad_s"] = source.name("yaw_rate_rad_s")
+        source.says["yaw_rate_rad_s"] = source.name("yaw_rate_rad_s")
         return source.column("yaw_rate_rad_s")
-    if "yaw_rad" in says:
-        says["yaw_rate_rad_s"] = "smoothing derivative of yaw"
-        return source.derivative(yaw, angle=True)
-    return np.full(source.stamps_ns.shape[0], np.nan)
+    if "yaw_rad" not in source.says:
+        return source.unknown
+    source.says["yaw_rate_rad_s"] = "smoothing derivative of yaw"
+    return source.derivative(yaw, angle=True)
 
 
-def _body_velocity(source: _Source, says: dict[str, str]) -> tuple[FloatArray, FloatArray]:
+def _body_velocity(source: _Source) -> tuple[FloatArray, FloatArray]:
     """Return v_x, v_y at the measurement point of the ground truth."""
-    kind = source.plan.velocity
-    nothing = np.full(source.stamps_ns.shape[0], np.nan)
-    if kind == "none":
-        return nothing, nothing.copy()
+    kind, name, column, says = source.plan.velocity, source.name, source.column, source.says
     if kind in ("velocity and heading", "position and heading"):
-        vx, vy, how = _velocity_by_heading(source)
-        says["vx_m_s"] = says["vy_m_s"] = how
-        return vx, vy
+        return _velocity_by_heading(source)
     if kind in ("ground speed and sideslip", "ground speed alone"):
-        velocity = source.reference_velocity()
+        velocity, ground = source.reference_velocity(), f"ground speed of {name(source.plan.base)}"
         speed = np.hypot(velocity[:, 0], velocity[:, 1])
         if source.reference == "ECEF":
             speed = np.sqrt((velocity * velocity).sum(axis=1))
-        says["vx_m_s"] = f"ground speed of {source.name(source.plan.base)} taken as v_x, no heading known"
         if kind == "ground speed alone":
-            return speed, nothing
-        beta = source.column("sideslip_rad")
-        says["vx_m_s"] = f"ground speed of {source.name(source.plan.base)} times cos sideslip"
-        says["vy_m_s"] = f"ground speed of {source.name(source.plan.base)} times sin sideslip"
-        return speed * np.cos(beta), speed * np.sin(beta)
-    vx = source.column("vx_m_s")
-    says["vx_m_s"] = source.name("vx_m_s")
+            says["vx_m_s"] = f"{ground} taken as v_x, no heading known"
+            return speed, source.unknown
+        says |= {"vx_m_s": f"{ground} times cos sideslip", "vy_m_s": f"{ground} times sin sideslip"}
+        return speed * np.cos(column("sideslip_rad")), speed * np.sin(column("sideslip_rad"))
+    if kind == "none":
+        return source.unknown, source.unknown
+    vx, vy = column("vx_m_s"), source.unknown
+    says["vx_m_s"] = name("vx_m_s")
     if kind == "body velocity":
-        says["vy_m_s"] = source.name("vy_m_s")
-        return vx, source.column("vy_m_s")
-    if kind == "v_x and sideslip":
-        says["vy_m_s"] = f"v_x times tan of {source.name('sideslip_rad')}"
-        return vx, vx * np.tan(source.column("sideslip_rad"))
-    if kind == "v_x, course and yaw":
-        says["vy_m_s"] = f"v_x times tan of {source.name('course_rad')} minus {source.name('yaw_rad')}"
-        return vx, vx * np.tan(wrap_angle(source.column("course_rad") - source.column("yaw_rad")))
-    return vx, nothing
+        says["vy_m_s"], vy = name("vy_m_s"), column("vy_m_s")
+    elif kind == "v_x and sideslip":
+        says["vy_m_s"] = f"v_x times tan of {name('sideslip_rad')}"
+        vy = vx * np.tan(column("sideslip_rad"))
+    elif kind == "v_x, course and yaw":
+        says["vy_m_s"] = f"v_x times tan of {name('course_rad')} minus {name('yaw_rad')}"
+        vy = vx * np.tan(wrap_angle(column("course_rad") - column("yaw_rad")))
+    return vx, vy
 
 
-def _velocity_by_heading(source: _Source) -> tuple[FloatArray, FloatArray, str]:
-    velocity = source.reference_velocity()
-    how = f"{source.name(source.plan.base)} turned into the body by "
-    if source.plan.velocity == "position and heading":
-        how = f"smoothing derivative of {source.name(source.plan.base)} turned into the body by "
-    attitude = source.plan.attitude
+def _velocity_by_heading(source: _Source) -> tuple[FloatArray, FloatArray]:
+    velocity, attitude = source.reference_velocity(), source.plan.attitude
     if source.reference == "ENU" and ("yaw_rad" in source or attitude is None):
-        yaw = source.column("yaw_rad")
+        yaw, by = source.column("yaw_rad"), source.name("yaw_rad")
         vx = np.cos(yaw) * velocity[:, 0] + np.sin(yaw) * velocity[:, 1]
         vy = -np.sin(yaw) * velocity[:, 0] + np.cos(yaw) * velocity[:, 1]
-        return vx, vy, how + source.name("yaw_rad")
-    assert attitude is not None
-    rotation = source.rotation(attitude)
-    vx = (rotation[:, :, 0] * velocity).sum(axis=1)
-    vy = (rotation[:, :, 1] * velocity).sum(axis=1)
-    return vx, vy, how + f"{source.name('quat_wxyz')}, read as {attitude.body} to {attitude.frame}"
+    else:
+        assert attitude is not None
+        rotation, by = source.rotation(attitude), source.attitude_text
+        vx, vy = ((rotation[:, :, i] * velocity).sum(axis=1) for i in range(2))
+    how = "smoothing derivative of " if source.plan.velocity == "position and heading" else ""
+    source.says |= dict.fromkeys(
+        ("vx_m_s", "vy_m_s"), f"{how}{source.name(source.plan.base)} turned into the body by {by}"
+    )
+    return vx, vy
 
 
-def _velocity_to_cg(
-    plan: TruthPlan, vx: FloatArray, vy: FloatArray, rate: FloatArray, says: dict[str, str]
-) -> tuple[FloatArray, FloatArray, bool]:
-    x, y, _ = plan.position_m
+def _velocity_at_cg(source: _Source, vx: FloatArray, vy: FloatArray, rate: FloatArray) -> tuple[FloatArray, FloatArray]:
+    x, y, _ = source.plan.position_m
     if (x, y) == (0.0, 0.0):
-        return vx, vy, False
-    if "yaw_rate_rad_s" not in says:
-        says["cg"] = f"velocities left at ({x:g}, {y:g}) m from the CG: no yaw rate to move them by"
-        return vx, vy, False
-    says["cg"] = f"velocities moved to the CG from ({x:g}, {y:g}) m"
-    return *shift_velocity_to_cg(vx, vy, rate, (x, y)), True
+        return vx, vy
+    if "yaw_rate_rad_s" not in source.says:
+        source.says["cg"] = f"velocities left at ({x:g}, {y:g}) m from the CG: no yaw rate to move them by"
+        return vx, vy
+    source.says["cg"] = f"velocities {_MOVED} from ({x:g}, {y:g}) m"
+    return shift_velocity_to_cg(vx, vy, rate, (x, y))
 
 
-def _sideslip(source: _Source, vx: FloatArray, vy: FloatArray, moved: bool, says: dict[str, str]) -> FloatArray:
-    if "vy_m_s" in says:
-        says["sideslip_rad"] = "atan2(v_y, v_x)" + (" at the CG" if moved else "")
+def _sideslip(source: _Source, vx: FloatArray, vy: FloatArray) -> FloatArray:
+    if "vy_m_s" in source.says:
+        is_moved = _MOVED in source.says.get("cg", "")
+        source.says["sideslip_rad"] = "atan2(v_y, v_x)" + (" at the CG" if is_moved else "")
         return np.arctan2(vy, vx)
     if "sideslip_rad" in source:
-        says["sideslip_rad"] = source.name("sideslip_rad")
-        return source.column("sideslip_rad")
-    return np.full(source.stamps_ns.shape[0], np.nan)
+        source.says["sideslip_rad"] = source.name("sideslip_rad")
+    return source.column("sideslip_rad")
 
 
-def _lateral_acceleration(
-    source: _Source, vx: FloatArray, vy: FloatArray, rate: FloatArray, says: dict[str, str]
-) -> FloatArray:
+def _lateral_acceleration(source: _Source, vx: FloatArray, vy: FloatArray, rate: FloatArray) -> FloatArray:
+    says, attitude, gradient = source.says, source.plan.attitude, source.plan.roll_gradient_rad_per_m_s2
     if "ay_m_s2" in source:
-        ay = source.column("ay_m_s2")
+        ay, (x, y, _) = source.column("ay_m_s2"), source.plan.position_m
         says["ay_m_s2"] = source.name("ay_m_s2")
-        x, y, _ = source.plan.position_m
         if (x, y) != (0.0, 0.0) and "yaw_rate_rad_s" in says:
-            says["ay_m_s2"] += ", moved to the CG"
+            says["ay_m_s2"] += f", {_MOVED}"
             ay = ay - source.derivative(rate) * x + rate * rate * y
         return ay
-    if "vy_m_s" in says and "yaw_rate_rad_s" in says:
-        attitude, gradient = source.plan.attitude, source.plan.roll_gradient_rad_per_m_s2
-        if attitude is not None and attitude.has_roll and gradient != 0.0:
-            says["ay_m_s2"] = _AY_DERIVED
-            gravity = GRAVITY_M_S2 * source.rotation(attitude)[:, 2, 1]
-            return (source.derivative(vy) + vx * rate + gravity) / (1.0 + GRAVITY_M_S2 * gradient)
+    if not {"vy_m_s", "yaw_rate_rad_s"} <= says.keys():
+        return source.unknown
+    if attitude is None or not attitude.has_roll or gradient == 0.0:
         says["ay_m_s2"] = _AY_UNKNOWN
-    return np.full(source.stamps_ns.shape[0], np.nan)
+        return source.unknown
+    says["ay_m_s2"] = _AY_DERIVED
+    gravity = GRAVITY_M_S2 * source.rotation(attitude)[:, 2, 1]
+    return (source.derivative(vy) + vx * rate + gravity) / (1.0 + GRAVITY_M_S2 * gradient)
 
 
-# ---- latency and dependence ----
+# ---- dependence ----
 
 
-def _same_share(a: Channel, b: Channel) -> float:
+def same_share(a: Channel, b: Channel) -> float:
     """Return the share of equal values at common stamps, or by index for equal lengths; 0 with too few samples."""
     _, i, j = np.intersect1d(a.stamps_ns, b.stamps_ns, assume_unique=True, return_indices=True)
     shares = [0.0]

@@ -16,7 +16,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.store import check_output, update_car
-from pdhef_logtool.drive.model_file import Sensors
+from pdhef_logtool.drive.plan import Sensors
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.learning.drives import (
     DriveRecord,

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from pdhef_logtool.mapping.channels import MappedChannels as MappedChannels
-from pdhef_logtool.mapping.channels import clean_samples as clean_samples
-from pdhef_logtool.mapping.channels import gate_mask as gate_mask
 from pdhef_logtool.mapping.channels import merge_losses as merge_losses
 from pdhef_logtool.mapping.channels import read_signals as read_signals
 from pdhef_logtool.mapping.checking import check_mapping as check_mapping
 from pdhef_logtool.mapping.checking import resolve_mapping as resolve_mapping
-from pdhef_logtool.mapping.choosing import ChosenMapping as ChosenMapping
 from pdhef_logtool.mapping.choosing import choose_mapping as choose_mapping
 from pdhef_logtool.mapping.choosing import tables_for as tables_for
 from pdhef_logtool.mapping.clocks import ClockModel as ClockModel
-from pdhef_logtool.mapping.clocks import apply_clock as apply_clock
 from pdhef_logtool.mapping.clocks import clock_key as clock_key
-from pdhef_logtool.mapping.clocks import fit_clock_line as fit_clock_line
 from pdhef_logtool.mapping.clocks import fit_clocks as fit_clocks
 from pdhef_logtool.mapping.mapping_file import load_mapping as load_mapping
 from pdhef_logtool.mapping.mapping_file import mapping_of as mapping_of
@@ -23,7 +18,6 @@ from pdhef_logtool.mapping.mapping_file import mapping_to_toml as mapping_to_tom
 from pdhef_logtool.mapping.recognition import Ambiguity as Ambiguity
 from pdhef_logtool.mapping.recognition import AutoMapping as AutoMapping
 from pdhef_logtool.mapping.recognition import auto_map as auto_map
-from pdhef_logtool.mapping.records import VECTOR_COLUMNS as VECTOR_COLUMNS
 from pdhef_logtool.mapping.records import Mapping as Mapping
 from pdhef_logtool.mapping.records import QualityGate as QualityGate
 from pdhef_logtool.mapping.records import SignalSource as SignalSource

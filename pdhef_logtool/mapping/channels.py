@@ -122,9 +122,9 @@ def gate_mask(
     if gate_stamps_ns.shape[0] == 0:
         return np.zeros(stamps_ns.shape[0], np.bool_)
     passes = np.zeros(gate_values.shape[0], np.bool_)
-    if gate.minimum is not None or gate.maximum is not None:
-        low = -np.inf if gate.minimum is None else gate.minimum
-        high = np.inf if gate.maximum is None else gate.maximum
+    if gate.min is not None or gate.max is not None:
+        low = -np.inf if gate.min is None else gate.min
+        high = np.inf if gate.max is None else gate.max
         passes |= (gate_values >= low) & (gate_values <= high)
     if gate.values:
         passes |= np.isin(gate_values, np.asarray(gate.values))
@@ -158,28 +158,17 @@ def read_signals(
     for source in (*resolved.signals.values(), *resolved.truth.values()):
         request_source(log, source, requests)
     columns = log.read(requests, start_ns, end_ns, stamps=stamps) if requests or stamps else {}
-    losses = _topic_losses(log, resolved, clocks, columns)
+    reading = _Reading(log, clocks, columns)
+    for source in (*resolved.signals.values(), *resolved.truth.values()):
+        reading.times(source)
     if isinstance(log, CanSignalLog):
-        losses += log.short_frames
-    counts: dict[tuple[Role, str], Counter[str]] = {}
-    timed: dict[tuple[str, float], _Times] = {}
-
-    def channels(role: Role, sources: Mapped[str, SignalSource], units: Mapped[str, str]) -> dict[str, Channel]:
-        result = {}
-        for name, source in sources.items():
-            count = counts[role, name] = Counter()
-            result[name] = _channel(log, source, units.get(name, ""), clocks, columns, losses, count, timed)
-        return result
-
-    signals = channels("signal", resolved.signals, SIGNAL_UNITS)
-    truth = channels("truth", resolved.truth, TRUTH_UNITS)
+        reading.losses += log.short_frames
+    signals = {n: reading.channel("signal", s, SIGNAL_UNITS.get(n, "")) for n, s in resolved.signals.items()}
+    truth = {n: reading.channel("truth", s, TRUTH_UNITS.get(n, "")) for n, s in resolved.truth.items()}
     if gate is not None and truth:
-        before = truth
-        truth = _apply_gate(log, gate, truth, clocks, start_ns, end_ns, losses)
-        for name, channel in truth.items():
-            counts["truth", name]["truth-quality"] += len(before[name]) - len(channel)
+        truth = reading.gated(gate, truth, start_ns, end_ns)
     times = {topic: columns[topic] for topic in stamps}
-    return MappedChannels(signals, truth, merge_losses([losses]), counts, times)
+    return MappedChannels(signals, truth, merge_losses([reading.losses]), reading.counts, times)
 
 
 def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
@@ -205,104 +194,112 @@ def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
 
 def dropped(kind: str, where: str, log_time_ns: IntArray) -> Loss:
     """Return the loss record of samples with these log times [N]."""
-    return Loss(
-        kind=kind,
-        what=LOSS_TEXTS[kind],
-        where=where,
-        start_ns=int(log_time_ns.min()) if log_time_ns.shape[0] else None,
-        end_ns=int(log_time_ns.max()) + 1 if log_time_ns.shape[0] else None,
-        count=int(log_time_ns.shape[0]),
-        severity="lost" if kind in LOST_KINDS else "note",
-    )
-
-
-def _topic_losses(
-    log: DriveLog, mapping: Mapping, clocks: dict[str, ClockModel], columns: dict[str, Columns]
-) -> list[Loss]:
-    """Count the losses by the stamps of each topic once, independent of its number of signals."""
-    losses: list[Loss] = []
-    seen: set[str] = set()
-    for source in (*mapping.signals.values(), *mapping.truth.values()):
-        key = clock_key(source)
-        if key in seen or source.read_topic not in columns:
-            continue
-        seen.add(key)
-        topic = columns[source.read_topic]
-        clock = clocks.get(key, ClockModel())
-        stamps, usable = stamps_on_log_clock(log, topic, source, clock)
-        times = topic.log_time_ns
-        if not usable.all():
-            losses.append(dropped("bad-stamp", source.read_topic, times[~usable]))
-            stamps, times = stamps[usable], times[usable]
-        if stamps.shape[0] > 1 and not np.all(stamps[1:] > stamps[:-1]):
-            late = np.concatenate([[False], stamps[1:] < np.maximum.accumulate(stamps)[:-1]])
-            if late.any():
-                losses.append(dropped("out-of-order", source.read_topic, times[late]))
-            order = np.argsort(stamps, kind="stable")
-            repeated = np.concatenate([[False], stamps[order][1:] == stamps[order][:-1]])
-            if repeated.any():
-                losses.append(dropped("duplicate-stamp", source.read_topic, times[order[repeated]]))
-        if clock.unusable:
-            what = f"log time is used instead of {source.stamp}: {clock.unusable}"
-            losses.append(Loss("log-time-serves", what, source.read_topic, severity="note"))
-        if not clock.delay_known:
-            losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], source.read_topic, severity="note"))
-    return losses
+    n = int(log_time_ns.shape[0])
+    start, end = (int(log_time_ns.min()), int(log_time_ns.max()) + 1) if n else (None, None)
+    return Loss(kind, LOSS_TEXTS[kind], where, start, end, n, "lost" if kind in LOST_KINDS else "note")
 
 
 class _Times(NamedTuple):
-    """Times of a topic's messages for one latency: measured and arrived [N], and which messages these are [M]."""
+    """Usable stamps of a topic on the log's clock and their log times [N], and which messages these are [M]."""
 
-    measured_ns: IntArray
-    arrival_ns: IntArray
+    stamps_ns: IntArray
+    log_time_ns: IntArray
     usable: BoolArray
 
 
-def _times(log: DriveLog, topic: Columns, source: SignalSource, clock: ClockModel) -> _Times:
-    on_log_clock, usable = stamps_on_log_clock(log, topic, source, clock)
-    log_time = topic.log_time_ns
-    if not usable.all():
-        on_log_clock, log_time = on_log_clock[usable], log_time[usable]
-    measured = on_log_clock - np.int64(round(source.latency_s * 1e9))
-    return _Times(measured, np.maximum(log_time if clock.delay_known else on_log_clock, measured), usable)
+@dataclass(slots=True)
+class _Reading:
+    """Columns of topics, and what their channels share. Each topic's losses by its stamps are counted once."""
 
+    log: DriveLog
+    clocks: Mapped[str, ClockModel]
+    columns: Mapped[str, Columns]
+    losses: list[Loss] = field(default_factory=list)
+    counts: dict[tuple[Role, str], Counter[str]] = field(default_factory=dict)
+    timed: dict[str, _Times] = field(default_factory=dict)
+    measured: dict[tuple[str, float], tuple[IntArray, IntArray]] = field(default_factory=dict)
 
-def _channel(
-    log: DriveLog,
-    source: SignalSource,
-    unit: str,
-    clocks: dict[str, ClockModel],
-    columns: dict[str, Columns],
-    losses: list[Loss],
-    count: Counter[str],
-    timed: dict[tuple[str, float], _Times],
-) -> Channel:
-    """Return the clean channel of a source; append to ``losses`` and count its samples in ``count``.
+    def times(self, source: SignalSource) -> _Times | None:
+        """Return the times of a source's topic; None if it was not read."""
+        key, where, topic = clock_key(source), source.read_topic, self.columns.get(source.read_topic)
+        if key in self.timed or topic is None:
+            return self.timed.get(key)
+        clock = self.clocks.get(key, ClockModel())
+        stamps, usable = stamps_on_log_clock(self.log, topic, source, clock)
+        times = topic.log_time_ns
+        if not usable.all():
+            self.losses.append(dropped("bad-stamp", where, times[~usable]))
+            stamps, times = stamps[usable], times[usable]
+        if stamps.shape[0] > 1 and not np.all(stamps[1:] > stamps[:-1]):
+            late = np.concatenate([[False], stamps[1:] < np.maximum.accumulate(stamps)[:-1]])
+            order = np.argsort(stamps, kind="stable")
+            repeated = np.concatenate([[False], stamps[order][1:] == stamps[order][:-1]])
+            lost = {"out-of-order": times[late], "duplicate-stamp": times[order[repeated]]}
+            self.losses += [dropped(kind, where, lost_ns) for kind, lost_ns in lost.items() if lost_ns.size]
+        if clock.unusable:
+            what = f"log time is used instead of {source.stamp}: {clock.unusable}"
+            self.losses.append(Loss("log-time-serves", what, where, severity="note"))
+        if not clock.delay_known:
+            self.losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], where, severity="note"))
+        return self.timed.setdefault(key, _Times(stamps, times, usable))
 
-    ``timed``: times of the topics, which their channels share.
-    """
-    topic = columns.get(source.read_topic)
-    if topic is None or len(topic) == 0:
-        empty = np.empty(0, np.int64)
-        shape = (0,) if source.columns == 1 else (0, source.columns)
-        return Channel(source.name, unit, source.label, empty, empty, np.empty(shape))
-    key = (clock_key(source), source.latency_s)
-    if key not in timed:
-        timed[key] = _times(log, topic, source, clocks.get(key[0], ClockModel()))
-    measured, arrival, usable = timed[key]
-    values, log_time = si_values(topic, source), topic.log_time_ns
-    count.update({"read": len(topic), "bad-stamp": int(np.count_nonzero(~usable))})
-    if not usable.all():
-        values, log_time = values[usable], log_time[usable]
-    clean = clean_samples(measured, arrival, values, valid_min=source.valid_min, valid_max=source.valid_max)
-    where = f"{source.name} ({source.label})"
-    count.update({"nan": clean.nan_at.shape[0], "out-of-range": clean.out_of_range_at.shape[0]})
-    count.update({"repeated": clean.same, "duplicate-stamp": clean.other})
-    if clean.nan_at.shape[0]:
-        losses.append(dropped("nan", where, log_time[clean.nan_at]))
-    if clean.out_of_range_at.shape[0]:
-        losses.append(dropped("out-of-range", where, log_time[clean.out_of_range_at]))
-    return Channel(source.name, unit, source.label, clean.stamps_ns, clean.arrival_ns, clean.values)
+    def channel(self, role: Role, source: SignalSource, unit: str) -> Channel:
+        """Return the clean channel of a source, and count its samples and losses."""
+        count = self.counts[role, source.name] = Counter()
+        topic, times = self.columns.get(source.read_topic), self.times(source)
+        if topic is None or times is None or len(topic) == 0:
+            empty = np.empty(0, np.int64)
+            shape = (0,) if source.columns == 1 else (0, source.columns)
+            return Channel(source.name, unit, source.label, empty, empty, np.empty(shape))
+        key = (clock_key(source), source.latency_s)
+        if key not in self.measured:  # channels of one topic share their stamps
+            measured_ns = times.stamps_ns - np.int64(round(source.latency_s * 1e9))
+            is_known = self.clocks.get(key[0], ClockModel()).delay_known
+            arrived_ns = np.maximum(times.log_time_ns if is_known else times.stamps_ns, measured_ns)
+            self.measured[key] = measured_ns, arrived_ns
+        values = si_values(topic, source)
+        if not times.usable.all():
+            values = values[times.usable]
+        low, high = source.valid_min, source.valid_max
+        clean = clean_samples(*self.measured[key], values, valid_min=low, valid_max=high)
+        lost = {"nan": clean.nan_at, "out-of-range": clean.out_of_range_at}
+        count.update({"read": len(topic), "bad-stamp": int(np.count_nonzero(~times.usable))})
+        count.update({kind: rows.shape[0] for kind, rows in lost.items()})
+        count.update({"repeated": clean.same, "duplicate-stamp": clean.other})
+        where = f"{source.name} ({source.label})"
+        self.losses += [dropped(kind, where, times.log_time_ns[rows]) for kind, rows in lost.items() if rows.size]
+        return Channel(source.name, unit, source.label, clean.stamps_ns, clean.arrival_ns, clean.values)
+
+    def gated(self, gate: QualityGate, truth: dict[str, Channel], start_ns: int, end_ns: int) -> dict[str, Channel]:
+        """Return the ground truth that passes the gate, and count what does not."""
+        source = gate.as_source()
+        period_ns = self.clocks.get(clock_key(source), ClockModel()).median_period_s * 1e9
+        # A gate that was sent once applies to the whole log.
+        whole_ns = max(0, self.log.end_ns - self.log.start_ns)
+        hold_ns = int(GATE_HOLD_PERIODS * period_ns) if np.isfinite(period_ns) else whole_ns
+        requests: dict[str, list[str]] = {}
+        request_source(self.log, source, requests)
+        # Ground truth in this window may depend on a gate message that was recorded before the window, or after it.
+        columns = self.log.read(requests, start_ns - hold_ns - GATE_MARGIN_NS, end_ns + GATE_MARGIN_NS)
+        stamps, values, times = (
+            np.empty(0, np.int64),
+            np.empty(0),
+            _Reading(self.log, self.clocks, columns).times(source),
+        )
+        if times is not None and times.usable.size:
+            stamps = times.stamps_ns - np.int64(round(source.latency_s * 1e9))
+            values = si_values(columns[source.read_topic], source)[times.usable]
+            order = np.lexsort((values, times.log_time_ns, stamps))
+            stamps, values = stamps[order], values[order]
+        passed: dict[str, Channel] = {}
+        for name, channel in truth.items():
+            keep = gate_mask(channel.stamps_ns, stamps, values, gate, hold_ns)
+            if not keep.all():
+                loss = dropped("truth-quality", f"{name} ({gate.describe()})", channel.arrival_ns[~keep])
+                self.losses.append(loss)
+                self.counts["truth", name]["truth-quality"] += loss.count or 0
+            passed[name] = channel.take(keep)
+        return passed
 
 
 def signed(magnitude: FloatArray, sign: FloatArray) -> FloatArray:
@@ -337,39 +334,3 @@ def si_of(source: SignalSource, parts: Sequence[FloatArray]) -> FloatArray:
     elif (width > 1 and raw.ndim == 1) or (width == 1 and raw.ndim == 2):
         raw = np.full((n, width) if width > 1 else n, np.nan)
     return np.asarray(raw * np.asarray(source.scale) + np.asarray(source.offset), dtype=np.float64)
-
-
-def _apply_gate(
-    log: DriveLog,
-    gate: QualityGate,
-    truth: dict[str, Channel],
-    clocks: dict[str, ClockModel],
-    start_ns: int,
-    end_ns: int,
-    losses: list[Loss],
-) -> dict[str, Channel]:
-    source = gate.as_source()
-    clock = clocks.get(clock_key(source), ClockModel())
-    period_ns = clock.median_period_s * 1e9
-    # A gate that was sent once applies to the whole log.
-    hold_ns = int(GATE_HOLD_PERIODS * period_ns) if np.isfinite(period_ns) else max(0, log.end_ns - log.start_ns)
-    requests: dict[str, list[str]] = {}
-    request_source(log, source, requests)
-    # Ground truth in this window may depend on a gate message that was recorded before the window, or after it.
-    columns = log.read(requests, start_ns - hold_ns - GATE_MARGIN_NS, end_ns + GATE_MARGIN_NS)
-    topic = columns.get(source.read_topic)
-    stamps = np.empty(0, np.int64)
-    values = np.empty(0)
-    if topic is not None and len(topic):
-        on_log_clock, usable = stamps_on_log_clock(log, topic, source, clock)
-        gate_stamps = on_log_clock[usable] - np.int64(round(source.latency_s * 1e9))
-        raw_values = si_values(topic, source)[usable]
-        order = np.lexsort((raw_values, topic.log_time_ns[usable], gate_stamps))
-        stamps, values = gate_stamps[order], raw_values[order]
-    gated: dict[str, Channel] = {}
-    for name, channel in truth.items():
-        keep = gate_mask(channel.stamps_ns, stamps, values, gate, hold_ns)
-        if not keep.all():
-            losses.append(dropped("truth-quality", f"{name} ({gate.describe()})", channel.arrival_ns[~keep]))
-        gated[name] = channel.take(keep)
-    return gated

@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.table_file import TableSettings
 from pdhef_logtool.mapping.checking import check_mapping
-from pdhef_logtool.mapping.recognition import RUN, Ambiguity, auto_map
+from pdhef_logtool.mapping.recognition import RUN, AutoMapping, auto_map
 from pdhef_logtool.mapping.records import Mapping
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 
 
-@dataclass(frozen=True, slots=True)
-class ChosenMapping:
-    """The selected mapping and its open points.
-
-    Attributes
-    ----------
-    missing : signals without a source. ambiguities : possible errors.
-    """
-
-    mapping: Mapping
-    missing: tuple[str, ...]
-    ambiguities: tuple[Ambiguity, ...] = ()
-
-
 def choose_mapping(
     log: DriveLog, mapping: Mapping | None, *, prefer_truth: Literal["perfect", "rtk"], require_signals: bool = True
-) -> ChosenMapping:
+) -> AutoMapping:
     """Return the given mapping, or the recognised one; ambiguities are reported, never resolved silently.
 
     Raises
@@ -43,7 +29,7 @@ def choose_mapping(
             mapping = _filled(mapping, auto_map(log, prefer_truth=prefer_truth).mapping)
         check_mapping(mapping, log)
         missing = tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
-        return ChosenMapping(mapping, missing)
+        return AutoMapping(mapping, (), missing)
     auto = auto_map(log, prefer_truth=prefer_truth)
     if runs := next((a.candidates for a in auto.ambiguities if a.subject == RUN), ()):
         raise MappingError(
@@ -59,7 +45,7 @@ def choose_mapping(
             where=str(log.path),
             remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
         )
-    return ChosenMapping(auto.mapping, auto.missing, auto.ambiguities)
+    return auto
 
 
 def tables_for(mapping: Mapping | None, settings: TableSettings) -> TableSettings:

@@ -1,14 +1,22 @@
-"""Fields of a log during the evaluation of candidates: look-ups and relations."""
+"""Fields of a log during the evaluation of candidates: look-ups, relations, the path, and units that no name gives.
+
+Units have a posterior, given gravity, other speeds, a_x ≈ v̇ and a_y ≈ v r.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import Field
-from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, spread
+from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
+from pdhef_logtool.mapping.evidence import CELL_NS, Fit, Pieces, fit, ratio, spread
+from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
 
 #: Smallest correlation that counts as a relation.
@@ -17,6 +25,16 @@ CLEAR = 0.75
 EXCITED_A_M_S2 = 0.25
 #: Standard deviation of the curvature below which a path counts as straight; speed at standstill.
 EXCITED_CURVATURE_1_M, SLOW_M_S = 0.0001, 1.0
+#: Half of the window for a course from positions, in cells.
+_HALF = 5
+#: Quantities of positions.
+PLACES = ("latitude", "longitude", "position")
+#: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
+SAME, BY_DRIVING = 0.03, 0.15
+#: Probability at which a unit counts as known.
+CERTAIN = 0.9
+#: Energies of rare units.
+RARE = {"mph": 1.5, "mg": 1.5}
 
 
 @dataclass(slots=True)
@@ -74,3 +92,175 @@ def mean_of(columns: Sequence[FloatArray]) -> FloatArray:
     finite = np.isfinite(stacked)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(finite, stacked, 0.0).sum(axis=0) / finite.sum(axis=0))
+
+
+# ------------------------------------------------------------------------------------------------ path
+
+
+def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
+    """Return the steps north and east over a second, in m [M], of the first positions that change; None without any."""
+    pairs = {"latitude": "longitude", "position": "position"}
+    for north in (f for f in fields.positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
+        wanted = (pairs[north.meaning.quantity], "x" if north.meaning.part else "")
+        others = [f for f in fields.positions if (f.meaning.quantity, f.meaning.part) == wanted]
+        same = [f for f in others if f.topic.name == north.topic.name]
+        # Recorders with one number per topic store latitude and longitude in different topics.
+        east = same[0] if same else others[0] if len(others) == 1 else None
+        if east is None or not (north.seen.changes or east.seen.changes):
+            continue
+        up, right = _step(fields, north.si), _step(fields, east.si)
+        if north.meaning.quantity == "latitude":
+            up, right = up * DEGREE_M, right * DEGREE_M * math.cos(math.radians(float(np.nanmean(north.si))))
+        if np.isfinite(up).any():
+            return up, right
+    return None
+
+
+def path_velocity(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
+    """Return the velocity north and east along the path of positions, m/s [M]; None without positions."""
+    steps = _path(fields)
+    seconds = 2 * _HALF * CELL_NS * 1e-9
+    return None if steps is None else (steps[0] / seconds, steps[1] / seconds)
+
+
+def path_speed(fields: Fields) -> FloatArray | None:
+    """Return the speed along the path of positions, m/s [M]; None without positions."""
+    velocity = path_velocity(fields)
+    return None if velocity is None else np.hypot(*velocity)
+
+
+def _step(fields: Fields, cells: FloatArray) -> FloatArray:
+    rows = cells.reshape(len(fields.pieces.starts), -1)
+    out = np.full_like(rows, np.nan)
+    out[:, _HALF:-_HALF] = rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]
+    return out.ravel()
+
+
+# ------------------------------------------------------------------------------------------------ units
+
+
+class Unit(NamedTuple):
+    """A unit of a field. ``factor`` to SI, with the 1-sigma ``spread`` of its logarithm; ``energy``: -ln prior odds."""
+
+    name: str
+    factor: float
+    quantity: str = ""
+    spread: float = 0.0
+    energy: float = 0.0
+
+
+class Gain(NamedTuple):
+    """A measured gain that is 1, but for a factor of 1-sigma ``sigma``, in the right units of some fields.
+
+    ``powers``: exponents of the fields' factors in the gain. ``broken``: probability that the relation does not apply.
+    """
+
+    powers: tuple[int, ...]
+    gain: float
+    sigma: float
+    broken: float = 0.01
+
+
+def posterior(units: Sequence[Sequence[Unit]], gains: Sequence[Gain]) -> FloatArray:
+    """Return the probabilities [K_1, K_2, ...] of the combinations of the K_i units of each field i.
+
+    The logarithm of a gain is normal; if its relation does not apply, it is uniform over a range of four. The
+    probabilities sum to less than 1: the rest is the probability that a relation does not apply.
+    """
+    grids = np.meshgrid(*(range(len(ways)) for ways in units), indexing="ij")
+    factors, spreads, energies = (
+        [np.array([getattr(u, name) for u in ways])[grid] for ways, grid in zip(units, grids, strict=True)]
+        for name in ("factor", "spread", "energy")
+    )
+    applies = total = np.exp(-np.sum(energies, axis=0))
+    for gain in gains:
+        off, variance = math.log(abs(gain.gain)), gain.sigma**2
+        for factor, width, power in zip(factors, spreads, gain.powers, strict=True):
+            off, variance = off + power * np.log(factor), variance + (power * width) ** 2
+        density = (1.0 - gain.broken) * np.exp(-(off**2) / (2.0 * variance)) / np.sqrt(2.0 * np.pi * variance)
+        applies, total = applies * density, total * (density + 0.25 * gain.broken)
+    return np.asarray(applies / total.sum())
+
+
+def settle(items: Sequence[Field], gains: Sequence[Gain], by: str, bonus: float = 0.0) -> None:
+    """Select the units that are certain given these gains; fields with an uncertain name gain the score ``bonus``."""
+    if not gains:
+        return
+    joint = posterior([[Unit(*u, energy=RARE.get(u[0], 0.0)) for u in f.units] for f in items], gains)
+    for axis, item in enumerate(items):
+        share = joint.sum(axis=tuple(i for i in range(joint.ndim) if i != axis))
+        if share.max() < CERTAIN or item.fixed:
+            continue
+        if not item.unit_known:
+            item.use(item.units[int(share.argmax())][0])
+            item.reasons.append(f"unit {item.factors[0][0]} by {by}")
+        item.bonus += bonus if item.score < LEAST_SCORE else 0.0
+
+
+def decide_units(fields: Fields) -> None:
+    """Determine units that no name gives: by gravity first, then by relations between quantities."""
+    _by_gravity(fields)
+    _speeds(fields)
+    _by_speeding_up(fields)
+    _by_turning(fields)
+    _by_siblings(fields)
+
+
+def _by_gravity(fields: Fields) -> None:
+    groups: dict[str, dict[str, Field]] = {}
+    for item in fields.candidates:
+        if item.meaning.quantity == "acceleration" and item.is_axis:
+            groups.setdefault(triad_of(item), {})[item.meaning.part] = item
+        elif item.meaning.quantity == "acceleration" and item.meaning.part == "z":  # named vertical, without a triad
+            groups[f"{triad_of(item)}.{item.path}"] = {"z": item}
+    for axes in groups.values():
+        if set(axes) in ({"z"}, set("xyz")):
+            size = float(np.linalg.norm([np.nanmean(f.seen.values) for f in axes.values()]))
+            for item in axes.values() if size > 0.0 else ():
+                settle((item,), [Gain((1,), size / G_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
+
+
+def _speeds(fields: Fields) -> None:
+    """Determine the units of speeds by a known speed and by positions."""
+    settled = [f for f in fields.all("speed") if f.unit_known or f.fixed]
+    reference = max(settled, key=lambda f: f.score, default=None)
+    path = path_speed(fields)
+    for item in fields.all("speed"):
+        others = [path, None if reference is None or reference is item else reference.si]
+        times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others if other is not None]
+        settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x is not None and x > 0.0], "other speeds")
+
+
+def _by_speeding_up(fields: Fields) -> None:
+    """Determine the units of speeds and of a_x by a_x ≈ v̇."""
+    for speed, ax in itertools.product(fields.open("speed"), fields.open("acceleration", "x")):
+        # With two unknown units, x of a vector is ambiguous: it may be in the world frame.
+        if len(ax.units) > 1 < len(speed.units) and speed.is_axis and speed.meaning.part == "x":
+            continue
+        relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
+        if relation is not None and relation.correlation >= CLEAR:
+            settle((ax, speed), [Gain((1, -1), relation.slope, BY_DRIVING)], "a_x ≈ v̇", bonus=0.3)
+
+
+def _by_turning(fields: Fields) -> None:
+    """Determine the units of a_y, yaw rate and speed by a_y ≈ v r."""
+    speed = fields.best("speed")
+    if speed is None:
+        return
+    for rate, ay in itertools.product(fields.open("rate", "z")[:4], fields.open("acceleration", "y")[:4]):
+        relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
+        if relation is not None and abs(relation.correlation) > CLEAR:
+            settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
+
+
+def _by_siblings(fields: Fields) -> None:
+    """Use the unit of other accelerations, or velocities, of the same message."""
+    for kinds in ({"acceleration"}, {"speed", "velocity"}):
+        settled = {leaf_group(f): f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known}
+        mine = (f for f in fields.candidates if f.meaning.quantity in kinds and f.meaning.strength > 0.6)
+        for item in [f for f in mine if not f.unit_known and leaf_group(f) in settled]:
+            other = settled[leaf_group(item)]
+            same = [u for u, s in item.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
+            if same:
+                item.use(same[0])
+                item.reasons.append(f"unit {same[0]} as of {other.path}")

@@ -8,24 +8,19 @@ from collections.abc import Mapping as MappingABC
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
 
 from pdhef_logtool.mapping.naming import UNITS, plain_unit, unit_of
 from pdhef_logtool.mapping.records import (
-    AUTO_STAMP,
     CAN_PREFIX,
     RECORDER_STAMPS,
-    VECTOR_COLUMNS,
-    CanDataEncoding,
     CanSettings,
-    Clock,
-    Combine,
     Mapping,
     QualityGate,
     SignalSource,
-    StampUnit,
 )
 from pdhef_logtool.records.errors import MappingError, MappingFileError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
@@ -43,77 +38,48 @@ RESERVED_NAMES = ("truth", "sensors", "reference")
 #: Kind of unit of a quantity by its SI unit.
 _KINDS = {"rad": "angle", "rad/s": "rate", "m/s": "speed", "m/s^2": "acceleration", "m": "position"}
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Name = Annotated[str, Field(min_length=1)]
+Kind = TypeVar("Kind", SignalSource, QualityGate, CanSettings)
+#: Classes that check the entries of a record.
+_CHECKED: dict[type, Any] = {
+    kind: dataclass(
+        kind,
+        frozen=True,
+        config=ConfigDict(extra="forbid", strict=True, str_min_length=1, allow_inf_nan=False, defer_build=True),
+    )
+    for kind in (SignalSource, QualityGate, CanSettings)
+}
 
 
-class _Timed(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
-
-    topic: Name
-    stamp: Name = AUTO_STAMP
-    latency_s: Finite = 0.0
-    stamp_unit: StampUnit = "ros"
-    clock: Clock = "utc"
-
-    @model_validator(mode="after")
-    def _device_clock_has_a_stamp(self) -> _Timed:
-        if self.clock == "device" and self.stamp in RECORDER_STAMPS:
-            raise ValueError(f'clock = "device" needs a stamp of the device, not "{self.stamp}"')
-        return self
-
-
-class _SourceTable(_Timed):
-    field: Name | Annotated[list[Name], Field(min_length=1)]
-    scale: Finite | list[Finite] = 1.0
-    unit: Name | None = None
-    offset: Finite | list[Finite] = 0.0
-    valid_min: Finite | None = None
-    valid_max: Finite | None = None
-    combine: Combine = "sum"
-
-    @model_validator(mode="after")
-    def _values_make_sense(self) -> _SourceTable:
-        if any(s == 0.0 for s in (self.scale if isinstance(self.scale, list) else [self.scale])):
-            raise ValueError("scale must not be 0")
-        if self.valid_min is not None and self.valid_max is not None and self.valid_min >= self.valid_max:
-            raise ValueError("valid_min must be below valid_max")
-        return self
+def _record(kind: type[Kind], raw: object, where: str, problems: list[str], **more: object) -> Kind | None:
+    """Return the record of a table with ``more`` entries; None after adding to ``problems``."""
+    if not isinstance(raw, dict):
+        checked(_CHECKED[kind], raw, where, problems)
+        return None
+    problems += [unknown(name, [f.name for f in fields(kind)], where) for name in more.keys() & raw.keys()]
+    table = {key: tuple(v) if isinstance(v, list) else v for key, v in raw.items()}
+    entries = checked(_CHECKED[kind], {**table, **more}, where, problems)
+    record = None if entries is None else kind(**{f.name: getattr(entries, f.name) for f in fields(kind)})
+    if record is not None and (problem := _problem_of(record)):
+        problems.append(f"{where}: {problem}")
+        return None
+    return record
 
 
-class _GateTable(_Timed):
-    field: Name
-    min: Finite | None = None
-    max: Finite | None = None
-    values: list[Finite] = Field(default_factory=list)
-
-    @model_validator(mode="after")
-    def _has_a_condition(self) -> _GateTable:
-        if self.min is None and self.max is None and not self.values:
-            raise ValueError("give min, max or values")
-        if self.min is not None and self.max is not None and self.min > self.max:
-            raise ValueError("min must not be above max")
-        return self
-
-
-class _CanTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
-
-    dbc: Name | Annotated[list[Name], Field(min_length=1)]
-    id_field: str = ""
-    data_field: str = ""
-    data_encoding: CanDataEncoding = "bytes"
-    length_field: str = ""
-    extended_field: str = ""
-    bus_field: str = ""
-    bus: int | None = None
-    id_mask: Annotated[int, Field(ge=1, lt=1 << 29)] = (1 << 29) - 1
-
-    @model_validator(mode="after")
-    def _bus_has_a_field(self) -> _CanTable:
-        if (self.bus is None) != (not self.bus_field):
-            raise ValueError("bus and bus_field belong together")
-        return self
+def _problem_of(record: SignalSource | QualityGate | CanSettings) -> str:
+    """Return which entries of a record contradict one another; empty without a contradiction."""
+    if isinstance(record, CanSettings):
+        if not 1 <= record.id_mask <= (most := CanSettings(()).id_mask):
+            return f"id_mask should be from 1 to {most}"
+        return "" if (record.bus is None) == (not record.bus_field) else "bus and bus_field belong together"
+    if record.clock == "device" and record.stamp in RECORDER_STAMPS:
+        return f'clock = "device" needs a stamp of the device, not "{record.stamp}"'
+    if isinstance(record, SignalSource):
+        low, high = record.valid_min, record.valid_max
+        is_empty = low is not None and high is not None and low >= high
+        return _shape_problem(record) or ("valid_min must be below valid_max" if is_empty else "")
+    if record.min is not None and record.max is not None and record.min > record.max:
+        return "min must not be above max"
+    return "" if (record.min, record.max, record.values) != (None, None, ()) else "give min, max or values"
 
 
 def mapping_of(given: Mapping | Path | str | None) -> Mapping | None:
@@ -147,20 +113,12 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     MappingFileError : Entries are wrong, unknown, missing or contradict one another.
     """
     sections = (
-        "signals",
-        "truth",
-        "truth_quality",
-        "estimates",
-        "can",
-        "fill_recognised",
-        "recorder",
-        "rate_hz",
-        "group",
-    )
+        "signals", "truth", "truth_quality", "estimates", "can", "fill_recognised", "recorder", "rate_hz", "group",
+    )  # fmt: skip
     problems = [unknown(key, sections) for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
-    quality = _read_gate(raw["truth_quality"], problems) if "truth_quality" in raw else None
+    quality = _record(QualityGate, raw["truth_quality"], "truth_quality", problems) if "truth_quality" in raw else None
     estimates = _read_estimates(raw.get("estimates", {}), problems)
     can = _read_can(raw["can"], folder, problems) if "can" in raw else None
     fill = raw.get("fill_recognised", False)
@@ -206,17 +164,11 @@ def _read_section(
             else:
                 problems.append(unknown(name, allowed, section))
             continue
-        model = checked(_SourceTable, table, where, problems)
-        if model is None:
-            continue
-        scale, problem = _scale(name, model)
-        problem = problem or _shape_problem(name, model)
-        if problem:
-            problems.append(f"{where}: {problem}")
-            continue
-        entries = model.model_dump(exclude={"unit"}) | {"scale": scale}
-        values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in entries.items()}
-        out[name] = SignalSource(name=name, **values)
+        table, problem = _in_si(name, table)
+        problems += [f"{where}: {problem}"] if problem else []
+        source = None if problem else _record(SignalSource, table, where, problems, name=name)
+        if source is not None:
+            out[name] = source
     return out
 
 
@@ -243,72 +195,61 @@ def _read_recorder(raw: object, problems: list[str]) -> tuple[tuple[str, str], .
 
 
 def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | None:
-    model = checked(_CanTable, raw, "can", problems)
-    if model is None:
-        return None
-    files = model.dbc if isinstance(model.dbc, list) else [model.dbc]
-    return CanSettings(dbc=tuple(folder / f for f in files), **model.model_dump(exclude={"dbc"}))
+    files = raw.get("dbc") if isinstance(raw, dict) else None
+    files = [files] if isinstance(files, str) else files
+    if isinstance(raw, dict) and isinstance(files, list) and all(f and isinstance(f, str) for f in files):
+        raw = {**raw, "dbc": tuple(folder / f for f in files) or None}
+    return _record(CanSettings, raw, "can", problems)
 
 
-def _scale(name: str, model: _SourceTable) -> tuple[float | list[float], str]:
-    """Return the scale to SI, from the unit if there is one, and a problem of the unit."""
-    if model.unit is None:
-        return model.scale, ""
+def _in_si(name: str, table: object) -> tuple[object, str]:
+    """Return the table of a source with the scale to SI in place of a unit, and a problem of the unit."""
+    if not isinstance(table, dict) or "unit" not in table:
+        return table, ""
+    unit, scale = table["unit"], table.get("scale", 1.0)
     si = (SIGNAL_UNITS | TRUTH_UNITS | ESTIMATE_UNITS)[name]
     kind = "wheel rate" if si == "rad/s" and name.startswith("wheel") else _KINDS.get(si, "")
     units = UNITS.get(kind, {})
-    factor = unit_of(f"x_{plain_unit(model.unit)}", kind)[1] if units else None
+    factor = unit_of(f"x_{plain_unit(unit)}", kind)[1] if units and isinstance(unit, str) else None
     if factor is None:
-        return model.scale, f'unit = "{model.unit}" is unknown for {si}, known are {", ".join(units) or si}'
-    if isinstance(model.scale, list) or abs(model.scale) != 1.0:
-        return model.scale, "give unit or scale, not both; scale = -1 reverses the sign"
-    return factor * model.scale, ""
+        return table, f'unit = "{unit}" is unknown for {si}, known are {", ".join(units) or si}'
+    if scale not in (1.0, -1.0):
+        return table, "give unit or scale, not both; scale = -1 reverses the sign"
+    return {**{k: v for k, v in table.items() if k != "unit"}, "scale": factor * scale}, ""
 
 
-def _shape_problem(name: str, model: _SourceTable) -> str:
-    columns = VECTOR_COLUMNS.get(name, 1)
-    fields = model.field if isinstance(model.field, list) else [model.field]
-    if model.combine != "sum" and (columns > 1 or len(fields) < 2):
-        what = {"norm": "length", "root": "root of the sum", "signed": "magnitude and sign"}[model.combine]
-        return (
-            f'combine = "{model.combine}" is the {what} of two or more fields, '
-            f"{name} has {columns} columns of {len(fields)}"
-        )
-    problem = _vector_problem(columns, model) if columns > 1 else _scalar_problem(name, len(fields), model)
-    from_can = [f for f in fields if f.startswith(CAN_PREFIX)]
-    if not problem and from_can and (columns > 1 or len(fields) > 1):
-        what = "is a vector" if columns > 1 else "has several fields"
-        return f"{name} {what}: CAN signals of different frames have no common stamp"
-    if not problem and any(f.count(".") != 1 for f in from_can):
-        return f"field must be {CAN_PREFIX}<message>.<signal>"
-    return problem
-
-
-def _vector_problem(columns: int, model: _SourceTable) -> str:
-    for key in ("field", "scale", "offset"):
-        value = getattr(model, key)
-        if isinstance(value, list) and len(value) != columns:
-            return f"{key} must have {columns} entries, got {len(value)}"
-    return ""
-
-
-def _scalar_problem(name: str, fields: int, model: _SourceTable) -> str:
-    if isinstance(model.offset, list):
-        return f"offset must be a single value, {name} is no vector"
-    if fields == 1 and isinstance(model.scale, list):
-        return f"scale must be a single value, {name} is no vector and has one field"
+def _shape_problem(source: SignalSource) -> str:
+    """Return why fields, scale and offset of a source do not fit its columns or one another; empty if they do."""
+    name, columns, fields_, offset = source.name, source.columns, len(source.paths), source.offset
+    scales = source.scale if isinstance(source.scale, tuple) else (source.scale,)
+    problem = ""
+    if 0.0 in scales or not all(source.paths):
+        problem = "scale must not be 0" if 0.0 in scales else "field must not be empty"
+    elif source.combine != "sum" and (columns > 1 or fields_ < 2):
+        what = {"norm": "length", "root": "root of the sum", "signed": "magnitude and sign"}[source.combine]
+        problem = f'combine = "{source.combine}" is the {what} of two or more fields, '
+        problem += f"{name} has {columns} columns of {fields_}"
+    elif columns > 1:
+        lists = {key: v for key in ("field", "scale", "offset") if isinstance(v := getattr(source, key), tuple)}
+        wrong = [f"{key} must have {columns} entries, got {len(v)}" for key, v in lists.items() if len(v) != columns]
+        problem = next(iter(wrong), "")
+    elif isinstance(offset, tuple):
+        problem = f"offset must be a single value, {name} is no vector"
+    elif fields_ == 1 and isinstance(source.scale, tuple):
+        problem = f"scale must be a single value, {name} is no vector and has one field"
     # Sum of several fields: one component of a sensor with rotated axes.
-    if fields > 1 and not (isinstance(model.scale, list) and len(model.scale) == fields):
-        return f"{name} is the sum of its fields, each times its scale: scale must have {fields} entries"
-    return ""
+    elif fields_ > 1 and not (isinstance(source.scale, tuple) and len(scales) == fields_):
+        problem = f"{name} is the sum of its fields, each times its scale: scale must have {fields_} entries"
+    return problem or _problem_of_frames(source)
 
 
-def _read_gate(raw: object, problems: list[str]) -> QualityGate | None:
-    model = checked(_GateTable, raw, "truth_quality", problems)
-    if model is None:
-        return None
-    values = model.model_dump(exclude={"min", "max", "values"})
-    return QualityGate(minimum=model.min, maximum=model.max, values=tuple(model.values), **values)
+def _problem_of_frames(source: SignalSource) -> str:
+    from_can, columns = [f for f in source.paths if f.startswith(CAN_PREFIX)], source.columns
+    if from_can and (columns > 1 or len(source.paths) > 1):
+        what = "is a vector" if columns > 1 else "has several fields"
+        return f"{source.name} {what}: CAN signals of different frames have no common stamp"
+    is_wrong = any(f.count(".") != 1 for f in from_can)
+    return f"field must be {CAN_PREFIX}<message>.<signal>" if is_wrong else ""
 
 
 def contradictions(mapping: Mapping) -> list[str]:
@@ -448,20 +389,19 @@ def missing_signals(mapping: Mapping) -> tuple[str, ...]:
 
 def _source_lines(source: SignalSource) -> list[str]:
     names = ("stamp", "scale", "offset", "latency_s", "valid_min", "valid_max", "stamp_unit", "clock", "combine")
-    lines = _lines(source, {n: n for n in names}, always=("scale",))
+    lines = _lines(source, names, always=("scale",))
     return [f"topic = {_toml(source.topic)}", f"field = {_toml(source.field)}", *lines]
 
 
 def _gate_lines(gate: QualityGate) -> list[str]:
-    names = {"stamp": "stamp", "minimum": "min", "maximum": "max"}
-    names |= {n: n for n in ("values", "latency_s", "stamp_unit", "clock")}
+    names = ("stamp", "min", "max", "values", "latency_s", "stamp_unit", "clock")
     return [f"topic = {_toml(gate.topic)}", f"field = {_toml(gate.field)}", *_lines(gate, names)]
 
 
 def _can_lines(can: CanSettings) -> list[str]:
     files = tuple(path.absolute().as_posix() if path.exists() else path.name for path in can.dbc)
     names = ("id_field", "data_field", "length_field", "extended_field", "bus_field", "data_encoding")
-    lines = ["[can]", f"dbc = {_toml(files)}", *_lines(can, {n: n for n in names})]
+    lines = ["[can]", f"dbc = {_toml(files)}", *_lines(can, names)]
     if can.bus is not None:
         lines.append(f"bus = {can.bus}")
     if can.id_mask != CanSettings(()).id_mask:
@@ -470,12 +410,12 @@ def _can_lines(can: CanSettings) -> list[str]:
 
 
 def _lines(
-    record: SignalSource | QualityGate | CanSettings, names: MappingABC[str, str], always: tuple[str, ...] = ()
+    record: SignalSource | QualityGate | CanSettings, names: Sequence[str], always: tuple[str, ...] = ()
 ) -> list[str]:
-    """Return the entries that differ from the defaults; ``names`` maps names of the record to names in the file."""
+    """Return the entries of these names that differ from the defaults."""
     default = {f.name: f.default for f in fields(record)}
     values = {n: getattr(record, n) for n in names}
-    return [f"{names[n]} = {_toml(v)}" for n, v in values.items() if n in always or v != default[n]]
+    return [f"{n} = {_toml(v)}" for n, v in values.items() if n in always or v != default[n]]
 
 
 def entries_of(source: SignalSource, *names: str) -> str:

@@ -1,28 +1,32 @@
-"""Ground truth of an undocumented navigation system: vectors by their names, the heading convention by the path.
+"""Motion over ground: axes of a velocity, signals of GNSS receivers, and ground truth of navigation systems.
 
 Names contain north, east and up, or ECEF. They rarely define whether a heading is clockwise from north or
-counter-clockwise from east, in degrees or radians. As a car mostly moves in the direction of its heading, the
-convention follows from a comparison with the path.
+counter-clockwise from east, in degrees or radians, or whether x and y are axes of the earth or of the body. As a car
+mostly moves in the direction of its heading, this follows from a comparison with the path and the yaw rate.
+A source that also has a heading (two antennas, INS) or sideslip is ground truth, and never an input of an estimator.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from functools import cached_property
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.mapping.candidates import Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
-from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen
-from pdhef_logtool.mapping.naming import Meaning, meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
+from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
+from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.records.geometry import DEGREE_M
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.mapping.vendors import Vendors, load_vendors
+from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
 
 #: Minimum speed for the course to be the direction of the car.
 MOVING_M_S = 3.0
@@ -43,10 +47,232 @@ _CONVENTIONS = (
     ("degrees counter-clockwise from east", math.radians(1.0), 0.0),
     ("radians counter-clockwise from east", 1.0, 0.0),
 )
+#: Tolerance of the ratio of a velocity to the speed from positions; speed over ground over that along the path if the
+#: axes are the earth's; share of the time that a body moves ahead.
+NEAR_PATH, SAME_STEPS, AHEAD_SHARE = 0.08, (0.7, 1.4), 0.6
+#: Least share of its y axis in a path: along the x axis, velocities over ground and of the body are equal.
+ACROSS_SHARE = 0.1
+#: Axes of the x and y of a velocity; empty if the drive does not show them, "not ahead" if they are not the body's.
+Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
+#: Note on every speed that is a length.
+NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative: in reverse it has the wrong sign"
+_EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
+#: Ground truth with one of these contains a heading, or motion that needs one.
+HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
+#: Course of a single antenna in addition to a heading from two antennas: a sensor, even of a ground-truth instrument.
+RAW_COURSE = "heading_raw"
 
 
 #: Ground-truth quantities of one topic, and the note on their source.
 NavigationTruth: TypeAlias = tuple[dict[str, SignalSource], str]
+
+
+def length_of(velocity: SignalSource) -> SignalSource:
+    """Return the speed from a ground-truth velocity: the length of its horizontal part, of all three axes in ECEF."""
+    level = len(velocity.paths) if velocity.name == "ecef_velocity_m_s" else 2
+    scale = velocity.scale[:level] if isinstance(velocity.scale, tuple) else (velocity.scale,) * level
+    return replace(velocity, name="speed_m_s", field=velocity.paths[:level], scale=scale, offset=0.0, combine="norm")
+
+
+def axes_of(
+    pieces: Pieces, x: FloatArray, y: FloatArray, steps: tuple[FloatArray, FloatArray] | None, rate: FloatArray | None
+) -> Axes:
+    """Return the axes of a horizontal velocity [M]; x and y in any unit.
+
+    Parameters
+    ----------
+    steps : of a path, north and east. rate : yaw rate in any unit. Over ground, the direction of the velocity turns
+        with the car; in the body's axes it stays ahead.
+    """
+    orders: tuple[tuple[Axes, FloatArray, FloatArray], ...] = ()
+    if steps is not None:
+        north, east = steps
+        orders = (("east, north", east, north), ("north, east", north, east))
+    for order, *along in orders:
+        fits = [fit(a, b) for a, b in zip(along, (x, y), strict=True)]
+        is_across = np.nanmean(along[1] ** 2) > ACROSS_SHARE**2 * np.nanmean(along[0] ** 2 + along[1] ** 2)
+        if is_across and all(
+            f is not None and f.correlation > CLEAR and SAME_STEPS[0] < f.slope < SAME_STEPS[1] for f in fits
+        ):
+            return order
+    length = np.hypot(x, y)
+    moving = length > SLOW_M_S
+    with np.errstate(invalid="ignore", divide="ignore"):
+        turning = np.where(moving, (x * pieces.rate_of(y) - y * pieces.rate_of(x)) / length**2, np.nan)
+    relation = None if rate is None else fit(pieces.smooth(rate), turning)
+    sense = _sense(relation)
+    if sense > 0.0:
+        return "east, north"
+    enough = np.count_nonzero(moving) >= FEWEST_CELLS
+    # A car may reverse; without a path, a direction that is often opposite shows axes of the earth.
+    ahead = x if steps is None else np.abs(x)
+    is_ahead = not enough or bool(np.mean((ahead > np.abs(y))[moving]) >= AHEAD_SHARE)
+    if sense < 0.0 and steps is None:  # in a slide the direction in the body's axes turns against the car, too
+        return "" if is_ahead else "north, east"
+    if not is_ahead:
+        return "not ahead"
+    return "" if relation is None else "body"
+
+
+def _sense(relation: Fit | None) -> float:
+    """Return the sign with which a direction turns with the yaw rate, rad/s or deg/s; 0 if unclear.
+
+    The direction over ground turns as fast as the car; a sideslip that follows the yaw rate turns less.
+    """
+    if relation is None or abs(relation.correlation) <= CLEAR:
+        return 0.0
+    is_equal = any(SAME_STEPS[0] < relation.slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0)))
+    return math.copysign(float(is_equal or relation.slope < 0.0), relation.slope)
+
+
+def twist_axes(log: DriveLog, velocity: SignalSource, references: Sequence[SignalSource]) -> Axes:
+    """Return the axes of a velocity's first two fields by positions and a yaw rate among ``references``.
+
+    A velocity with another size than that along the path is in an unknown unit: its axes are unknown, too.
+    """
+    pieces, read, anchors = _read(log, (velocity, *references))
+    x, y = (read.get((velocity.topic, path)) for path in velocity.paths[:2])
+    if x is None or y is None:
+        return ""
+    fields = _on_path(pieces, anchors)
+    path = path_speed(fields)
+    times = None if path is None else ratio(path, np.hypot(x.cells, y.cells), SLOW_M_S)
+    if times is not None and abs(times - 1.0) > NEAR_PATH:
+        return ""
+    rate = next((f.si for f in anchors if f.meaning.quantity == "rate"), None)
+    return axes_of(pieces, x.cells, y.cells, path_velocity(fields), rate)
+
+
+def _read(log: DriveLog, sources: Sequence[SignalSource]) -> tuple[Pieces, dict[tuple[str, str], Seen], list[Field]]:
+    """Read sources in a few pieces of a log; return them also as fields."""
+    pieces, requests = Pieces(log), dict[str, list[str]]()
+    for source in sources:
+        requests.setdefault(source.topic, []).extend(source.paths)
+    read = pieces.read(requests)
+    return pieces, read, anchors_of(log, sources, read)
+
+
+def _on_path(pieces: Pieces, anchors: Sequence[Field]) -> Fields:
+    return Fields(pieces, {}, [], [f for f in anchors if f.meaning.quantity in PLACES])
+
+
+# ------------------------------------------------------------------------------------------------ receivers
+
+
+def has_heading(truth: Collection[str]) -> bool:
+    """Return whether ground truth contains a heading, or motion that needs one."""
+    return bool(HEADING & set(truth))
+
+
+def gnss_signals(signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
+    """Return the GNSS signals that mapped ground truth contains: a velocity, or speed and course of one topic."""
+    if has_heading(truth):
+        return {}
+    if (velocity := truth.get("enu_velocity_m_s")) is not None:
+        return {name: component(velocity, name, i) for i, name in enumerate((_EAST, _NORTH))}
+    course = truth.get("course_rad")
+    speeds = [s for s in (signals.get("speed_m_s"), truth.get("vx_m_s")) if s is not None]
+    if course is None or not any(s.topic == course.topic for s in speeds):
+        return {}
+    speed = next(s for s in speeds if s.topic == course.topic)
+    return {
+        name: replace(source, name=name) for name, source in (("gnss_speed_m_s", speed), ("gnss_course_rad", course))
+    }
+
+
+def component(vector: SignalSource, name: str, column: int) -> SignalSource:
+    """Return one column of a vector as a separate signal."""
+    scale, offset = (value[column] if isinstance(value, tuple) else value for value in (vector.scale, vector.offset))
+    return replace(vector, name=name, field=vector.paths[column], scale=scale, offset=offset)
+
+
+def receiver_signals(
+    topic: str, stamp: str, paths: Collection[str], vendors: Vendors | None = None
+) -> dict[str, SignalSource]:
+    """Return the GNSS signals of a topic if it contains, at any depth, the fields of a receiver; empty otherwise."""
+    there = set(paths)
+    for receiver in (vendors or load_vendors()).receivers:
+        leaf = min(receiver.has)
+        for base in sorted(p.removesuffix(leaf) for p in there if p == leaf or p.endswith(f".{leaf}")):
+            if not all(f"{base}{name}" in there for name in receiver.has):
+                continue
+            if any(f"{base}{name}" in there for name in receiver.without):
+                return {}
+            sources = {
+                f.name: SignalSource(f.name, topic, f"{base}{path}", stamp, f.scale, f.offset)
+                for path, f in receiver.fields.items()
+                if f"{base}{path}" in there
+            }
+            if "position_covariance_type" in receiver.has:  # 1 sigma: the root of the mean variance east and north
+                squared = tuple(f"{base}position_covariance[{i}]" for i in (0, 4))
+                accuracy = SignalSource("gnss_position_accuracy_m", topic, squared, stamp, (0.5, 0.5), combine="root")
+                sources[accuracy.name] = accuracy
+            return sources
+    return {}
+
+
+# ------------------------------------------------------------------------------------------------ by names
+
+
+class _Instrument:
+    """A topic with the fields of a navigation system or receiver by their names.
+
+    ``mapped``: a source that is mapped already, with a unit that the drive shows.
+    """
+
+    def __init__(self, log: DriveLog, topic: TopicInfo, mapped: SignalSource | None = None) -> None:
+        self.log, self.topic, self.fields = log, topic.name, log.fields(topic.name, quiet=True)
+        self.stamp = stamp_path_of(self.fields)
+        numbers = (f for f in self.fields if f.kind == "number")
+        named = ((f.path, meaning_of(topic.name, topic.type_name, f.path, f.unit)) for f in numbers)
+        self.meanings = {path: meaning for path, meaning in named if meaning is not None}
+        if mapped is not None and mapped.topic == topic.name and isinstance(mapped.scale, float):
+            units = {p: replace(self.meanings[p], scale=mapped.scale) for p in mapped.paths if p in self.meanings}
+            self.meanings |= units
+        first = {m.quantity: path for path, m in reversed(self.meanings.items())}
+        self.places = {name: self.source(name, first[q]) for name, q in _PLACES.items() if q in first}
+        self.velocities = [*_horizontal(self.fields)]
+        angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
+        self.angles = {path: meaning for meaning, path in angles}
+
+    def source(self, name: str, path: str, scale: float = 1.0, offset: float = 0.0) -> SignalSource:
+        """Return a field of the topic as a source."""
+        return SignalSource(name, self.topic, path, self.stamp, scale, offset)
+
+    @cached_property
+    def seen(self) -> dict[str, Seen]:
+        """Values of velocities, angles and positions in a few pieces of the log, by path."""
+        paths = [*(p for v in self.velocities for p in v.values()), *self.angles]
+        wanted = [*dict.fromkeys([*paths, *(s.paths[0] for s in self.places.values())])]
+        return {path: seen for (_, path), seen in self.pieces.read({self.topic: wanted} if wanted else {}).items()}
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """The pieces of the log."""
+        return Pieces(self.log)
+
+    @property
+    def has_place(self) -> bool:
+        """Return whether there are degrees of latitude and longitude of a moving car."""
+        limits = zip(_PLACES, (90.0, 180.0), strict=True)
+        return all(n in self.places and _is_place(self.seen.get(self.places[n].paths[0]), most) for n, most in limits)
+
+    @property
+    def course(self) -> FloatArray:
+        """Direction of the path, counter-clockwise from east, rad [M]; NaN at low speed."""
+        read = {(self.topic, path): seen for path, seen in self.seen.items()}
+        velocity = path_velocity(_on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read)))
+        nothing = np.full(len(self.pieces.starts) * self.pieces.cells_a_piece, np.nan)
+        return nothing if velocity is None else _direction(*velocity)
+
+    @property
+    def over_ground(self) -> list[SignalSource]:
+        """Velocity east and north over ground; empty without one."""
+        if not self.velocities:
+            return []
+        paths = [self.velocities[0][side] for side in "en"]
+        unit = unit_of(paths[1].rpartition(".")[2], "speed")[1] or 1.0
+        return [self.source(name, path, unit) for name, path in zip((_EAST, _NORTH), paths, strict=True)]
 
 
 def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool = False) -> NavigationTruth | None:
@@ -57,7 +283,7 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
     topics : of navigation systems and references with undocumented types.
     whole : whether only a velocity with a heading counts.
     """
-    truths = [truth for t in topics if (truth := _of_topic(log, t)) is not None]
+    truths = [truth for t in topics if (truth := _truth_of(_Instrument(log, t))) is not None]
     truths = [t for t in truths if not whole or {"enu_velocity_m_s", "yaw_rad"} <= set(t[0])]
     return max(truths, key=lambda t: len(t[0]), default=None)
 
@@ -68,102 +294,63 @@ def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = Non
     ``speed`` is mapped already, with a unit that the drive shows. A velocity must agree with the path, if there is one.
     A heading that is the direction of the path is a course.
     """
-    fields = log.fields(topic.name, quiet=True)
-    stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
-    meanings |= _with_known_unit(topic.name, meanings, speed)
-    first = {m.quantity: path for path, m in reversed(meanings.items())}
-    velocity = next(_horizontal(fields), {})
-    if not {"latitude", "longitude"} <= set(first):
-        return {s.name: s for s in (_velocity_over_ground(topic.name, stamp, velocity) if velocity else ())}
-    angles = [p for q in ("course", "heading") for p, m in meanings.items() if m.quantity == q]
-    pieces = Pieces(log)
-    samples = pieces.read(
-        {topic.name: [*dict.fromkeys([*velocity.values(), *angles, *(first[q] for q in _PLACES.values())])]}
-    )
-    seen = {path: values for (_, path), values in samples.items()}
-    places = {n: SignalSource(n, topic.name, first[q], stamp) for n, q in _PLACES.items()}
-    if not (_is_place(seen.get(first["latitude"]), 90.0) and _is_place(seen.get(first["longitude"]), 180.0)):
+    its = _Instrument(log, topic, speed)
+    if len(its.places) < len(_PLACES):
+        return {s.name: s for s in its.over_ground}
+    if not its.has_place:
         return {}
-    sources = [replace(places[n], name=f"gnss_{q}_deg") for n, q in _PLACES.items()]
-    if (course := _course(places, samples, topic.name, pieces)) is None:
-        return {source.name: source for source in sources}
-    sides = {side: seen[velocity[side]].cells for side in "ne" if velocity.get(side, "") in seen}
-    if len(sides) > 1 and _median_off(np.arctan2(sides["n"], sides["e"]) - course) < NEAR_RAD:
-        sources += _velocity_over_ground(topic.name, stamp, velocity)
+    sources = [replace(its.places[n], name=name) for n, name in zip(_PLACES, GNSS_POSITION, strict=True)]
+    sides = [its.seen.get(s.paths[0]) for s in its.over_ground]
+    east, north = (None if s is None else s.cells for s in sides) if sides else (None, None)
+    if east is not None and north is not None and _median_off(np.arctan2(north, east) - its.course) < NEAR_RAD:
+        sources += its.over_ground
     else:
-        sources += _speed_and_course(topic.name, stamp, meanings, {p: seen[p] for p in angles if p in seen}, course)
+        sources += _speed_and_course(its)
     return {source.name: source for source in sources}
 
 
-def _with_known_unit(topic: str, meanings: Mapping[str, Meaning], speed: SignalSource | None) -> dict[str, Meaning]:
-    """Return the meaning of the field that is mapped as the speed, with the unit of the mapping."""
-    if speed is None or speed.topic != topic or not isinstance(speed.scale, float):
-        return {}
-    return {p: replace(meanings[p], scale=speed.scale) for p in speed.paths if p in meanings}
-
-
-def _velocity_over_ground(topic: str, stamp: str, velocity: Mapping[str, str]) -> Iterator[SignalSource]:
-    unit = unit_of(velocity["n"].rpartition(".")[2], "speed")[1] or 1.0
-    for name, side in (("gnss_velocity_east_m_s", "e"), ("gnss_velocity_north_m_s", "n")):
-        yield SignalSource(name, topic, velocity[side], stamp, unit)
-
-
-def _speed_and_course(
-    topic: str, stamp: str, meanings: Mapping[str, Meaning], angles: Mapping[str, Seen], course: FloatArray
-) -> Iterator[SignalSource]:
-    """Yield the first speed with a unit and the first of the angles that is the path's course, if both exist."""
-    speed = next((p for p, m in meanings.items() if m.quantity == "speed" and m.scale is not None), None)
-    for path, seen in angles.items() if speed is not None else ():
+def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
+    """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
+    speed = next((p for p, m in its.meanings.items() if m.quantity == "speed" and m.scale is not None), None)
+    for path, meaning in its.angles.items() if speed is not None else ():
         # A course over ground is clockwise from north by definition; the path confirms this and determines the unit.
-        unit = meanings[path].scale
-        fitting = [c[1:] for c in _CONVENTIONS[:2] if unit is None or math.isclose(-c[1], unit)]
-        fitting = [c for c in fitting if _off(seen, course, *c) < NEAR_RAD]
+        fitting = [c[1:] for c in _CONVENTIONS[:2] if meaning.scale is None or math.isclose(-c[1], meaning.scale)]
+        fitting = [c for c in fitting if path in its.seen and _off(its.seen[path], its.course, *c) < NEAR_RAD]
         if fitting and speed is not None:
-            yield SignalSource("gnss_course_rad", topic, path, stamp, *fitting[0])
-            yield SignalSource("gnss_speed_m_s", topic, speed, stamp, meanings[speed].scale or 1.0)
+            yield its.source("gnss_course_rad", path, *fitting[0])
+            yield its.source("gnss_speed_m_s", speed, its.meanings[speed].scale or 1.0)
             return
 
 
-def _meanings(topic: TopicInfo, fields: tuple[FieldInfo, ...]) -> dict[str, Meaning]:
-    named = ((f.path, meaning_of(topic.name, topic.type_name, f.path, f.unit)) for f in fields if f.kind == "number")
-    return {path: meaning for path, meaning in named if meaning is not None}
-
-
-def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
-    fields = log.fields(topic.name, quiet=True)
-    stamp = stamp_path_of(fields)
-    truth = {s.name: s for s in (*_enu_velocities(topic, fields, stamp), *_ecef_vectors(topic, fields, stamp))}
-    meanings = _meanings(topic, fields)
-    first = {m.quantity: path for path, m in reversed(meanings.items())}
-    places = {n: SignalSource(n, topic.name, first[q], stamp) for n, q in _PLACES.items() if q in first}
-    headings = {p: m.scale for p, m in meanings.items() if m.quantity == "heading"}
-    pieces = Pieces(log)
-    paths = [p for s in (*truth.values(), *places.values()) for p in s.paths if "ecef" not in p.lower()]
-    samples = pieces.read({topic.name: [*dict.fromkeys([*paths, *headings])]}) if paths or headings else {}
-    seen = [samples.get((topic.name, source.paths[0])) for source in places.values()]
-    if len(seen) == 2 and all(map(_is_place, seen, (90.0, 180.0))):
-        truth |= places
-    note = f"ground truth comes from {topic.name}, by the names of its fields"
-    course = _course(truth, samples, topic.name, pieces)
-    conventions = {p: _convention(samples.get((topic.name, p)), course, unit) for p, unit in headings.items()}
-    for path, convention in conventions.items():
+def _truth_of(its: _Instrument) -> NavigationTruth | None:
+    truth = {s.name: s for s in (*_enu_velocities(its), *_ecef_vectors(its))}
+    course = None
+    if its.has_place:
+        truth |= its.places
+        course = its.course
+    if velocity := truth.get("enu_velocity_m_s"):
+        east, north = (its.seen.get(path) for path in velocity.paths[:2])
+        course = None if east is None or north is None else _direction(north.cells, east.cells)
+    note = f"ground truth comes from {its.topic}, by the names of its fields"
+    for path in (p for p, m in its.angles.items() if m.quantity == "heading"):
+        convention = _convention(its.seen.get(path), course, its.angles[path].scale)
         if convention is not None:
             words, scale, offset = convention
-            truth["yaw_rad"] = SignalSource("yaw_rad", topic.name, path, stamp, scale, offset)
+            truth["yaw_rad"] = its.source("yaw_rad", path, scale, offset)
             note += f"; {path} is in {words}, which agrees with the course over ground"
             break
     useful = {"enu_velocity_m_s", "ecef_velocity_m_s", "ecef_position_m", "lat_deg"} & set(truth)
     return (truth, note) if useful else None
 
 
-def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:
+def _enu_velocities(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first velocity east, north, up (or down) by the field names of one struct."""
-    for paths_of in _horizontal(fields):
+    for paths_of in its.velocities:
         if vertical := next((s for s in "ud" if s in paths_of), ""):
             paths = (paths_of["e"], paths_of["n"], paths_of[vertical])
             factor = unit_of(paths[0].rpartition(".")[2], "speed")[1] or 1.0
             scale = (factor, factor, factor if vertical == "u" else -factor)
-            yield SignalSource("enu_velocity_m_s", topic.name, paths, stamp, scale)
+            yield SignalSource("enu_velocity_m_s", its.topic, paths, its.stamp, scale)
             return
 
 
@@ -195,14 +382,14 @@ def side_of(struct: str, leaf: str) -> str:
     return side if is_speed else ""
 
 
-def _ecef_vectors(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:
+def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the arrays of three in ECEF that are a position or a velocity by name, in the order of the fields."""
-    paths = dict.fromkeys(f.path for f in fields)
+    paths = dict.fromkeys(f.path for f in its.fields)
     for base in dict.fromkeys(p.removesuffix("[0]") for p in paths if p.endswith("[0]") and "ecef" in p.lower()):
         words = set(words_of(base))
         name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
         if f"{base}[2]" in paths and f"{base}[3]" not in paths and words & {"velocity", "vel", "position", "pos"}:
-            yield SignalSource(name, topic.name, tuple(f"{base}[{i}]" for i in range(3)), stamp)
+            yield SignalSource(name, its.topic, tuple(f"{base}[{i}]" for i in range(3)), its.stamp)
 
 
 def _is_place(seen: Seen | None, most: float) -> bool:
@@ -212,22 +399,7 @@ def _is_place(seen: Seen | None, most: float) -> bool:
     return float(np.nanmax(seen.cells) - np.nanmin(seen.cells)) < WIDEST_DEG
 
 
-def _course(
-    truth: dict[str, SignalSource], read: dict[tuple[str, str], Seen], topic: str, pieces: Pieces
-) -> FloatArray | None:
-    """Return the direction of travel counter-clockwise from east where the car moves, rad [M]."""
-    if "enu_velocity_m_s" in truth:
-        columns = [read.get((topic, p)) for p in truth["enu_velocity_m_s"].paths[:2]]
-        if any(c is None for c in columns):
-            return None
-        east, north = (c.cells for c in columns if c is not None)
-    elif {"lat_deg", "lon_deg"} <= set(truth):
-        latitude, longitude = (read[topic, truth[n].paths[0]].cells for n in ("lat_deg", "lon_deg"))
-        narrowed = math.cos(math.radians(float(np.nanmean(latitude))))
-        north, east = (pieces.rate_of(c) * DEGREE_M for c in (latitude, longitude))
-        east = east * narrowed
-    else:
-        return None
+def _direction(north: FloatArray, east: FloatArray) -> FloatArray:
     return np.where(np.hypot(north, east) > MOVING_M_S, np.arctan2(north, east), np.nan)
 
 

@@ -15,15 +15,24 @@ from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.evidence import Pieces, Seen
-from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_heading, receiver_signals
-from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, Axes, length_of, twist_axes
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
-from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
+from pdhef_logtool.mapping.navigation import (
+    NEVER_NEGATIVE,
+    RAW_COURSE,
+    Axes,
+    gnss_signals,
+    has_heading,
+    length_of,
+    named_gnss,
+    navigation_truth,
+    receiver_signals,
+    twist_axes,
+)
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
-from pdhef_logtool.mapping.weighing import Weighed, weigh
+from pdhef_logtool.mapping.weighing import Weighing, weigh
 from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
@@ -84,7 +93,7 @@ class Ambiguity:
 
 @dataclass(frozen=True, slots=True)
 class AutoMapping:
-    """A recognised mapping and its open points.
+    """A recognised or given mapping and its open points.
 
     Attributes
     ----------
@@ -127,17 +136,13 @@ class _Draft:
         seen = self.values(topic, covariance)
         return seen.shape[0] > 0 and bool((seen == -1.0).all())
 
-    def take(
-        self,
-        into: _Sources,
-        name: str,
-        topic: str,
-        path: str | tuple[str, ...],
-        scale: float = 1.0,
-        offset: float = 0.0,
-    ) -> None:
-        """Add a source for a signal or a truth channel."""
-        into[name] = SignalSource(name, topic, path, stamp_path_of(self.log.fields(topic)), scale, offset)
+    def take(self, into: _Sources, name: str, topic: str, path: str, scale: float = 1.0, offset: float = 0.0) -> None:
+        """Add a source of one field for a signal or a truth channel."""
+        into[name] = SignalSource(name, topic, path, self.stamp(topic), scale, offset)
+
+    def stamp(self, topic: str) -> str:
+        """Return the path of a topic's measurement time."""
+        return stamp_path_of(self.log.fields(topic))
 
     def doubt(self, subject: str, candidates: tuple[str, ...], chosen: str | None, reason: str) -> None:
         """Note an ambiguity."""
@@ -198,7 +203,7 @@ def auto_map(
     _map_gnss(draft, topics, vendors)
     _speed_of_receiver(draft)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
-    mapping = replace(mapping, checks=weighed.checks, open_signs=weighed.open_signs)
+    mapping = replace(mapping, checks=tuple(weighed.checks), open_signs=weighed.open_signs)
     candidates = weighed.candidates
     if decoded is not None:
         mapping = decoded.as_mapped(mapping)
@@ -281,7 +286,7 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 # ------------------------------------------------------------------------------------------------ candidates
 
 
-def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
+def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighing:
     """Take candidates for signals without a well-known type."""
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
     # A measured steering angle has priority over a command, regardless of its type.
@@ -398,7 +403,7 @@ def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
     references: _Sources = {}
     if _has_pose(draft, twist):
         for axis in "xy":
-            draft.take(references, f"{axis}_m", twist.name, _join(_FIELDS["pose"][_type(twist)], f"position.{axis}"))
+            draft.take(references, f"{axis}_m", twist.name, _pose(twist, f"position.{axis}"))
     elif fix := next((t for t in topics if _has_fix(draft, t)), None):
         for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude")):
             draft.take(references, name, fix.name, path)
@@ -513,7 +518,7 @@ def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     needed += [table[kind] for table in (_FIELDS["steering"], _FIELDS["speed"]) if kind in table][:1]
     either = list(_IMU_PATHS) if kind in IMU_TYPES else []
     either += [_twist(topic, "linear", "x")] if kind in TWIST_FIELDS else []
-    either += [_join(_FIELDS["pose"][kind], "position.x")] if kind in _FIELDS["pose"] else []
+    either += [_pose(topic, "position.x")] if kind in _FIELDS["pose"] else []
     fields = log.fields(topic.name) if needed or either else ()
     return all(has_path(fields, p) for p in needed) and (not either or any(has_path(fields, p) for p in either))
 
@@ -534,8 +539,8 @@ def _is_truth(topic: TopicInfo) -> bool:
     return bool(_words(topic.name) & (TRUTH_WORDS | NAVIGATION_WORDS))
 
 
-def _join(prefix: str, path: str) -> str:
-    return f"{prefix}.{path}" if prefix else path
+def _pose(topic: TopicInfo, part: str) -> str:
+    return f"{_FIELDS['pose'][_type(topic)]}.{part}".removeprefix(".")
 
 
 def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen]:
@@ -558,7 +563,7 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
         paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
     if kind in _FIELDS["pose"]:
         parts = [*(f"position.{a}" for a in "xy"), *(f"orientation.{a}" for a in "xyzw")]
-        paths += [_join(_FIELDS["pose"][kind], part) for part in parts]
+        paths += [_pose(topic, part) for part in parts]
     if kind in FIX_TYPES:
         paths += ["latitude", "longitude", "altitude", "status.status", "heading", "course"]
     return [*paths, *(table[kind] for table in (TWIST_COVARIANCES, _FIELDS["pose_covariance"]) if kind in table)]
@@ -605,9 +610,8 @@ def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     if not measured:
-        draft.notes.append(
-            f"{FROM_COMMAND} {chosen.name}, not from a measured angle: actuator lag and steering play are missing"
-        )
+        lacks = "actuator lag and steering play are missing"
+        draft.notes.append(f"{FROM_COMMAND} {chosen.name}, not from a measured angle: {lacks}")
     draft.take(draft.signals, "steer_rad", chosen.name, _FIELDS["steering"][_type(chosen)])
 
 
@@ -643,9 +647,8 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     path = _FIELDS["speed"][kind] if kind in _FIELDS["speed"] else _twist(chosen, "linear", "x")
     draft.take(draft.signals, "speed_m_s", chosen.name, path)
     if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
-        draft.notes.append(
-            f"{chosen.name} contains a lateral velocity, which is not used: its name does not suggest ground truth"
-        )
+        why = "its name does not suggest ground truth"
+        draft.notes.append(f"{chosen.name} contains a lateral velocity, which is not used: {why}")
 
 
 def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
@@ -706,12 +709,8 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     if axes in ("east, north", "north, east") or (receives and axes != "body"):
         return _take_earth_velocity(draft, chosen, axes, is_body=is_body)
     if axes == "not ahead":
-        draft.doubt(
-            "ground-truth velocity frame",
-            (f"{chosen.name} as body velocity",),
-            chosen.name,
-            "the type's convention is the body frame, although x is mostly not the direction of travel",
-        )
+        why = "the type's convention is the body frame, although x is mostly not the direction of travel"
+        draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
         values = draft.values(chosen.name, full)
@@ -734,9 +733,9 @@ def _take_earth_velocity(draft: _Draft, chosen: TopicInfo, axes: str, *, is_body
     why = "x is not the direction of travel" if axes == "not ahead" else "it has the direction of its path"
     draft.doubt("ground-truth velocity frame", readings, readings[1], why)
     paths = tuple(_twist(chosen, "linear", a) for a in ("yxz" if is_down else "xyz"))
-    draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
-    if is_down:
-        draft.truth["enu_velocity_m_s"] = replace(draft.truth["enu_velocity_m_s"], scale=(1.0, 1.0, -1.0))
+    scale = (1.0, 1.0, -1.0) if is_down else 1.0
+    name, stamp = "enu_velocity_m_s", draft.stamp(chosen.name)
+    draft.truth[name] = SignalSource(name, chosen.name, paths, stamp, scale)
     rates = draft.values(chosen.name, _twist(chosen, "angular", "z"))
     if is_body and _span(rates) > 0.0:
         draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
@@ -752,9 +751,7 @@ def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:
     v = np.concatenate([draft.values(topic.name, forward), draft.values(topic.name, left)])
     if v.shape[0] and (v == 0.0).all() and _type(topic) in _FIELDS["pose"]:
         # Converters from fixes to odometry leave the twist at zero while the pose changes.
-        x = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.x"))
-        y = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.y"))
-        return not (_span(x) > 1.0 or _span(y) > 1.0)
+        return all(_span(draft.values(topic.name, _pose(topic, f"position.{a}"))) <= 1.0 for a in "xy")
     return True
 
 
@@ -769,16 +766,13 @@ def _span(values: FloatArray) -> float:
 
 
 def _has_pose(draft: _Draft, topic: TopicInfo) -> bool:
-    if _type(topic) not in _FIELDS["pose"] or draft.is_disowned(
-        topic.name, _FIELDS["pose_covariance"].get(_type(topic), "")
-    ):
+    kind = _type(topic)
+    if kind not in _FIELDS["pose"] or draft.is_disowned(topic.name, _FIELDS["pose_covariance"].get(kind, "")):
         return False
-    base = _FIELDS["pose"][_type(topic)]
-    if not all(draft.is_given(topic.name, _join(base, f"position.{a}")) for a in "xy"):
-        return False
-        # A pose that stays at the origin is a filler.
-    xy = np.concatenate([draft.values(topic.name, _join(base, f"position.{a}")) for a in "xy"])
-    return xy.shape[0] == 0 or bool((xy != 0.0).any())
+    paths = [_pose(topic, f"position.{a}") for a in "xy"]
+    # A pose that stays at the origin is a filler.
+    xy = np.concatenate([draft.values(topic.name, path) for path in paths])
+    return all(draft.is_given(topic.name, path) for path in paths) and (xy.shape[0] == 0 or bool((xy != 0.0).any()))
 
 
 def _has_fix(draft: _Draft, topic: TopicInfo) -> bool:
@@ -799,15 +793,14 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
     if _type(chosen) in FIX_TYPES:
         _map_fix(draft, chosen, alone=velocity is None)
         return
-    base = _FIELDS["pose"][_type(chosen)]
     for name, axis in (("x_m", "x"), ("y_m", "y")):
-        draft.take(draft.truth, name, chosen.name, _join(base, f"position.{axis}"))
-    paths = tuple(_join(base, f"orientation.{a}") for a in "wxyz")
+        draft.take(draft.truth, name, chosen.name, _pose(chosen, f"position.{axis}"))
+    paths = tuple(_pose(chosen, f"orientation.{a}") for a in "wxyz")
     if not all(draft.is_given(chosen.name, path) for path in paths):  # the log's own definition decides
         return
     norms = np.linalg.norm(np.stack([draft.values(chosen.name, path) for path in paths]), axis=0)
     if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < 0.01)):
-        draft.take(draft.truth, "quat_wxyz", chosen.name, paths)
+        draft.truth["quat_wxyz"] = SignalSource("quat_wxyz", chosen.name, paths, draft.stamp(chosen.name))
 
 
 def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
@@ -822,7 +815,7 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
         draft.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it gives no sideslip")
     for name, path in (("yaw_rad", "heading"), ("course_rad", "course")):
         if path in given:
-            draft.take(draft.truth, name, fix.name, path, scale=-1.0, offset=np.pi / 2.0)
+            draft.take(draft.truth, name, fix.name, path, -1.0, np.pi / 2.0)
     if "heading" in given:
         draft.notes.append(
             f"ground-truth yaw comes from {fix.name}.heading: it is one only with two antennas or an INS"
@@ -832,7 +825,5 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
         return
     # 0 is any fix; 2 is a ground-based augmented fix, which receivers report for RTK.
     lowest = 2.0 if "rtk" in _words(fix.name) and bool((status == 2.0).any()) else 0.0
-    draft.quality = QualityGate(
-        topic=fix.name, field="status.status", minimum=lowest, stamp=stamp_path_of(draft.log.fields(fix.name))
-    )
+    draft.quality = QualityGate(fix.name, "status.status", min=lowest, stamp=draft.stamp(fix.name))
     draft.notes.append(f"ground truth is used where {fix.name}.status.status is at least {lowest:g}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -123,12 +123,12 @@ class CanSettings:
 
 @dataclass(frozen=True, slots=True)
 class QualityGate:
-    """Condition for the use of ground truth: the field is in [``minimum``, ``maximum``] or one of ``values``."""
+    """Condition for the use of ground truth: the field is in [``min``, ``max``] or one of ``values``."""
 
     topic: str
     field: str
-    minimum: float | None = None
-    maximum: float | None = None
+    min: float | None = None
+    max: float | None = None
     values: tuple[float, ...] = ()
     stamp: str = AUTO_STAMP
     stamp_unit: StampUnit = "ros"
@@ -143,9 +143,9 @@ class QualityGate:
     def describe(self) -> str:
         """Return the gate's condition in words."""
         parts = []
-        if self.minimum is not None or self.maximum is not None:
-            low = "-inf" if self.minimum is None else f"{self.minimum:g}"
-            high = "inf" if self.maximum is None else f"{self.maximum:g}"
+        if self.min is not None or self.max is not None:
+            low = "-inf" if self.min is None else f"{self.min:g}"
+            high = "inf" if self.max is None else f"{self.max:g}"
             parts.append(f"in [{low}, {high}]")
         if self.values:
             parts.append("one of " + ", ".join(f"{v:g}" for v in self.values))
@@ -207,6 +207,18 @@ class Mapping:
         yield from self.truth.values()
         if self.quality is not None:
             yield self.quality.as_source()
+
+    @property
+    def by_subject(self) -> dict[str, SignalSource]:
+        """Signals by name, and ground truth by ``truth.NAME``."""
+        return {**self.signals, **{f"truth.{name}": source for name, source in self.truth.items()}}
+
+    def with_sources(self, changed: dict[str, SignalSource], notes: Iterable[str] = ()) -> Mapping:
+        """Return the mapping with other sources, named as in :attr:`by_subject`, and further notes."""
+        every = self.by_subject | changed
+        truth = {n.removeprefix("truth."): s for n, s in every.items() if n.startswith("truth.")}
+        signals = {n: s for n, s in every.items() if not n.startswith("truth.")}
+        return replace(self, signals=signals, truth=truth, notes=(*self.notes, *notes))
 
     @property
     def topics(self) -> tuple[str, ...]:

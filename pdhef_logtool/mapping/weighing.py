@@ -24,14 +24,23 @@ from pdhef_logtool.mapping.candidates import (
     named_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, fit, ratio
-from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields, agree, mean_of
-from pdhef_logtool.mapping.gnss_signals import has_heading
-from pdhef_logtool.mapping.ground_speed import axes_of
+from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, ratio
+from pdhef_logtool.mapping.fields import (
+    BY_DRIVING,
+    CLEAR,
+    SLOW_M_S,
+    Fields,
+    Gain,
+    Unit,
+    agree,
+    decide_units,
+    mean_of,
+    path_velocity,
+    posterior,
+)
 from pdhef_logtool.mapping.naming import words_of
-from pdhef_logtool.mapping.path import path_velocity
+from pdhef_logtool.mapping.navigation import axes_of, has_heading
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.mapping.units import BY_DRIVING, Gain, Unit, decide_units, posterior
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
@@ -69,26 +78,13 @@ IN_SI = {"m/s": 0.0, "km/h": 3.0, "mph": 3.0, "rad/s": 0.0, "rpm": 3.0}
 POSSIBLE, LIKELY = 0.05, 0.25
 
 
-@dataclass(frozen=True, slots=True)
-class Weighed:
-    """Result of the selection: sources, candidates, notes, undecided checks, groups of signals with unknown signs."""
-
-    signals: dict[str, SignalSource] = field(default_factory=dict)
-    truth: dict[str, SignalSource] = field(default_factory=dict)
-    candidates: tuple[Candidate, ...] = ()
-    notes: tuple[str, ...] = ()
-    rivals: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    checks: tuple[Check, ...] = ()
-    open_signs: tuple[tuple[str, ...], ...] = ()
-
-
 def weigh(
     log: DriveLog,
     topics: Sequence[tuple[TopicInfo, Role]],
     signals: Mapping[str, SignalSource],
     truth: Mapping[str, SignalSource],
     vendors: Vendors,
-) -> Weighed:
+) -> Weighing:
     """Select fields for the missing signals, and for ground truth if there is none.
 
     Parameters
@@ -96,11 +92,10 @@ def weigh(
     topics : topics that may contain candidates, with their kinds of data.
     signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
     """
-    wanted = [
-        n for n in named_fields(log, topics, vendors) if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)
-    ]
-    if not wanted or log.end_ns <= log.start_ns:
-        return Weighed()
+    named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
+    wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
+    if not wanted:
+        return Weighing(Fields(Pieces(log), {}, [], []), "")
     positions = [s for n, s in truth.items() if n in _POSITIONS]
     pieces, weighable = look(log, wanted, vendors, [*signals.values(), *positions])
     anchors = {n: f for n, s in signals.items() if (f := anchor_of(s, weighable)) is not None}
@@ -108,10 +103,10 @@ def weigh(
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
-    weighing = _Weighing(fields, truth_topic(may_be_true))
+    weighing = Weighing(fields, truth_topic(may_be_true))
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
-    return weighing.result()
+    return weighing
 
 
 def _is_wanted(
@@ -135,11 +130,19 @@ def _is_wanted(
 
 
 @dataclass(slots=True)
-class _Weighing:
+class Weighing:
+    """Selection of fields from the candidates.
+
+    Attributes
+    ----------
+    truth_from : topic of the ground truth. taken, true : selected fields by signal and by ground-truth quantity.
+    rivals : fields of a signal with nearly the same score. checks : undecided points.
+    """
+
     fields: Fields
     truth_from: str
     taken: dict[str, Field] = field(default_factory=dict)
-    truth: dict[str, Field] = field(default_factory=dict)
+    true: dict[str, Field] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rivals: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
@@ -237,18 +240,18 @@ class _Weighing:
         if first.unit_known or first.fixed:
             return first.meaning.quantity
         mean = mean_of([f.seen.cells for f in wheels])
-        times, sigma = self._per_turning(mean), BY_DRIVING
+        times, sigma, by = self._per_turning(mean), BY_DRIVING, "a_y ≈ v r"
         if speed is not None:
-            times, sigma = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS
+            times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
         beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
         in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
-        best, reason, doubt = _likeliest_unit(times, sigma, "a_y ≈ v r" if speed is None else "the speed", in_si=in_si)
+        best, reasons, doubt = _unit_of_wheels(times, sigma, by, in_si=in_si)
         if times is not None and not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
         for item in wheels:
             item.factors = ((best.name, best.factor / (USUAL_RADIUS_M if best.spread else 1.0)),)
             item.unit_known = not doubt
-            item.reasons += [reason] if reason else []
+            item.reasons += reasons
             item.doubts += [doubt] if doubt else []
         return best.quantity
 
@@ -292,8 +295,7 @@ class _Weighing:
             return _steering_by_range(item, kinds, relation)
         metres = abs(relation.slope)
         ways = [Unit(u, f / USUAL_LENGTH_M[k], k, 0.7) for k in kinds for u, f in item.units]
-        shares = posterior([ways], [Gain((1,), metres, BY_DRIVING, 1e-3)])
-        likely = [ways[i] for i in np.argsort(-shares) if shares[i] >= LIKELY * shares.max()]
+        likely = _likely(ways, metres, BY_DRIVING, LIKELY, broken=1e-3)
         name, unit = likely[0].quantity, likely[0].name
         usual = metres * likely[0].factor
         low, high = _STEERING_M[name]
@@ -308,10 +310,11 @@ class _Weighing:
             item.doubts.append(f"it could be {likely[1].quantity} in {likely[1].name} as well")
         return name, True
 
-    def _open_signs(self) -> tuple[tuple[str, ...], ...]:
+    @property
+    def open_signs(self) -> tuple[tuple[str, ...], ...]:
         """Return the signals with an unknown sign (documentation, name, mounting); signals of one axis as a group."""
         open_fields = {n: f for n, f in self.taken.items() if n in _SIGNED and _has_open_sign(f)}
-        open_truth = {n: f for n, f in self.truth.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
+        open_truth = {n: f for n, f in self.true.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
         lateral, across = open_fields.get("ay_m_s2"), open_truth.get("vy_m_s")
         groups: list[tuple[str, ...]] = [(n,) for n in open_fields]
         groups += [(f"truth.{n}",) for n in open_truth]
@@ -337,15 +340,15 @@ class _Weighing:
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
         documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
         # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
-        self.truth = named if not documented or _SLIP & set(named) - set(documented) else documented
-        if not self.truth:
+        self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
+        if not self.true:
             return
         first = its[0]
-        if first.role == "sensor" and self.truth.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
-            self.truth.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
+        if first.role == "sensor" and self.true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
+            self.true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
         agrees = self._truth_turns()
         # Fields of ground truth are no inputs, except the speed of a navigation system without another speed.
-        mine = set(map(id, self.truth.values()))
+        mine = set(map(id, self.true.values()))
         for signal in [n for n, f in self.taken.items() if id(f) in mine and n != "speed_m_s"]:
             if first.role != "navigation":
                 del self.taken[signal]
@@ -354,12 +357,12 @@ class _Weighing:
             remedy = 'name it under [truth] in a mapping file, or --waive "truth.source"'
             self.checks.append(Check("truth.source", "truth", "undecided", evidence, remedy))
         self.notes.append(f"ground truth comes from {first.topic.name}, by the names of its fields")
-        for name, item in self.truth.items():
+        for name, item in self.true.items():
             self._tell(f"truth.{name}", item)
 
     def _truth_turns(self) -> bool:
         """Return whether the yaw rates of ground truth and sensor are equal up to the sign."""
-        sensor, true = self._chosen("yaw_rate_rad_s"), self.truth.get("yaw_rate_rad_s")
+        sensor, true = self._chosen("yaw_rate_rad_s"), self.true.get("yaw_rate_rad_s")
         return sensor is not None and true is not None and any(agree(sensor.si, s * true.si) for s in (1.0, -1.0))
 
     # ------------------------------------------------------------------------------------------------- reporting
@@ -378,10 +381,21 @@ class _Weighing:
             remedy = f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"'
             self.checks.append(Check(f"{name}.candidate", name, "undecided", evidence, remedy))
 
-    def result(self) -> Weighed:
-        """Return the result of the selection."""
+    @property
+    def signals(self) -> dict[str, SignalSource]:
+        """Sources of the selected signals."""
+        return {n: f.candidate(n, "signals", taken=True).source for n, f in self.taken.items()}
+
+    @property
+    def truth(self) -> dict[str, SignalSource]:
+        """Sources of the selected ground truth."""
+        return {n: f.candidate(n, "truth", taken=True).source for n, f in self.true.items()}
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """All fields that may be a signal or ground truth, the selected and the surest first."""
         candidates = [f.candidate(n, "signals", taken=True) for n, f in self.taken.items()]
-        candidates += [f.candidate(n, "truth", taken=True) for n, f in self.truth.items()]
+        candidates += [f.candidate(n, "truth", taken=True) for n, f in self.true.items()]
         used = {(c.section, c.source.label) for c in candidates}
         for item in self.fields.candidates:
             for name in names_of(item.meaning.quantity, item.meaning.part)[:1]:
@@ -389,17 +403,9 @@ class _Weighing:
                 if (record.section, record.source.label) not in used and (item.role != "truth"):
                     candidates.append(record)
             name = _truth_name(item)
-            if name and item.role in ("truth", "navigation") and not self.truth:
+            if name and item.role in ("truth", "navigation") and not self.true:
                 candidates.append(item.candidate(name, "truth", taken=False))
-        return Weighed(
-            signals={n: f.candidate(n, "signals", taken=True).source for n, f in self.taken.items()},
-            truth={n: f.candidate(n, "truth", taken=True).source for n, f in self.truth.items()},
-            candidates=tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score))),
-            notes=tuple(self.notes),
-            rivals=tuple(self.rivals),
-            checks=tuple(self.checks),
-            open_signs=self._open_signs(),
-        )
+        return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
 
 
 def _has_open_sign(item: Field) -> bool:
@@ -451,7 +457,7 @@ def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
 
 
 def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit | None) -> tuple[str, bool | None]:
-    """Return :meth:`_Weighing._steering_kind` by the range of values, if the curvature is not conclusive."""
+    """Return :meth:`Weighing._steering_kind` by the range of values, if the curvature is not conclusive."""
     name = kinds[-1] if item.seen.largest * item.factors[0][1] > 0.9 else kinds[0]
     if item.fixed:
         return name, None
@@ -481,16 +487,21 @@ def truth_topic(weighable: Sequence[Field]) -> str:
     return best[1]
 
 
-def _likeliest_unit(times: float | None, sigma: float, by: str, *, in_si: bool) -> tuple[Unit, str, str]:
-    """Return the likeliest unit of wheel speeds if ``times`` of it are 1 m/s, the reason and the doubt."""
+def _unit_of_wheels(times: float | None, sigma: float, by: str, *, in_si: bool) -> tuple[Unit, list[str], str]:
+    """Return the likeliest unit of wheel speeds if ``times`` of it are 1 m/s, the reasons and the doubt."""
     if times is None or not times > 0.0:
         doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
-        return WHEEL_UNITS[0], "", doubt
+        return WHEEL_UNITS[0], [], doubt
     units = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in WHEEL_UNITS]
-    shares = posterior([units], [Gain((1,), times, sigma)])
-    best, *others = (units[i] for i in np.argsort(-shares) if shares[i] >= POSSIBLE * shares.max())
+    best, *others = _likely(units, times, sigma, POSSIBLE)
     doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
-    return best, f"{times:.4g} of it is 1 m/s by {by}", doubt
+    return best, [f"{times:.4g} of it is 1 m/s by {by}"], doubt
+
+
+def _likely(units: Sequence[Unit], gain: float, sigma: float, least: float, broken: float = 0.01) -> Sequence[Unit]:
+    """Return the likely units of a field with this gain, the likeliest first; ``least``: share of the highest one."""
+    shares = posterior([units], [Gain((1,), gain, sigma, broken)])
+    return [units[i] for i in np.argsort(-shares) if shares[i] >= least * shares.max()]
 
 
 def _truth_name(item: Field) -> str:

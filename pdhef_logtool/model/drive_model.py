@@ -14,8 +14,8 @@ from pdhef_logtool.car.model import CarModel, TaughtParameter
 from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.drive.friction import FrictionFrom, FrictionSource
-from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.options import AUTO
+from pdhef_logtool.drive.plan import Sensors
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.drive_signals import DriveSignals, calibrated_signals
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping as Mapped
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +16,11 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive, sideslip_offset
 from pdhef_logtool.drive.columns import columns_on_grid
+from pdhef_logtool.drive.delays import LatencyEstimate, booked_on_the_late, truth_latency
 from pdhef_logtool.drive.measured import measure
-from pdhef_logtool.drive.mounting import truth_latency
 from pdhef_logtool.drive.relation_checks import relation_checks
 from pdhef_logtool.drive.relations import BIAS_RAD_S, GAIN_RANGE, compare
-from pdhef_logtool.drive.truth import LatencyEstimate, booked_on_the_late, derive_truth
+from pdhef_logtool.drive.truth import TruthTrack, derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks, load_mapping, read_signals
 from pdhef_logtool.records.checks import Check
@@ -27,6 +29,16 @@ from truthsim.drive import simulate_drive, write_drive
 
 T0 = 1_700_000_000_000_000_000
 MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
+
+
+def checks_of(
+    signals: Mapped[str, Channel],
+    truth: Mapped[str, Channel] | None = None,
+    derived: TruthTrack | None = None,
+    vehicle: VehicleParameters | None = None,
+    **options: Any,
+) -> tuple[Check, ...]:
+    return check_drive(measure(signals, truth, derived, vehicle), vehicle, **options)
 
 
 def channel(name: str, time_s: np.ndarray, values: np.ndarray) -> Channel:
@@ -90,7 +102,7 @@ def verdicts(checks: tuple[Check, ...], verdict: str) -> set[str]:
 
 
 def failed(channels: dict[str, Channel]) -> set[str]:
-    return verdicts(check_drive(channels), "failed")
+    return verdicts(checks_of(channels), "failed")
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -104,7 +116,7 @@ def test_right_drives_fail_nothing(seed: int, calm: bool) -> None:
 def test_every_mistake_is_found_and_its_signal_named(name: str, factor: float) -> None:
     channels = drive(3)
     wrong = replace(channels[name], values=channels[name].values * factor)
-    checks = check_drive({**channels, name: wrong})
+    checks = checks_of({**channels, name: wrong})
     assert {c.subject for c in checks if c.verdict == "failed"} == {name}
     aspects = {-1.0: {"sign"}, -180 / np.pi: {"sign", "unit"}}.get(factor, {"unit"})
     assert verdicts(checks, "failed") == {f"{name}.{a}" for a in aspects}
@@ -119,7 +131,7 @@ def test_a_quiet_drive_accuses_nobody_and_says_what_it_lacks(name: str) -> None:
     channels = drive(5, calm=True)
     for factor in (-1.0, 1.5):
         wrong = replace(channels[name], values=channels[name].values * factor)
-        checks = check_drive({**channels, name: wrong})
+        checks = checks_of({**channels, name: wrong})
         assert verdicts(checks, "failed") == set()
         (doubt,) = (c for c in checks if c.name == f"{name}.sign")
         assert doubt.verdict == "undecided"
@@ -145,13 +157,13 @@ def test_gravity_in_a_level_axis_is_found(offset: float, name: str) -> None:
 def test_exchanged_steering_angles() -> None:
     channels = drive(4)
     as_wheel = replace(channels["steer_rad"], values=channels["steer_rad"].values * 16.0)
-    (check,) = (c for c in check_drive({**channels, "steer_rad": as_wheel}) if c.verdict == "failed")
+    (check,) = (c for c in checks_of({**channels, "steer_rad": as_wheel}) if c.verdict == "failed")
     assert "steering-wheel angle" in check.remedy
     del channels["steer_rad"]
     right = replace(as_wheel, name="steering_wheel_rad")
     assert failed({**channels, "steering_wheel_rad": right}) == set()
     wrong = replace(right, values=right.values / 16.0)
-    (check,) = (c for c in check_drive({**channels, "steering_wheel_rad": wrong}) if c.verdict == "failed")
+    (check,) = (c for c in checks_of({**channels, "steering_wheel_rad": wrong}) if c.verdict == "failed")
     assert "road-wheel angle" in check.remedy
 
 
@@ -166,11 +178,11 @@ def test_standing_or_missing_data_decide_nothing() -> None:
     channels = drive(6)
     standing = {n: replace(c, values=0.0 * c.values) for n, c in channels.items()}
     assert failed(standing) == set()
-    assert "steer_rad.sign" in verdicts(check_drive(standing), "undecided")
-    assert check_drive({}) == ()
+    assert "steer_rad.sign" in verdicts(checks_of(standing), "undecided")
+    assert checks_of({}) == ()
     empty = {n: replace(c, stamps_ns=c.stamps_ns[:0], values=c.values[:0]) for n, c in channels.items()}
     assert failed(empty) == set()
-    assert verdicts(check_drive({"speed_m_s": channels["speed_m_s"]}), "undecided") == {"speed_m_s.unit"}
+    assert verdicts(checks_of({"speed_m_s": channels["speed_m_s"]}), "undecided") == {"speed_m_s.unit"}
 
 
 @pytest.mark.slow
@@ -204,7 +216,7 @@ def checked(found: MappedChannels, vehicle: VehicleParameters | None = None, **f
     for key, factor in factors.items():
         store, name = (truth, key.removeprefix("truth_")) if key.startswith("truth_") else (signals, key)
         store[name] = replace(store[name], values=store[name].values * factor)
-    return check_drive(signals, truth, derive_truth(truth) if truth else None, vehicle)
+    return checks_of(signals, truth, derive_truth(truth) if truth else None, vehicle)
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +269,7 @@ def test_a_truth_that_is_turned_by_half_a_degree(road: MappedChannels) -> None:
     vx, vy = truth["vx_m_s"].values, truth["vy_m_s"].values
     truth["vx_m_s"] = replace(truth["vx_m_s"], values=np.cos(turn) * vx - np.sin(turn) * vy)
     truth["vy_m_s"] = replace(truth["vy_m_s"], values=np.sin(turn) * vx + np.cos(turn) * vy)
-    checks = check_drive(road.signals, truth, derive_truth(truth))
+    checks = checks_of(road.signals, truth, derive_truth(truth))
     assert verdicts(checks, "failed") == {"truth.sideslip_rad.offset"}
 
 
@@ -336,7 +348,9 @@ def planted(found: MappedChannels, lever_m: float = 0.0, gain: float = 1.0, dela
 
 def late_checks(found: MappedChannels, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
     truth = derive_truth(found.truth)
-    return check_drive(found.signals, found.truth, truth, vehicle, latency=truth_latency(found, truth))
+    return checks_of(
+        found.signals, found.truth, truth, vehicle, latency=truth_latency(found.signals, found.truth, truth)
+    )
 
 
 @pytest.mark.parametrize(
@@ -383,7 +397,7 @@ def test_what_the_car_knows_of_its_sensors_fails_nothing(sample_logs_dir: Path, 
 @pytest.mark.parametrize("delay_s", [0.038, -0.038])
 def test_a_delay_is_booked_on_what_is_late(sample_logs_dir: Path, delay_s: float) -> None:
     found = planted(survey(sample_logs_dir / "sweep.mcap"), delay_s=delay_s)
-    latency = truth_latency(found, derive_truth(found.truth))
+    latency = truth_latency(found.signals, found.truth, derive_truth(found.truth))
     late_gyro, late_truth = max(delay_s, 0.0), max(-delay_s, 0.0)
     assert latency.gyro_delay_s == pytest.approx(late_gyro, abs=0.002)
     assert latency.latency_s == pytest.approx(late_truth, abs=0.002)
@@ -408,7 +422,7 @@ def test_what_one_wrong_signal_contradicts_is_not_blamed_with_it() -> None:
         )
         for w in ("fl", "fr")
     }
-    checks = check_drive({**{n: c for n, c in channels.items() if "wheel" not in n}, **angles})
+    checks = checks_of({**{n: c for n, c in channels.items() if "wheel" not in n}, **angles})
     assert verdicts(checks, "failed") == {"wheel_speed_fl_m_s.unit", "wheel_speed_fr_m_s.unit"}
     assert not {c.subject for c in checks if c.verdict == "undecided"}
 
@@ -417,7 +431,7 @@ def test_of_two_that_nothing_tells_apart_one_fails_and_the_other_is_undecided() 
     channels = {n: c for n, c in drive(3).items() if n in ("steer_rad", "yaw_rate_rad_s", "ax_m_s2", "speed_m_s")}
     for name in ("steer_rad", "yaw_rate_rad_s"):
         wrong = replace(channels[name], values=-channels[name].values)
-        checks = check_drive({**channels, name: wrong})
+        checks = checks_of({**channels, name: wrong})
         assert verdicts(checks, "failed") == {"steer_rad.sign"}
         assert verdicts(checks, "undecided") == {"yaw_rate_rad_s.sign"}
         assert {c.subject for c in checks if c.verdict == "passed"} >= {"ax_m_s2", "speed_m_s"}
@@ -426,18 +440,18 @@ def test_of_two_that_nothing_tells_apart_one_fails_and_the_other_is_undecided() 
 def test_a_wheel_that_spins_and_a_gain_that_is_close_are_undecided() -> None:
     channels = drive(3)
     wheel = channels["wheel_speed_rl_m_s"]
-    checks = check_drive({**channels, wheel.name: replace(wheel, values=1.3 * wheel.values)})
+    checks = checks_of({**channels, wheel.name: replace(wheel, values=1.3 * wheel.values)})
     assert verdicts(checks, "failed") == set()
     assert verdicts(checks, "undecided") == {f"{wheel.name}.unit"}
 
 
 def test_a_unit_passes_where_the_drive_rules_out_all_others() -> None:
-    units = verdicts(check_drive(drive(3)), "passed")
+    units = verdicts(checks_of(drive(3)), "passed")
     assert units >= {"speed_m_s.unit", "yaw_rate_rad_s.unit", "steer_rad.unit"}
     slow = {n: replace(c, values=0.25 * c.values) if "speed" in n else c for n, c in drive(3).items()}
     slow |= {n: replace(slow[n], values=0.25 * slow[n].values) for n in ("yaw_rate_rad_s", "ax_m_s2")}
     slow["ay_m_s2"] = replace(slow["ay_m_s2"], values=slow["ay_m_s2"].values / 16.0)
-    units = verdicts(check_drive(slow), "passed")
+    units = verdicts(checks_of(slow), "passed")
     assert "steer_rad.unit" not in units, "a model car's wheel turns like a car's steering wheel"
 
 
@@ -467,7 +481,7 @@ def test_two_spinning_wheels_show_no_speed() -> None:
 def test_a_magnitude_without_its_sign_does_not_pass() -> None:
     channels = drive(3)
     yaw = channels["yaw_rate_rad_s"]
-    checks = check_drive({**channels, "yaw_rate_rad_s": replace(yaw, values=np.abs(yaw.values))})
+    checks = checks_of({**channels, "yaw_rate_rad_s": replace(yaw, values=np.abs(yaw.values))})
     assert "passed" not in {c.verdict for c in checks if c.subject == "yaw_rate_rad_s"}
 
 
@@ -526,5 +540,5 @@ def test_no_number_warns(name: str) -> None:
         np.where(i // 200 % 2 == 0, np.nan, values),
         np.nan * values,
     ):
-        checks = check_drive({**channels, name: replace(channels[name], values=wrong)})
+        checks = checks_of({**channels, name: replace(channels[name], values=wrong)})
         assert not any("nan" in c.remedy or "inf" in c.remedy for c in checks)

@@ -37,14 +37,10 @@ def pair(kind: str, rng: np.random.Generator, n: int) -> tuple[FloatArray, Float
     if kind == "holes":
         walk[rng.random(n) < 0.3] = late[rng.random(n) < 0.3] = np.nan
     made = {
-        "walk": (walk, late),
-        "holes": (walk, late),
-        "equal": (walk, walk.copy()),
-        "constant": (np.zeros(n), late),
-        "ties": (np.arange(n) % 2.0, np.arange(n) % 2.0),
-        "far from zero": (walk + 1e4, late),
+        "walk": (walk, late), "holes": (walk, late), "equal": (walk, walk.copy()), "constant": (np.zeros(n), late),
+        "ties": (np.arange(n) % 2.0, np.arange(n) % 2.0), "far from zero": (walk + 1e4, late),
         "tiny and huge": (walk * 1e-100, late * 1e100),
-    }
+    }  # fmt: skip
     return made[kind]
 
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.hypotheses import Relation, block_gains, known_hypotheses, posterior
-from pdhef_logtool.drive.mounting import scaled_source
 from pdhef_logtool.drive.plan import plan_drive
+from pdhef_logtool.drive.survey import scaled_source
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.runs.inspection import inspect_drive_log

@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 
 from pdhef_logtool import PdhefError, ReadOptions, RunConfig, read_drive, run
 from pdhef_logtool.cli.app import app
-from pdhef_logtool.drive.checks import check_drive, misread_channels
+from pdhef_logtool.drive.checks import misread_channels
 from pdhef_logtool.records.signals import Channel
 from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
 from studies.pages import write_toml
-from tests.drive.test_checks import drive
+from tests.drive.test_checks import checks_of, drive
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -56,7 +56,7 @@ def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path, t
 )
 def test_impossible_magnitudes_need_no_second_signal(name: str, factor: float, remedy: str) -> None:
     channel = drive(3)[name.replace("roll", "yaw")]
-    checks = check_drive({name: replace(channel, name=name, values=channel.values * factor)})
+    checks = checks_of({name: replace(channel, name=name, values=channel.values * factor)})
     (check,) = (c for c in checks if c.name == f"{name}.unit")
     assert check.verdict == "failed"
     assert remedy in check.remedy
@@ -68,7 +68,7 @@ def test_a_model_car_that_spins_is_possible() -> None:
     stamps = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
     values = {"yaw_rate_rad_s": 5.3 * np.sin(stamps * 1e-9), "ay_m_s2": 12.0 * np.sin(stamps * 1e-9)}
     channels = {n: Channel(n, "", f"/imu.{n}", stamps, stamps, v) for n, v in values.items()}
-    assert not [c for c in check_drive(channels) if c.verdict == "failed"]
+    assert not [c for c in checks_of(channels) if c.verdict == "failed"]
 
 
 def run_with(path: Path, mapping: Path, out: Path) -> int:

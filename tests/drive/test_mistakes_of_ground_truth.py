@@ -16,7 +16,7 @@ from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
-from tests.drive.test_checks import drive
+from tests.drive.test_checks import checks_of, drive
 
 VEHICLE = default_vehicle().model_copy(update={"mass_kg": default_vehicle().mass_kg + 1.0})
 TEXT = "truth.vy_m_s against the rear axle of the vehicle file"
@@ -38,10 +38,10 @@ def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, 
     return signals, {n: replace(rate, name=n, values=v) for n, v in values.items()}
 
 
-def checks_of(vehicle: VehicleParameters, vy_factor: float) -> dict[str, Check]:
+def checks_by_name(vehicle: VehicleParameters, vy_factor: float) -> dict[str, Check]:
     signals, truth = with_truth(vehicle, vy_factor)
     derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
-    return {c.name: c for c in check_drive(signals, truth, derived, vehicle)}
+    return {c.name: c for c in checks_of(signals, truth, derived, vehicle)}
 
 
 @settings(max_examples=4, deadline=None, derandomize=True)
@@ -63,7 +63,7 @@ def test_gains_of_v_y_are_in_proportion_to_its_scale(place_m: float, factor: flo
 @pytest.mark.parametrize("factor", [1.0, 57.2958, 1.0 / 57.2958, 9.80665, 1.0 / 9.80665])
 def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -> None:
     vehicle = VEHICLE.model_copy(update={"truth_position_m": (place_m, 0.0, 0.0)})
-    checks = checks_of(vehicle, factor)
+    checks = checks_by_name(vehicle, factor)
     if factor == 1.0:
         assert not [n for n, c in checks.items() if c.verdict == "failed" and n.startswith("truth.vy_m_s.")]
     else:
@@ -87,7 +87,7 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     truth["vy_m_s"] = replace(truth["vy_m_s"], values=factor * vy)
     truth["y_m"] = truth["y_m"].take(np.arange(vy.size) % 1000 != 500)  # a sample of one axis is missing
     derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
-    checks = {c.name: c for c in check_drive(signals, truth, derived, vehicle) if c.subject == "truth.vy_m_s"}
+    checks = {c.name: c for c in checks_of(signals, truth, derived, vehicle) if c.subject == "truth.vy_m_s"}
     failed = [n for n, c in checks.items() if c.verdict == "failed"]
     assert failed == ([] if factor == 1.0 else ["truth.vy_m_s.sign" if factor < 0.0 else "truth.vy_m_s.unit"])
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
@@ -106,7 +106,7 @@ def test_exchanged_velocities_of_ground_truth_are_named() -> None:
     signals, truth = with_truth(VEHICLE, 1.0)
     ahead, across = truth["vx_m_s"], truth["vy_m_s"]
     truth |= {"vx_m_s": replace(ahead, values=across.values), "vy_m_s": replace(across, values=ahead.values)}
-    found = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    found = checks_of(signals, truth, derive_truth(truth), VEHICLE)
     named = {c.subject for c in found if c.name.endswith(".axis") and c.remedy.startswith("exchange the fields")}
     assert named == {"truth.vx_m_s", "truth.vy_m_s"}
     assert {c.subject for c in found if c.verdict == "failed"} <= {*named, "truth.sideslip_rad"}
@@ -116,7 +116,7 @@ def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> Non
     signals, truth = with_truth(VEHICLE, 1.0)
     rate = truth["yaw_rate_rad_s"]
     truth["yaw_rate_rad_s"] = replace(rate, values=2000.0 * rate.values)
-    found = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    found = checks_of(signals, truth, derive_truth(truth), VEHICLE)
     assert {c.subject for c in found if c.verdict == "failed"} == {"truth.yaw_rate_rad_s"}
 
 
@@ -145,7 +145,7 @@ def test_a_wrong_speed_does_not_make_the_steering_wrong(factor: float) -> None:
     signals = {n: c for n, c in drive(3).items() if not n.startswith("wheel")}
     speed = signals["speed_m_s"]
     signals["speed_m_s"] = replace(speed, values=speed.values * factor)
-    found = check_drive(signals, vehicle=VEHICLE)
+    found = checks_of(signals, vehicle=VEHICLE)
     failed = [c for c in found if c.verdict == "failed"]
     assert [c.name for c in failed] == ["speed_m_s.unit"]
     assert f"by {1.0 / factor:.6g}" in failed[0].remedy
@@ -158,7 +158,7 @@ def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
     noise = np.random.default_rng(1).standard_normal(ay.values.size // 100 + 1).repeat(100)[: ay.values.size]
     loud = replace(ay, values=0.4 * ay.values + 0.55 * noise)
     kept = {n: signals[n] for n in ("yaw_rate_rad_s", "speed_m_s")} | {"ay_m_s2": loud}
-    checks = {c.name: c for c in check_drive(kept)}
+    checks = {c.name: c for c in checks_of(kept)}
     unit = checks.get("ay_m_s2.unit", checks.get("ay_m_s2.sign"))
     assert unit is not None
     assert unit.verdict == "undecided"
@@ -170,9 +170,9 @@ def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed() -> None:
     signals = {n: c for n, c in drive(3, calm=True).items() if n in ("wheel_speed_rl_m_s", "yaw_rate_rad_s", "ay_m_s2")}
     wheel = signals["wheel_speed_rl_m_s"]
     wheels = {f"wheel_speed_{w}_m_s": replace(wheel, name=f"wheel_speed_{w}_m_s") for w in ("fl", "fr", "rl", "rr")}
-    assert not [c for c in check_drive(signals | wheels) if c.verdict == "failed"]
+    assert not [c for c in checks_of(signals | wheels) if c.verdict == "failed"]
     turned = {n: replace(c, values=-c.values) for n, c in wheels.items()}
-    assert {c.name for c in check_drive(signals | turned) if c.verdict == "failed"} == {f"{n}.sign" for n in wheels}
+    assert {c.name for c in checks_of(signals | turned) if c.verdict == "failed"} == {f"{n}.sign" for n in wheels}
 
 
 @pytest.mark.parametrize(("name", "factor"), [("x_m", 1e-3), ("y_m", 3.2808), ("x_m", -1.0), ("y_m", -1.0), ("", 1.0)])
@@ -186,7 +186,7 @@ def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(
     }
     scales = {n: factor if n == name else 1.0 for n in pose}
     truth |= {n: replace(truth["vx_m_s"], name=n, values=0.01 * scales[n] * v) for n, v in pose.items()}
-    checks = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    checks = checks_of(signals, truth, derive_truth(truth), VEHICLE)
     failed = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject.startswith("truth.")}
     expected = "" if not name else "truth.y_m.sign" if factor < 0.0 else f"truth.{name}.scale"
     assert list(failed) == [n for n in [expected] if n]
@@ -206,11 +206,11 @@ def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
     mapping = Mapping({}, {n: SignalSource(n, "/fix", n) for n in degrees})
     derived = derive_truth(truth)
     measured = measure(signals, truth, derived, VEHICLE, mapping)
-    checks = check_drive(signals, truth, derived, VEHICLE, measured=measured)
+    checks = check_drive(measured, VEHICLE)
     (sign,) = (c for c in checks if c.subject == "truth.lat_deg" and c.verdict == "failed")
     assert sign.name == "truth.lat_deg.sign" and "exchanged" in sign.remedy and "lon_deg" in sign.remedy
     both = replace(measured, scales=measured.scales | {"truth.x_m": 1.0, "truth.y_m": 1.0})
-    found = check_drive(signals, truth, derived, VEHICLE, measured=both)  # positions in metres go before degrees
+    found = check_drive(both, VEHICLE)  # positions in metres go before degrees
     assert {c.subject for c in found if c.verdict == "failed" and c.subject != "ay_m_s2"} == {"truth.y_m"}
 
 
@@ -219,7 +219,7 @@ def test_a_heading_turns_as_the_gyro_does(factor: float) -> None:
     signals, truth = with_truth(VEHICLE, 1.0)
     yaw = 1.0 + np.cumsum(truth["yaw_rate_rad_s"].values) * 0.01
     truth["yaw_rad"] = replace(truth["vx_m_s"], name="yaw_rad", values=factor * np.angle(np.exp(1j * yaw)))
-    checks = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    checks = checks_of(signals, truth, derive_truth(truth), VEHICLE)
     failed = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject == "truth.yaw_rad"}
     kind = {1.0: [], -1.0: ["truth.yaw_rad.sign"]}.get(factor, ["truth.yaw_rad.unit"])
     assert list(failed) == kind

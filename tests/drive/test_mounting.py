@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.frames import angles_deg
 from pdhef_logtool.drive.measured import measure
-from pdhef_logtool.drive.mounting import Mounting, find_mounting, survey_log
+from pdhef_logtool.drive.mounting import ACCELERATIONS, RATES, Mounting, angles_deg, find_mounting, find_triads
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.recorded import read_recorded
+from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, fit_clocks, load_mapping, read_signals, resolve_mapping
-from pdhef_logtool.mapping.triads import ACCELERATIONS, RATES, find_triads
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.inspection.report import inspect_drive_log, write_mapping
 from tests.turned_log import TurnedLog, rotation

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.mounting import Survey, survey_log
 from pdhef_logtool.drive.plan import plan_drive, with_gyro_delay
-from pdhef_logtool.drive.proposals import mapping_proposals
+from pdhef_logtool.drive.survey import Survey, mapping_proposals, survey_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks, load_mapping
 from pdhef_logtool.runs.inspection.report import inspect_drive_log, write_mapping
@@ -98,7 +97,7 @@ def test_a_recognised_mapping_needs_no_command_for_a_sign(log) -> None:
     assert "scale = -1.0" in corrected["steer_rad.corrected"]
     assert "steer_rad" not in plan.refused
     assert plan.mapping.signals["steer_rad"].scale == -1.0
-    assert "steer_rad is read with -1 times its scale" in " ".join(plan.mapping.notes)
+    assert "steer_rad: read with -1 times its scale" in " ".join(plan.mapping.notes)
     assert plan.mapping.signals["yaw_rate_rad_s"].latency_s == vehicle.sensors.yaw_rate_delay_s
     assert "the car's gyro is" in " ".join(plan.mapping.notes)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,18 +13,20 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
+from pdhef_logtool.drive.delays import estimate_truth_latency
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.truth import (
     channel_of,
     dependent_signals,
     derive_truth,
     differentiate,
-    estimate_truth_latency,
     plan_truth,
     truth_at,
     valid_as_a_whole,
 )
+from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
+from pdhef_logtool.records.tracks import make_track
 
 T0 = 1_700_000_000_000_000_000
 LAT, LON = np.deg2rad(57.7), np.deg2rad(11.9)
@@ -118,16 +121,12 @@ def sources(stamps, d: Drive) -> dict[str, dict]:
         },
         "ecef velocity without position": {"ecef_velocity_m_s": v_ecef, "quat_wxyz": quat(ECEF * turn)},
         "ecef velocity, lat, yaw": {
-            "lat_deg": lat,
-            "lon_deg": lon,
-            "alt_m": alt,
-            "ecef_velocity_m_s": v_ecef,
-            "yaw_rad": wrapped,
+            "lat_deg": lat, "lon_deg": lon, "alt_m": alt, "ecef_velocity_m_s": v_ecef, "yaw_rad": wrapped,
         },
         "position, yaw": {"x_m": d.x, "y_m": d.y, "yaw_rad": wrapped},
         "lat lon, yaw": {"lat_deg": lat, "lon_deg": lon, "alt_m": alt, "yaw_rad": wrapped},
         "ecef position, quat": {"ecef_position_m": ecef, "quat_wxyz": quat(turn)},
-    }
+    }  # fmt: skip
 
 
 KINDS = tuple(sources(*drive(1.0)))
@@ -489,3 +488,41 @@ def test_there_is_no_sideslip_at_standstill():
     assert valid_as_a_whole(out, truth.derivation, 0.3).valid[still].mean() > 0.9
     assert np.isfinite(out.vx_m_s).all()
     np.testing.assert_array_equal(out.sideslip_rad[~still], before.sideslip_rad[~still])
+
+
+SLOW_M_S, RATE_HZ = 1.0, 50
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write 20 s of driving: at 10 s the car stops, at 14 s the sensors fail for 2 s beside the ground truth."""
+    path = tmp_path_factory.mktemp("log") / "correvit.csv"
+    t = np.arange(20 * RATE_HZ) / RATE_HZ
+    speed = np.where((t > 10.0) & (t < 12.0), 0.0, 20.0)
+    rate = np.where(speed > 0.0, 0.2 * np.sin(2.0 * t), 0.0)
+    lines = ["time [s],Speed [m/s],YawRate [rad/s],AccY [m/s2],AccX [m/s2],Sideslip [rad]"]
+    for i in range(len(t)):
+        sensors = f"{speed[i]},{rate[i]},{speed[i] * rate[i]},0" if not 14.0 <= t[i] < 16.0 else ",,,"
+        lines.append(f"{t[i]:.2f},{sensors},{-0.1 * rate[i]:.5f}")
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_sideslip_alone_is_scored_above_the_measured_low_speed_limit(log: Path) -> None:
+    mapping = log.with_suffix(".toml")
+    entry = '[{}]\ntopic = "csv"\nfield = "{}"\n'
+    fields = {"speed_m_s": "Speed", "yaw_rate_rad_s": "YawRate", "ay_m_s2": "AccY", "ax_m_s2": "AccX"}
+    signals = [entry.format(f"signals.{name}", field) for name, field in fields.items()]
+    mapping.write_text("".join([*signals, entry.format("truth.sideslip_rad", "Sideslip")]))
+    with read_drive(log, "saloon", mapping) as drive:
+        whole = drive.whole()
+    truth, seconds = whole.truth, (whole.signals.stamps_ns - whole.log_start_ns) * 1e-9
+    assert truth is not None and not np.isfinite(truth.vx_m_s).any()
+    estimate = make_track("zero", truth.stamps_ns, sideslip_rad=np.zeros(len(truth)))
+    scored = np.isfinite(signal_error(estimate, truth, "sideslip_rad", SLOW_M_S))
+    standing = (seconds > 10.05) & (seconds < 11.95)
+    driving = (seconds > 0.1) & (seconds < 9.9) | (seconds > 12.1) & (seconds < 19.9)
+    assert scored[driving].all()
+    assert not scored[standing].any()
+    assert not ((seconds > 14.01) & (seconds < 15.99)).any()
+    np.testing.assert_allclose(whole.truth.measured_speed_m_s[driving], 20.0, atol=0.01)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
-from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.mapping_file import mapping_from_dict
@@ -560,52 +560,22 @@ def test_a_well_known_log_is_not_read_for_candidates() -> None:
 @pytest.mark.parametrize(
     ("path", "quantity"),
     [
-        ("steering_wheel_torque", ""),
-        ("engine_speed_rpm", ""),
-        ("yaw_rate_std", ""),
-        ("angular_velocity_covariance[0]", ""),
-        ("steering_angle_velocity", ""),
-        ("steering_ratio", ""),
-        ("wheel_speed_rpm", ""),
-        ("frame_rate", ""),
-        ("accelerator_pedal", ""),
-        ("gyro_bias.z", ""),
-        ("wind_speed", ""),
-        ("yaw_rate", "rate"),
-        ("vehicle_speed", "speed"),
-        ("angular_velocity.z", "rate"),
-        ("ay", "acceleration"),
-        ("imu.accel.y", "acceleration"),
-        ("a_lat", "acceleration"),
-        ("psi_dot", "rate"),
-        ("angVelZ", "rate"),
-        ("v_lat", "velocity"),
-        ("StrgWhlAng", "steering"),
-        ("wheel_fl.speed", "wheel speed"),
-        ("rear_right.speed", "wheel speed"),
-        ("omega_fl", "wheel rate"),
-        ("LWI_Lenkradwinkel", "steering"),
-        ("ESP_Gierrate", "rate"),
-        ("Querbeschleunigung", "acceleration"),
-        ("Längsbeschleunigung", "acceleration"),
-        ("ESP_HL_Radgeschw", "wheel speed"),
-        ("Fahrzeuggeschwindigkeit", "speed"),
-        ("lat", "latitude"),
-        ("state.twist.twist.linear.x", "speed"),
-        ("state.twist.twist.linear.y", "velocity"),
-        ("state.twist.twist.angular.z", "rate"),
-        ("wheel_angle", "steering"),
-        ("wheel_angle_speed", ""),
-        ("steering_angle_sign", ""),
-        ("cross_acceleration", "acceleration"),
-        ("speed_vessel_frame.y", "velocity"),
-        ("accelerometer.acceleration.v[1]", "acceleration"),
-        ("gyroscope.gyroUncalibrated.v[2]", "rate"),
-        ("vEgo", "speed"),
-        ("LFspeed", "wheel speed"),
-        ("AFRspeed", ""),
+        ("steering_wheel_torque", ""), ("engine_speed_rpm", ""), ("yaw_rate_std", ""),
+        ("angular_velocity_covariance[0]", ""), ("steering_angle_velocity", ""), ("steering_ratio", ""),
+        ("wheel_speed_rpm", ""), ("frame_rate", ""), ("accelerator_pedal", ""), ("gyro_bias.z", ""),
+        ("wind_speed", ""), ("yaw_rate", "rate"), ("vehicle_speed", "speed"), ("angular_velocity.z", "rate"),
+        ("ay", "acceleration"), ("imu.accel.y", "acceleration"), ("a_lat", "acceleration"), ("psi_dot", "rate"),
+        ("angVelZ", "rate"), ("v_lat", "velocity"), ("StrgWhlAng", "steering"), ("wheel_fl.speed", "wheel speed"),
+        ("rear_right.speed", "wheel speed"), ("omega_fl", "wheel rate"), ("LWI_Lenkradwinkel", "steering"),
+        ("ESP_Gierrate", "rate"), ("Querbeschleunigung", "acceleration"), ("Längsbeschleunigung", "acceleration"),
+        ("ESP_HL_Radgeschw", "wheel speed"), ("Fahrzeuggeschwindigkeit", "speed"), ("lat", "latitude"),
+        ("state.twist.twist.linear.x", "speed"), ("state.twist.twist.linear.y", "velocity"),
+        ("state.twist.twist.angular.z", "rate"), ("wheel_angle", "steering"), ("wheel_angle_speed", ""),
+        ("steering_angle_sign", ""), ("cross_acceleration", "acceleration"), ("speed_vessel_frame.y", "velocity"),
+        ("accelerometer.acceleration.v[1]", "acceleration"), ("gyroscope.gyroUncalibrated.v[2]", "rate"),
+        ("vEgo", "speed"), ("LFspeed", "wheel speed"), ("AFRspeed", ""),
     ],
-)
+)  # fmt: skip
 def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
     meaning = meaning_of("/topic", "a/B", path)
     assert (meaning.quantity if meaning else "") == quantity
@@ -644,36 +614,25 @@ def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
 @pytest.mark.parametrize(
     ("name", "unit", "quantity", "part", "scale"),
     [
-        ("LWS_Angle", "°", "steering", "wheel", DEG),
-        ("SAS_deg", "", "steering", "wheel", DEG),
+        ("LWS_Angle", "°", "steering", "wheel", DEG), ("SAS_deg", "", "steering", "wheel", DEG),
         ("delta_SW", "deg", "steering", "wheel", DEG),
         ("LWI_Lenkradwinkel", "Unit_DegreOfArc", "steering", "wheel", DEG),
-        ("LW_WINKEL", "Grad", "steering", "wheel", DEG),
-        ("STR_ANG", "deg", "steering", "", DEG),
-        ("GY", "G", "acceleration", "y", G),
-        ("a_x", "Unit_MeterPerSeconSquar", "acceleration", "x", 1.0),
-        ("YR", "deg/s", "rate", "z", DEG),
-        ("psiP_Veh", "rad/s", "rate", "z", 1.0),
+        ("LW_WINKEL", "Grad", "steering", "wheel", DEG), ("STR_ANG", "deg", "steering", "", DEG),
+        ("GY", "G", "acceleration", "y", G), ("a_x", "Unit_MeterPerSeconSquar", "acceleration", "x", 1.0),
+        ("YR", "deg/s", "rate", "z", DEG), ("psiP_Veh", "rad/s", "rate", "z", 1.0),
         ("AngularVelocity.Yaw", "", "rate", "z", None),
-        ("ESP_v_Signal", "Unit_KiloMeterPerHour", "speed", "", 1 / 3.6),
-        ("v", "m/s", "speed", "", 1.0),
-        ("WSFL", "km/h", "wheel speed", "fl", 1 / 3.6),
-        ("ESP_wheelSpeedReL", "kph", "wheel speed", "rl", 1 / 3.6),
+        ("ESP_v_Signal", "Unit_KiloMeterPerHour", "speed", "", 1 / 3.6), ("v", "m/s", "speed", "", 1.0),
+        ("WSFL", "km/h", "wheel speed", "fl", 1 / 3.6), ("ESP_wheelSpeedReL", "kph", "wheel speed", "rl", 1 / 3.6),
         ("Raddrehzahl_VR", "1/min", "wheel rate", "fr", 2.0 * math.pi / 60.0),
-        ("wheel_rl", "U/min", "wheel rate", "rl", 2.0 * math.pi / 60.0),
-        ("pose.yaw", "", "heading", "", None),
-        ("Yaw", "Deg/Sec", "rate", "z", DEG),
-        ("IMU_YawRtVal", "deg/s", "rate", "z", DEG),
-        ("VehYaw_W_Actl", "rad/s", "rate", "z", 1.0),
-        ("Lateral", "m/s^2", "acceleration", "y", 1.0),
+        ("wheel_rl", "U/min", "wheel rate", "rl", 2.0 * math.pi / 60.0), ("pose.yaw", "", "heading", "", None),
+        ("Yaw", "Deg/Sec", "rate", "z", DEG), ("IMU_YawRtVal", "deg/s", "rate", "z", DEG),
+        ("VehYaw_W_Actl", "rad/s", "rate", "z", 1.0), ("Lateral", "m/s^2", "acceleration", "y", 1.0),
         ("StePinComp_An_Est", "Degrees", "steering", "wheel", DEG),
-        ("WHEELSPEEDRL", "km/h", "wheel speed", "rl", 1 / 3.6),
-        ("Angle volant", "deg", "steering", "wheel", DEG),
-        ("Vitesse de lacet", "deg/s", "rate", "z", DEG),
-        ("Accelerazione laterale", "g", "acceleration", "y", G),
+        ("WHEELSPEEDRL", "km/h", "wheel speed", "rl", 1 / 3.6), ("Angle volant", "deg", "steering", "wheel", DEG),
+        ("Vitesse de lacet", "deg/s", "rate", "z", DEG), ("Accelerazione laterale", "g", "acceleration", "y", G),
         ("Velocidad", "km/h", "speed", "", 1 / 3.6),
     ],
-)
+)  # fmt: skip
 def test_abbreviations_and_spelled_out_units(
     name: str, unit: str, quantity: str, part: str, scale: float | None
 ) -> None:
@@ -686,17 +645,10 @@ def test_abbreviations_and_spelled_out_units(
 @pytest.mark.parametrize(
     ("name", "unit"),
     [
-        ("gx", ""),
-        ("V", "V"),
-        ("YR", ""),
-        ("LWS_Speed", "°/s"),
-        ("FL_Susp_Vel", "mm/s"),
-        ("VW_FL", "bar"),
-        ("str", ""),
-        ("StePinRelInit_An_Sns", "Degrees"),
-        ("Lateral", "deg"),
+        ("gx", ""), ("V", "V"), ("YR", ""), ("LWS_Speed", "°/s"), ("FL_Susp_Vel", "mm/s"), ("VW_FL", "bar"),
+        ("str", ""), ("StePinRelInit_An_Sns", "Degrees"), ("Lateral", "deg"),
     ],
-)
+)  # fmt: skip
 def test_abbreviations_of_other_quantities_are_none(name: str, unit: str) -> None:
     assert meaning_of("log", "", name, unit) is None
 

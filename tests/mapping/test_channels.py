@@ -10,15 +10,9 @@ from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.mapping import (
-    Mapping,
-    QualityGate,
-    SignalSource,
-    clean_samples,
-    fit_clocks,
-    gate_mask,
-    read_signals,
-)
+from pdhef_logtool.logs.drive_log import Columns
+from pdhef_logtool.mapping import Mapping, QualityGate, SignalSource, fit_clocks, read_signals
+from pdhef_logtool.mapping.channels import clean_samples, gate_mask, si_values
 from pdhef_logtool.records.signals import Channel, Loss
 
 T0 = 1_700_000_000_000_000_000
@@ -103,13 +97,9 @@ def test_what_is_dropped_is_counted_and_named() -> None:
     mapping = imu_mapping(valid_min=-50.0, valid_max=50.0)
     signals, _, losses = read_all(log, mapping)
     assert {k: (x.count, x.severity) for k, x in losses.items()} == {
-        "nan ay_m_s2": (2, "lost"),
-        "out-of-range ay_m_s2": (3, "note"),
-        "nan yaw_rate_rad_s": (1, "lost"),
-        "duplicate-stamp /imu": (1, "note"),
-        "bad-stamp /imu": (1, "lost"),
-        "out-of-order /imu": (1, "note"),
-    }
+        "nan ay_m_s2": (2, "lost"), "out-of-range ay_m_s2": (3, "note"), "nan yaw_rate_rad_s": (1, "lost"),
+        "duplicate-stamp /imu": (1, "note"), "bad-stamp /imu": (1, "lost"), "out-of-order /imu": (1, "note"),
+    }  # fmt: skip
     assert losses["nan ay_m_s2"].start_ns == topic.log_time_ns[3]
     assert losses["nan ay_m_s2"].end_ns == topic.log_time_ns[7] + 1
     assert len(signals["ay_m_s2"]) == 200 - 2 - 3 - 1 - 1
@@ -212,7 +202,7 @@ def test_gate_agrees_with_a_search_by_hand(seed: int) -> None:
     stamps = np.sort(rng.integers(0, 100, 30))
     gate_stamps = np.sort(rng.integers(0, 100, rng.integers(0, 12)))
     values = rng.choice([np.nan, 1.0, 2.0, 3.0, 4.0], gate_stamps.shape[0])
-    gate = QualityGate("/g", "f", minimum=2.5, maximum=3.5, values=(1.0,))
+    gate = QualityGate("/g", "f", min=2.5, max=3.5, values=(1.0,))
     got = gate_mask(stamps, gate_stamps, values, gate, hold_ns=15)
     for stamp, keep in zip(stamps, got, strict=True):
         before = [i for i, g in enumerate(gate_stamps) if g <= stamp]
@@ -245,3 +235,28 @@ def test_a_gate_that_falls_silent_holds_for_two_of_its_periods() -> None:
     mapping = replace(base, truth={"vx_m_s": vx}, quality=QualityGate("/status", "mode", values=(4.0,)))
     _, truth, _ = read_all(log, mapping)
     np.testing.assert_array_equal(truth["vx_m_s"].stamps_ns, stamps[:51])
+
+
+N = 4
+
+
+def columns(**fields: np.ndarray) -> Columns:
+    times = np.arange(N, dtype=np.int64)
+    return Columns("/a", times, times, fields)
+
+
+@pytest.mark.parametrize(
+    ("name", "raw", "shape"),
+    [
+        ("enu_velocity_m_s", np.ones((N, 2)), (N, 3)),
+        ("quat_wxyz", np.ones((N, 3)), (N, 4)),
+        ("enu_velocity_m_s", np.ones(N), (N, 3)),
+        ("speed_m_s", np.ones((N, 3)), (N,)),
+    ],
+)
+def test_what_is_not_the_signal_s_shape_is_missing_at_every_sample(
+    name: str, raw: np.ndarray, shape: tuple[int, ...]
+) -> None:
+    values = si_values(columns(v=raw), SignalSource(name, "/a", "v"))
+    assert values.shape == shape
+    assert np.isnan(values).all()

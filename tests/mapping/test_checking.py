@@ -51,7 +51,7 @@ def test_what_is_there_passes() -> None:
                 "enu_velocity_m_s": SignalSource("enu_velocity_m_s", "/steer", "gyro"),
                 "ecef_position_m": SignalSource("ecef_position_m", "/steer", ("angle", "gyro[0]", "gyro[1]")),
             },
-            quality=QualityGate("/steer", "angle", minimum=0.0),
+            quality=QualityGate("/steer", "angle", min=0.0),
         ),
         log(),
     )
@@ -107,7 +107,7 @@ def test_stamps_that_the_file_leaves_open_come_from_the_schema() -> None:
                 "speed_m_s": SignalSource("speed_m_s", "/bare", "data"),
                 "ay_m_s2": SignalSource("ay_m_s2", "/imu/data", "linear_acceleration.y", stamp="publish_time"),
             },
-            quality=QualityGate("/steer", "angle", minimum=0.0),
+            quality=QualityGate("/steer", "angle", min=0.0),
         ),
     )
     assert {n: s.stamp for n, s in got.signals.items()} == {

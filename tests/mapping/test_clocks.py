@@ -8,7 +8,8 @@ from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, apply_clock, clock_key, fit_clock_line, fit_clocks
+from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, clock_key, fit_clocks
+from pdhef_logtool.mapping.clocks import apply_clock, fit_clock_line
 from pdhef_logtool.records.errors import MappingError
 
 T0 = 1_700_000_000_000_000_000

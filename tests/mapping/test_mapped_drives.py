@@ -12,7 +12,6 @@ from pdhef_logtool.mapping import (
     MappedChannels,
     Mapping,
     SignalSource,
-    apply_clock,
     auto_map,
     check_mapping,
     clock_key,
@@ -21,6 +20,7 @@ from pdhef_logtool.mapping import (
     read_signals,
 )
 from pdhef_logtool.mapping.choosing import choose_mapping
+from pdhef_logtool.mapping.clocks import apply_clock
 
 MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.mapping import VECTOR_COLUMNS, Mapping, QualityGate, SignalSource, load_mapping, mapping_to_toml
+from pdhef_logtool.mapping import Mapping, QualityGate, SignalSource, load_mapping, mapping_to_toml
+from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
 
@@ -192,8 +193,8 @@ def mappings(draw: st.DrawFn) -> Mapping:
         quality = QualityGate(
             topic="/gate" + draw(texts),
             field=draw(texts),
-            minimum=draw(st.sampled_from([None, -1.5])),
-            maximum=draw(st.sampled_from([None, 4.0])),
+            min=draw(st.sampled_from([None, -1.5])),
+            max=draw(st.sampled_from([None, 4.0])),
             values=tuple(draw(st.lists(numbers, min_size=1, max_size=3))),
             stamp=draw(texts),
             latency_s=draw(numbers),

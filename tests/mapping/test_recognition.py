@@ -144,18 +144,11 @@ def test_two_truths_are_said_and_the_one_with_a_pose_is_taken() -> None:
 @pytest.mark.parametrize(
     ("name", "role"),
     [
-        ("/wheel/odometry", "speed"),
-        ("/vehicle/odom", "speed"),
-        ("/can/odom", "speed"),
-        ("/oxts/odometry", "truth"),
-        ("/ground_truth/state", "truth"),
-        ("/vicon/car", "truth"),
-        ("/odometry/filtered", "neither"),
-        ("/localization/kinematic_state", "neither"),
-        ("/something", "neither"),
-        ("/ground/odometry", "speed"),
+        ("/wheel/odometry", "speed"), ("/vehicle/odom", "speed"), ("/can/odom", "speed"), ("/oxts/odometry", "truth"),
+        ("/ground_truth/state", "truth"), ("/vicon/car", "truth"), ("/odometry/filtered", "neither"),
+        ("/localization/kinematic_state", "neither"), ("/something", "neither"), ("/ground/odometry", "speed"),
     ],
-)
+)  # fmt: skip
 def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
     auto = found({name: odometry()})
     assert ("speed_m_s" in auto.mapping.signals) == (role == "speed")
@@ -217,7 +210,7 @@ def test_a_fix_alone_is_the_truth_with_a_gate() -> None:
     auto = found({"/rtk/fix": fix(2.0)})
     assert set(auto.mapping.truth) == {"lat_deg", "lon_deg", "alt_m"}
     assert auto.mapping.quality is not None
-    assert auto.mapping.quality.minimum == 2.0
+    assert auto.mapping.quality.min == 2.0
     assert auto.mapping.quality.field == "status.status"
 
 
@@ -278,7 +271,7 @@ def test_what_was_ambiguous_names_its_readings_and_the_one_that_was_taken() -> N
 def test_a_fix_is_gated_by_the_best_that_its_receiver_can_say(name: str, status: float, lowest: float) -> None:
     auto = found({name: fix(status)})
     gate = auto.mapping.quality
-    assert gate is not None and (gate.topic, gate.minimum, gate.stamp) == (name, lowest, "header.stamp")
+    assert gate is not None and (gate.topic, gate.min, gate.stamp) == (name, lowest, "header.stamp")
     assert auto.mapping.notes == (f"ground truth is used where {name}.status.status is at least {lowest:g}",)
 
 

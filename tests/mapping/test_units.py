@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.mapping.candidates import ANGLES, SPEEDS
-from pdhef_logtool.mapping.units import BY_DRIVING, CERTAIN, RARE, SAME, Gain, Unit, posterior
+from pdhef_logtool.mapping.fields import BY_DRIVING, CERTAIN, RARE, SAME, Gain, Unit, posterior
 
 SPEED, RATE = ([Unit(*u, energy=RARE.get(u[0], 0.0)) for u in units] for units in (SPEEDS, ANGLES))
 

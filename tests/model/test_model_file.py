@@ -13,8 +13,8 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel, TaughtParameter, read_model
 from pdhef_logtool.drive import reading
-from pdhef_logtool.drive.model_file import with_earlier_drive
 from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.plan import with_earlier_drive
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.model.drive_model import DriveModel

@@ -13,9 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
-from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
+from pdhef_logtool.drive.survey import Proposal, apply_proposals, mapping_proposals, survey_log
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import all_specs
 from pdhef_logtool.logs.columnar_log import ColumnarLog

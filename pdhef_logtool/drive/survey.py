@@ -1,0 +1,325 @@
+"""Survey of a drive: its first minutes as the mapping reads them, with the corrections that they show.
+
+Corrections of unit, sign, mounting, heading of ground truth and delay. A recognised mapping is corrected where that is
+certain; a mapping file is only checked, and its corrections are proposals, each relative to the current mapping: the
+order of their application does not matter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from collections.abc import Mapping as Mapped
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive.check_table import result
+from pdhef_logtool.drive.checks import (
+    ay_delay,
+    check_drive,
+    misread_channels,
+    offset_check,
+    sensor_errors,
+    sideslip_offset,
+)
+from pdhef_logtool.drive.delays import LATE_GYRO_S, LatencyEstimate, LateSensor, late_sensors, truth_latency
+from pdhef_logtool.drive.measured import Measured, measure
+from pdhef_logtool.drive.mounting import (
+    ACCELERATIONS,
+    MOUNTED,
+    RATES,
+    Mounting,
+    Triad,
+    find_mounting,
+    find_triads,
+    mounting_checks,
+    named_rows,
+    turned_signals,
+    upright_check,
+)
+from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
+from pdhef_logtool.drive.truth import TruthPlan, TruthTrack, derive_truth, plan_truth
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping.mapping_file import entries_of
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import FloatArray
+
+#: Smaller delays of a_y may be due to body roll.
+LEAST_AY_DELAY_S = 0.015
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """The first minutes of a log as its mapping reads them, with the IMU rotated to the car's axes if that is certain.
+
+    ``vehicle``: from the vehicle file, or the default car. ``corrected``: checks for the changes of a recognised
+    mapping.
+    """
+
+    mapping: Mapping
+    channels: MappedChannels
+    measured: Measured
+    vehicle: VehicleParameters
+    truth: TruthTrack | None
+    truth_plan: TruthPlan | None
+    latency: LatencyEstimate | None
+    triads: tuple[Triad | None, Triad | None] = (None, None)
+    mounting: Mounting | None = None
+    force: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    corrected: tuple[Check, ...] = ()
+
+    @property
+    def mounted(self) -> tuple[Check, ...]:
+        """Checks of the axes that the IMU's signals are read from."""
+        by_drive = [] if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
+        is_open = self.mapping.origin == "auto" and not (self.mounting is not None and self.mounting.confident)
+        upright = upright_check(named_rows(self.mapping, *self.triads), self.force) if is_open else None
+        return (*by_drive, *([] if upright is None else [upright]))
+
+    @property
+    def is_mounted(self) -> bool:
+        """Whether the drive confirms that the IMU is read from the right axes."""
+        return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
+
+    @cached_property
+    def checks(self) -> tuple[Check, ...]:
+        """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
+        drive_checks = self._of(self.measured, self.latency)
+        return (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
+
+    @cached_property
+    def sensor_checks(self) -> tuple[Check, ...]:
+        """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
+        if not self.channels.truth:
+            return self.checks
+        return (*self.mounted, *self._of(measure(self.channels.signals, {}, None, self.vehicle, self.mapping), None))
+
+    def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
+        """Return the channels that must not be used, with the reason. Ground truth does not decide about sensors.
+
+        Parameters
+        ----------
+        waived : names of checks that are ignored. is_causal : no sensor is refused because of later samples.
+        """
+        by_everything = misread_channels(self.checks, waived)
+        refused = {n: why for n, why in by_everything.items() if n.startswith("truth.")}
+        return refused if is_causal else refused | misread_channels(self.sensor_checks, waived)
+
+    def _of(self, measured: Measured, latency: LatencyEstimate | None) -> tuple[Check, ...]:
+        return check_drive(measured, self.vehicle, latency=latency, late=self.late, mounting_is_known=self.is_mounted)
+
+    @cached_property
+    def late(self) -> tuple[LateSensor, ...]:
+        """Sensors with late time stamps, from the signals alone."""
+        return late_sensors(self.channels.signals)
+
+    def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
+        """Yield the mapping's undecided checks that the drive does not decide either."""
+        passed = {c.name for c in drive_checks if c.verdict == "passed"} - {
+            f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
+        }
+        doubts = [c for c in self.mapping.checks if "unit" in c.evidence or "share" in c.evidence]
+        doubted = {c.name.removesuffix(".candidate") for c in doubts}
+        for check in self.mapping.checks:
+            signal = check.name.removesuffix(".candidate")
+            # Without a known radius, rim speeds in m/s and in rad/s look alike. v_y has the unit of its v_x.
+            unit = f"{signal.replace('truth.vy', 'truth.vx')}.unit"
+            is_resolved = unit in passed and not signal.startswith("wheel") and "a share" not in check.evidence
+            if f"{signal}.sign" not in passed or (signal in doubted and not is_resolved):
+                yield check
+
+
+def survey_log(
+    log: DriveLog,
+    mapping: Mapping,
+    clocks: dict[str, ClockModel],
+    span_ns: tuple[int, int],
+    vehicle: VehicleParameters | None = None,
+    *,
+    rescale: bool = True,
+) -> Survey:
+    """Read a span of a log and find the mounting of its IMU and a wrong unit or sign.
+
+    A recognised mapping is corrected where that is certain, with a note; a mapping file is only checked.
+
+    Parameters
+    ----------
+    vehicle : of the drive; None uses the default car.
+    rescale : whether to search for a wrong unit or sign.
+    """
+    vehicle = vehicle or default_vehicle()
+    triads = find_triads(log, mapping)
+    extra: dict[str, SignalSource] = {}
+    for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
+        extra |= {} if triad is None else triad.components(names)
+    channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
+    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
+    truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
+    truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
+    measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
+    # The inputs of an estimator must not depend on ground truth: a mounting from ground truth is only checked.
+    mounting = find_mounting(measured.without_truth(), triads, mapping)
+    blind = mounting is not None and mounting.confident
+    if not blind and truth is not None:
+        mounting = find_mounting(measured, triads, mapping)
+    force = _mean_force(channels)
+    channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
+    measured = measured.without(extra)
+    corrected: list[Check] = []
+    if mounting is not None and mapping.origin == "auto" and blind and not mounting.is_as_named:
+        note = f"{mounting.text}, and is read so: {mounting.evidence}"
+        signals = turned_signals(mapping, mounting, triads)
+        corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
+        mapping = mapping.with_sources(signals, [note])
+        channels = read_signals(log, mapping, clocks, *span_ns)
+        mounting = replace(mounting, named=mounting.rows)
+        measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
+    latency = truth_latency(channels.signals, channels.truth, truth)
+    survey = Survey(
+        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, force, tuple(corrected)
+    )
+    return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
+
+
+def _mean_force(channels: MappedChannels) -> FloatArray:
+    """Return the mean acceleration [3] in the sensor's axes; NaN without a component."""
+    components = [channels.signals.get(n) for n in ACCELERATIONS]
+    return np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
+
+
+def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
+    """Return the survey with undocumented signs decided, or with one wrong unit or sign corrected.
+
+    A correction must be certain. Documented units and signs are corrected
+    without ground truth, and each such correction is a failed check.
+    """
+    mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
+    probable = measured.posterior(mounting_is_known=is_mounted)
+    turned = [n for g in measured.open_signs if probable.turned(g[0]) >= CERTAIN for n in g]
+    factors = dict.fromkeys(turned, (-1.0, "its sign is not documented, and the drive shows it"))
+    if not turned:
+        measured = replace(measured, open_signs=()).without_truth()
+        factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
+    said = {n: (f, f"read with {f:.6g} times its scale: {evidence}") for n, (f, evidence) in factors.items()}
+    if not (proposals := _rescaled(mapping, said)):
+        return survey
+    scaled = replace(apply_proposals(proposals, mapping), open_signs=())
+    again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
+    # A failing sensor resembles a wrong unit of another one, but only a right correction leaves no contradiction.
+    failed = [check.name for check in again.checks if check.verdict == "failed"]
+    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis")) for n in failed)
+    checks = [] if turned else [_corrected(p.subject, p.source, f"{p.subject} is {p.evidence}") for p in proposals]
+    return survey if is_bad else replace(again, corrected=(*survey.corrected, *checks, *again.corrected))
+
+
+def _corrected(name: str, source: SignalSource, note: str) -> Check:
+    return result("SIGNAL.corrected", "failed", name, evidence=note, entries=entries_of(source, "field", "scale"))
+
+
+def scaled_source(source: SignalSource, factor: float) -> SignalSource:
+    """Return a source with scale and offset multiplied by a factor, without its valid range."""
+
+    def times(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        return tuple(v * factor for v in value) if isinstance(value, tuple) else value * factor
+
+    # A valid range in the wrong unit would drop correct values.
+    return replace(source, scale=times(source.scale), offset=times(source.offset), valid_min=None, valid_max=None)
+
+
+# ------------------------------------------------------------------------------------------------ proposals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposal:
+    """One correction.
+
+    Attributes
+    ----------
+    subject : signal, or ``truth.QUANTITY``. evidence : one sentence with figures.
+    source : corrected source of the subject, for the mapping.
+    """
+
+    subject: str
+    evidence: str
+    source: SignalSource
+
+
+def apply_proposals(proposals: Sequence[Proposal], mapping: Mapping) -> Mapping:
+    """Return the mapping with the corrections in it, each with a note."""
+    return mapping.with_sources(
+        {p.subject: p.source for p in proposals}, [f"{p.subject}: {p.evidence}" for p in proposals]
+    )
+
+
+def _rescaled(mapping: Mapping, factors: Mapped[str, tuple[float, str]]) -> list[Proposal]:
+    """Return the correction of scales by factors, with their evidence."""
+    sources = mapping.by_subject
+    return [
+        Proposal(n, said, scaled_source(sources[n], factor)) for n, (factor, said) in factors.items() if n in sources
+    ]
+
+
+def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
+    """Return the certain corrections of mounting, unit, sign and delay from the first minutes of a drive."""
+    mapping, mounting = survey.mapping, survey.mounting
+    proposals: list[Proposal] = []
+    if mounting is not None and mounting.confident and not mounting.is_as_named:
+        turned, said = turned_signals(mapping, mounting, survey.triads), f"{mounting.text}: {mounting.evidence}"
+        proposals += [Proposal(n, said, s) for n, s in turned.items() if s != mapping.signals[n]]
+    else:
+        factors = explained_factors(survey.measured, mounting_is_known=survey.is_mounted)
+        proposals += _rescaled(mapping, factors) if factors else _of_a_turned_truth(survey)
+    sources = mapping.by_subject | {p.subject: p.source for p in proposals}
+    for name, (delay_s, evidence) in _delays(survey).items():
+        late = replace(sources[name], latency_s=round(sources[name].latency_s + delay_s, 4))
+        proposals.append(Proposal(name, evidence, late))
+    return tuple(proposals)
+
+
+def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
+    """Return the delay and the evidence of each late signal, from ground truth, otherwise from another sensor."""
+    delays: dict[str, tuple[float, str]] = {}
+    latency = survey.latency
+    if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:
+        delays["yaw_rate_rad_s"] = latency.gyro_delay_s, latency.reason
+    # The delay of a_y is not observable from another axis.
+    is_mounted = survey.mounting is None or survey.mounting.is_as_named
+    by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
+    if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, 3.0 * by_truth[1]):
+        delays["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against ground truth"
+    for sensor in survey.late:
+        told_by_truth = sensor.names[0] == "yaw_rate_rad_s" and latency is not None and latency.reliable
+        for name in sensor.names if sensor.exact and not told_by_truth else ():
+            delays.setdefault(name, (sensor.delay_s, sensor.evidence))
+    return delays
+
+
+def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
+    """Return corrected ground-truth sources if the sideslip has a constant offset that a mapping can correct."""
+    columns, truth = survey.measured.columns, survey.mapping.truth
+    check = None if survey.truth is None else offset_check(columns)
+    if check is None or check.verdict != "failed":
+        return []
+    (offset, _), evidence = sideslip_offset(columns), check.evidence
+    vx, vy = truth.get("vx_m_s"), truth.get("vy_m_s")
+    changed: dict[str, SignalSource] = {}
+    if "sideslip_rad" in truth:
+        source = truth["sideslip_rad"]
+        changed["sideslip_rad"] = replace(source, offset=_single(source.offset) - offset)
+    elif vx is not None and vy is not None:
+        if (vx.topic, vx.stamp) == (vy.topic, vy.stamp) and isinstance(vx.field, str) and isinstance(vy.field, str):
+            c, s, fields = math.cos(offset), math.sin(offset), (vx.field, vy.field)
+            ahead, left = _single(vx.scale), _single(vy.scale)
+            changed["vx_m_s"] = replace(vx, field=fields, scale=(c * ahead, s * left))
+            changed["vy_m_s"] = replace(vy, field=fields, scale=(-s * ahead, c * left))
+    elif "yaw_rad" in truth:
+        changed["yaw_rad"] = replace(truth["yaw_rad"], offset=_single(truth["yaw_rad"].offset) + offset)
+    return [Proposal(f"truth.{n}", evidence, source) for n, source in changed.items()]
+
+
+def _single(value: float | tuple[float, ...]) -> float:
+    return value[0] if isinstance(value, tuple) else value
