@@ -20,6 +20,7 @@ from pdhef_logtool.logs.table_clocks import (
     TIME_UNITS_NS,
     Clock,
     ascending_rows,
+    calendar_clock,
     number_clock,
     rate_clock,
     rescaled,
@@ -54,7 +55,7 @@ _UNITS = frozenset(
     )
 ) | {*TIME_UNITS_NS}
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
-_LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
+_LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ł": "l"})
 
 #: Words of titles in other alphabets, and their English.
 _TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
@@ -62,6 +63,7 @@ _OTHER_ALPHABET = re.compile("|".join(_TRANSLATIONS))
 
 _TIME = re.compile(
     r"(?:(?:time|t|timestamp|time_?stamps?|stamp|utc|utc_time|gps_time|date_?time|datetime|zeit(?:stempel)?|log_time|rel(?:ative)?_time|"
+    r"temps|tempo|tiempo|tid|tijd|czas|cas|zaman|"
     rf"elapsed(?:_time)?|time_of_day|[cp]?ts|ticks?|secs?)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
 )
 _TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
@@ -75,6 +77,8 @@ _SIGNAL = re.compile(
     r"(?:signal|channel|variable|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
 )
 _VALUE = re.compile(r"(?:physical_|signal_|phys_|telemetry_|metric_)?(?:value|val|wert)")
+#: Columns of times that are split into their parts.
+_CALENDAR = ("year", "month", "day", "hour", "minute", "second")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 
 
@@ -144,6 +148,11 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     if week is not None and seconds is not None:
         clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
         return replace(clock, columns=frozenset({week, seconds}))
+    for of in ("", "utc_", "gps_"):
+        if all((parts := {part: names.get(f"{of}{part}", "") for part in _CALENDAR}).values()):
+            columns = [_numbers(sheet.columns[name]) for name in parts.values()]
+            clock = replace(calendar_clock(columns), columns=frozenset(parts.values()))
+            return _in_two_columns(clock, sheet, parts["second"], names)
     grades = {name: grade for name in sheet.columns if (grade := _grade(sheet, name)) is not None}
     clocks = {name: _read_clock(sheet, name, others, rate_hz) for name in grades}
     chosen, *rivals = _best_clocks(clocks, grades)
@@ -200,9 +209,10 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     column, text = sheet.columns[name], snake(name)
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
+        given = column.drop_nulls().head(20)
+        times = {*text_clock(given).stamps_ns.tolist()} - {NO_TIME}
         if not (is_time or _TIME_LIKE.search(text) or _DATE.fullmatch(text)):
-            return None
-        times = {*text_clock(column.drop_nulls().head(20)).stamps_ns.tolist()} - {NO_TIME}
+            return 2 if len(times) == len(given) > 1 else None
         return (0 if is_time else 1) if len(times) > (not is_time) else None
     if column.dtype.kind not in "iufM":
         return None
@@ -280,6 +290,24 @@ def tables_of(
     for number, (there, columns) in enumerate(ordered, 1):
         name = sheet.name if number == 1 else f"{sheet.name}_{number}"
         yield Table.of_arrays(name, stamps[rows][there], columns, sheet.units, sheet.type_name)
+
+
+def by_times(name: str, columns: dict[str, Any], units: dict[str, str]) -> Iterator[Sheet]:
+    """Yield a sheet for each ascending column of times titled as the first column, with the columns that follow it."""
+    first, *_ = titles = [*columns]
+    pattern = rf"{re.escape(first)}(_\d+)?" if _TIME.fullmatch(snake(first)) else "(?!)"
+    named = [i for i, n in enumerate(titles) if re.fullmatch(pattern, n) and units.get(n) == units.get(first)]
+    starts = [
+        i for i in named if isinstance(c := columns[titles[i]], np.ndarray) and (np.diff(c[np.isfinite(c)]) > 0).all()
+    ]
+    if len(starts) < 2 or starts[0]:
+        yield Sheet(name, columns, units)
+        return
+    for number, (begin, end) in enumerate(zip(starts, [*starts[1:], len(titles)], strict=True), 1):
+        there = np.isfinite(columns[titles[begin]])
+        part = {t: c[there] if isinstance(c := columns[t], np.ndarray) else c.filter(there) for t in titles[begin:end]}
+        if len(part) > 1:
+            yield Sheet(name if number == 1 else f"{name}_{number}", part, units)
 
 
 def clock_notes(clock: Clock, where: str) -> list[Loss]:

@@ -25,7 +25,7 @@ import numpy as np
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
 from pdhef_logtool.logs.table_clocks import NO_TIME, placed, unwrapped, whole_days
-from pdhef_logtool.logs.table_columns import Sheet, is_unit, read_head, tables_of
+from pdhef_logtool.logs.table_columns import Sheet, by_times, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
@@ -35,6 +35,14 @@ if TYPE_CHECKING:
 
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
+#: Bytes that show the encoding. Latin-1 has no letters from 0x81 to 0x9f, where most signs of Shift JIS begin, and no
+#: words of accented letters only; of GBK every sign has two high bytes.
+_FIRST_BYTES = 1 << 16
+_ENCODINGS = {
+    "utf-8-sig": rb"",
+    "cp932": rb"(?:[\x81-\x9f][\x40-\xfc]){2}",
+    "gb18030": rb"^(?=[\s\S]*[\xa1-\xfe]{4})(?:[\0-\x7f]|[\x81-\xfe]{2})*$",
+}
 #: Cells below the header that show the decimal mark of the file.
 _CELLS_OF_HEAD = 10_000
 #: Cells that are in memory as texts at the same time.
@@ -78,8 +86,11 @@ def open_csv(file: TableFile) -> Tables:
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
-    sheet = Sheet("csv", columns, given)
-    return Tables("csv", list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
+    rate_hz = file.settings.rate_hz
+    tables = [
+        t for sheet in by_times("csv", columns, given) for t in tables_of(sheet, file.name, losses, None, rate_hz)
+    ]
+    return Tables("csv", tables, losses)
 
 
 def open_vbo(file: TableFile) -> Tables:
@@ -110,11 +121,23 @@ def open_vbo(file: TableFile) -> Tables:
 
 
 def _text(file: TableFile) -> io.TextIOWrapper:
-    """Return the text of a file: UTF-16 with a byte order mark, otherwise UTF-8; other bytes are read as Latin-1."""
-    mark = file.stream.read(2)
+    """Return the text of a file: UTF-16 with a byte order mark, otherwise UTF-8, or as its first bytes show."""
+    start = file.stream.read(_FIRST_BYTES)
     file.stream.seek(0)
-    encoding, errors = ("utf-16", "replace") if mark in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "as-latin-1")
-    return io.TextIOWrapper(file.stream, encoding, errors)
+    if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return io.TextIOWrapper(file.stream, "utf-16", "replace")
+    return io.TextIOWrapper(file.stream, *_eight_bits(start))
+
+
+def _eight_bits(start: bytes) -> tuple[str, str]:
+    """Return encoding and treatment of errors: UTF-8, Shift JIS or GBK; bytes that they do not have are Latin-1."""
+    lines = start.rpartition(b"\n")[0]
+    for encoding, shows in _ENCODINGS.items():
+        with suppress(UnicodeDecodeError):
+            lines.decode(encoding)
+            if re.search(shows, lines):
+                return encoding, "as-latin-1"
+    return "utf-8-sig", "as-latin-1"
 
 
 def _rows(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -142,9 +165,13 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     lengths = Counter(len(row) for row in rows[-20:])
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
-    full = next((i for i, row in enumerate(rows) if len(row) == width > 1 and _share(row, _VALUE.fullmatch) >= 0.5), 0)
-    widths = {width, width - 1} if full and not rows[full][-1].strip() else {width}  # rows may end with a separator
-    above = [i for i in range(full) if len(rows[i]) in widths and _share(rows[i], _VALUE.fullmatch) < 0.5]
+    numbers = [i for i, row in enumerate(rows) if len(row) == width > 1 and _share(row, _VALUE.fullmatch) >= 0.5]
+    for full in numbers[:2] or [0]:  # above the titles there may be a row of the channels' numbers
+        # Rows may end with a separator.
+        widths = {width, width - 1} if full and not rows[full][-1].strip() else {width}
+        above = [i for i in range(full) if len(rows[i]) in widths and _share(rows[i], _VALUE.fullmatch) < 0.5]
+        if above:
+            break
     if not above:
         got = "none" if full else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)

@@ -220,7 +220,8 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Meaning | None:
     """Return the meaning by names; short names depend on others: g_x with a_x is a gyro, r with v_x and v_y a yaw rate.
 
-    The letters u, v and r of one message are the velocities ahead and to the left and the yaw rate.
+    The letters u, v and r of one message are the velocities ahead and to the left and the yaw rate; vl is a velocity
+    to the left beside vf (forward), and ahead (längs) beside vq (quer).
 
     An array without a known length is also tried as a vector of three axes.
     """
@@ -233,6 +234,10 @@ def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Mea
             path = letter[1] + {"u": "vx", "v": "vy", "r": "yaw_rate"}[letter[2]]
         elif letter[2] == "r" and ({"vx", "vy"} <= beside or ("v" in beside and {"ay", "a_y"} & beside)):
             path = f"{letter[1]}yaw_rate"
+    if across := re.fullmatch(r"((?:.*\.)?[vV])([lq])", path):
+        beside = {p.removeprefix(across[1]) for p in there if p.startswith(across[1])}
+        sides = {"l": "_lat"} if "f" in beside else {"l": "_long", "q": "_lat"} if {"l", "q"} <= beside else {}
+        path = across[1] + sides.get(across[2], across[2])
     paths = dict.fromkeys((path, path.replace("[]", "[2]")))
     meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
     return next((meaning for meaning in meanings if meaning is not None), None)
