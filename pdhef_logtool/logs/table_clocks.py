@@ -287,16 +287,6 @@ def week_clock(week: FloatArray, seconds: FloatArray) -> Clock:
     return Clock(_to_utc(stamps, has_time), notes)
 
 
-def calendar_clock(parts: Sequence[FloatArray]) -> Clock:
-    """Return the clock of years, months, days, hours, minutes and seconds, [N] each."""
-    has_time = np.logical_and.reduce([np.isfinite(part) for part in parts])
-    year, month, day, hour, minute = (np.where(has_time, part, 0.0).astype(np.int64) for part in parts[:5])
-    days, is_day = _civil(year, month, day)
-    second = np.round(np.where(has_time, parts[5], 0.0) * _SECONDS).astype(np.int64)
-    stamps = days * _DAY_NS + hour * _HOUR_NS + minute * _MINUTE_NS + second
-    return Clock(np.where(has_time & is_day, stamps, NO_TIME))
-
-
 def _to_utc(stamps: IntArray, has_time: BoolArray) -> IntArray:
     """Return UTC of GPS times [N], both in ns since 1970."""
     since, leap = np.array(_GPS["leap_seconds"], np.int64).T

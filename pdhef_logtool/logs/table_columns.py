@@ -7,6 +7,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +21,6 @@ from pdhef_logtool.logs.table_clocks import (
     TIME_UNITS_NS,
     Clock,
     ascending_rows,
-    calendar_clock,
     number_clock,
     rate_clock,
     rescaled,
@@ -55,17 +55,14 @@ _UNITS = frozenset(
     )
 ) | {*TIME_UNITS_NS}
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
-_LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ł": "l"})
+#: Letters in ASCII.
+LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ł": "l"})
 
 #: Words of titles in other alphabets, and their English.
 _TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
 _OTHER_ALPHABET = re.compile("|".join(_TRANSLATIONS))
 
-_TIME = re.compile(
-    r"(?:(?:time|t|timestamp|time_?stamps?|stamp|utc|utc_time|gps_time|date_?time|datetime|zeit(?:stempel)?|log_time|rel(?:ative)?_time|"
-    r"temps|tempo|tiempo|tid|tijd|czas|cas|zaman|"
-    rf"elapsed(?:_time)?|time_of_day|[cp]?ts|ticks?|secs?)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
-)
+_TIME = re.compile(CONSTANTS["clocks"]["names"].format("|".join(TIME_UNITS_NS)))
 _TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
 _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
 _WEEK_TIME = re.compile(
@@ -77,15 +74,13 @@ _SIGNAL = re.compile(
     r"(?:signal|channel|variable|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
 )
 _VALUE = re.compile(r"(?:physical_|signal_|phys_|telemetry_|metric_)?(?:value|val|wert)")
-#: Columns of times that are split into their parts.
-_CALENDAR = ("year", "month", "day", "hour", "minute", "second")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 
 
 def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
     text = _OTHER_ALPHABET.sub(lambda match: f" {_TRANSLATIONS[match[0]]} ", text)
-    text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(_LATIN)).encode("ascii", "ignore").decode()
+    text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(LATIN)).encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
     return f"n_{name}" if name[0].isdigit() else name
 
@@ -144,15 +139,8 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     LogError : no column contains times, and no rate is given.
     """
     names = {snake(name): name for name in reversed([*sheet.columns])}
-    week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
-    if week is not None and seconds is not None:
-        clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
-        return replace(clock, columns=frozenset({week, seconds}))
-    for of in ("", "utc_", "gps_"):
-        if all((parts := {part: names.get(f"{of}{part}", "") for part in _CALENDAR}).values()):
-            columns = [_numbers(sheet.columns[name]) for name in parts.values()]
-            clock = replace(calendar_clock(columns), columns=frozenset(parts.values()))
-            return _in_two_columns(clock, sheet, parts["second"], names)
+    if (in_parts := _in_parts(sheet, names)) is not None:
+        return in_parts
     grades = {name: grade for name in sheet.columns if (grade := _grade(sheet, name)) is not None}
     clocks = {name: _read_clock(sheet, name, others, rate_hz) for name in grades}
     chosen, *rivals = _best_clocks(clocks, grades)
@@ -176,9 +164,27 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     return replace(clock, notes=(*clock.notes, note)) if apart else clock
 
 
+def _in_parts(sheet: Sheet, names: Mapping[str, str]) -> Clock | None:
+    """Return the clock of GPS weeks and seconds, or of years, months and so on until the second; None without them."""
+    import polars as pl
+
+    week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
+    if week is not None and seconds is not None:
+        clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
+        return replace(clock, columns=frozenset({week, seconds}))
+    places = {re.sub("^(utc|gps)_", "", n): name for n, name in names.items()}
+    parts = [places.get(part, "") for part in ("year", "month", "day", "hour", "minute", "second")]
+    if not all(parts):
+        return None
+    *whole, second = (pl.Series(_numbers(sheet.columns[part])) for part in parts)
+    date = [part.cast(pl.Int64, strict=False) for part in whole]
+    clock = text_clock(pl.select(pl.format("{}-{}-{} {}:{}:{}", *date, second)).to_series())
+    return _in_two_columns(replace(clock, columns=frozenset(parts)), sheet, parts[-1], names)
+
+
 def _in_two_columns(clock: Clock, sheet: Sheet, name: str, names: Mapping[str, str]) -> Clock:
     """Return a clock of seconds with the fractions of another column, ``stamp.sec`` and ``stamp.nanosec``."""
-    rest = re.fullmatch(r"(.*?)_?(?:s|sec|secs|seconds)", snake(name))
+    rest = re.fullmatch(r"(.*?)_?(?:s|secs?|seconds?)", snake(name))
     if rest is None:
         return clock
     for unit, ns in TIME_UNITS_NS.items():
@@ -210,10 +216,9 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
         given = column.drop_nulls().head(20)
-        times = {*text_clock(given).stamps_ns.tolist()} - {NO_TIME}
-        if not (is_time or _TIME_LIKE.search(text) or _DATE.fullmatch(text)):
-            return 2 if len(times) == len(given) > 1 else None
-        return (0 if is_time else 1) if len(times) > (not is_time) else None
+        named = _TIME_LIKE.search(text) or _DATE.fullmatch(text)
+        grade, others = (0, 0) if is_time else (1, 1) if named else (2, max(1, len(given) - 1))
+        return grade if len({*text_clock(given).stamps_ns.tolist()} - {NO_TIME}) > others else None
     if column.dtype.kind not in "iufM":
         return None
     given = column[~np.isnat(column)].view(np.int64) if column.dtype.kind == "M" else column[np.isfinite(column)]
@@ -294,20 +299,19 @@ def tables_of(
 
 def by_times(name: str, columns: dict[str, Any], units: dict[str, str]) -> Iterator[Sheet]:
     """Yield a sheet for each ascending column of times titled as the first column, with the columns that follow it."""
-    first, *_ = titles = [*columns]
-    pattern = rf"{re.escape(first)}(_\d+)?" if _TIME.fullmatch(snake(first)) else "(?!)"
-    named = [i for i, n in enumerate(titles) if re.fullmatch(pattern, n) and units.get(n) == units.get(first)]
-    starts = [
-        i for i in named if isinstance(c := columns[titles[i]], np.ndarray) and (np.diff(c[np.isfinite(c)]) > 0).all()
-    ]
-    if len(starts) < 2 or starts[0]:
+    titles = [*columns]
+    named = re.compile(rf"{re.escape(titles[0])}(_\d+)?" if _TIME.fullmatch(snake(titles[0])) else "(?!)")
+    starts = [i for i, t in enumerate(titles) if named.fullmatch(t) and _ascends(columns[t])]
+    if len(starts) < 2:
         yield Sheet(name, columns, units)
         return
-    for number, (begin, end) in enumerate(zip(starts, [*starts[1:], len(titles)], strict=True), 1):
-        there = np.isfinite(columns[titles[begin]])
-        part = {t: c[there] if isinstance(c := columns[t], np.ndarray) else c.filter(there) for t in titles[begin:end]}
-        if len(part) > 1:
-            yield Sheet(name if number == 1 else f"{name}_{number}", part, units)
+    for number, (begin, end) in enumerate(pairwise([*starts, len(titles)]), 1):
+        there = np.flatnonzero(np.isfinite(columns[titles[begin]]))
+        yield Sheet(f"{name}_{number}", {t: columns[t][there] for t in titles[begin:end]}, units)
+
+
+def _ascends(column: NDArray[Any] | Series) -> bool:
+    return isinstance(column, np.ndarray) and bool((np.diff(column[np.isfinite(column)]) > 0).all())
 
 
 def clock_notes(clock: Clock, where: str) -> list[Loss]:

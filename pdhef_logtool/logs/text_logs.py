@@ -35,14 +35,6 @@ if TYPE_CHECKING:
 
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
-#: Bytes that show the encoding. Latin-1 has no letters from 0x81 to 0x9f, where most signs of Shift JIS begin, and no
-#: words of accented letters only; of GBK every sign has two high bytes.
-_FIRST_BYTES = 1 << 16
-_ENCODINGS = {
-    "utf-8-sig": rb"",
-    "cp932": rb"(?:[\x81-\x9f][\x40-\xfc]){2}",
-    "gb18030": rb"^(?=[\s\S]*[\xa1-\xfe]{4})(?:[\0-\x7f]|[\x81-\xfe]{2})*$",
-}
 #: Cells below the header that show the decimal mark of the file.
 _CELLS_OF_HEAD = 10_000
 #: Cells that are in memory as texts at the same time.
@@ -86,10 +78,8 @@ def open_csv(file: TableFile) -> Tables:
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
-    rate_hz = file.settings.rate_hz
-    tables = [
-        t for sheet in by_times("csv", columns, given) for t in tables_of(sheet, file.name, losses, None, rate_hz)
-    ]
+    sheets, rate_hz = by_times("csv", columns, given), file.settings.rate_hz
+    tables = [table for sheet in sheets for table in tables_of(sheet, file.name, losses, rate_hz=rate_hz)]
     return Tables("csv", tables, losses)
 
 
@@ -121,23 +111,11 @@ def open_vbo(file: TableFile) -> Tables:
 
 
 def _text(file: TableFile) -> io.TextIOWrapper:
-    """Return the text of a file: UTF-16 with a byte order mark, otherwise UTF-8, or as its first bytes show."""
-    start = file.stream.read(_FIRST_BYTES)
+    """Return the text of a file in the encoding that its first bytes show; bytes without a meaning are Latin-1."""
+    start = file.stream.read(io.DEFAULT_BUFFER_SIZE)
     file.stream.seek(0)
-    if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return io.TextIOWrapper(file.stream, "utf-16", "replace")
-    return io.TextIOWrapper(file.stream, *_eight_bits(start))
-
-
-def _eight_bits(start: bytes) -> tuple[str, str]:
-    """Return encoding and treatment of errors: UTF-8, Shift JIS or GBK; bytes that they do not have are Latin-1."""
-    lines = start.rpartition(b"\n")[0]
-    for encoding, shows in _ENCODINGS.items():
-        with suppress(UnicodeDecodeError):
-            lines.decode(encoding)
-            if re.search(shows, lines):
-                return encoding, "as-latin-1"
-    return "utf-8-sig", "as-latin-1"
+    shown = (name for name, pattern in CONSTANTS["encodings"].items() if re.match(pattern.encode(), start))
+    return io.TextIOWrapper(file.stream, next(shown, "utf-8-sig"), "as-latin-1")
 
 
 def _rows(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -166,14 +144,10 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
     numbers = [i for i, row in enumerate(rows) if len(row) == width > 1 and _share(row, _VALUE.fullmatch) >= 0.5]
-    for full in numbers[:2] or [0]:  # above the titles there may be a row of the channels' numbers
-        # Rows may end with a separator.
-        widths = {width, width - 1} if full and not rows[full][-1].strip() else {width}
-        above = [i for i in range(full) if len(rows[i]) in widths and _share(rows[i], _VALUE.fullmatch) < 0.5]
-        if above:
-            break
+    # Above the titles there may be a row with the numbers of the channels.
+    full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width))), (0, []))
     if not above:
-        got = "none" if full else "no row of numbers below it"
+        got = "none" if numbers else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
     # Titles, above them those of groups, below them units, sources and the name of an index.
     names = max(reversed(above[-3:]), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
@@ -183,6 +157,12 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     groups = rows[names - 1] if names - 1 in above else []
     under = [rows[i] for i in above if names < i < first]
     return _joined(rows[names], groups, under), units, first
+
+
+def _titles(rows: Sequence[Sequence[str]], width: int) -> list[int]:
+    """Return the rows of texts above the last row; rows may end with a separator."""
+    widths = {width, width - 1} if not rows[-1][-1].strip() else {width}
+    return [i for i, row in enumerate(rows[:-1]) if len(row) in widths and _share(row, _VALUE.fullmatch) < 0.5]
 
 
 def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
