@@ -63,7 +63,7 @@ _TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
 _OTHER_ALPHABET = re.compile("|".join(_TRANSLATIONS))
 
 _TIME = re.compile(CONSTANTS["clocks"]["names"].format("|".join(TIME_UNITS_NS)))
-_TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
+_TIME_LIKE = re.compile(CONSTANTS["clocks"]["like"])
 _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
 _WEEK_TIME = re.compile(
     r"(?:(?:gps|gnss)_)?(?:i?tow|sow|time_of_week|seconds_of_week|week_seconds|seconds|time)(?:_m?s)?"
