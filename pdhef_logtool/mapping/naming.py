@@ -307,7 +307,7 @@ def _corner(words: tuple[str, ...], leaf_words: tuple[str, ...]) -> str:
         for word in group:
             if word in _CORNERS:
                 return _CORNERS[word]
-            if word in _GERMAN and {"wheel", "whl"} & set(words):
+            if word in _GERMAN and {"wheel", "whl", "rad"} & set(words):
                 return _GERMAN[word]
         ends = {"front": "f", "rear": "r", "back": "r"}, {"left": "l", "right": "r"}
         if "axle" in group:

@@ -673,6 +673,7 @@ def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
         ("Accelerazione laterale", "g", "acceleration", "y", G),
         ("Velocidad", "km/h", "speed", "", 1 / 3.6),
         ("Girhastighet", "°/s", "rate", "z", DEG),
+        ("Rad_VL_Geschw", "km/h", "wheel speed", "fl", 1 / 3.6),
         ("Rattvinkel", "°", "steering", "wheel", DEG),
         ("Hjulhastighet VB", "km/h", "wheel speed", "rl", 1 / 3.6),
         ("Predkosc katowa odchylenia", "°/s", "rate", "z", DEG),
