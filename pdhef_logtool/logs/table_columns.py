@@ -8,6 +8,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,17 +51,15 @@ _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
 _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS_NS}
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
-_LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
+#: Letters in ASCII.
+LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ł": "l"})
 
 #: Words of titles in other alphabets, and their English.
 _TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
 _OTHER_ALPHABET = re.compile("|".join(_TRANSLATIONS))
 
-_TIME = re.compile(
-    r"(?:(?:time|t|timestamp|time_?stamps?|stamp|utc|utc_time|gps_time|date_?time|datetime|zeit(?:stempel)?|log_time|rel(?:ative)?_time|"
-    rf"elapsed(?:_time)?|time_of_day|[cp]?ts|ticks?|secs?)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
-)
-_TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
+_TIME = re.compile(CONSTANTS["clocks"]["names"].format("|".join(TIME_UNITS_NS)))
+_TIME_LIKE = re.compile(CONSTANTS["clocks"]["like"])
 _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
 _WEEK_TIME = re.compile(
     r"(?:(?:gps|gnss)_)?(?:i?tow|sow|time_of_week|seconds_of_week|week_seconds|seconds|time)(?:_m?s)?"
@@ -77,7 +76,7 @@ _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
     text = _OTHER_ALPHABET.sub(lambda match: f" {_TRANSLATIONS[match[0]]} ", text)
-    text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(_LATIN)).encode("ascii", "ignore").decode()
+    text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(LATIN)).encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
     return f"n_{name}" if name[0].isdigit() else name
 
@@ -136,10 +135,8 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     LogError : no column contains times, and no rate is given.
     """
     names = {snake(name): name for name in reversed([*sheet.columns])}
-    week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
-    if week is not None and seconds is not None:
-        clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
-        return replace(clock, columns=frozenset({week, seconds}))
+    if (in_parts := _in_parts(sheet, names)) is not None:
+        return in_parts
     grades = {name: grade for name in sheet.columns if (grade := _grade(sheet, name)) is not None}
     clocks = {name: _read_clock(sheet, name, others, rate_hz) for name in grades}
     chosen, *rivals = _best_clocks(clocks, grades)
@@ -163,9 +160,27 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     return replace(clock, notes=(*clock.notes, note)) if apart else clock
 
 
+def _in_parts(sheet: Sheet, names: Mapping[str, str]) -> Clock | None:
+    """Return the clock of GPS weeks and seconds, or of years, months and so on until the second; None without them."""
+    import polars as pl
+
+    week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
+    if week is not None and seconds is not None:
+        clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
+        return replace(clock, columns=frozenset({week, seconds}))
+    places = {re.sub("^(utc|gps)_", "", n): name for n, name in names.items()}
+    parts = [places.get(part, "") for part in ("year", "month", "day", "hour", "minute", "second")]
+    if not all(parts):
+        return None
+    *whole, second = (pl.Series(_numbers(sheet.columns[part])) for part in parts)
+    date = [part.cast(pl.Int64, strict=False) for part in whole]
+    clock = text_clock(pl.select(pl.format("{}-{}-{} {}:{}:{}", *date, second)).to_series())
+    return _in_two_columns(replace(clock, columns=frozenset(parts)), sheet, parts[-1], names)
+
+
 def _in_two_columns(clock: Clock, sheet: Sheet, name: str, names: Mapping[str, str]) -> Clock:
     """Return a clock of seconds with the fractions of another column, ``stamp.sec`` and ``stamp.nanosec``."""
-    rest = re.fullmatch(r"(.*?)_?(?:s|sec|secs|seconds)", snake(name))
+    rest = re.fullmatch(r"(.*?)_?(?:s|secs?|seconds?)", snake(name))
     if rest is None:
         return clock
     for unit, ns in TIME_UNITS_NS.items():
@@ -223,10 +238,10 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     column, text = sheet.columns[name], snake(name)
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
-        if not (is_time or _TIME_LIKE.search(text) or _DATE.fullmatch(text)):
-            return None
-        times = {*text_clock(column.drop_nulls().head(20)).stamps_ns.tolist()} - {NO_TIME}
-        return (0 if is_time else 1) if len(times) > (not is_time) else None
+        given = column.drop_nulls().head(20)
+        named = _TIME_LIKE.search(text) or _DATE.fullmatch(text)
+        grade, others = (0, 0) if is_time else (1, 1) if named else (2, max(1, len(given) - 1))
+        return grade if len({*text_clock(given).stamps_ns.tolist()} - {NO_TIME}) > others else None
     if column.dtype.kind not in "iufM":
         return None
     given = column[~np.isnat(column)].view(np.int64) if column.dtype.kind == "M" else column[np.isfinite(column)]
@@ -303,6 +318,23 @@ def tables_of(
     for number, (there, columns) in enumerate(ordered, 1):
         name = sheet.name if number == 1 else f"{sheet.name}_{number}"
         yield Table.of_arrays(name, stamps[rows][there], columns, sheet.units, sheet.type_name)
+
+
+def by_times(name: str, columns: dict[str, Any], units: dict[str, str]) -> Iterator[Sheet]:
+    """Yield a sheet for each ascending column of times titled as the first column, with the columns that follow it."""
+    titles = [*columns]
+    named = re.compile(rf"{re.escape(titles[0])}(_\d+)?" if _TIME.fullmatch(snake(titles[0])) else "(?!)")
+    starts = [i for i, t in enumerate(titles) if named.fullmatch(t) and _ascends(columns[t])]
+    if len(starts) < 2:
+        yield Sheet(name, columns, units)
+        return
+    for number, (begin, end) in enumerate(pairwise([*starts, len(titles)]), 1):
+        there = np.flatnonzero(np.isfinite(columns[titles[begin]]))
+        yield Sheet(f"{name}_{number}", {t: columns[t][there] for t in titles[begin:end]}, units)
+
+
+def _ascends(column: NDArray[Any] | Series) -> bool:
+    return isinstance(column, np.ndarray) and bool((np.diff(column[np.isfinite(column)]) > 0).all())
 
 
 def clock_notes(clock: Clock, where: str) -> list[Loss]:

@@ -27,7 +27,7 @@ import numpy as np
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
 from pdhef_logtool.logs.table_clocks import NO_TIME, placed, unwrapped, whole_days
-from pdhef_logtool.logs.table_columns import Sheet, is_unit, read_head, tables_of
+from pdhef_logtool.logs.table_columns import Sheet, by_times, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
@@ -84,8 +84,9 @@ def open_csv(file: TableFile) -> Tables:
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
-    sheet = Sheet("csv", columns, given)
-    return Tables("csv", list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
+    sheets, rate_hz = by_times("csv", columns, given), file.settings.rate_hz
+    tables = [table for sheet in sheets for table in tables_of(sheet, file.name, losses, rate_hz=rate_hz)]
+    return Tables("csv", tables, losses)
 
 
 def open_vbo(file: TableFile) -> Tables:
@@ -116,11 +117,11 @@ def open_vbo(file: TableFile) -> Tables:
 
 
 def _text(file: TableFile) -> io.TextIOWrapper:
-    """Return the text of a file: UTF-16 with a byte order mark, otherwise UTF-8; other bytes are read as Latin-1."""
-    mark = file.stream.read(2)
+    """Return the text of a file in the encoding that its first bytes show; bytes without a meaning are Latin-1."""
+    start = file.stream.read(io.DEFAULT_BUFFER_SIZE)
     file.stream.seek(0)
-    encoding, errors = ("utf-16", "replace") if mark in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "as-latin-1")
-    return io.TextIOWrapper(file.stream, encoding, errors)
+    shown = (name for name, pattern in CONSTANTS["encodings"].items() if re.match(pattern.encode(), start))
+    return io.TextIOWrapper(file.stream, next(shown, "utf-8-sig"), "as-latin-1")
 
 
 def _rows(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -148,11 +149,11 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     lengths = Counter(len(row) for row in rows[-20:])
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
-    full = next((i for i, row in enumerate(rows) if len(row) == width > 1 and _share(row, _VALUE.fullmatch) >= 0.5), 0)
-    widths = {width, width - 1} if full and not rows[full][-1].strip() else {width}  # rows may end with a separator
-    above = [i for i in range(full) if len(rows[i]) in widths and _share(rows[i], _VALUE.fullmatch) < 0.5]
+    numbers = [i for i, row in enumerate(rows) if len(row) == width > 1 and _share(row, _VALUE.fullmatch) >= 0.5]
+    # Above the titles there may be a row with the numbers of the channels.
+    full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width))), (0, []))
     if not above:
-        got = "none" if full else "no row of numbers below it"
+        got = "none" if numbers else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
     # Titles, above them those of groups, below them units, sources and the name of an index.
     names = max(reversed(above[-3:]), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
@@ -162,6 +163,12 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     groups = rows[names - 1] if names - 1 in above else []
     under = [rows[i] for i in above if names < i < first]
     return _joined(rows[names], groups, under), units, first
+
+
+def _titles(rows: Sequence[Sequence[str]], width: int) -> list[int]:
+    """Return the rows of texts above the last row; rows may end with a separator."""
+    widths = {width, width - 1} if not rows[-1][-1].strip() else {width}
+    return [i for i, row in enumerate(rows[:-1]) if len(row) in widths and _share(row, _VALUE.fullmatch) < 0.5]
 
 
 def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:

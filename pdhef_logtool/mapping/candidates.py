@@ -21,7 +21,7 @@ from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import STATES, UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
+from pdhef_logtool.mapping.naming import STATES, UNIT_TEXTS, UNITS, Meaning, is_command, meaning_among, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
@@ -212,30 +212,9 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             if info.path in documented.fields:
                 results.append((topic, role, info, documented.fields[info.path].meaning, True))
             elif not documented.fields or info.path.count(".") or documented.has:
-                meaning = _meaning_by_names(topic, info, there)
+                meaning = meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
-
-
-def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Meaning | None:
-    """Return the meaning by names; short names depend on others: g_x with a_x is a gyro, r with v_x and v_y a yaw rate.
-
-    The letters u, v and r of one message are the velocities ahead and to the left and the yaw rate.
-
-    An array without a known length is also tried as a vector of three axes.
-    """
-    path = info.path
-    if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
-        path = f"{gyro[1]}gyro_{gyro[2]}"
-    if letter := re.fullmatch(r"((?:.*\.)?)([uvr])", path):
-        beside = {p.removeprefix(letter[1]) for p in there if p.startswith(letter[1])}
-        if {"u", "v", "r"} <= beside:
-            path = letter[1] + {"u": "vx", "v": "vy", "r": "yaw_rate"}[letter[2]]
-        elif letter[2] == "r" and ({"vx", "vy"} <= beside or ("v" in beside and {"ay", "a_y"} & beside)):
-            path = f"{letter[1]}yaw_rate"
-    paths = dict.fromkeys((path, path.replace("[]", "[2]")))
-    meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
-    return next((meaning for meaning in meanings if meaning is not None), None)
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
@@ -294,7 +273,7 @@ def _weighable(
     path = info.path.removesuffix("[]")
     for name in [path] if (topic.name, path) in samples else [f"{path}[{i}]" for i in range(MOST_COLUMNS)]:
         seen = samples.get((topic.name, name))
-        its = meaning if name == path else meaning_of(topic.name, topic.type_name, name, info.unit)
+        its = meaning if name == path else meaning_among(topic.name, topic.type_name, name, info.unit)
         if its is None and meaning.quantity == "speed":
             its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
         if seen is None or its is None or not _is_measured(name, seen):

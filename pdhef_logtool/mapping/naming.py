@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
+from pdhef_logtool.logs.table_columns import LATIN
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
 
 #: Size of the cache of meanings: the drives of a fleet have the same names.
@@ -26,6 +28,8 @@ VOCABULARY = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encodin
 UNITS: dict[str, dict[str, float]] = VOCABULARY["units"]
 #: Spelling of units in reports.
 UNIT_TEXTS: dict[str, str] = VOCABULARY["unit_texts"]
+#: Names of a struct, and the longer names that short ones have beside them.
+_SHORT_NAMES = tuple((frozenset(beside.split()), names) for beside, names in VOCABULARY["short_names"].items())
 _UNIT_PHRASES: tuple[tuple[str, str], ...] = tuple(VOCABULARY["unit_phrases"].items())
 _SPELLED_UNITS = tuple((re.compile(pattern), sign) for pattern, sign in VOCABULARY["unit_parts"].items())
 _SYNONYMS: dict[str, str] = VOCABULARY["synonyms"]
@@ -40,9 +44,8 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
-    for letter, latin in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("Ä", "Ae"), ("Ö", "Oe"), ("Ü", "Ue")):
-        name = name.replace(letter, latin)
-    name = _CORNER_AT_END.sub(r"_\g<0>_", _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name))
+    name = _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name.translate(LATIN))
+    name = _CORNER_AT_END.sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
         if part.lower() in _SYNONYMS:
             words += _SYNONYMS[part.lower()].split()
@@ -151,6 +154,23 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     ``unit_text`` is the unit stored in the log (``km/h``, ``°/s``), empty without one.
     """
     return _meaning_of_topic(topic, path, unit_text) or _meaning_of_path(topic, type_name, path, unit_text)
+
+
+def meaning_among(topic: str, type_name: str, path: str, unit_text: str, there: Collection[str] = ()) -> Meaning | None:
+    """Return :func:`meaning_of` a field beside others; an array of unknown length may be a vector of three axes."""
+    path = _spelled_out(path, there)
+    meanings = (meaning_of(topic, type_name, p, unit_text) for p in (path, path.replace("[]", "[2]")))
+    return next((meaning for meaning in meanings if meaning is not None), None)
+
+
+def _spelled_out(path: str, there: Collection[str]) -> str:
+    """Return a path with a longer name for one whose meaning the other names of its struct give: g_x beside a_x."""
+    if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
+        return f"{gyro[1]}gyro_{gyro[2]}"
+    leaf = path.rpartition(".")[2]
+    struct = path.removesuffix(leaf)
+    beside = {p.removeprefix(struct) for p in there if p.startswith(struct)}
+    return struct + next((names[leaf] for needed, names in _SHORT_NAMES if leaf in names and needed <= beside), leaf)
 
 
 def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> Meaning | None:
@@ -287,7 +307,7 @@ def _corner(words: tuple[str, ...], leaf_words: tuple[str, ...]) -> str:
         for word in group:
             if word in _CORNERS:
                 return _CORNERS[word]
-            if word in _GERMAN and {"wheel", "whl"} & set(words):
+            if word in _GERMAN and {"wheel", "whl", "rad"} & set(words):
                 return _GERMAN[word]
         ends = {"front": "f", "rear": "r", "back": "r"}, {"left": "l", "right": "r"}
         if "axle" in group:

@@ -443,7 +443,7 @@ def _role(topic: TopicInfo) -> Role:
 
 
 def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Without a sensor, take the yaw rate from an odometry and the speed from a navigation system, with a note."""
+    """Without a sensor, take the yaw rate from an odometry and the speed from navigation or a twist, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"] | _TOPICS["estimate"])]
     if "yaw_rate_rad_s" not in draft.signals:
@@ -457,6 +457,11 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     if not draft.signals or has_speed(draft.signals):
         return
     _speed_of_navigation(draft, topics)
+    bodies = [t for t in twists if not _is_truth(t) and _axes(draft, t, topics) == "body"]
+    if len(bodies) == 1 and not has_speed(draft.signals):
+        draft.take(draft.signals, "speed_m_s", bodies[0].name, _twist(bodies[0], "linear", "x"))
+        draft.notes.append(f"speed_m_s comes from {bodies[0].name}, whose x is ahead, as no other source gives a speed")
+        draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
 
 
 def _speed_of_receiver(draft: _Draft) -> None:

@@ -35,6 +35,7 @@ FIRST_RUNS = {
     "vendors": "layouts of race loggers, INS, phones, data frames and ROS tables were built last, and scored once",
     "later": "layouts of loggers, buses and exports in five languages were built after the causes were corrected, and "
     "scored once",
+    "fresh": "layouts of 16 tables and buses and 10 ROS logs were built after that, and scored once",
     "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",

@@ -100,6 +100,9 @@ DRIVES: dict[str, DriveSpec] = {
     "bends": DriveSpec("banked-road", 80.0, 0.9, 3, 60.0),
     "short": DriveSpec("road", 80.0, 0.9, 21, 60.0),
     "brief": DriveSpec("stop-and-go", 50.0, 0.9, 1, 12.0),
+    "motorway": DriveSpec("road", 120.0, 0.95, 41, 90.0),
+    "gravel": DriveSpec("road", 90.0, 0.6, 42, 110.0, vehicle="suv"),
+    "ring": DriveSpec("banked-road", 95.0, 0.95, 43, 75.0, vehicle="hatchback"),
     "other": DriveSpec("road", 60.0, 0.9, 31, 60.0, vehicle="hatchback"),
 }
 

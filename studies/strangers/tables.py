@@ -168,6 +168,98 @@ def _duration(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     path.write_text(_text(clock, columns, ["Time", *columns], ","), encoding="utf-8")
 
 
+def _race_export(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a race analysis program's export: pairs of keys above the titles, units and empty lines, quoted cells."""
+    names = [_split(title) for title in columns]
+    head = [
+        ["Format", "MoTeC CSV File", "", "", "Workbook", ""],
+        ["Log Date", "24/11/2025", "", "", "Origin Time", "0.000", "s"],
+    ]
+    head += [["Log Time", "14:05:12", "", "", "Start Time", "0.000", "s"], ["Sample Rate", "100.000", "Hz"], []]
+    head += [["Time", *(n for n, _ in names)], ["s", *(u for _, u in names)], [], []]
+    table = [
+        [f"{s / 1e9:.3f}" for s in (stamps - stamps[0]).tolist()],
+        *([f"{v:.9g}" for v in c] for c in columns.values()),
+    ]
+    rows = [",".join(f'"{cell}"' for cell in row) for row in (*head, *zip(*table, strict=True))]
+    path.write_text("\r\n".join([*rows, ""]), encoding="utf-8")
+
+
+def _sections(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write an engine tuner's log: sections in brackets, numbers of the channels above their names and units."""
+    names = [_split(title) for title in columns]
+    head = ["Log File", "Version: 1.0", "", "[Log Information]", "Creation Time: 11/24/2025 2:05:12 PM", "Notes: ", ""]
+    head += ["[Channel Information]", ",".join(str(i) for i in (0, *range(12, 12 + len(names))))]
+    head += [
+        ",".join(["Offset", *(n for n, _ in names)]),
+        ",".join(["s", *(u for _, u in names)]),
+        "",
+        "[Channel Data]",
+    ]
+    clock = [f"{s / 1e9:.3f}" for s in (stamps - stamps[0]).tolist()]
+    path.write_text("\n".join([*head, _text(clock, columns, [], ",")]), encoding="utf-8")
+
+
+def _time_of_day(
+    path: Path, stamps: IntArray, columns: dict[str, Any], title: str, encoding: str, comma: bool = True
+) -> None:
+    """Write names and units in two rows and the time of day, in the encoding and with the decimal sign of a country."""
+    names = [_split(column) for column in columns]
+    clock = [t[11:] for t in np.datetime_as_string(stamps.astype("datetime64[ns]"), "ms")]
+    head = [";".join([title, *(n for n, _ in names)]), ";".join(["", *(u for _, u in names)])]
+    text = "\n".join([*head, _text(clock, columns, [], ";")])
+    path.write_bytes((text.replace(".", ",") if comma else text.replace(";", ",")).encode(encoding))
+
+
+def _calendar(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write an inertial sensor's export: remarks, and the time from year to nanosecond in seven columns."""
+    titles = [
+        "PacketCounter",
+        *(f"UTC_{n}" for n in ("Nano", "Year", "Month", "Day", "Hour", "Minute", "Second")),
+        "UTC_Valid",
+    ]
+    clock = []
+    for i, stamp in enumerate(stamps.tolist()):
+        at = dt.datetime.fromtimestamp(stamp // 10**9, tz=dt.UTC)
+        clock.append(f"{i % 65536}\t{stamp % 10**9}\t{at:%Y\t%m\t%d\t%H\t%M\t%S}\t5")
+    remarks = [
+        "// Start Time: Unknown",
+        "// Update Rate: 100.0Hz",
+        "// Filter Profile: automotive",
+        "// Option Flags: none",
+    ]
+    path.write_text("\n".join([*remarks, _text(clock, columns, [*titles, *columns], "\t")]), encoding="utf-8")
+
+
+def _hashes(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a phone's lap timer: remarks after #, quoted titles, seconds since the start beside those of the epoch."""
+    head = ["# RaceRender Data: lap timer on a phone", "# Vehicle: car 3", "# Device Free Space: 12345 MB"]
+    titles = [f'"{title}"' for title in ("Time", "UTC Time", "Lap", *columns)]
+    clock = [f"{(s - int(stamps[0])) / 1e9:.3f},{s / 1e9:.3f},1" for s in stamps.tolist()]
+    path.write_text("\n".join([*head, _text(clock, columns, titles, ","), "# Session End"]), encoding="utf-8")
+
+
+def _own_times(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a measurement tool's export: each device's columns follow a column of its own times."""
+    start = min(int(t.arrival_ns[0]) for t in topics)
+    columns = []
+    for topic in topics:
+        columns.append(["time [s]", *(f"{(s - start) / 1e9:.4f}" for s in topic.arrival_ns.tolist())])
+        columns += [[title, *(f"{v:.6g}" for v in values.tolist())] for title, values in topic.fields.items()]
+    length = max(map(len, columns))
+    rows = zip(*([*column, *[""] * (length - len(column))] for column in columns), strict=True)
+    path.write_text("\n".join([*map(";".join, rows), ""]), encoding="utf-8")
+
+
+def _parameters(path: Path, topics: Sequence[Topic]) -> None:
+    """Write an app's long form: quoted seconds of the day, parameter, value and unit, with a semicolon at the end."""
+    rows = [
+        (f"{stamp % (86_400 * 10**9) / 1e9:.6f}", name, f"{v:.9g}", unit) for stamp, name, v, unit in _long_rows(topics)
+    ]
+    cells = [("SECONDS", "PID", "VALUE", "UNITS"), *rows]
+    path.write_text("\n".join([*("".join(f'"{cell}";' for cell in row) for row in cells), ""]), encoding="utf-8")
+
+
 def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     """Return a row for each value: time in ns, signal, value, unit."""
     rows = [
@@ -366,6 +458,12 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
     "csv-logger": (".txt", _logger),
     "csv-levels": (".csv", _levels),
     "csv-duration": (".csv", _duration),
+    "csv-race": (".csv", _race_export),
+    "csv-sections": (".csv", _sections),
+    "csv-japanese": (".csv", partial(_time_of_day, title="時刻", encoding="cp932", comma=False)),
+    "csv-swedish": (".csv", partial(_time_of_day, title="Tid", encoding="utf-8")),
+    "csv-calendar": (".txt", _calendar),
+    "csv-hashes": (".csv", _hashes),
     "parquet-nested": (".parquet", _nested_parquet),
     "parquet": (".parquet", _parquet),
     "vbo": (".vbo", _vbo),
@@ -374,6 +472,8 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
 _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "csv-long": (".csv", _long_csv),
     "csv-records": (".csv", _records_csv),
+    "csv-times": (".csv", _own_times),
+    "csv-parameters": (".csv", _parameters),
     "parquet-long": (".parquet", _long_parquet),
     "mat": (".mat", _mat),
     "mat-runs": (".mat", _mat_runs),

@@ -87,6 +87,21 @@ DIALECTS = {
         RELATIVE_NS,
     ),
     "bars": (_csv(SECONDS, '"time"|"s"|0|1,"ay"|"m/s²"|-3.0|3.0|100,"speed"|"km/h"|0.0|9.0|50').encode(), RELATIVE_NS),
+    "channel-numbers": (
+        _csv(SECONDS, "[Channels]\n0,12,13\ntime,ay,speed\ns,m/s²,km/h\n\n[Data]").encode(),
+        RELATIVE_NS,
+    ),
+    "calendar": (
+        _csv(
+            [f"{100_000_000 * (i % 10)},2024,5,1,12,0,{i // 10}" for i in range(N)],
+            "UTC_Nano,UTC_Year,UTC_Month,UTC_Day,UTC_Hour,UTC_Minute,UTC_Second," + _HEAD.partition(",")[2],
+        ).encode(),
+        NOON_NS,
+    ),
+    "clock-by-its-cells": (
+        _csv([t.partition("T")[2] for t in _iso()], _HEAD.replace("time", "Ώρα")).encode(),
+        RELATIVE_NS + 12 * 3600 * 10**9,
+    ),
     "minutes": (_csv([f"05:{t:06.3f}" for t in TIME_S], _HEAD).encode(), RELATIVE_NS + 300 * 10**9),
     "month-first": (_csv([f"5/1/2024 {t.partition('T')[2]}" for t in _iso()], _HEAD).encode(), NOON_NS),
     "dead-clock": (_csv([f"0,{t}" for t in SECONDS], "utc," + _HEAD).encode(), RELATIVE_NS),
@@ -113,7 +128,7 @@ def test_every_dialect_of_csv_gives_the_same_columns(dialect: str, tmp_path: Pat
         assert [(x.kind, x.severity) for x in log.lost] == ASSUMED.get(dialect, [])
     np.testing.assert_array_equal(read.fields["ay"], AY)
     np.testing.assert_array_equal(read.fields["speed"], SPEED)
-    expected = start_ns + np.round(TIME_S * 1e9).astype(np.int64)
+    expected = start_ns + np.round(TIME_S * 1e9).astype(np.int64) * (10 if dialect == "calendar" else 1)
     assert np.abs(read.log_time_ns - expected).max() < 500  # a date in seconds has no more digits
 
 
@@ -145,6 +160,37 @@ def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_numbe
     np.testing.assert_array_equal(read["csv"].fields["ay_2"], 2 * AY)
     np.testing.assert_array_equal(read["csv_2"].fields["speed"], SPEED[::10])
     np.testing.assert_array_equal(read["csv_2"].log_time_ns, read["csv"].log_time_ns[::10])
+
+
+@pytest.mark.parametrize(
+    ("encoding", "title", "name"),
+    [
+        ("cp932", "ヨーレート [deg/s]", "yaw_rate"),
+        ("cp932", "前後加速度", "longitudinal_acceleration"),
+        ("gb18030", "横摆角速度 [deg/s]", "yaw_rate"),
+        ("utf-8", "횡가속도", "lateral_acceleration"),
+        ("latin-1", "Größe [°]", "Groesse"),
+        ("cp1252", "Größe – Weg", "Groesse_Weg"),
+        ("utf-8", "Wzdłużne", "Wzdluzne"),
+    ],
+)
+def test_the_bytes_of_the_titles_show_their_encoding(encoding: str, title: str, name: str, tmp_path: Path) -> None:
+    rows = [f"{t:.2f},{a:.4f}" for t, a in zip(TIME_S, AY, strict=True)]
+    with closing(_log(tmp_path / "a.csv", "\n".join([f"t,{title}", *rows]).encode(encoding))) as log:
+        assert [f.path for f in log.fields("csv")] == [name]
+
+
+def test_columns_behind_times_of_their_own_have_these_and_a_lap_time_is_none(tmp_path: Path) -> None:
+    rows = [f"{t:.2f};{a:.4f};{t % 0.5:.2f};" for t, a in zip(TIME_S, AY, strict=True)]
+    rows = [row + (f"{0.003 + 0.05 * i:.3f};{SPEED[i]}" if i < N // 5 else ";") for i, row in enumerate(rows)]
+    with closing(_log(tmp_path / "a.csv", "\n".join(["time;ay;time;time;speed", *rows]).encode())) as log:
+        assert [(t.name, t.messages) for t in log.topics] == [("csv_1", N), ("csv_2", N // 5)]
+        read = log.read({"csv_1": ["ay", "time_2"], "csv_2": ["speed"]})
+        assert not log.lost
+    np.testing.assert_array_equal(read["csv_1"].fields["ay"], AY)
+    np.testing.assert_array_equal(read["csv_2"].fields["speed"], SPEED[: N // 5])
+    expected = RELATIVE_NS + np.round((0.003 + 0.05 * np.arange(N // 5)) * 1e9)
+    assert np.abs(read["csv_2"].log_time_ns - expected).max() < 500
 
 
 def test_damaged_rows_are_losses_and_the_others_are_read(tmp_path: Path) -> None:

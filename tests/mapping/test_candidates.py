@@ -14,7 +14,7 @@ from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.mapping_file import mapping_from_dict
-from pdhef_logtool.mapping.naming import meaning_of, unit_of
+from pdhef_logtool.mapping.naming import meaning_among, meaning_of, unit_of
 from pdhef_logtool.mapping.vendors import load_vendors
 from pdhef_logtool.records.errors import MappingFileError
 
@@ -631,6 +631,13 @@ def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
         ("WHEELSPEEDRL", "km/h", "wheel speed", "rl", 1 / 3.6), ("Angle volant", "deg", "steering", "wheel", DEG),
         ("Vitesse de lacet", "deg/s", "rate", "z", DEG), ("Accelerazione laterale", "g", "acceleration", "y", G),
         ("Velocidad", "km/h", "speed", "", 1 / 3.6),
+        ("Girhastighet", "°/s", "rate", "z", DEG),
+        ("Rad_VL_Geschw", "km/h", "wheel speed", "fl", 1 / 3.6),
+        ("Rattvinkel", "°", "steering", "wheel", DEG),
+        ("Hjulhastighet VB", "km/h", "wheel speed", "rl", 1 / 3.6),
+        ("Predkosc katowa odchylenia", "°/s", "rate", "z", DEG),
+        ("Kat obrotu kierownicy", "°", "steering", "wheel", DEG),
+        ("StW_Angl", "deg", "steering", "wheel", DEG),
     ],
 )  # fmt: skip
 def test_abbreviations_and_spelled_out_units(
@@ -640,6 +647,24 @@ def test_abbreviations_and_spelled_out_units(
     assert meaning is not None
     assert (meaning.quantity, meaning.part) == (quantity, part)
     assert meaning.scale == (None if scale is None else pytest.approx(scale))
+
+
+@pytest.mark.parametrize(
+    ("path", "beside", "meant"),
+    [
+        ("ins.vl", ("ins.vf", "ins.vu"), ("velocity", "y")),
+        ("Vl", ("Vq", "Schwimmwinkel"), ("speed", "x")),
+        ("Vq", ("Vl", "Schwimmwinkel"), ("velocity", "y")),
+        ("vl", ("vr", "hl"), None),
+        ("Vl", (), None),
+        ("s.r", ("s.u", "s.v"), ("rate", "z")),
+    ],
+)
+def test_a_short_name_is_what_the_names_beside_it_show(
+    path: str, beside: tuple[str, ...], meant: tuple[str, str] | None
+) -> None:
+    meaning = meaning_among("log", "", path, "", {path, *beside})
+    assert (meaning and (meaning.quantity, meaning.part)) == meant
 
 
 @pytest.mark.parametrize(
