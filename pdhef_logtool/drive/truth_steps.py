@@ -47,7 +47,7 @@ def steps_from_truth(signals: Signals, truth: StateTrack) -> tuple[SensorChange,
     """Return for each sensor of signals [N] its step from the ground truth in mid-drive, if there is one."""
     if not len(signals):
         return ()
-    found, cells, end_ns = [], cells_of(signals), int(signals.stamps_ns[-1]) + 1
+    changes, cells, end_ns = [], cells_of(signals), int(signals.stamps_ns[-1]) + 1
     for name, (y, x, turned) in _differences(signals, truth).items():
         columns = {"jump": np.ones(len(y)), "gain": x, "delay": -turned}
         table = np.column_stack([*columns.values()])
@@ -66,8 +66,8 @@ def steps_from_truth(signals: Signals, truth: StateTrack) -> tuple[SensorChange,
             if share < SHARP[name]:
                 continue
             start_ns = at_ns
-        found.append(SensorChange(name, f"{kind}_from_truth", start_ns, end_ns, end_ns, step.size, step.std))
-    return tuple(found)
+        changes.append(SensorChange(name, f"{kind}_from_truth", start_ns, end_ns, end_ns, step.size, step.std))
+    return tuple(changes)
 
 
 def _sharpest(signals: Signals, cells: Cells, name: str, start_ns: int, size: float) -> tuple[float, int]:
@@ -80,11 +80,12 @@ def _sharpest(signals: Signals, cells: Cells, name: str, start_ns: int, size: fl
 
 
 def _differences(signals: Signals, truth: StateTrack) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
-    """Return for each sensor its mean difference to the truth, the truth, and its change over a block, each [J]."""
+    """Return for each sensor its mean difference to ground truth x, x, and the change of x over a block [J]."""
     block = (signals.stamps_ns - signals.stamps_ns[0]) // round(BLOCK_S * 1e9)
     count = int(block[-1]) + 1
     first = np.searchsorted(block, np.arange(count))
     seconds = np.diff(signals.stamps_ns[first] * 1e-9, append=np.nan)
+    seconds = np.where(seconds > 0.0, seconds, np.nan)  # a block in a gap
 
     def mean(column: FloatArray) -> FloatArray:
         return _means(column, block, count)

@@ -73,7 +73,8 @@ def _flip_in_chunk(number: int) -> Callable[[Path], None]:
         source.close()
         assert index is not None
         data = bytearray(file.read_bytes())
-        data[(index.chunks[number].start + index.chunks[number].end) // 2] ^= 1
+        extent, _ = index.chunks[number]
+        data[(extent.start + extent.end) // 2] ^= 1
         file.write_bytes(data)
 
     return spoil
