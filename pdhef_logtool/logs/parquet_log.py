@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import describe_damage
@@ -15,13 +16,13 @@ from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
-if TYPE_CHECKING:
-    from polars import Series
+_NULL = np.iinfo(np.int64).min
+#: Units of NumPy's dates, by those types of Arrow that have no unit.
+_DATE_UNITS = {"date32[day]": "D", "date64[ms]": "ms"}
 
 
 def open_parquet(file: TableFile) -> Tables:
     """Read a Parquet file; a column that cannot be read is a loss, in its row group."""
-    import polars as pl
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -45,13 +46,8 @@ def open_parquet(file: TableFile) -> Tables:
         if kinds[path] == "duration":
             units[name] = "s"
         try:
-            column = pa.chunked_array([chunk for part in parts for chunk in part[path].chunks])
-            if kinds[path] == "text":
-                columns[name] = _texts(column, name, file, losses)
-            else:
-                is_decimal = pa.types.is_decimal(column.type)  # polars ends at those of 256 bits
-                column = column.cast(pa.float64(), safe=False) if is_decimal else column
-                columns[name] = _numbers(pl.Series(pl.from_arrow(column)))
+            chunks = [chunk for part in parts for chunk in part[path].chunks]
+            columns[name] = _column(pa.chunked_array(chunks), kinds[path], name, file, losses)
         except Exception as error:  # noqa: BLE001  any error of a conversion
             losses.append(Loss("bad-column", f"{path} cannot be read: {describe_damage(error)[1]}", file.name))
     sheet = Sheet("parquet", columns, units)
@@ -135,15 +131,27 @@ def _column_of_group(source: Any, number: int, path: str, rows: int) -> Any:
     return table[path]
 
 
-def _numbers(column: Series) -> NDArray[Any]:
-    """Return numbers or dates [N] with NaN (NaT) for null; durations and times of day in s."""
-    import polars as pl
+def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Loss]) -> Any:
+    """Return a column as an array [N] with NaN (NaT) for null, or as texts."""
+    import pyarrow as pa
 
-    if column.dtype == pl.Duration:
-        return column.dt.total_nanoseconds(fractional=True).to_numpy() / 1e9
-    if column.dtype == pl.Time:
-        return unwrapped(column.to_physical().cast(pl.Float64).to_numpy() / 1e9)
-    return column.cast(pl.Float64).to_numpy() if column.dtype == pl.Boolean else column.to_numpy()
+    if kind == "text":
+        return _texts(column, name, file, losses)
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    unit = _DATE_UNITS.get(str(column.type)) or getattr(column.type, "unit", "")
+    if kind == "date":
+        column = column.cast(pa.int32()) if unit == "D" else column
+        return column.cast(pa.int64()).fill_null(_NULL).to_numpy().view(f"M8[{unit}]")
+    if kind == "duration":
+        is_of_day = pa.types.is_time(column.type)
+        column = column.cast(pa.int32()) if pa.types.is_time32(column.type) else column
+        values = column.cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
+        values = values / np.timedelta64(1, "s").astype(f"m8[{unit}]").astype(np.int64)
+        return unwrapped(values) if is_of_day else values
+    if pa.types.is_floating(column.type) or (pa.types.is_integer(column.type) and not column.null_count):
+        return column.to_numpy()
+    return column.cast(pa.float64(), safe=False).to_numpy()
 
 
 def _texts(column: Any, name: str, file: TableFile, losses: list[Loss]) -> NDArray[Any] | Any:
@@ -152,7 +160,7 @@ def _texts(column: Any, name: str, file: TableFile, losses: list[Loss]) -> NDArr
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    column.validate(full=True)  # polars ends the process at texts that are no UTF-8
+    column.validate(full=True)  # texts that are not UTF-8 would end the process
     dictionaries = [chunk for chunk in column.chunks if pa.types.is_dictionary(chunk.type)]
     sizes = (pc.sum(pc.take(pc.binary_length(c.dictionary), c.indices)).as_py() or 0 for c in dictionaries)
     file.limits.check_table(sum(sizes), file.size, f"{file.name}, {name}")
