@@ -122,7 +122,7 @@ class Drive:
     @property
     def checks(self) -> tuple[Check, ...]:
         """Checks of signals, ground truth and vehicle file, after reading also of changes; waived checks are marked."""
-        changes = () if self._recorded is None else (*self._recorded.changes, *self._recorded.from_truth)
+        changes = () if self._recorded is None else self._recorded.every_change
         return (*_checks_of(self.plan, self.options), *change_checks(changes, self.log.start_ns))
 
     @property
@@ -177,8 +177,7 @@ class Drive:
         if self._recorded is None or self._recorded.plan is not self.plan:
             unchanged = [n.removesuffix(CHANGE_SUFFIX) for n in self.options.waived]
             self._recorded = read_recorded(self.log, self.plan, unchanged, self.name)
-            changes = (*self._recorded.changes, *self._recorded.from_truth)
-            for check in change_checks(changes, self.log.start_ns):
+            for check in change_checks(self._recorded.every_change, self.log.start_ns):
                 if (text := _failed_text(check)) not in self.notes:
                     self.tell(text)
         return self._recorded

@@ -63,6 +63,11 @@ class WholeDrive:
         return f"<WholeDrive {self.name}: {self.seconds:.1f} s, with{'out' * (self.truth is None)} ground truth>"
 
     @property
+    def every_change(self) -> tuple[SensorChange, ...]:
+        """All changes of sensors in mid-drive, corrected or not."""
+        return (*self.changes, *self.from_truth)
+
+    @property
     def seconds(self) -> float:
         """Time from first to last stamp."""
         return float(self.signals.stamps_ns[-1] - self.signals.stamps_ns[0]) * 1e-9

@@ -178,9 +178,7 @@ def cells_of(signals: Signals) -> Cells:
     count = int(cell[-1]) + 1
 
     def mean(column: FloatArray, most: int) -> FloatArray:
-        finite = np.isfinite(column)
-        samples = np.bincount(cell[finite], minlength=count)
-        total = np.bincount(cell[finite], weights=column[finite], minlength=count)
+        samples, total = samples_and_sums(column, cell, count)
         last = np.maximum.accumulate(np.where(samples > 0, np.arange(count), -1))
         fresh = (last >= 0) & (np.arange(count) - last <= most)
         return np.where(fresh, total[last] / np.maximum(samples[last], 1), np.nan)
@@ -188,6 +186,13 @@ def cells_of(signals: Signals) -> Cells:
     s = signals
     columns = (s.ay_m_s2, s.yaw_rate_rad_s, s.steer_rad, s.speed_m_s, s.ax_m_s2)
     return Cells(signals.stamps_ns, cell, *map(mean, columns, (2, 2, 2, 10, 2)))
+
+
+def samples_and_sums(column: FloatArray, part: IntArray, count: int) -> tuple[IntArray, FloatArray]:
+    """Return the number and the sum of the finite samples of a column [N] in each part [count] of a drive."""
+    finite = np.isfinite(column)
+    samples = np.bincount(part[finite], minlength=count).astype(np.int64)
+    return samples, np.bincount(part[finite], weights=column[finite], minlength=count).astype(np.float64)
 
 
 def _mean(column: FloatArray, start: int, end: int) -> FloatArray:

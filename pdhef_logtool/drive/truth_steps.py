@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.drive.sensor_changes import Cells, SensorChange, cells_of, sample_steps
+from pdhef_logtool.drive.sensor_changes import SensorChange, cells_of, sample_steps, samples_and_sums
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -47,7 +47,7 @@ def steps_from_truth(signals: Signals, truth: StateTrack) -> tuple[SensorChange,
     """Return for each sensor of signals [N] its step from the ground truth in mid-drive, if there is one."""
     if not len(signals):
         return ()
-    changes, cells, end_ns = [], cells_of(signals), int(signals.stamps_ns[-1]) + 1
+    changes, end_ns = [], int(signals.stamps_ns[-1]) + 1
     for name, (y, x, turned) in _differences(signals, truth).items():
         columns = {"jump": np.ones(len(y)), "gain": x, "delay": -turned}
         table = np.column_stack([*columns.values()])
@@ -62,7 +62,7 @@ def steps_from_truth(signals: Signals, truth: StateTrack) -> tuple[SensorChange,
             continue
         start_ns = int(signals.stamps_ns[0]) + round(rows[step.block] * BLOCK_S * 1e9)
         if kind == "jump":
-            share, at_ns = _sharpest(signals, cells, name, start_ns, step.size)
+            share, at_ns = _sharpest(signals, name, start_ns, step.size)
             if share < SHARP[name]:
                 continue
             start_ns = at_ns
@@ -70,8 +70,9 @@ def steps_from_truth(signals: Signals, truth: StateTrack) -> tuple[SensorChange,
     return tuple(changes)
 
 
-def _sharpest(signals: Signals, cells: Cells, name: str, start_ns: int, size: float) -> tuple[float, int]:
+def _sharpest(signals: Signals, name: str, start_ns: int, size: float) -> tuple[float, int]:
     """Return the largest step of neighbouring samples near a time as share of ``size``, and the time of the likest."""
+    cells = cells_of(signals)
     near = np.array([start_ns - BLOCK_S * 1e9, start_ns + BLOCK_S * 1e9]).astype(np.int64)
     first, last = cells.of_stamp[np.searchsorted(signals.stamps_ns, near).clip(0, len(signals) - 1)]
     shares = np.nan_to_num(sample_steps(getattr(signals, name), cells)[first : last + 1] / size)
@@ -106,9 +107,7 @@ def _differences(signals: Signals, truth: StateTrack) -> dict[str, tuple[FloatAr
 
 def _means(column: FloatArray, block: IntArray, count: int) -> FloatArray:
     """Return the means of a column [N] over blocks [J]; NaN where too many samples are missing."""
-    finite = np.isfinite(column)
-    samples = np.bincount(block[finite], minlength=count)
-    total = np.bincount(block[finite], weights=column[finite], minlength=count)
+    samples, total = samples_and_sums(column, block, count)
     return np.where(samples > FILLED * np.bincount(block, minlength=count), total / np.maximum(samples, 1), np.nan)
 
 
