@@ -14,6 +14,7 @@ from typing import Any
 from pdhef_logtool.car.assumed_values import RULES
 from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.drive.check_table import TABLE
+from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.evaluation.metrics import registry as metrics
 from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.results.arrow_schema import load_schema
@@ -38,6 +39,12 @@ def _metrics() -> Iterator[tuple[str, ...]]:
     for m in metrics.registered().values():
         unit = "that of the signal" if m.unit is None else m.unit
         yield f"`{m.name}`", m.label, unit, m.direction or "–", m.definition
+
+
+def _estimators() -> Iterator[tuple[str, ...]]:
+    for spec in SPECS:
+        needs = [*sorted(spec.needs), " or ".join(sorted(spec.one_of))]
+        yield f"`{spec.name}`", spec.text, ", ".join(filter(None, needs))
 
 
 def _checks() -> Iterator[tuple[str, ...]]:
@@ -69,6 +76,7 @@ def _columns(table: str) -> Iterator[tuple[str, ...]]:
 
 _TABLES: dict[str, tuple[str, Callable[[], Iterable[tuple[str, ...]]]]] = {
     "metrics": ("metric, label, unit, best, definition", _metrics),
+    "estimators": ("name, estimate, needs", _estimators),
     "checks": ("check, compares, fails where, remedy", _checks),
     "settings": ("key, default, meaning", lambda: _entries(RunConfig, {f.name: f.default for f in fields(RunConfig)})),
     "sensors": ("key, default, meaning", lambda: _entries(Sensors, Sensors().model_dump())),
