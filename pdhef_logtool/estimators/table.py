@@ -231,7 +231,7 @@ class Skipped:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the estimator."""
         return self.spec.name
 
 

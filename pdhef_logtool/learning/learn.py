@@ -159,7 +159,7 @@ def _without_truth(
 
 
 def _check(got: str, expected: str) -> None:
-    """Raise EstimatorError if the drives lack something."""
+    """Raise EstimatorError if ``got`` states what the drives lack."""
     if got:
         remedy = "give more drives of this car, or map v_y, sideslip, or position and heading as ground truth"
         raise EstimatorError(expected=expected, got=got, where="learn", remedy=remedy)

@@ -157,7 +157,7 @@ class ColumnarLog(DriveLog):
         return tuple(losses)
 
     def _channel_losses(self, c: int, channel: ChannelRecord, undecodable: int) -> Iterator[Loss]:
-        """Yield what is lost and noted of the messages of one channel."""
+        """Yield the losses and notes of the messages of one channel."""
         schema = self._schemas.get((c, channel.id))
         if undecodable:
             what = f"{undecodable} messages do not fit the type of their topic"

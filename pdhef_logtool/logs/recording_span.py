@@ -63,7 +63,7 @@ class Cut:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpan:
-    """The log times that count.
+    """Recording span of a log: the times at which its messages are used.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class RecordingSpan:
     def unused(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray | None:
         """Return which of a topic's messages in a span (all of them, in file order) are left out; None: none of them.
 
-        To be asked where anything is ``left_out`` at all.
+        Only of use if any message is ``left_out``.
         """
         of_earlier_passes = _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
         unused = ~_inside(log_time_ns, self.intervals) | of_earlier_passes

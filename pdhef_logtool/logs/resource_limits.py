@@ -66,7 +66,7 @@ class ResourceLimits:
         return ResourceLimits(**{name: type(value)(value * factor) for name, value in values.items()})
 
     def check(self, limit: str, amount: float, what: str) -> None:
-        """Raise :class:`LimitError` if an amount is above the limit of this name; ``what`` claims it."""
+        """Raise :class:`LimitError` if an amount, claimed by ``what``, is above the limit of this name."""
         allowed = getattr(self, limit)
         if amount > allowed:
             raise LimitError(

@@ -96,7 +96,7 @@ def _short(scale: float | tuple[float, ...]) -> str:
 
 @dataclass(slots=True)
 class Field:
-    """A field with a meaning, during the evaluation.
+    """A field with a quantity by name or type, during the evaluation.
 
     Attributes
     ----------

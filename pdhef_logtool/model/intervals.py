@@ -122,7 +122,7 @@ class Interval:
 
 @dataclass(slots=True)
 class DriveIntervals:
-    """Intervals of the estimators of a drive by name; ``notes_of_own`` : of estimators that state their own."""
+    """Intervals of the estimators of a drive by name; ``notes_of_own`` : notes on intervals that estimators provide."""
 
     by_name: dict[str, Interval]
     notes_of_own: dict[str, str]

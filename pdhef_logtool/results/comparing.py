@@ -190,7 +190,7 @@ class Comparison:
 
     @property
     def verdict(self) -> FigureVerdict:
-        """The gravest verdict of the figures."""
+        """The worst verdict of the figures."""
         return min((f.verdict for f in self.figures), key=_GRAVITY.index, default="equal")
 
     @property

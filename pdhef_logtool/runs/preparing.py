@@ -68,7 +68,7 @@ def prepare(drive: Drive, config: RunConfig) -> PreparedDrive:
 def choose(
     drive: Drive, names: Sequence[str] | None = None, car: Car | None = None, *, gnss: bool = True
 ) -> tuple[list[Estimator], list[Skipped]]:
-    """Return the estimators that a drive and a car let run, and those that they do not.
+    """Return the estimators that can run on a drive and a car, and the skipped ones with the reasons.
 
     Parameters
     ----------

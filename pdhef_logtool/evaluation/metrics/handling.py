@@ -41,7 +41,7 @@ class _Steering(NamedTuple):
 
 
 def responses(drive: EvaluatedDrive) -> Iterator[Columns]:
-    """Yield the figures of each track, one column a figure with the same value at all stamps of its manoeuvre."""
+    """Yield the figures of each track: a column for each, with one value at all stamps of its manoeuvre."""
     if drive.calibrated is None:
         return
     signals, vehicle, _ = drive.calibrated
