@@ -406,7 +406,7 @@ def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tupl
 
 
 def _without_repeats(signals: Signals, cells: Cells) -> Signals:
-    """Return signals without stuck values of accelerometer and gyro, whose end would be a jump.
+    """Return signals without stuck values of accelerometer and gyro: their end would be taken for a jump.
 
     A stuck axis of a sensor that is mounted askew has a small part of the other axes' noise.
     """

@@ -110,7 +110,7 @@ def draw(x, L, places, m, points):  # type: ignore[no-untyped-def]
 
 @_sum
 def _products(block, places, a, b):  # type: ignore[no-untyped-def]
-    """Return the scalar products of row a with four rows from b on; rows beyond the last one are the last one."""
+    """Return the scalar products of row a with four rows from b on; beyond the last row, the last row again."""
     last, of_a = places.shape[0] - 1, _row(block, places, a)
     row_0, row_1 = _row(block, places, b), _row(block, places, min(b + 1, last))
     row_2, row_3 = _row(block, places, min(b + 2, last)), _row(block, places, min(b + 3, last))

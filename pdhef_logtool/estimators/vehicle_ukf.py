@@ -127,7 +127,7 @@ _JUST_REJECTED_S = 1e-9
 U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED, U_STEER_KNOWN = range(6)
 INPUTS = 6
 
-#: What a filter remembers of the steps before: whether it runs; last inputs and residual; ages, s; duration of the
+#: Memory of a filter of the steps before: whether it runs; last inputs and residual; ages, s; duration of the
 #: standstill, s; mean normalised square of the innovations; last speed sample; largest recent share of the grip that is
 #: used, decaying; time since the first sample of an unbroken rejection of a_y, yaw rate and speed, s.
 MEMORY_FIELDS: list[tuple[Any, ...]] = [
@@ -479,7 +479,7 @@ def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyp
 def diverges(rules, x, m):  # type: ignore[no-untyped-def]
     """Return whether innovations remain far beyond their covariance, or the motion is impossible.
 
-    Without a speed sensor nothing but a wrong acceleration drives a car backwards that fast.
+    Without a speed sensor, only a wrong acceleration makes a car drive backwards that fast.
     """
     reverses = not rules.use_speed and x[VX] < -rules.dynamic_speed_m_s
     slides = x[VX] > rules.dynamic_speed_m_s and abs(math.atan2(x[VY], x[VX])) > DIVERGED_SIDESLIP_RAD

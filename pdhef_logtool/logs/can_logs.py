@@ -246,7 +246,7 @@ _STEP_NS = 10**9
 
 
 class _TextLog:
-    """Reader of a log of text with a frame a line."""
+    """Reader of a text log with one frame per line."""
 
     kind = ""
 
@@ -299,7 +299,7 @@ class _TextLog:
         return stamps
 
     def _bus_numbers(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the numbers [N, 6] of frames with those of buses."""
+        """Return the numbers [N, 6] of frames, completed by the bus numbers."""
         return numbers
 
 

@@ -506,7 +506,7 @@ class ColumnarLog(DriveLog):
                 yield span
 
     def _collect_span(self, request: _Request, c: int, span: Span, parts: Mapping[str, list[Columns]]) -> None:
-        """Add the columns of the requested topics in a span; if it is opened, keep those of expected topics."""
+        """Add the columns of the requested topics in a span; if it is opened, keep columns of expected topics too."""
         channels, plans, expected = self.containers[c].channels, request.plans, request.expected
         requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
         stored = self._columns.get((c, span.index), {})

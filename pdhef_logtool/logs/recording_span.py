@@ -224,7 +224,7 @@ class _Looked:
     stamps: Mapping[int, IntArray] | None = None
 
     def pieces(self) -> Iterator[tuple[int, int, int, Mapping[str, int]]]:
-        """Yield start, end, messages, and messages by topic; one piece a stretch."""
+        """Yield start, end, messages, and messages by topic; one piece per stretch."""
         if self.stamps is None:
             counts: Counter[str] = Counter()
             for id_, messages in self.span.counts.items():
@@ -327,7 +327,7 @@ def _inside(times_ns: IntArray, intervals: Sequence[tuple[int, int]]) -> BoolArr
 
 
 def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Iterable[Cut]) -> BoolArray:
-    """Return which of a topic's messages in the span of a place, file and span, the cuts leave out."""
+    """Return the mask of a topic's messages in a span, at ``place`` (file, span), that the cuts leave out."""
     left_out = np.zeros(times_ns.shape[0], np.bool_)
     for cut in cuts:
         if cut.topic == topic and place >= cut.place[:2]:

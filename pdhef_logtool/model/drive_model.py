@@ -1,4 +1,4 @@
-"""The model of a drive: the one record of what is known about its recording and its car, without ground truth.
+"""The model of a drive: the one record of the knowledge about its recording and its car, without ground truth.
 
 See docs/method.md#self-calibration.
 """

@@ -487,7 +487,7 @@ def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
 
 
 def _history(runs: Sequence[OpenedRun], steps: Sequence[Comparison], asked: Requirement) -> Iterator[HistoryRow]:
-    """Yield the runs with the steps [N - 1] between them."""
+    """Yield a row per run, with the comparison ``steps`` [N - 1] to the run before it."""
     for run, step in zip(runs, (None, *steps), strict=True):
         version = str((run.document.get("versions") or {}).get("pdhef-logtool") or "unknown")
         figures = () if step is None else step.figures

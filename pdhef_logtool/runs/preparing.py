@@ -72,7 +72,7 @@ def choose(
 
     Parameters
     ----------
-    names : of estimators, ``["all"]`` or ``["peers"]``; None: those of a run. car : None: of the drive.
+    names : of estimators, ``["all"]`` or ``["peers"]``; None: those that a run chooses. car : by default the drive's.
     gnss : whether filters may use GNSS velocity.
     """
     car = drive.car if car is None else car
