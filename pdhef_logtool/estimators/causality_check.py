@@ -48,7 +48,7 @@ class CausalityCheck:
         return (deepcopy(state),)
 
     def check(self, estimator: StepEstimator, signals: Signals, before: Any, steps: Any) -> None:
-        """Compare the ``steps`` of a window with the steps of its first part; ``before`` as returned above."""
+        """Compare the ``steps`` of a window with the steps of its first part; ``before`` from :meth:`state_before`."""
         if before is None or len(signals) < 2:
             return
         for count in _cuts(len(signals), self._windows[estimator.name], self.full):

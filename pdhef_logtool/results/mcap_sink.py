@@ -80,7 +80,7 @@ def topic_of(estimator: str, what: str) -> str:
 
 
 def thinned_step_ns(source_bytes: int, *, rows: int, others: int, span_ns: int) -> int:
-    """Return the step of the tracks that are not shown first with which an annotated log is at most twice its source.
+    """Return the time step of the other estimators' rows for an annotated log of at most twice its source.
 
     ``rows`` : stamps of a track. ``others`` : number of such tracks. Room for selected estimate and ground truth is
     kept: one state per stamp of the former, and four messages of both every 50 ms.
