@@ -53,7 +53,7 @@ SpanTimes = Callable[[int, Span], Mapping[int, IntArray] | None]
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """Messages to leave out: of a topic, with log times in [low_ns, high_ns], at or after ``place`` (file, span, row)."""
+    """Messages of a topic to leave out: log times in [low_ns, high_ns], at or after ``place`` (file, span, row)."""
 
     topic: str
     place: tuple[int, int, int]
