@@ -1,75 +1,95 @@
 """Tables of the documentation that are made of the code when the site is built: a hook of MkDocs.
 
-In a page, ``<!-- table: metrics -->`` becomes the table of all metrics; ``checks``, ``settings``, ``sensors`` and
-``assumed_values`` are the others.
+In a page, ``<!-- table: metrics -->`` becomes the table of all metrics; the names of the others are in :data:`_TABLES`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, fields
+from functools import partial
 from typing import Any
 
 from pdhef_logtool.car.assumed_values import RULES
 from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.drive.check_table import TABLE
+from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.evaluation.metrics import registry as metrics
+from pdhef_logtool.logs.resource_limits import ResourceLimits
+from pdhef_logtool.results.arrow_schema import load_schema
+from pdhef_logtool.results.opened_run import TABLES
 from pdhef_logtool.runs.config import RunConfig
+from truthsim.manoeuvres import MANOEUVRES
+from truthsim.sensors import SensorNoise
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Return a page with its tables; raises KeyError for one of an unknown name."""
-    return re.sub(r"<!-- table: (\w+) -->", lambda match: "\n".join(_TABLES[match[1]]()), markdown)
+    return re.sub(r"<!-- table: (\w+) -->", lambda match: "\n".join(_lines(*_TABLES[match[1]])), markdown)
 
 
-def _metrics() -> Iterator[str]:
-    yield "| metric | label | unit | best | definition |"
-    yield "| --- | --- | --- | --- | --- |"
+def _lines(columns: str, rows: Callable[[], Iterable[tuple[str, ...]]]) -> Iterator[str]:
+    head = tuple(columns.split(", "))
+    for row in (head, ("---",) * len(head), *rows()):
+        yield f"| {' | '.join(cell.replace('|', '&#124;') for cell in row)} |"
+
+
+def _metrics() -> Iterator[tuple[str, ...]]:
     for m in metrics.registered().values():
         unit = "that of the signal" if m.unit is None else m.unit
-        yield f"| `{m.name}` | {m.label} | {unit} | {m.direction or '–'} | {m.definition} |"
+        yield f"`{m.name}`", m.label, unit, m.direction or "–", m.definition
 
 
-def _checks() -> Iterator[str]:
-    yield "| check | compares | fails where | remedy |"
-    yield "| --- | --- | --- | --- |"
+def _estimators() -> Iterator[tuple[str, ...]]:
+    for spec in SPECS:
+        needs = [*sorted(spec.needs), " or ".join(sorted(spec.one_of))]
+        yield f"`{spec.name}`", spec.text, ", ".join(filter(None, needs))
+
+
+def _checks() -> Iterator[tuple[str, ...]]:
     for name, entry in TABLE.items():
         remedy = re.sub(r"{\w+(:[^}]*)?}", "…", entry["remedy"])
-        yield f"| `{name}` | {entry['compares']} | {entry['fails']} | {'–' if remedy == '…' else remedy} |"
+        yield f"`{name}`", entry["compares"], entry["fails"], "–" if remedy == "…" else remedy
 
 
-def _settings() -> Iterator[str]:
-    yield from _entries(RunConfig, {key.name: key.default for key in fields(RunConfig)})
-
-
-def _sensors() -> Iterator[str]:
-    yield from _entries(Sensors, Sensors().model_dump())
-
-
-def _entries(kind: type, defaults: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the table of the attributes that the docstring of a class describes, with their defaults."""
-    yield "| key | default | meaning |"
-    yield "| --- | --- | --- |"
+def _entries(kind: type, defaults: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yield a row for each attribute that the docstring of a class describes, with its default."""
     described = (kind.__doc__ or "").partition("----------")[2]
     texts = dict(re.findall(r"^    (\w+) : (.*(?:\n        .*)*)", described, re.MULTILINE))
     for key, value in defaults.items():
         text = re.sub(r" \(:func:`[^`]*`\)", "", " ".join(texts[key].split())).replace("``", "`")
-        default = "–" if value in (None, ()) else str(value).lower()
-        yield f"| `{key}` | {default} | {text} |"
+        number = f"{value:,}" if type(value) is int else f"{value:.4g}" if isinstance(value, float) else ""
+        yield f"`{key}`", "–" if value in (None, ()) else number or str(value).lower(), text
 
 
-def _assumed_values() -> Iterator[str]:
-    yield "| entry left out | rule | spread |"
-    yield "| --- | --- | --- |"
-    for rule in RULES:
-        yield f"| `{rule.entry}` | {rule.text} | {rule.spread:.0%} |"
+def _tables() -> Iterator[tuple[str, ...]]:
+    for name in TABLES:
+        schema = load_schema(f"{name}.parquet.json")
+        yield f"`{name}`", schema["title"].partition(": ")[2], ", ".join(f"`{c['name']}`" for c in schema["columns"])
 
 
-_TABLES: dict[str, Callable[[], Iterator[str]]] = {
-    "metrics": _metrics,
-    "checks": _checks,
-    "settings": _settings,
-    "sensors": _sensors,
-    "assumed_values": _assumed_values,
-}
+def _columns(table: str) -> Iterator[tuple[str, ...]]:
+    for column in load_schema(f"{table}.parquet.json")["columns"]:
+        yield f"`{column['name']}`", column["unit"], column["description"]
+
+
+_TABLES: dict[str, tuple[str, Callable[[], Iterable[tuple[str, ...]]]]] = {
+    "metrics": ("metric, label, unit, best, definition", _metrics),
+    "estimators": ("name, estimate, needs", _estimators),
+    "checks": ("check, compares, fails where, remedy", _checks),
+    "settings": ("key, default, meaning", lambda: _entries(RunConfig, {f.name: f.default for f in fields(RunConfig)})),
+    "sensors": ("key, default, meaning", lambda: _entries(Sensors, Sensors().model_dump())),
+    "sensor_errors": ("name, default, meaning", lambda: _entries(SensorNoise, SensorNoise()._asdict())),
+    "limits": ("limit, default, meaning", lambda: _entries(ResourceLimits, asdict(ResourceLimits()))),
+    "assumed_values": (
+        "entry left out, rule, spread", lambda: ((f"`{r.entry}`", r.text, f"{r.spread:.0%}") for r in RULES),
+    ),
+    "manoeuvres": (
+        "name, manoeuvre, km/h, μ",
+        lambda: ((f"`{n}`", m.description, f"{m.speed_km_h:g}", f"{m.friction:g}") for n, m in MANOEUVRES.items()),
+    ),
+    "tables": ("table, rows, columns", _tables),
+    "estimates": ("column, unit, meaning", partial(_columns, "estimates")),
+    "residuals": ("column, unit, meaning", partial(_columns, "residuals")),
+}  # fmt: skip

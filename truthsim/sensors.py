@@ -27,7 +27,49 @@ WHEEL_PHASE_S = 0.006
 
 
 class SensorNoise(NamedTuple):
-    """1-sigma errors. White noise is Student-t with 4 degrees of freedom scaled to the sigma; GNSS/INS is Gaussian."""
+    """Errors of the sensors of a drive: 1-sigma where a spread, SI units.
+
+    White noise is Student-t with 4 degrees of freedom, scaled to the sigma; that of GNSS/INS is Gaussian.
+
+    Attributes
+    ----------
+    acceleration_m_s2 : white noise of a_x and a_y.
+    yaw_rate_rad_s : white noise of the gyro.
+    steer_rad : white noise of the road-wheel angle.
+    wheel_speed_m_s : white noise of each wheel's speed.
+    acceleration_bias_m_s2 : bias of a_x and a_y, constant over a drive.
+    yaw_rate_bias_rad_s : bias of the gyro, constant over a drive.
+    steer_bias_rad : bias of the road-wheel angle, constant over a drive.
+    wheel_scale : relative error of the radius of each wheel.
+    acceleration_walk_m_s2 : slow drift of the accelerometers (Ornstein–Uhlenbeck process).
+    yaw_rate_walk_rad_s : slow drift of the gyro.
+    walk_time_s : time constant of both drifts.
+    can_delay_s : delay of each message on the bus.
+    jitter_s : further delay, uniform from 0 to this value; the order on a topic is kept.
+    rtk_position_m : error of the INS's position.
+    rtk_velocity_m_s : error of its velocity.
+    rtk_heading_rad : error of its heading.
+    rtk_yaw_rate_rad_s : error of its yaw rate.
+    rtk_tilt_rad : error of its roll and pitch.
+    rtk_time_s : time constant of the errors of the INS; white noise of a third of each sigma is added.
+    rtk_delay_s : delay of the INS's messages.
+    rtk_heading_offset_rad : unknown mounting of the INS: offset of its heading.
+    rtk_x_m : unknown mounting of the INS: position forward of the CG.
+    rtk_y_m : the same, position to the left of the CG.
+    wheel_dead_m_s : speed below which a wheel with 48 teeth gives no pulse in time and reads 0.
+    acceleration_range_m_s2 : full scale of the 16-bit accelerometers; beyond it they read full scale.
+    rate_range_rad_s : full scale of the 16-bit gyros.
+    imu_x_m : position of the IMU forward of the CG.
+    imu_y_m : position of the IMU to the left of the CG.
+    imu_z_m : position of the IMU above the CG.
+    steering_wheel_step_rad : resolution of the angle, which is measured at the steering wheel: 0.1°.
+    steer_gain : relative error of the steering ratio.
+    steer_play_rad : total free play between steering wheel and road wheels, as an angle of the road wheels.
+    message_loss : share of the messages of IMU, steering and wheel speeds that the bus loses.
+    rtk_outages_per_h : outages of the RTK fix per hour; half of them leave a float solution with 30 times the position
+        error, in the others the INS coasts.
+    rtk_outage_s : their mean duration (exponential distribution).
+    """
 
     acceleration_m_s2: float = 0.12
     yaw_rate_rad_s: float = 0.004
@@ -37,42 +79,31 @@ class SensorNoise(NamedTuple):
     yaw_rate_bias_rad_s: float = 0.0015
     steer_bias_rad: float = 0.0008
     wheel_scale: float = 0.003
-    #: Slow walk: Ornstein–Uhlenbeck with this spread and time constant.
     acceleration_walk_m_s2: float = 0.02
     yaw_rate_walk_rad_s: float = 0.0004
     walk_time_s: float = 120.0
     can_delay_s: float = 0.010
-    #: Further arrival delay, uniform in [0, jitter]; order on a topic is kept.
     jitter_s: float = 0.0
     rtk_position_m: float = 0.010
     rtk_velocity_m_s: float = 0.012
     rtk_heading_rad: float = 0.0005
     rtk_yaw_rate_rad_s: float = 0.0010
     rtk_tilt_rad: float = 0.0005
-    #: Time constant of the INS's correlated error; white noise of a third of each sigma is added.
     rtk_time_s: float = 2.0
     rtk_delay_s: float = 0.020
-    #: Unknown mounting of the INS: offset of its heading, and position relative to the CG, forward and left.
     rtk_heading_offset_rad: float = 0.0
     rtk_x_m: float = 0.0
     rtk_y_m: float = 0.0
-    #: Below this speed a wheel with 48 teeth gives no pulse in time, and the sensor reads zero.
     wheel_dead_m_s: float = 0.15
-    #: Full scale of the 16-bit accelerometers and gyros; beyond it they read full scale.
     acceleration_range_m_s2: float = 16.0
     rate_range_rad_s: float = 4.0
-    #: Place of the IMU from the CG: forward, left, up.
     imu_x_m: float = 0.0
     imu_y_m: float = 0.0
     imu_z_m: float = 0.0
-    #: The angle is measured at the steering wheel in steps of 0.1 degrees; 1-sigma of the relative error of the ratio.
     steering_wheel_step_rad: float = 0.1 * np.pi / 180.0
     steer_gain: float = 0.0
-    #: Total free play between steering wheel and road wheels, as an angle of the road wheels.
     steer_play_rad: float = 0.0
-    #: Share of the messages of IMU, steering and wheel speeds that the bus loses.
     message_loss: float = 0.0
-    #: Outages of the RTK fix: rate, and mean duration (exponential); half of them leave a float solution.
     rtk_outages_per_h: float = 0.0
     rtk_outage_s: float = 8.0
 

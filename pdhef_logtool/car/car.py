@@ -88,7 +88,7 @@ class Car:
 
     @classmethod
     def of(cls, vehicle: VehicleParameters, **parts: Any) -> Car:
-        """Return a car of a vehicle with other attributes."""
+        """Return the car of a vehicle, which is also its datasheet; ``parts`` are further attributes."""
         return cls(vehicle, vehicle, **parts)
 
     @classmethod

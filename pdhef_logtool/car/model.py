@@ -1,4 +1,4 @@
-"""What earlier drives show about a car: ``model.toml``, for later drives of the same car and recorder.
+"""Results of earlier drives for a car: ``model.toml``, for later drives of the same car and recorder.
 
 Every run writes one of its drive; ``pdhef learn`` pools drives. In a car's folder it is the prior of every calibration;
 ``pdhef run --model FILE`` takes the sensors from it as well, so that no estimate depends on later samples.

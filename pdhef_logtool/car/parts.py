@@ -1,6 +1,7 @@
 """Parts of a car: fit.
 
-Each part contains the digest of its inputs. If an input has changed, the part is stale and is not used.
+Each part contains the digest of its inputs. If an input has changed, the part is stale and is not used, not even with a
+warning: noise for other tyres can triple the error.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The car of a drive: what a fit to the sensors of the drive, without ground truth, determines of it."""
+"""The car of a drive as fitted to the sensors of the drive, without ground truth."""
 
 from __future__ import annotations
 

@@ -330,7 +330,7 @@ def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
 
 
 def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehicleParameters) -> Signals:
-    """Return signals that were corrected for one vehicle's ratio, offset and biases, corrected for another vehicle."""
+    """Return signals that were corrected for the vehicle ``was`` (ratio, offset, biases), corrected for ``vehicle``."""
     before, after = was.sensors, vehicle.sensors
     if (was.steering_ratio, was.steer_offset_rad, before) == (vehicle.steering_ratio, vehicle.steer_offset_rad, after):
         return signals

@@ -1,1 +1,5 @@
-"""Cache of machine code that numba compiles."""
+"""Machine code that numba compiles, kept between processes.
+
+:mod:`~.cache` provides ``njit``, :mod:`~.sources` the digest of all sources under which the code is kept. It imports
+only :mod:`~pdhef_logtool.records`, because every package with kernels imports it.
+"""

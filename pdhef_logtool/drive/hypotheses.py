@@ -58,8 +58,8 @@ class Relation:
 
     Attributes
     ----------
-    expected : range of plausible gains. samples : number of independent samples. moves : both sides, or one of two that
-        must move together, move by more than disturbances do. signless : one side has no sign.
+    expected : range of plausible gains. samples : number of independent samples. moves : whether the signals vary
+        by more than disturbances cause: both, or one of two that must vary together. signless : one side has no sign.
     least_correlation : below it the gain gives no information.
     typical : the likeliest gain. blocks : gains of blocks of the drive, each without the block's means. most_energy :
         largest energy of a gain.
@@ -256,7 +256,7 @@ def known_hypotheses(
 
 
 def _sides(groups: Sequence[tuple[str, ...]]) -> Iterator[tuple[str, ...]]:
-    """Yield the signals of sensors and those of ground truth: two recorders may have a convention each."""
+    """Yield the signals of the sensors, then of the ground truth: the two recorders may use different conventions."""
     for is_true in (False, True):
         if names := tuple(n for g in groups if any(m.startswith("truth.") == is_true for m in g) for n in g):
             yield names

@@ -266,7 +266,7 @@ def _is_shown(turn: _Turn, hand: float, measured: Measured) -> bool:
 
 
 def _parts_agree(whole: _Turn, parts: Sequence[_Turn | None]) -> bool:
-    """Return whether the parts of a drive give the same step; a short drive must correlate closely as a whole."""
+    """Return whether the parts of a drive give the same multiple of 90°; a short drive must correlate as a whole."""
     step, fitted = nearest_step(whole.rotation), [p for p in parts if p is not None]
     agree = all(p.correlation >= PART_CORRELATION and np.allclose(nearest_step(p.rotation), step) for p in fitted)
     return agree and (len(fitted) == len(parts) or whole.correlation >= ASKEW_CORRELATION)

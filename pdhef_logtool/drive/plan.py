@@ -67,7 +67,7 @@ class DrivePlan:
     latency : of the ground truth against the sensors; None without ground truth yaw rate or gyro.
     dependent : ground truth quantities that are an input of the estimators, with the reason.
     derivation : derivation of each ground truth quantity.
-    decided_s : duration that decided the sensors, of this log or of that of the model file.
+    decided_s : duration that decided the sensors, of this log, or of the log of the model file.
     checks : of signals, ground truth and vehicle file.
     refused : mapped channels that must not be used, with the reason; names of ground truth begin with ``truth.``.
     """

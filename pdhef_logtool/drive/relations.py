@@ -350,7 +350,7 @@ def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) ->
 
 
 def steering_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
-    """Return steering angle times speed: yaw rates up to a factor, which are often recorded with the wrong sign."""
+    """Return steering angle times speed, which is in proportion to the yaw rate, often with the wrong sign."""
     steers = [] if speed_name is None else [n for n in ("steer_rad", "steering_wheel_rad") if n in columns]
     return [(f"{n} x speed", columns[n] * columns[str(speed_name)]) for n in steers]
 

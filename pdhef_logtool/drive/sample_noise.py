@@ -33,7 +33,7 @@ MAX_SPIKES = 2
 
 @njit(cache=True)
 def _squared_noise(time_s, z, times, values, span_s):  # type: ignore[no-untyped-def]
-    """Return the squared difference of ``z`` from the parabola through the last three samples over its gain, or NaN."""
+    """Return the squared deviation of ``z`` from the parabola through the last three samples, over its gain, or NaN."""
     a1, a2, a3 = time_s - times[0], time_s - times[1], time_s - times[2]
     if a3 > span_s or not (0.0 < a1 < a2 < a3):
         return math.nan

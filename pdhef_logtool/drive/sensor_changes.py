@@ -121,7 +121,7 @@ class Cells(NamedTuple):
         return self._replace(**{column: values + by if kind == "jump" else values * (1.0 + by)})
 
     def time_of(self, cell: int) -> int:
-        """Return the first stamp in a cell or behind it."""
+        """Return the first stamp in a cell or after it."""
         row = int(np.searchsorted(self.of_stamp, cell))
         return int(self.stamps_ns[row]) if row < len(self.stamps_ns) else int(self.stamps_ns[-1]) + 1
 
@@ -242,7 +242,7 @@ def _fitted(table: FloatArray) -> _Relation:
 
 
 class _Block(NamedTuple):
-    """A part of the evidence: statistics of a step behind each cell, and what a unit of each hypothesis does to them.
+    """A part of the evidence: statistics of a step after each cell, and their change by a unit of each hypothesis.
 
     Attributes
     ----------
@@ -326,7 +326,7 @@ def _std_so_far(column: FloatArray) -> FloatArray:
 
 
 def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return whether the likeliest change behind each cell is named, its hypothesis, evidence, size and 1-sigma."""
+    """Return whether the likeliest change after each cell is named, its hypothesis, evidence, size and 1-sigma."""
     tried = [cells.changed(FIELDS[name], kind, TRIED) for name, kind in HYPOTHESES]
     blocks = [_relation_block(i, t) for i, t in enumerate(zip(*map(_tables, (cells, *tried)), strict=True))]
     blocks += [_sample_block(name, signals, cells, tried) for name in FIELDS]
@@ -354,7 +354,7 @@ def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, Flo
 
 
 def _first_step(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
-    """Return the first change of the bias or gain of a sensor behind a time."""
+    """Return the first change of the bias or gain of a sensor after a time; None without one."""
     cells = cells_of(signals)
     is_named, best, evidence, size, std = _likeliest(signals, cells)
     is_named &= np.array([name not in ignored for name, _ in HYPOTHESES])[best]
@@ -406,7 +406,7 @@ def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tupl
 
 
 def _without_repeats(signals: Signals, cells: Cells) -> Signals:
-    """Return signals without stuck values of accelerometer and gyro, whose end would be a jump.
+    """Return signals without stuck values of accelerometer and gyro: their end would be taken for a jump.
 
     A stuck axis of a sensor that is mounted askew has a small part of the other axes' noise.
     """

@@ -142,7 +142,7 @@ def _is_burst(time_s: FloatArray, is_noisy: BoolArray, window_s: float) -> BoolA
 
 
 def _reported_spikes(time_s: FloatArray, beyond: FloatArray) -> list[int]:
-    """Return the spikes among samples [n] whose accumulated evidence exceeds the one of a long tail."""
+    """Return the spikes among samples [n] with more accumulated evidence than long-tailed noise gives."""
     reported, nats, before_s = [], 0.0, 0.0
     for k in map(int, np.flatnonzero(beyond)):
         nats = max(nats - SPIKE_FORGOTTEN_NATS_PER_S * (time_s[k] - before_s), 0.0)

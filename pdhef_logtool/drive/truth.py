@@ -243,7 +243,7 @@ def channel_of(truth: TruthTrack, name: str) -> Channel:
 def dependent_signals(
     signals_channels: Mapping[str, Channel], truth_channels: Mapping[str, Channel], *, role: str = "input"
 ) -> dict[str, str]:
-    """Find truth channels that equal an input channel.
+    """Return the truth channels that equal an input channel, by name with a sentence.
 
     Equal means: at the same stamps (or, for channels of the same length, sample by sample) values agree to 1e-6
     relative, more than the rounding of float32, on at least 99 % of the samples, and the channel is not constant.
@@ -410,7 +410,7 @@ class _Source:
         return _turn(self._from_ecef(), ecef - np.array(self.plan.origin.ecef_m))
 
     def reference_velocity(self) -> FloatArray:
-        """Return [N, 3] in the reference frame, differentiated from the position if need be."""
+        """Return [N, 3] in the reference frame, differentiated from the position if there is no velocity."""
         if "enu_velocity_m_s" in self:
             return self.column("enu_velocity_m_s")
         if "ecef_velocity_m_s" in self:

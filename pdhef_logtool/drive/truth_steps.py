@@ -71,7 +71,7 @@ def steps_from_truth(signals: Signals, truth: StateTrack) -> tuple[SensorChange,
 
 
 def _sharpest(signals: Signals, name: str, start_ns: int, size: float) -> tuple[float, int]:
-    """Return the largest step of neighbouring samples near a time as share of ``size``, and the time of the likest."""
+    """Return the largest step of neighbouring samples near a time over ``size``, and the time of the best match."""
     cells = cells_of(signals)
     near = np.array([start_ns - BLOCK_S * 1e9, start_ns + BLOCK_S * 1e9]).astype(np.int64)
     first, last = cells.of_stamp[np.searchsorted(signals.stamps_ns, near).clip(0, len(signals) - 1)]

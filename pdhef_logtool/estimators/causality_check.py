@@ -29,7 +29,7 @@ RELATIVE_TOLERANCE = 4.0 * float(np.finfo(np.float32).eps)
 
 @dataclass(slots=True)
 class CausalityCheck:
-    """The check over one drive; ``failed`` has the reason by estimator, also of those that failed otherwise.
+    """The check over one drive; ``failed`` has the reason by estimator, also for other failures.
 
     A check that is not ``full`` costs little: the first drive of a run has the full one.
     """
@@ -48,7 +48,7 @@ class CausalityCheck:
         return (deepcopy(state),)
 
     def check(self, estimator: StepEstimator, signals: Signals, before: Any, steps: Any) -> None:
-        """Compare the ``steps`` of a window with the steps of its first part; ``before`` as returned above."""
+        """Compare the ``steps`` of a window with the steps of its first part; ``before`` from :meth:`state_before`."""
         if before is None or len(signals) < 2:
             return
         for count in _cuts(len(signals), self._windows[estimator.name], self.full):
@@ -64,7 +64,7 @@ class CausalityCheck:
 
 
 def _cuts(count: int, number: int, full: bool) -> Iterator[int]:
-    """Yield how many samples of a window of ``count`` are kept, the same in every run."""
+    """Yield the numbers of samples of a window of ``count`` after which the rest is masked, the same in every run."""
     random = np.random.default_rng((count, number))
     for most in (min(count, SHORT_CUT), count) if full else (min(count, SHORT_CUT),):
         yield int(random.integers(1, most))

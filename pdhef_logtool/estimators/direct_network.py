@@ -30,7 +30,7 @@ _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s
 
 @dataclass(frozen=True, slots=True)
 class DirectNetwork:
-    """The estimator of this file; ``weights`` is a word for what the model learned."""
+    """The estimator of this file; ``weights`` is the word for the learned part of the model in its note."""
 
     algorithm = "direct-network"
     version = 1

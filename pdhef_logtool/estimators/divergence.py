@@ -46,7 +46,7 @@ MEMORY_SIZE = 15
 
 
 def watched_track(track: StateTrack, signals: Signals, vehicle: VehicleParameters) -> StateTrack:
-    """Return a track [N] with ``diverged`` completed.
+    """Return a track [N] with ``diverged`` set also where the sensors contradict it.
 
     Estimates without a covariance are not monitored: they make no claim about their accuracy.
     """

@@ -162,7 +162,7 @@ def _take_arrivals(memory, now, until, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _start(memory, now, start, start_variance, vx, vy):  # type: ignore[no-untyped-def]
-    """Begin the queue with a first state; the statistic of the receiver stays."""
+    """Restart the queue with a first state; the innovation statistic of the receiver is kept."""
     now.rows, now.has_heading, now.grip, now.elapsed, now.ay_sum, now.rate_sum = 1, 0, 0.0, 0.0, 0.0, 0.0
     now.nis = max(now.nis, 1.0)
     memory.rows[:, :], memory.rows[:, ARRIVAL] = 0.0, np.inf

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
-#: What the mechanism remembers: β, and C of Eq 22 for each measurement.
+#: Memory of the mechanism: β, and C of Eq 22 for each measurement.
 ADAPTED = np.dtype([("trust", np.float64), ("c", np.float64, (READINGS,))])
 
 
@@ -209,7 +209,7 @@ class PaperHybridUkf:
 
     @property
     def measurement_variance(self) -> FloatArray:
-        """R_0 of [a_y, r, v_x], [3]: the sensors'; the constants bound that of a_y from below."""
+        """R_0 of [a_y, r, v_x], [3]: the sensors' variance, for a_y at least ``constants.ay_variance``."""
         s = self.vehicle.sensors
         std = np.array([s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s])
         variance: FloatArray = std**2
@@ -218,7 +218,7 @@ class PaperHybridUkf:
 
     @property
     def parallel(self) -> ukf.VehicleUkf:
-        """The physics filter in parallel, whose model, initial covariance and Q_0 are those of this filter."""
+        """The physics filter in parallel, with model, initial covariance and Q_0 of this filter."""
         return ukf.nominal_filter(self.vehicle, use_speed=self.use_speed, name="parallel")
 
     def run(self, signals: Signals, state: PaperState | None) -> tuple[PaperSteps, PaperState]:

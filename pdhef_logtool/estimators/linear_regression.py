@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class LinearRegression(DirectNetwork):
-    """The estimator of this file."""
+    """Sideslip by a linear regression on the network's features, through a low pass."""
 
     algorithm = "linear-regression"
     weights: ClassVar[str] = "coefficients"

@@ -19,7 +19,7 @@ OPEN_LOOP = "open-loop:calibrated"
 
 
 def uses_calibration(name: str) -> bool:
-    """Whether an estimator is on the calibrated or identified vehicle; all others are on the vehicle file."""
+    """Return whether an estimator uses the calibrated or identified vehicle; all others use the vehicle file."""
     return name == OPEN_LOOP or preset_of(name) in SELF_CALIBRATED
 
 

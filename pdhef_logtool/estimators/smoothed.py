@@ -170,7 +170,7 @@ def smoothed_track(physics: VehicleUkf, steps: ForwardSteps, following: ForwardS
 
 
 def blocks(stamps_ns: IntArray, block_s: float) -> Iterator[slice]:
-    """Yield the steps of each block of ``block_s`` that has any, counted from the first step."""
+    """Yield the steps of each non-empty block of ``block_s``, counted from the first step."""
     if not len(stamps_ns):
         yield slice(0, 0)
         return

@@ -1,6 +1,43 @@
 """Registry of estimators: a line of :data:`SPECS` and a file with the builder of each.
 
 A name is a preset: ``build`` returns the algorithm for a car and options (:mod:`~.algorithm`).
+
+Another package adds an estimator by an entry point of the group :data:`ENTRY_POINTS` that names its :class:`Spec`. It
+receives read-only signals, and its errors are contained (:mod:`~.plug_ins`). Example::
+
+    # half_slip.py, of a package whose pyproject.toml has
+    # [project.entry-points."pdhef.estimators"]
+    # half-slip = "half_slip:SPEC"
+    from dataclasses import dataclass
+
+    from pdhef_logtool.car.vehicle import VehicleParameters
+    from pdhef_logtool.estimators.base import make_steps
+    from pdhef_logtool.estimators.stepwise import measured_speed
+    from pdhef_logtool.estimators.table import Spec
+
+
+    @dataclass(frozen=True)
+    class HalfSlip:
+        algorithm = "half-slip"
+        version = 1
+
+        vehicle: VehicleParameters
+        name: str = "half-slip"
+        causal: bool = True
+
+        def run(self, signals, state):
+            vx, state = measured_speed(signals, self.vehicle.sensors.speed_hold_s, state)
+            yaw_rate = signals.yaw_rate_rad_s
+            vy = 0.5 * self.vehicle.cg_to_rear_axle_m * yaw_rate
+            return make_steps(vx, vy, yaw_rate), state
+
+
+    def build(name, car, options):
+        return HalfSlip(car.vehicle, name)
+
+
+    NEEDS = frozenset({"speed_m_s", "yaw_rate_rad_s"})
+    SPEC = Spec("half-slip", "half of the sideslip without tyre slip", build, NEEDS, 0x123456)
 """
 
 from __future__ import annotations
@@ -194,7 +231,7 @@ class Skipped:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the estimator."""
         return self.spec.name
 
 

@@ -110,7 +110,7 @@ def draw(x, L, places, m, points):  # type: ignore[no-untyped-def]
 
 @_sum
 def _products(block, places, a, b):  # type: ignore[no-untyped-def]
-    """Return the sums of products of row a and the four rows from b; rows behind the last one are the last one."""
+    """Return the scalar products of row a with four rows from b on; beyond the last row, the last row again."""
     last, of_a = places.shape[0] - 1, _row(block, places, a)
     row_0, row_1 = _row(block, places, b), _row(block, places, min(b + 1, last))
     row_2, row_3 = _row(block, places, min(b + 2, last)), _row(block, places, min(b + 3, last))
@@ -125,7 +125,7 @@ def _products(block, places, a, b):  # type: ignore[no-untyped-def]
 
 @_sum
 def _deviate(row, m, n):  # type: ignore[no-untyped-def]
-    """Replace a row of a block by its deviations from the centre, in whose column is δ / √w; return the mean."""
+    """Replace a row by its deviations from the centre, the centre by √(0.5 / n) times their sum; return the mean."""
     centre, moved = row[0], 0.0
     for i in range(WIDTH):
         row[i] = row[i] - centre if i <= 2 * m else 0.0
@@ -136,7 +136,7 @@ def _deviate(row, m, n):  # type: ignore[no-untyped-def]
 
 @_inline
 def _covariance(L, a, row, m):  # type: ignore[no-untyped-def]
-    """Return the covariance of an entry a before the model and a result behind it, which has the deviations ``row``."""
+    """Return the covariance of state entry a before the model with a result after it, of deviations ``row``."""
     s = 0.0
     for i in range(min(a + 1, m)):
         s += L[a, i] * (row[1 + i] - row[1 + m + i])

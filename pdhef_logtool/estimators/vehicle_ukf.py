@@ -127,7 +127,7 @@ _JUST_REJECTED_S = 1e-9
 U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED, U_STEER_KNOWN = range(6)
 INPUTS = 6
 
-#: What a filter remembers of the steps before: whether it runs; last inputs and residual; ages, s; duration of the
+#: Memory of a filter of the steps before: whether it runs; last inputs and residual; ages, s; duration of the
 #: standstill, s; mean normalised square of the innovations; last speed sample; largest recent share of the grip that is
 #: used, decaying; time since the first sample of an unbroken rejection of a_y, yaw rate and speed, s.
 MEMORY_FIELDS: list[tuple[Any, ...]] = [
@@ -205,7 +205,7 @@ class Belief(NamedTuple):
 class StepInputs(NamedTuple):
     """Inputs at a step, held if missing, and its measurements.
 
-    ``steers`` states that the filter may start with the steering, ``steer_ok`` that it may go on with it.
+    ``steers``: the steering is sufficient to start the filter; ``steer_ok``: to continue it.
     """
 
     dt: float
@@ -411,7 +411,7 @@ def changing(layout):  # type: ignore[no-untyped-def]
 
 @_inline
 def columns_of(points):  # type: ignore[no-untyped-def]
-    """Return the columns of a block for the centre and other points: whole vectors; the rest are at the centre."""
+    """Return the number of columns of a block for a centre and ``points`` others, rounded up to whole vectors."""
     return (points + LANES) // LANES * LANES
 
 
@@ -477,9 +477,9 @@ def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyp
 
 @_inline
 def diverges(rules, x, m):  # type: ignore[no-untyped-def]
-    """Return whether innovations stay far beyond their covariance, or the motion is impossible.
+    """Return whether innovations remain far beyond their covariance, or the motion is impossible.
 
-    Without a speed sensor nothing but a wrong acceleration drives a car backwards that fast.
+    Without a speed sensor, only a wrong acceleration makes a car drive backwards that fast.
     """
     reverses = not rules.use_speed and x[VX] < -rules.dynamic_speed_m_s
     slides = x[VX] > rules.dynamic_speed_m_s and abs(math.atan2(x[VY], x[VX])) > DIVERGED_SIDESLIP_RAD
@@ -519,7 +519,7 @@ def is_finite(x, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyped-def]
-    """Filter one window; ``belief`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
+    """Filter one window; ``belief`` is moved in place. ``links`` are of length 0 if not requested."""
     q_std, r_std, initial_std, standstill_std, rules = tuning
     layout, places, p, car = model
     x, P, memory = belief
@@ -606,7 +606,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-untyped-def]
-    """Predict the steps that are due with their inputs held; the rows of no step (−1) are left.
+    """Predict the steps ``due`` with their inputs held; rows without a step (−1) are unchanged.
 
     Over a latency the model is nearly linear: the covariance is J P Jᵀ + Q. J is of differences away from 0, which are
     mirrored with the state.

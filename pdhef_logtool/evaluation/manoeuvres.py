@@ -347,7 +347,7 @@ def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
 
 
 def _repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """Slalom, continuous sine and sine sweep: swings of alternating sign with regular spacing, long series first."""
+    """Yield slalom, continuous sine, sine sweep: swings of alternating sign with regular spacing, long series first."""
     parts = _regular_parts(swings, rules)
     long = [p for p in parts if len(p) >= rules.sweep_repeated]
     steady = [p for p in long if min(s.peak for s in p[-2:]) >= 0.5 * max(s.peak for s in p)]
@@ -387,7 +387,7 @@ def _name_of_repeated(part: Sequence[_Swing], rules: ManoeuvreRules) -> str:
 
 
 def _lane_changes(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
-    """Double lane changes: out, back, and straight at the end, within the length of a course."""
+    """Yield double lane changes: out, back, and straight at the end, within the length of a course."""
     for i in range(len(swings)):
         before = swings[i - 1] if i and (swings[i].start - swings[i - 1].end) * _STEP_S < rules.swing_gap_s else None
         if before is not None and before.peak > rules.equal_peaks * swings[i].peak:
@@ -435,7 +435,7 @@ def _straight_before(run: _Run, row: int, rules: ManoeuvreRules) -> bool:
 
 
 def _two_swings(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
-    """Sine steer, sine with dwell and fishhook: from straight ahead, two swings to opposite sides, equally high."""
+    """Yield sine steer, sine with dwell, fishhook: from straight ahead, two equally high swings to opposite sides."""
     for first, second in pairwise(swings):
         close = (second.start - first.end) * _STEP_S <= 0.5 * rules.swing_gap_s
         low, high = sorted((first.peak, second.peak))
@@ -468,7 +468,7 @@ def _has_dwell(run: _Run, first: _Swing, second: _Swing) -> bool:
 
 
 def _steps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
-    """ISO 7401 steps: from straight ahead to an angle within a short time, then held."""
+    """Yield steps (ISO 7401): from straight ahead to an angle within a short time, then held."""
     held_rows = round(rules.held_s / _STEP_S)
     for swing in swings:
         if swing.end - swing.start < held_rows or swing.peak < rules.peak_m_s2:
@@ -493,7 +493,7 @@ def _steps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterat
 
 
 def _ramps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
-    """Ramp steer: the angle grows along a line for seconds, from straight ahead, at one speed."""
+    """Yield ramps: the angle grows along a line for seconds, from straight ahead, at one speed."""
     for swing in swings:
         row = swing.start + int(np.argmax(np.abs(run.steer[swing.start : swing.end]))) + 1
         speed = run.speed[swing.start : row]
@@ -511,7 +511,7 @@ def _ramps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterat
 
 
 def _circles(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """ISO 4138: half a circle or more at a curvature that stays within a share of its median."""
+    """Yield circles (ISO 4138): half a circle or more with a curvature within a share of its median."""
     stamps = np.arange(len(run), dtype=np.int64) * _STEP_NS
     for sign in (1, -1):
         for a, b in runs(stamps, sign * run.turn > rules.circle_m_s2):
@@ -527,7 +527,7 @@ def _circles(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iter
 
 
 def _slowing(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """ISO 7975 and ISO 9816: the car slows in a steady turn while the steering is held."""
+    """Yield braking (ISO 7975) and power-off (ISO 9816): the car slows in a steady turn while the steering is held."""
     pre, ahead, lag = round(rules.turn_s / _STEP_S), round(rules.slowing_s / _STEP_S), 15
     n = len(run)
     if n < pre + ahead + lag:

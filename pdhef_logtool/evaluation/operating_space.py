@@ -30,8 +30,8 @@ MAX_STEP_S = 0.2
 class Cell:
     """A cell of the grid with data of the drive.
 
-    ``speed`` and ``ay``: indices of the lower edges. ``scored``: number of stamps with the mean squared sideslip error
-    of the selected estimate, NaN without one.
+    ``speed`` and ``ay``: indices of the lower edges. ``scored``: number of stamps in the mean
+    squared sideslip error of the selected estimate, which is NaN without any.
     """
 
     speed: int

@@ -341,7 +341,7 @@ def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[Driv
 
 
 def _times(requirement: Requirement, bounded: Bounded) -> float:
-    """Return how many times as much driving decides if value and spread do not change, in tenths.
+    """Return the factor on the amount of driving that gives a verdict if value and spread do not change, in tenths.
 
     The width of the interval is in proportion to the inverse square root of the amount, for positive values in the
     logarithm, as in the bootstrap.

@@ -127,7 +127,7 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
 
 
 def taken(signals: Signals, truth: StateTrack | None, column: str) -> FloatArray:
-    """Return a column [N] of the ground truth if it has any finite value, else of the sensors: one source a drive."""
+    """Return a column [N] of the ground truth if it has any finite value, else of the sensors: one source per drive."""
     of_truth = truth is not None and np.isfinite(getattr(truth, column)).any()
     return np.asarray(getattr(truth if of_truth else signals, column))
 

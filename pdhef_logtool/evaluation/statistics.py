@@ -295,7 +295,7 @@ def _lognormal_excess(values: FloatArray, power: float, tail: float) -> float:
 
 
 def _error(top: FloatArray, below: FloatArray, counts: FloatArray, power: float, *, log: bool) -> FloatArray:
-    """Return the standard errors [M] of the statistic with ``counts`` [M, N] of the units [N], by the delta method."""
+    """Return the standard errors [M] of the statistic in resamples, ``counts`` [M, N] of the units (delta method)."""
     total, base = counts @ top, counts @ below
     ratio = total / base
     n = len(top)
@@ -443,14 +443,14 @@ def _bounds(ascending: FloatArray, share: float, effect: Dependence) -> tuple[fl
 
 
 def _at(ascending: FloatArray, place: float) -> float:
-    """Return the value at a place between order statistics; between infinite ones the outer one."""
+    """Return the value at a fractional rank, interpolated; beside an infinite value, the value at the lower rank."""
     i = math.floor(place)
     low, high = float(ascending[i]), float(ascending[min(i + 1, len(ascending) - 1)])
     return low if low == high or not (math.isfinite(low) and math.isfinite(high)) else low + (place - i) * (high - low)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values corrected for being several (Holm 1979), in the given order."""
+    """Return p-values corrected for multiple tests (Holm 1979), in the given order."""
     corrected = [1.0] * len(p_values)
     largest = 0.0
     for rank, i in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):

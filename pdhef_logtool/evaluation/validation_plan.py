@@ -126,7 +126,7 @@ class Requirement:
 
     @property
     def name(self) -> str:
-        """What is limited, for example ``sideslip RMSE (nonlinear)``."""
+        """Name of the limited figure, for example ``sideslip RMSE (nonlinear)``."""
         return self._text("")
 
     @property

@@ -104,7 +104,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Read:
-    """Driving and sensors of a drive; ``opened`` : what it teaches, None without ground truth."""
+    """Driving and sensors of a drive; ``opened`` : its content for teaching, None without ground truth."""
 
     driving: Driving | None
     sensors: Sensors
@@ -159,7 +159,7 @@ def _without_truth(
 
 
 def _check(got: str, expected: str) -> None:
-    """Raise EstimatorError if the drives lack something."""
+    """Raise EstimatorError if ``got`` states a lack of the drives."""
     if got:
         remedy = "give more drives of this car, or map v_y, sideslip, or position and heading as ground truth"
         raise EstimatorError(expected=expected, got=got, where="learn", remedy=remedy)

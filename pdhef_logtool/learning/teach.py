@@ -125,7 +125,7 @@ def learn_from(drives: Sequence[OpenedDrive], progress: Any = lambda _text, _sha
 
 
 def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:
-    """Return the features of a drive, the sideslip error of ``physics`` on its calibrated car, and its response."""
+    """Return features, sideslip error of ``physics`` on the calibrated car, and response of a drive."""
     model = DriveModel.of(drive.drive, calibration)
     car = model.car
     physics, signals = make_estimator(PHYSICS, car), model.apply(drive.whole.signals).calibrated

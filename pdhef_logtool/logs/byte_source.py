@@ -30,7 +30,7 @@ class CutError(Exception):
 
 
 class SourceError(LogError):
-    """A log cannot be read at its location (any more). The log is not damaged, so this is never one of its losses."""
+    """A log cannot be read at its location (any more). This is no damage of the log, and never one of its losses."""
 
 
 class ChangedError(SourceError):
@@ -101,7 +101,7 @@ class ByteSource(ABC):
         return data
 
     def ahead(self, offset: int, size: int) -> tuple[bytes, int]:
-        """Return a block and the place in it where ``size`` bytes or more from an offset lie, if the file has them."""
+        """Return a block with ``size`` bytes or more from an offset, fewer at the file's end, and their place in it."""
         start, block = self._block
         position = offset - start
         if position >= 0 and position + size <= len(block):

@@ -122,12 +122,12 @@ class _Blf:
         return _tables("blf", self._file, stamps, numbers, content, self._losses)
 
     def _lose(self, kind: str, what: str) -> None:
-        """Add a loss; the last one counts those beyond the limit."""
+        """Add a loss; the last one counts all losses beyond the limit."""
         count = (self._losses.pop().count or 1) + 1 if len(self._losses) > _MOST_NAMED else None
         self._losses.append(Loss(kind, what, self._file.name, count=count))
 
     def _read_container(self, start: int, end: int, place: str) -> None:
-        """Read a container. A damaged one, or one beyond the limits, is a loss."""
+        """Read a container; a damaged or too large one is a loss."""
         method, size = struct.unpack_from("<H6xI", self._data, start + _HEAD)
         stored = self._data[start + _CONTAINER_HEAD : end]
         try:
@@ -246,7 +246,7 @@ _STEP_NS = 10**9
 
 
 class _TextLog:
-    """Reader of a log of text with a frame a line."""
+    """Reader of a text log with one frame per line."""
 
     kind = ""
 
@@ -260,7 +260,7 @@ class _TextLog:
         raise NotImplementedError
 
     def _add(self, stamp_ns: int, data: bytes, *parts: int) -> bool:
-        """Add a frame with its parts in their order; return False if it is none."""
+        """Add a frame with its parts in their order; return False if the line is no frame."""
         if parts[0] > ID_BITS:
             return False
         row = _ROW.pack(*parts)
@@ -299,7 +299,7 @@ class _TextLog:
         return stamps
 
     def _bus_numbers(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the numbers [N, 6] of frames with those of buses."""
+        """Return the numbers [N, 6] of frames, completed by the bus numbers."""
         return numbers
 
 

@@ -157,7 +157,7 @@ class ColumnarLog(DriveLog):
         return tuple(losses)
 
     def _channel_losses(self, c: int, channel: ChannelRecord, undecodable: int) -> Iterator[Loss]:
-        """Yield what is lost and noted of the messages of one channel."""
+        """Yield the losses and notes of the messages of one channel."""
         schema = self._schemas.get((c, channel.id))
         if undecodable:
             what = f"{undecodable} messages do not fit the type of their topic"
@@ -506,7 +506,7 @@ class ColumnarLog(DriveLog):
                 yield span
 
     def _collect_span(self, request: _Request, c: int, span: Span, parts: Mapping[str, list[Columns]]) -> None:
-        """Add the columns of the requested topics in a span; if it is opened, keep those of expected topics."""
+        """Add the columns of the requested topics in a span; if it is opened, keep columns of expected topics too."""
         channels, plans, expected = self.containers[c].channels, request.plans, request.expected
         requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
         stored = self._columns.get((c, span.index), {})

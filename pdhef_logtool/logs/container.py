@@ -128,7 +128,7 @@ class Block:
 
     @property
     def nbytes(self) -> int:
-        """Its memory."""
+        """Memory of the block in bytes."""
         columns = self.channel, self.log_time_ns, self.publish_time_ns, self.sequence, self.offset, self.length
         return memoryview(self.buffer).nbytes + sum(c.nbytes for c in columns)
 
@@ -239,7 +239,7 @@ class Container(ABC):
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
-    size : bytes of the file. cut : whether the file ends before its time. meter : resource limits.
+    size : bytes of the file. cut : whether the file is truncated. meter : resource limits.
     kind : of a log with this file only, as :class:`~.drive_log.DriveLog` has it.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
@@ -323,7 +323,7 @@ class Container(ABC):
         del spans
 
     def on_close(self, callback: Callable[[], None]) -> None:
-        """Call something when the container is closed; the last added comes first."""
+        """Register a function to call when the container is closed; the last one is called first."""
         self._closing.callback(callback)
 
     def close(self) -> None:
@@ -337,7 +337,7 @@ class Container(ABC):
     def lose(
         self, kind: str, what: str, start_ns: int | None = None, end_ns: int | None = None, count: int | None = None
     ) -> None:
-        """Note damage of this file; the 21st and later losses of a kind become one."""
+        """Record damage of this file; the 21st and later losses of a kind are merged."""
         n = self._losses[kind] = self._losses.get(kind, 0) + 1
         more = n - _LOSSES_OF_A_KIND
         if more <= 0:
@@ -366,7 +366,7 @@ class Container(ABC):
 
 
 class FileContainer(Container):
-    """A file that begins with ``magic`` (``magic_text`` in words), walked once from record to record.
+    """A file that begins with ``magic`` (``magic_text`` in words), read once from record to record.
 
     Parameters
     ----------

@@ -338,7 +338,7 @@ def _number(value: object) -> float:
 
 
 def _shape_of_values(values: Sequence[object]) -> tuple[str, int]:
-    """Judge a place that the schema leaves open by its first value."""
+    """Return kind and width of a field by its first value, if the schema leaves its type open."""
     value = next((value for value in values if value is not None), None)
     if isinstance(value, (list, tuple)):
         return "array", 0

@@ -90,7 +90,7 @@ def find_logs(
 
 
 def with_free_stem(log: LogInput, taken: Container[str]) -> LogInput:
-    """Return a log under its stem, or with digits behind it where :func:`as_taken` of the stem is among the taken."""
+    """Return a log with its stem, or with digits appended if :func:`as_taken` of the stem is in ``taken``."""
     if as_taken(log.stem) not in taken:
         return log
     return replace(log, stem=_with_digits(log.stem, "/".join(_parts(log.path)), taken))
@@ -239,7 +239,7 @@ def _matches(pattern: str) -> list[Path]:
 
 
 def _search(folder: Path, visited: set[str], settings: TableSettings) -> Iterator[Path]:
-    """Yield the logs below a folder, each folder once: links can lead back to where they lie."""
+    """Yield the logs below a folder; each folder is visited once, because links may form a loop."""
     from pdhef_logtool.logs.recording_folder import is_recording
 
     place = os.path.realpath(folder)
@@ -276,7 +276,7 @@ def _bare_name(name: str) -> str:
 
 
 def _parts(place: LogPlace) -> tuple[str, ...]:
-    """Return the folders that lead to a place, and its name; links are followed but for the last one."""
+    """Return the components of a path; all links but the last component are resolved."""
     if isinstance(place, RemotePlace):
         return (place.host, *place.parts[1:])
     return (*Path(os.path.realpath(place.parent)).parts[1:], place.name)

@@ -99,7 +99,7 @@ class DriveLog(ABC):
 
     @abstractmethod
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic; empty where none is known.
+        """Return the scalar leaves of a topic; empty if its type is unknown.
 
         With ``quiet`` a schema that does not parse is not reported as a loss.
         """

@@ -1,6 +1,15 @@
 """The formats of logs: an entry defines how files of a format are recognised and opened.
 
-A package adds formats by entry points of the group ``pdhef.log_formats``; each is a :class:`LogFormat`.
+A package adds formats by entry points of the group ``pdhef.log_formats``; each is a :class:`LogFormat`. Example, with
+``Table`` (a topic with its own times) and ``TableLog`` of :mod:`~.table_log`::
+
+    def open_npz(file: LogFile) -> DriveLog:
+        with np.load(file.path) as archive:
+            imu = {"ay": archive["ay"], "yaw_rate": archive["yaw_rate"]}
+            stamps_ns = np.round(archive["t"] * 1e9).astype(np.int64)  # ascending, since 1970
+        return TableLog(file, "npz", [Table.of_arrays("imu", stamps_ns, imu, {"ay": "g", "yaw_rate": "°/s"})])
+
+    FORMAT = LogFormat("a NumPy archive", "npz_log:open_npz", (".npz",), b"PK", needs_suffix=True)
 """
 
 from __future__ import annotations

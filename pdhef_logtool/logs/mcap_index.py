@@ -72,7 +72,7 @@ def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> M
 
 
 def chunk_places(source: ByteSource, limits: ResourceLimits) -> list[int]:
-    """Return where chunks begin according to the summary, as far as it can be read, ascending."""
+    """Return the ascending offsets of chunks according to the summary, as far as it can be read."""
     places: list[int] = []
     with suppress(*_UNREADABLE):
         indexes = (r for r in _records(_summary(source)[0], limits) if isinstance(r, ChunkIndex))

@@ -267,7 +267,7 @@ class Groups:
         return self._last[1][rows]
 
     def _frames(self, number: int, stamps: IntArray, rows: Any) -> Frames:
-        """Return the CAN frames of a group. Row numbers, of a virtual channel without a conversion, are no part."""
+        """Return the CAN frames of a group, without the row numbers of a virtual channel."""
         names = [channel.name.removeprefix(f"{_FRAMES}.") for channel in self._groups[number].channels]
         parts = {
             name: np.nan_to_num(self._values(number, i), nan=-1.0)[rows].astype(np.int64)

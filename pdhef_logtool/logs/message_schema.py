@@ -273,7 +273,7 @@ def _idl_types(text: str) -> Any:
     from rosbags.typesys.idl import IDLParser
 
     class QuickParser(IDLParser):
-        """Parses every rule once a place, where the plain one takes a hundred times as long for each bracket.
+        """Parser that applies each rule once per position; the plain one takes 100 times as long for each bracket.
 
         Products and shifts are refused: a few nested ones give a number that fills the memory, and the texts that ROS
         generates contain none.

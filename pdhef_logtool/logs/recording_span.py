@@ -53,7 +53,7 @@ SpanTimes = Callable[[int, Span], Mapping[int, IntArray] | None]
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """Messages of a topic in [low_ns, high_ns] that were recorded at or after a place: file, span, row."""
+    """Messages of a topic to leave out: log times in [low_ns, high_ns], at or after ``place`` (file, span, row)."""
 
     topic: str
     place: tuple[int, int, int]
@@ -63,7 +63,7 @@ class Cut:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpan:
-    """The log times that count.
+    """Recording span of a log: the times at which its messages are used.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class RecordingSpan:
     def unused(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray | None:
         """Return which of a topic's messages in a span (all of them, in file order) are left out; None: none of them.
 
-        To be asked where anything is ``left_out`` at all.
+        Only of use if any message is ``left_out``.
         """
         of_earlier_passes = _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
         unused = ~_inside(log_time_ns, self.intervals) | of_earlier_passes
@@ -224,7 +224,7 @@ class _Looked:
     stamps: Mapping[int, IntArray] | None = None
 
     def pieces(self) -> Iterator[tuple[int, int, int, Mapping[str, int]]]:
-        """Yield start, end, messages, and messages by topic; one piece a stretch."""
+        """Yield start, end, messages, and messages by topic; one piece per stretch."""
         if self.stamps is None:
             counts: Counter[str] = Counter()
             for id_, messages in self.span.counts.items():
@@ -327,7 +327,7 @@ def _inside(times_ns: IntArray, intervals: Sequence[tuple[int, int]]) -> BoolArr
 
 
 def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Iterable[Cut]) -> BoolArray:
-    """Return which of a topic's messages in the span of a place, file and span, the cuts leave out."""
+    """Return the mask of a topic's messages in a span, at ``place`` (file, span), that the cuts leave out."""
     left_out = np.zeros(times_ns.shape[0], np.bool_)
     for cut in cuts:
         if cut.topic == topic and place >= cut.place[:2]:

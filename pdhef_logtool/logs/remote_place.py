@@ -58,7 +58,7 @@ class RemotePlace:
 
     @property
     def name(self) -> str:
-        """Last component: the name as a file."""
+        """Name of the object: the last component of its path."""
         return self.parts[-1] if len(self.parts) > 1 else self.host
 
     @property

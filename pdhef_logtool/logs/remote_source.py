@@ -321,7 +321,7 @@ def _error(place: RemotePlace, got: str, remedy: str, expected: str = "an object
 
 
 def _words_of(error: Exception) -> tuple[str, str, bool]:
-    """Return cause, remedy, and whether a new request may help. The texts of aiohttp can contain the URL."""
+    """Return cause, remedy, and whether a new request may help; without aiohttp's texts, which can contain the URL."""
     import aiohttp
 
     if isinstance(error, PrivateRedirectError):

@@ -29,16 +29,20 @@ class ResourceLimits:
 
     Attributes
     ----------
-    chunk_bytes : decompressed bytes of a unit of reading: a chunk, or a run of messages without chunks.
-    chunk_ratio : decompressed by stored bytes of a chunk, or file, of more than a MiB.
-    chunk_messages : messages of a unit of reading.
+    chunk_bytes : decompressed bytes of a chunk, of a run of messages without chunks, or of a compressed message.
+    chunk_ratio : decompressed by stored bytes of a chunk, message or file of more than a MiB.
+    chunk_messages : messages of a chunk or run.
     messages_per_byte : messages by stored bytes of a chunk of more than 65,536 messages.
-    channels : of one file. metadata_bytes : of one declaration, metadata record or header.
-    schema_bytes : text or descriptors of one schema. schema_leaves : scalar places of an unfolded schema.
+    channels : channels of a file.
+    metadata_bytes : bytes of a declaration, metadata record, index record or header.
+    schema_bytes : bytes of the text or the descriptors of one schema.
+    schema_leaves : scalar fields of a schema with all its nested structs.
     schema_depth : structs inside one another, also of a JSON message.
     array_width : elements of an array that become columns.
-    table_bytes, table_ratio : bytes of a file's decoded tables: a constant part, and a part by stored bytes.
-    seconds, seconds_per_mib : processor time of reading: a constant part, and a part per MiB read.
+    table_bytes : bytes of the decoded tables of a file (CSV, Parquet, MAT, MDF, BLF, ...): a constant part.
+    table_ratio : a further part of them, by stored bytes.
+    seconds : processor time of reading: a constant part.
+    seconds_per_mib : a further part of it, for each MiB read.
     """
 
     chunk_bytes: int = 256 << 20
@@ -62,7 +66,7 @@ class ResourceLimits:
         return ResourceLimits(**{name: type(value)(value * factor) for name, value in values.items()})
 
     def check(self, limit: str, amount: float, what: str) -> None:
-        """Raise :class:`LimitError` if an amount is above the limit of this name; ``what`` claims it."""
+        """Raise :class:`LimitError` if an amount, claimed by ``what``, is above the limit of this name."""
         allowed = getattr(self, limit)
         if amount > allowed:
             raise LimitError(

@@ -171,7 +171,7 @@ def _assumption(values: NDArray[Any], factor: int, epoch: int, others: Sequence[
 
 
 def _as_rate_states(rate_hz: float, step: float) -> tuple[int, int, str]:
-    """Return the power of ten of ns that gives steps their rate, as :func:`_reading`."""
+    """Return, as :func:`_reading`, the unit (a power of ten in ns) in which a usual step agrees with the rate."""
     factor = int(10 ** max(0, round(math.log10(_SECONDS / (rate_hz * step)))))
     return factor, 0, f"no unit, read as {factor / _SECONDS:g} s, as rate_hz states"
 
@@ -250,7 +250,7 @@ def with_fractions(clock: Clock, fractions: FloatArray, unit_ns: int, name: str)
 
 
 def spread(clock: Clock) -> Clock:
-    """Return a clock whose rows are spread evenly where several share a time, as in exports in whole seconds."""
+    """Return a clock with rows spread evenly where several share a time, as in exports in whole seconds."""
     rows = np.flatnonzero(clock.stamps_ns != NO_TIME)
     times, first, count = np.unique(clock.stamps_ns[rows], return_index=True, return_counts=True)
     if len(times) < _CLOCKS["few_rows"] or (np.diff(first) < 0).any() or (usual := int(np.median(count))) < 2:

@@ -200,7 +200,7 @@ def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
 
 
 def _decades_too_short(columns: Mapping[str, Any], rows: IntArray, stamps: IntArray) -> int:
-    """Return n if times have to be multiplied by 10**n so that speed and path agree; 0 without evidence.
+    """Return the power of ten n for which times × 10**n make speed and path agree; 0 without evidence.
 
     Units of speed, from m/s to km/h, shorten the ratio of the path to the integral by up to 0.56 decades.
 
@@ -234,7 +234,7 @@ def _best_clocks(clocks: Mapping[str, Clock], grades: Mapping[str, int]) -> list
 
 
 def _grade(sheet: Sheet, name: str) -> int | None:
-    """Return how surely a column contains times, 0 by its name alone; None if it does not."""
+    """Return the confidence that a column contains times, 0 by its name alone; None if it contains none."""
     column, text = sheet.columns[name], snake(name)
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):

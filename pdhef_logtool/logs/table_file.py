@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TableSettings:
-    """What users state about a log of tables.
+    """Settings of the user for a log of tables.
 
     Attributes
     ----------
     rate_hz : rows per second of a table without times, or with times without a unit.
-    group : run whose tables are read: the beginning or the end of their names; empty: all tables.
+    group : run to read: the beginning or the end of the names of its tables; empty: all tables.
     folder : whether a folder of CSV files is one ``recording`` or several ``drives``; ``auto``: by their contents.
     """
 

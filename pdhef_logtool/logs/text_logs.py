@@ -172,7 +172,7 @@ def _titles(rows: Sequence[Sequence[str]], width: int) -> list[int]:
 
 
 def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
-    """Return titles behind those of their groups, which repeat, and the first one of an index below them."""
+    """Return titles with the repeated titles of their groups in front, and the title of an index column below them."""
     if groups and len({c.strip() for c in groups}) < len(titles) and all(groups):
         titles = [*titles[:1], *(f"{group}_{n}" for group, n in zip(groups[1:], titles[1:], strict=False))]
     return [next((row[0] for row in below if row[0] and not any(row[1:])), titles[0]), *titles[1:]]

@@ -1,4 +1,8 @@
-"""From ``topic.field`` to signal: mapping files, recognition of known types, clocks, and the reading of channels."""
+"""From ``topic.field`` to signal: mapping files, recognition of known types, clocks, and the reading of channels.
+
+A mapping states field, scale, offset and time of each signal; without a file, names and physics determine it. It must
+not import the car: a log is mapped before a vehicle is known.
+"""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def _short(scale: float | tuple[float, ...]) -> str:
 
 @dataclass(slots=True)
 class Field:
-    """A field with a meaning, during the evaluation.
+    """A field with a quantity by name or type, during the evaluation.
 
     Attributes
     ----------
@@ -300,7 +300,7 @@ def _weighable(
 
 
 def _is_measured(name: str, seen: Seen) -> bool:
-    """Return whether there are values, and not those of an enumeration."""
+    """Return whether there are values, other than codes of an enumeration."""
     is_state = not STATES.isdisjoint(words_of(name)[-1:]) and is_enumeration(seen.values)
     return bool(np.isfinite(seen.values).any()) and not is_state
 

@@ -209,7 +209,7 @@ class _Times(NamedTuple):
 
 @dataclass(slots=True)
 class _Reading:
-    """Columns of topics, and what their channels share. Each topic's losses by its stamps are counted once."""
+    """Columns of topics, and data that their channels share. Each topic's losses by its stamps are counted once."""
 
     log: DriveLog
     clocks: Mapped[str, ClockModel]

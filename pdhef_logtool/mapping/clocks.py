@@ -193,7 +193,7 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
 
 
 def _of_other_clocks(clocks: Mapped[str, ClockModel]) -> dict[str, str]:
-    """Return why clocks disagree with the others, by key; a common offset of all clocks is accepted."""
+    """Return why clocks disagree with the others, by key; an offset that all clocks share is accepted."""
     delays_s = {key: clock.median_delay_s for key, clock in clocks.items() if clock.samples}
     if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= MAX_CREDIBLE_DELAY_NS * 1e-9:
         return {}

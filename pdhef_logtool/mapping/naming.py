@@ -164,7 +164,7 @@ def meaning_among(topic: str, type_name: str, path: str, unit_text: str, there: 
 
 
 def _spelled_out(path: str, there: Collection[str]) -> str:
-    """Return a path with a longer name for one whose meaning the other names of its struct give: g_x beside a_x."""
+    """Return a path with a longer name if the other names of its struct give its meaning: g_x beside a_x."""
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
         return f"{gyro[1]}gyro_{gyro[2]}"
     leaf = path.rpartition(".")[2]

@@ -128,7 +128,7 @@ def _sense(relation: Fit | None) -> float:
 def twist_axes(log: DriveLog, velocity: SignalSource, references: Sequence[SignalSource]) -> Axes:
     """Return the axes of a velocity's first two fields by positions and a yaw rate among ``references``.
 
-    A velocity with another size than that along the path is in an unknown unit: its axes are unknown, too.
+    If its magnitude differs from the speed along the path, its unit is unknown, and so are its axes.
     """
     pieces, read, anchors = _read(log, (velocity, *references))
     x, y = (read.get((velocity.topic, path)) for path in velocity.paths[:2])

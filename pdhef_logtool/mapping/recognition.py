@@ -215,7 +215,7 @@ def auto_map(
 def _of_one_run(draft: _Draft, topics: list[TopicInfo]) -> list[TopicInfo]:
     """Return the topics of the run with most of them; note the choice if a table contains several runs.
 
-    Runs are the beginnings of names before the same devices with the same fields.
+    A run is a common beginning of names (``run_1/imu``, ``run_1/gnss``) that repeats with equal devices and fields.
     """
     if repeated := _repeated_groups(draft.log, topics):
         runs = ["1", *sorted({t.name.rpartition("_")[2] for t in repeated}, key=int)]

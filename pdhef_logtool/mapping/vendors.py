@@ -209,7 +209,7 @@ def _read(path: Path) -> Vendors:
 
 
 def _tables(raw: Mapping[str, Any], key: str, kind: type[_Table], problems: list[str]) -> Iterator[_Table]:
-    """Yield the sound tables of a key; what is wrong with the others is added to ``problems``."""
+    """Yield the valid tables of a key; the errors of the others are added to ``problems``."""
     entries = raw.get(key, [])
     for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
         if (model := checked(kind, table, f"{key}[{number}]", problems)) is not None:

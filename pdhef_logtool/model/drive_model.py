@@ -1,4 +1,4 @@
-"""The model of a drive: the one record of what is known about its recording and its car, without ground truth.
+"""The model of a drive: the one record of the knowledge about its recording and its car, without ground truth.
 
 See docs/method.md#self-calibration.
 """
@@ -49,7 +49,7 @@ class DriveModel:
 
     @classmethod
     def fit(cls, drive: Drive) -> DriveModel:
-        """Return the model of a drive as its options ask for it; no ground truth is used.
+        """Return the model of a drive by its option ``model``; no ground truth is used.
 
         ``auto`` fits the car to the drive. With a model file the car has the parameters of earlier drives, with ``off``
         the prior means about its vehicle file; both are independent of this drive.
@@ -121,7 +121,7 @@ def lacking(drive: Drive) -> list[str]:
 
 
 def read_driving(drive: Drive) -> Driving:
-    """Return the driving of a drive that can be calibrated on; its ground truth is not looked at.
+    """Return the driving of a drive for the calibration; its ground truth is not used.
 
     Raises EstimatorError without a stamp.
     """

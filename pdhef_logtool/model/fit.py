@@ -173,7 +173,7 @@ class CarFit:
         self._least_std = self._error_std = np.array(ERROR_STD[: 2 if driving.slopes is None else 3])
 
     def solve(self) -> FloatArray:
-        """Return the parameters of the lowest cost, with the standard deviation of their errors.
+        """Return the parameters θ [n] of the lowest cost; the scale of each channel's errors is estimated with them.
 
         A descent from a dry road does not find a minimum with saturated tyres: there are two starts. Both are prior
         values: starting from the fit without the taught prior, the taught fit often stays in the same minimum.

@@ -106,7 +106,7 @@ class Interval:
     def _lateral_velocity(self, physics: VehicleUkf, signals: Signals, number: int) -> FloatArray:
         """Return v_y [N] of a filter, on means of ``number`` samples as its vehicle corrects them.
 
-        It is that of the newest step that has arrived: over the latency the differences change little. A friction of
+        It is v_y of the newest step that has arrived: over the latency the differences change little. A friction of
         the log is relative.
         """
         physics = replace(physics, r_std=tuple(physics.measurement_std / math.sqrt(number)))
@@ -122,7 +122,7 @@ class Interval:
 
 @dataclass(slots=True)
 class DriveIntervals:
-    """Intervals of the estimators of a drive by name; ``notes_of_own`` : of estimators that state their own."""
+    """Intervals of the estimators of a drive by name; ``notes_of_own`` : notes on intervals that estimators provide."""
 
     by_name: dict[str, Interval]
     notes_of_own: dict[str, str]

@@ -95,7 +95,7 @@ def _tyres(vehicle_file: VehicleParameters, level: float, ratio: float, stds: tu
 
 
 def front_stiffness(vehicle: VehicleParameters, ratio: float, rear: float) -> float:
-    """Return the cornering stiffness of the front axle from the ratio of the coefficients and that of the rear axle."""
+    """Return the cornering stiffness of the front axle from the rear axle's and the ratio of the coefficients."""
     return ratio * rear * vehicle.axle_load_n(True) / vehicle.axle_load_n(False)
 
 
@@ -169,7 +169,7 @@ def prior_of(
     *,
     least_peak: float = 0.0,
 ) -> Prior:
-    """Return the prior of a car for a drive at a level of a_y, with what earlier drives have shown.
+    """Return the prior of a car for a drive at a level of a_y, with the evidence of earlier drives.
 
     ``least_peak`` : lower limit of the peak force over the file's. The default vehicle describes no tyres.
     """

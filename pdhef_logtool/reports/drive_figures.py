@@ -61,7 +61,7 @@ class Roles:
         return tuple(n for n in (self.main, self.rival, *self.others) if n)
 
     def series(self, name: str, values: FloatArray, width: float = 1.2) -> Series:
-        """Return the line of an estimator; lines other than selected, ground truth and best physics have a box."""
+        """Return the line of a track; lines of estimators other than ``main`` and ``rival`` can be hidden."""
         if name == self.main:
             return Series(name, colour(name), values, width + 1.0)
         if name not in self.others:

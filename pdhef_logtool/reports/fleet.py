@@ -148,7 +148,7 @@ def _rival(fleet: Fleet) -> str | None:
 
 
 def _told(fleet: Fleet) -> list[Distribution]:
-    """Return the distributions, the selected estimate's first; an estimator that is always selected appears once."""
+    """Return the distributions, first of the selected estimate; an estimator that is always selected appears once."""
     mains = {d.main for d in fleet.scored}
     if len(mains) > 1:
         return list(fleet.distributions)

@@ -178,7 +178,7 @@ def unit(text: str) -> str:
 
 
 def degrees(value_rad: float | None) -> str:
-    """Return an angle with a sensible number of digits."""
+    """Return an angle in degrees as text, with digits by its size; a dash for None."""
     if value_rad is None or not math.isfinite(value_rad):
         return DASH
     value = math.degrees(value_rad)

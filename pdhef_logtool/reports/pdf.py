@@ -129,7 +129,7 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
 
 
 def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
-    """Return failed checks, then assumptions, of drives with the drives that have them, empty for all drives."""
+    """Return failed checks, then assumptions, each with the names of its drives; an empty text for all drives."""
     labels: dict[str, list[str]] = {}
     for label, report in reports:
         for text in (*failed_checks(report), *assumptions_of(report)):

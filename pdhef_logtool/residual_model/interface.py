@@ -2,7 +2,43 @@
 
 A filter adds gain · rate to v̇_y and ṙ of its sigma points (Eq 19). The features are those of :mod:`~.features`, in
 training and in service. Another package adds a model by an entry point of the group :data:`ENTRY_POINTS` that names an
-object with this interface; ``--network NAME`` selects it (docs/estimators.md#residual-models).
+object with this interface; ``--network NAME`` selects it (docs/estimators.md#residual-models). This example has a GRU;
+load your weights in ``__init__``. It processes one step at a time, so that its result does not depend on how a drive is
+divided into calls::
+
+    # tyre_gru.py, of a package whose pyproject.toml has
+    # [project.entry-points."pdhef.residual_models"]
+    # tyre-gru = "tyre_gru:MODEL"
+    import numpy as np
+    import torch
+
+    from pdhef_logtool.residual_model.features import FEATURES
+    from pdhef_logtool.residual_model.interface import Residual
+
+    INPUTS = [FEATURES.index(name) for name in ("ay_m_s2", "steer_rad", "yaw_rate_rad_s")]
+    INPUT_SCALE, OUTPUT_SCALE = np.array([3.0, 0.05, 0.3]), 0.1
+
+
+    class Gru:
+        sha256 = "tyre-gru 1"
+
+        def __init__(self):
+            torch.manual_seed(0)
+            self.gru, self.head = torch.nn.GRU(len(INPUTS), 16), torch.nn.Linear(16, 2)
+
+        def residual(self, features, dt_s, state):
+            rate = np.zeros((len(features), 2))
+            for k, row in enumerate(features[:, INPUTS] / INPUT_SCALE):
+                if np.isnan(dt_s[k]) or not np.isfinite(row).all():
+                    state = None
+                if np.isfinite(row).all():
+                    with torch.no_grad():
+                        hidden, state = self.gru(torch.tensor(row, dtype=torch.float32)[None], state)
+                        rate[k] = OUTPUT_SCALE * self.head(hidden[0]).numpy()
+            return Residual(rate, np.ones(len(rate))), state
+
+
+    MODEL = Gru()
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ class _Sample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """Products of 1, features and error, summed over each block [B, c + 2, c + 2], in s; the drive of each block [B].
+    """Normal equations of each block [B, c + 2, c + 2]: sums of products of (1, features, error), in s; its drive [B].
 
     ``whole``: sums over drives, which include the ends of the blocks.
     """

@@ -32,7 +32,7 @@ def write_clips(
     source: Path | None = None,
     tell: Callable[[str], None] = lambda _text: None,
 ) -> FoundEvents:
-    """Write a clip an event into ``OUT/clips``, which they replace; return the events with their files.
+    """Write one clip per event to ``OUT/clips``, in place of earlier clips; return the events with their files.
 
     Parameters
     ----------

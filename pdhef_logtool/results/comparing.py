@@ -190,7 +190,7 @@ class Comparison:
 
     @property
     def verdict(self) -> FigureVerdict:
-        """The gravest verdict of the figures."""
+        """The worst verdict of the figures."""
         return min((f.verdict for f in self.figures), key=_GRAVITY.index, default="equal")
 
     @property
@@ -487,7 +487,7 @@ def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
 
 
 def _history(runs: Sequence[OpenedRun], steps: Sequence[Comparison], asked: Requirement) -> Iterator[HistoryRow]:
-    """Yield the runs with the steps [N - 1] between them."""
+    """Yield a row per run, with the comparison ``steps`` [N - 1] to the run before it."""
     for run, step in zip(runs, (None, *steps), strict=True):
         version = str((run.document.get("versions") or {}).get("pdhef-logtool") or "unknown")
         figures = () if step is None else step.figures

@@ -38,7 +38,7 @@ def notes_of(comparison: Comparison) -> list[str]:
 
 
 def history_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
-    """Return the heads of a history's table, a ``>`` before those of numbers, and the texts of its rows."""
+    """Return the heads of a history's table, ``>`` before heads of numbers, and the texts of its rows."""
     rows = []
     for row in comparison.history:
         of, step = row.figure, row.step

@@ -64,7 +64,7 @@ class Condition:
     falls: bool
 
     def is_true(self, columns: Mapping[str, FloatArray]) -> BoolArray:
-        """Return the rows on which it is true, on columns [N] without a track."""
+        """Return the mask [N] of the rows that fulfil it, for columns [N] of one track."""
         import polars as pl
 
         frame = pl.DataFrame(dict(columns)).with_columns(

@@ -177,7 +177,7 @@ def _needed(condition: Condition, main: str) -> set[str]:
 
 
 def _unfit(log: OpenedLog, there: Collection[str], needed: Collection[str]) -> str:
-    """Return why a drive with the tracks ``there`` cannot be searched, otherwise nothing."""
+    """Return why a drive with the tracks ``there`` cannot be searched; empty if it can."""
     if not there:
         return log.outcome if log.outcome.startswith("failed") else f"it has no {ESTIMATES_FILE}"
     missing = next((name for name in needed if name not in there), None)

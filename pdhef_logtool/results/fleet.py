@@ -122,7 +122,7 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class Rank:
-    """The place of an estimator: those that it is shown to be better than, pair by pair.
+    """Place of an estimator, and the estimators that it is significantly better than.
 
     ``place``: None where no difference between two estimators is significant. ``against_answer``: the median of its
     error over the selected estimate's, less 1; None for one that always is the selected estimate.
@@ -137,7 +137,7 @@ class Rank:
 
 @dataclass(frozen=True, slots=True)
 class Failures:
-    """Logs that ended alike: the ``reason`` of the first, and ``labels`` of the first :data:`NAMED` of ``count``."""
+    """Logs with the same failure: ``reason`` of the first, ``count``, and the first :data:`NAMED` ``labels``."""
 
     reason: str
     count: int
@@ -181,7 +181,7 @@ class Fleet:
 
     @property
     def scored(self) -> tuple[FleetDrive, ...]:
-        """Drives with a scored answer."""
+        """Drives with a scored selected estimate."""
         return tuple(d for d in self.drives if d.truth)
 
     @property
@@ -192,7 +192,7 @@ class Fleet:
 
     @property
     def without_truth(self) -> tuple[FleetDrive, ...]:
-        """The other drives, largest contradiction between answer and sensors first."""
+        """The other drives, largest contradiction between selected estimate and sensors first."""
 
         def contradiction(drive: FleetDrive) -> tuple[bool, float, str]:
             against = drive.d2 / drive.naive_d2 if drive.naive_d2 > 0.0 else math.nan

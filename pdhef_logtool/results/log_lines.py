@@ -20,7 +20,7 @@ _REASON_TEXTS = {r.name: r.text for r in REASONS}
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """A line: when, how severe, of what, and its text."""
+    """A line of the log: time, severity, subject and text."""
 
     stamp_ns: int
     level: int

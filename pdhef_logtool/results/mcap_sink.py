@@ -80,10 +80,10 @@ def topic_of(estimator: str, what: str) -> str:
 
 
 def thinned_step_ns(source_bytes: int, *, rows: int, others: int, span_ns: int) -> int:
-    """Return the step of the tracks that are not shown first with which an annotated log is at most twice its source.
+    """Return the time step of the other estimators' rows for an annotated log of at most twice its source.
 
     ``rows`` : stamps of a track. ``others`` : number of such tracks. Room for selected estimate and ground truth is
-    kept: a state a stamp of the one, and four messages of both every 50 ms.
+    kept: one state per stamp of the former, and four messages of both every 50 ms.
     """
     room = source_bytes - _DOCUMENT_BYTES - (rows + 4 * (span_ns // _POSE_STEP_NS)) * _MESSAGE_BYTES
     steps = [step for step in _STEPS_NS if span_ns <= LONGEST_WHOLE_NS or step >= _LONG_STEP_NS]

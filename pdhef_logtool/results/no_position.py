@@ -45,10 +45,10 @@ def without_pose(track: StateTrack) -> StateTrack:
 
 
 def topics_with_position(log: DriveLog, mapping: SignalMapping) -> frozenset[str]:
-    """Return the topics that are not copied: all but those in which no field can be a place.
+    """Return the topics that are not copied: all with a field that may be a position.
 
-    A field is known not to be a place if ``mapping`` maps it to a signal other than a pose, or if its name consists of
-    known words and names a motion or a state. Raw CAN frames, texts and bytes are never known.
+    A field cannot be a position if ``mapping`` maps it to a signal other than a pose, or if its name consists of
+    known words and names a motion or a state. Raw CAN frames, texts and bytes count as positions.
     """
     sources = (mapping.truth | mapping.signals).items()
     poses = {(s.topic, path) for name, s in sources if name in _POSES for path in s.paths}

@@ -109,7 +109,7 @@ class OpenedRun:
 
     @property
     def place(self) -> str:
-        """Where people find it."""
+        """Folder or URL of the run, for messages."""
         return str(self.folder) if self.mirror is None else self.mirror.objects.shown
 
     def table(self, name: str) -> pl.LazyFrame:

@@ -1,4 +1,4 @@
-"""estimates.parquet (wide, a row a stamp and estimator) and metrics.parquet (long, a row a figure)."""
+"""estimates.parquet (wide, a row per stamp and estimator) and metrics.parquet (long, a row per figure)."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def write_estimates(
     Parameters
     ----------
     path : the finished file.
-    selected : estimator, whose track is also written as :data:`SELECTED`.
+    selected : estimator; its track is also written as :data:`SELECTED`.
     causal_from_ns : first stamp from which the rows of an estimator depend on no later sample; an estimator without one
         is causal nowhere. None: unknown, and ``causal`` is null.
     rows_a_group : rows of one row group.

@@ -236,7 +236,7 @@ class _Judged:
         return self._why_unscored(names)
 
     def _why_unscored(self, names: Mapping[str, str]) -> str:
-        """Return the same if the drives have the estimators ``names``."""
+        """Return why no drive with the estimators ``names`` has the metric, with a remedy after a semicolon."""
         requirement, figures = self.requirement, self.figures
         scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
         if scored and all(self._tainted(log, names[log]) for log in scored):
@@ -313,7 +313,7 @@ def in_space(drive: JudgedDrive, report: Mapping[str, Any]) -> JudgedDrive:
 def in_spaces(
     drives: Sequence[JudgedDrive], plan: ValidationPlan, table: pl.LazyFrame, exposure: pl.LazyFrame
 ) -> Sequence[JudgedDrive]:
-    """Return the same of the tables ``drives`` and ``exposure`` of a run, which are read if the plan needs them."""
+    """Return drives with operating space and friction by two tables of a run, which are read if the plan needs them."""
     if not any(r.exposure for r in plan.requirements):
         return drives
     spaces: dict[str, dict[tuple[float, float], float]] = {}

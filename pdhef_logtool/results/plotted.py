@@ -35,7 +35,7 @@ def errors(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) ->
 
 
 def plotted_fields(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -> dict[str, FloatArray]:
-    """Return the fields [N] of ``pdhef_msgs/msg/PlottedEstimate`` but its header; of the ground truth no errors."""
+    """Return the fields [N] of ``pdhef_msgs/msg/PlottedEstimate`` but the header; no errors of ground truth."""
     fast = np.hypot(track.vx_m_s, track.vy_m_s) >= min_speed_m_s
     slip, rate = (
         np.where(is_drawn, DEGREES * getattr(track, column), np.nan)

@@ -108,8 +108,8 @@ def write_recording(
 ) -> None:
     """Write recording.rrd.
 
-    Each track is one entity with a row a stamp (of a drive above ten minutes 10 a second, of other estimators 5) and a
-    component a quantity, with value and confidence interval. Entities are named by the use of a track (``/truth``,
+    Each track is one entity with a row per stamp (above ten minutes 10 rows per second, 5 for other estimators) and a
+    component per quantity, with value and confidence interval. Entities are named by the use of a track (``/truth``,
     ``/main``, ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run with any estimators; the
     lines have their names. Errors are where ground truth and estimate share a stamp. The recording's properties have
     RMSE, verdicts, car, faults and version.

@@ -79,7 +79,7 @@ def tool_versions() -> dict[str, str]:
 
 
 def run_versions() -> dict[str, str]:
-    """Return the same and the digest that compiled code is kept under."""
+    """Return the versions, and the digest under which compiled code is kept."""
     return {**tool_versions(), "compiled": compiled_digest()}
 
 

@@ -67,7 +67,7 @@ class MainFacts:
 
 
 def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
-    """Return the ``answer`` of a report's document: why the estimator was selected, and the words."""
+    """Return the ``answer`` of a report: the reason of the selection, and the result in words."""
     figures = {
         (m["estimator"], m["signal"], m["metric"]): m["value"] for m in report["metrics"] if m["segment"] == "all"
     }
@@ -127,7 +127,7 @@ def result_of(report: Report) -> str:
 
 
 def assumptions_of(report: Report) -> list[str]:
-    """Return what the result of a document assumes, in independent clauses."""
+    """Return the assumptions of the result of a document, as independent clauses."""
     if report["answer"] is not None:
         return [clause for clause in report["answer"]["texts"]["assumed"].split("; ") if clause]
     vehicle = report["vehicle"]
@@ -147,7 +147,7 @@ def failed_checks(report: Report) -> list[str]:
 
 
 def degrees(value_rad: float) -> str:
-    """Return an angle with as many digits as a person reads."""
+    """Return an angle in degrees as text, with digits by its size."""
     shown = value_rad * DEGREES
     return f"{shown:.3f}°" if shown < 1.0 else f"{shown:.2f}°"
 

@@ -35,7 +35,7 @@ _BITS_OUT = 11
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened in [start_ns, end_ns): a segment, a divergence, a loss."""
+    """An event in [start_ns, end_ns): a segment, a divergence or a loss."""
 
     name: str
     start_ns: int

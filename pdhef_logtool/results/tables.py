@@ -68,7 +68,7 @@ def _list(name: str, rows: Sequence[Any]) -> pa.Array:
 
 
 def _table(name: str, rows: Sequence[Any]) -> pa.Table:
-    """Return rows, mappings or records, as a table; what a mapping lacks is null."""
+    """Return rows, mappings or records, as a table; entries that a mapping lacks are null."""
     schema = arrow_schema(f"{name}.parquet.json")
     get: Any = dict.get if rows and isinstance(rows[0], dict) else getattr
     return pa.Table.from_arrays([arrow_array([get(r, f.name) for r in rows], f.type) for f in schema], schema=schema)

@@ -98,7 +98,7 @@ class RunCars:
         return list(dict.fromkeys(map(self._place, [*named, *filter(None, [table.default])])))
 
     def read(self, path: Path | None) -> Car:
-        """Return a car, read when it is first asked for; raises VehicleError or ModelError."""
+        """Return a car, which is read at the first call; raises VehicleError or ModelError."""
         if path not in self._read:
             car = Car.load(path, network=self.config.network, sensors=self.config.sensor_profile)
             for note in car.notes:

@@ -64,22 +64,22 @@ class RunConfig:
     car : car folder, vehicle.toml, or ``saloon`` (the shipped car); None = the default sedan.
     cars : cars.toml, which assigns a car to each log; replaces ``car``.
     mapping : mapping.toml; None = signals are recognised.
-    start : start of the time slice (:func:`~pdhef_logtool.drive.options.parse_time`); None = that of the log.
-    end : end of the time slice; None = that of the log.
+    start : start of the time slice (:func:`~pdhef_logtool.drive.options.parse_time`); None = start of the log.
+    end : end of the time slice; None = end of the log.
     annotate : content of annotated.mcap: ``full`` (copy of the log with the estimates), ``sidecar`` (estimates only) or
         ``none``; None = ``full`` if ``keep`` is ``full``, otherwise ``none``.
     keep : files per log: ``metrics`` (report and metrics), ``estimates`` (and the tracks) or ``full``; None = ``full``,
         for more than 50 logs ``metrics``.
     sensors : ``full``, or ``esp`` (sensor set of the paper: the speed sensor only initialises the filters).
     sensor_profile : TOML file with ``[sensors]`` (noise, rates and limits of the sensors), or ``production``, in place
-        of the car's entries, for ``run`` and ``metrics``; None = those of the car.
+        of the car's entries, for ``run`` and ``metrics``; None = entries of the car.
     friction : ``auto`` (from the log, else the car, else 1; for ``extract`` first from the ground truth), ``file``, or
         a number.
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
     budget : factor on the limits of memory and time for reading a log.
     msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
         them, for raw CAN frames in BLF, ASC, candump and MDF files.
-    rate_hz : rows per second of a table without times, or with times without a unit; None = that of the mapping file.
+    rate_hz : rows per second of a table without times, or with times without a unit; None = rate of the mapping file.
     group : of a file with several runs, the one to read: the beginning or end of its names of topics.
     folder : whether a folder of tables is one ``recording`` or several ``drives``; ``auto``: CSV files with overlapping
         times and different columns are one recording.
@@ -94,10 +94,10 @@ class RunConfig:
     no_position : keep latitude, longitude and all other positions and headings out of the outputs. Topics are copied
         if each of their fields is known not to be a position; attachments, metadata and names of log files are left
         out.
-    waived : names of checks whose failure is ignored.
+    waived : names of checks that may fail.
     allow_private_redirects : follow redirects of web servers to hosts of this machine or its network.
     log_timeout_s : abort a log after this time without progress, in s.
-    max_memory_mb : abort a log whose worker process exceeds this much memory, in MB.
+    max_memory_mb : abort a log if its worker process exceeds this memory, in MB.
     strict : an INCONCLUSIVE requirement of the plan fails, too (exit code 4).
     full_worst : number of logs with the largest error that keep all files; None = 5 for more than 50 logs.
     """

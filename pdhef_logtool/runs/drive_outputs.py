@@ -80,7 +80,7 @@ class DriveOutputs:
         self._min_speed_m_s = run.car.vehicle.low_speed_blend_m_s
 
     def annotated(self) -> AbstractContextManager[AnnotatedMcap | None]:
-        """Return the annotated log as a context, None if it is not asked for; add remarks of the drive."""
+        """Return the annotated log as a context, None if it is not requested; add remarks of the drive."""
         config, drive = self._run.config, self._run.drive
         left_out = self._left_out() if config.no_position else None
         if config.annotation == "none":

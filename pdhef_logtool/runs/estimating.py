@@ -63,7 +63,7 @@ def estimate_drive(
 
     Parameters
     ----------
-    corrected : signals of the drive for the two vehicles of its car, whose estimators these are.
+    corrected : signals of the drive, corrected for the two vehicles of its car.
     intervals : None leaves them as the estimators give them.
     causality : collects the estimators that fail, or declare themselves causal and look ahead: they have no track.
         None does not check, and a failure is raised.
@@ -115,7 +115,7 @@ def _computation(estimator: Estimator, signals: Signals) -> tuple[str, int]:
 
 
 def _varied(estimator: Estimator, given: Signals, changes: Sequence[SensorChange]) -> list[FloatArray]:
-    """Return v_y [N] of an estimator on signals whose corrected sensors are one 1-sigma away, one by one."""
+    """Return v_y [N] of an estimator for each corrected sensor, with the correction changed by its 1-sigma."""
     varied = (c for c in changes if math.isfinite(c.std))
     away = (c.removed(given, c.known_ns, -c.std) for c in varied)
     return [run_estimator(estimator, signals).vy_m_s for signals in away]

@@ -124,7 +124,7 @@ class Journal:
 
     @classmethod
     def of(cls, folder: Path) -> Journal:
-        """Return a new journal of a folder, whether it exists or not."""
+        """Return an empty journal of a folder, also if the folder has one."""
         return cls(folder / JOURNAL_FILE)
 
     @classmethod
@@ -212,7 +212,7 @@ class Journal:
         return entry
 
     def add_place(self, label: str, place: Place, identity: str) -> None:
-        """Write down that a known log lies there too."""
+        """Record another place of a known log."""
         self._append({"label": label, "place": asdict(place), "identity": identity, "moved": True})
         self._places[place.key] = place, identity, label
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
-    """Return the plan of a file or the default one; raises UsageError when it is wrong or missing for ``junit``."""
+    """Return the plan of a file or the default plan; raises UsageError if it is wrong, or missing for ``junit``."""
     if file is not None:
         from pdhef_logtool.results.plan_verdicts import other_runs
 

@@ -68,11 +68,11 @@ def prepare(drive: Drive, config: RunConfig) -> PreparedDrive:
 def choose(
     drive: Drive, names: Sequence[str] | None = None, car: Car | None = None, *, gnss: bool = True
 ) -> tuple[list[Estimator], list[Skipped]]:
-    """Return the estimators that a drive and a car let run, and those that they do not.
+    """Return the estimators that can run on a drive and a car, and the skipped ones with the reasons.
 
     Parameters
     ----------
-    names : of estimators, ``["all"]`` or ``["peers"]``; None: those of a run. car : None: of the drive.
+    names : of estimators, ``["all"]`` or ``["peers"]``; None: those that a run chooses. car : by default the drive's.
     gnss : whether filters may use GNSS velocity.
     """
     car = drive.car if car is None else car

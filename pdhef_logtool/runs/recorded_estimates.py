@@ -213,7 +213,7 @@ def _score_drive(
 
 
 def _read(drive: Drive, sources: Sequence[EstimateSource]) -> tuple[list[RecordedEstimate], list[Loss]]:
-    """Read the estimates; add to the plan which ground truth depends on one."""
+    """Read the estimates; mark ground truth that equals a channel of an estimate as dependent in the drive's plan."""
     plan, recorded, losses = drive.plan, [], list[Loss]()
     for source in sources:
         estimate, lost = read_estimate(drive.log, source, plan.start_ns, plan.end_ns)
@@ -244,7 +244,7 @@ def _read_truth(drive: Drive) -> TruthTrack | None:
 
 
 def _reference(drive: Drive, model: DriveModel, config: RunConfig) -> DriveReference | None:
-    """Return the sideslip reference; raises MappingError where there is nothing to score against."""
+    """Return the sideslip reference; raises MappingError without reference and ground truth."""
     reference = reference_of(drive, model, config)
     if reference is not None and reference.estimator is not None:
         drive.tell("estimated sideslip reference: differences from it are no errors (docs/estimators.md#reference)")

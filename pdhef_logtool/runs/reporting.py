@@ -78,12 +78,12 @@ class FleetProgress:
     _since: float = field(default_factory=time.monotonic)
 
     def update(self, number: int, text: str, share: float) -> None:
-        """Take the progress of one log."""
+        """Show the progress of one log."""
         self._shares[number] = min(share, 1.0)
         self._show(text)
 
     def end(self, number: int) -> None:
-        """Take the end of one log."""
+        """Count a log as finished."""
         self._shares.pop(number, None)
         self.ended += 1
         if self.count > FEW_LOGS:

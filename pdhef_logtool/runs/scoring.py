@@ -24,7 +24,7 @@ class Evaluation:
 
     Attributes
     ----------
-    drive : what was scored. rows, events : figures, and events in order of time.
+    drive : the scored tracks and signals. rows, events : figures, and events in order of time.
     silent : why estimators have no valid row although the car moves. moves : whether it does.
     """
 
@@ -38,7 +38,7 @@ class Evaluation:
 def evaluate(
     drive: Drive, estimated: Estimated, model: DriveModel, dependent: Mapping[str, str] | None = None
 ) -> Evaluation:
-    """Score the tracks of a drive; ``dependent`` : as of :class:`EvaluatedDrive`, None: of the plan of the drive."""
+    """Score the tracks of a drive; ``dependent`` : as in :class:`EvaluatedDrive`, by default from the drive's plan."""
     signals, truth, vehicle = estimated.signals, estimated.truth, drive.car.vehicle
     manoeuvres = find_manoeuvres(drive.recorded().signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)

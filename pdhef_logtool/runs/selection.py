@@ -65,7 +65,7 @@ def _figures(rows: Iterable[MetricRow]) -> tuple[dict[str, float], dict[str, flo
 
 
 def default_names(car: Car, available: frozenset[str]) -> tuple[str, ...]:
-    """Return the estimators that run where none are named.
+    """Return the estimators of a run that names none.
 
     These are the preferred one, physics alone and the baseline; the simple ones for a car without validation data; and,
     where the log lacks signals that physics needs, those that need fewer.

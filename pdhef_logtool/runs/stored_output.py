@@ -39,7 +39,7 @@ EVERY_S = 30.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredEnd:
-    """Result of a drive that was uploaded: ``names`` of its objects, and the ``files`` that the command needs."""
+    """Result of an uploaded drive: ``names`` of its objects, and the ``files`` that the command needs."""
 
     end: DriveEnd
     names: tuple[str, ...]

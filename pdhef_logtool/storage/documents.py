@@ -122,7 +122,7 @@ def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
 
 
 def _oddity(document: object) -> str:
-    """Return the part that makes a document unreadable for us, or an empty string."""
+    """Return the feature that makes a document unacceptable, for example too deep nesting; empty without one."""
     if not isinstance(document, dict):
         return f"a {type(document).__name__} instead of named entries"
     level: list[object] = [document]
@@ -176,7 +176,7 @@ def checked(model: type[ModelT], raw: object, table: str, problems: list[str]) -
 
 
 def unknown(name: str, names: Iterable[str], table: str = "") -> str:
-    """Return the problem of an entry that a table does not have, with the most similar name."""
+    """Return the message for an unknown entry ``name`` of a table, with the most similar of the known ``names``."""
     return f"{_at(table, name)}: {_unknown(name, names, table)}"
 
 

@@ -322,7 +322,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
         return "there was no more memory" if most is None else f"took more than {most / 1e6:.0f} MB"
 
     def _lose(self, worker: _Worker[T], reason: str = "") -> Ended[T, R] | None:
-        """End a worker; its item is tried again, or has failed for a reason or for how the process ended.
+        """End a worker. Its item is repeated once; then return its failure, by ``reason`` or the process's end.
 
         If the fork server died with the worker, the item is not the cause: it is tried next.
         """

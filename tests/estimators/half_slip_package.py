@@ -1,18 +1,16 @@
-"""The estimator of ARCHITECTURE.md as a separate installed package with an entry point."""
+"""The estimator in the docstring of ``estimators/table.py`` as a separate installed package with an entry point."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
+from textwrap import dedent
 
-ROOT = Path(__file__).resolve().parents[2]
+from pdhef_logtool.estimators import table
 
 
 def example_code() -> str:
-    """Return the estimator as ARCHITECTURE.md shows it."""
-    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    return code
+    """Return the estimator as the docstring shows it."""
+    return dedent((table.__doc__ or "").partition("Example::\n")[2])
 
 
 def install(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -19,9 +19,9 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import EstimatorError, ModelError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model import interface
 from pdhef_logtool.residual_model.interface import ENTRY_POINTS, plug_in_names
 
-ROOT = Path(__file__).resolve().parents[2]
 CONSTANT = """
 import numpy as np
 from pdhef_logtool.residual_model.interface import Residual
@@ -62,8 +62,7 @@ def tracks(network: str, *parts: Signals, check: CausalityCheck | None = None) -
 
 def test_the_documented_network_acts_in_the_filter_causally(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
-    text = (ROOT / "docs" / "estimators.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    code = dedent((interface.__doc__ or "").partition("into calls::\n")[2])
     name = with_model(tmp_path, code, monkeypatch, "tyre_gru")
     whole = signals()
     (track,) = tracks(name, whole, check=CausalityCheck())

@@ -20,6 +20,7 @@ from pdhef_logtool.results.querying import query
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal
+from studies.documentation_tables import on_page_markdown
 from tests.results.made_run import entry
 from tests.run_report import report
 
@@ -115,7 +116,7 @@ def test_every_table_has_the_rows_of_all_logs_in_their_order(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", TABLES)
 def test_every_column_is_documented_and_of_its_kind(tmp_path: Path, name: str) -> None:
-    text = (ROOT / "docs/formats.md").read_text()
+    text = on_page_markdown((ROOT / "docs/formats.md").read_text())
     columns = [c["name"] for c in load_schema(f"{name}.parquet.json")["columns"]]
     (listed,) = re.findall(rf"^\| `{name}` \|[^|]*\|([^|]*)\|", text, re.MULTILINE)
     assert re.findall(r"`(\w+)`", listed) == columns

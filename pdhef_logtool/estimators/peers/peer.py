@@ -45,7 +45,7 @@ class Samples(StepColumns):
 
 
 class PeerState(NamedTuple):
-    """State between windows: of the speed, the last samples, and the memory of the filter."""
+    """State between windows: of the measured speed, the last samples, and the memory of the filter."""
 
     speed: StepState
     samples: Samples

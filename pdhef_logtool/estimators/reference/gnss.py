@@ -113,7 +113,7 @@ def gnss_follows_imu(rows: FloatArray) -> bool:
 def increments(rows: FloatArray, sampled: IntArray, delay_s: float) -> tuple[ComplexArray, ComplexArray]:
     """Return the changes of velocity between GNSS samples [M − 1], east + i north: of GNSS, and of the IMU.
 
-    ``sampled`` [M]: knots with a sample, of a velocity ``delay_s`` old. The unknown heading of the IMU is replaced by
+    ``sampled`` [M]: knots with a sample; its velocity is ``delay_s`` old. The unknown heading of the IMU is replaced by
     the slowly varying rotation with the best fit.
     """
     heading = np.cumsum(rows[:, s.MEAN_YAW_RATE]) / RATE_HZ

@@ -41,7 +41,7 @@ class _Steering(NamedTuple):
 
 
 def responses(drive: EvaluatedDrive) -> Iterator[Columns]:
-    """Yield the figures of each track, one column a figure with the same value at all stamps of its manoeuvre."""
+    """Yield the figures of each track: a column for each, with one value at all stamps of its manoeuvre."""
     if drive.calibrated is None:
         return
     signals, vehicle, _ = drive.calibrated
@@ -147,7 +147,7 @@ def _brake(of: _Steering, vx: FloatArray, rate: FloatArray, slip: FloatArray) ->
 
 
 def _sweep(of: _Steering, rate: FloatArray) -> _Figures:
-    """Return figures of the frequency response: cross-spectrum of steering and yaw rate over that of the steering."""
+    """Return figures of the frequency response: cross-spectrum of steering and yaw rate over the steering spectrum."""
     n, step = round(_SPECTRUM_S * _RATE_HZ), round(_NEXT_S * _RATE_HZ)
     at_s = np.arange(of.time_s[0], of.time_s[-1], 1.0 / _RATE_HZ)
     if len(at_s) < n or not np.isfinite(of.steer).all():

@@ -351,7 +351,7 @@ def _train_batch(
 
 
 def _validate(network: ResidualNetwork, pieces: Iterable[_Piece], device: str, signs: torch.Tensor | None) -> float:
-    """Return the loss of the network in operation; with ``signs`` the network is made odd."""
+    """Return the loss as in operation, over whole sequences; with ``signs`` the network is made odd."""
     network.eval()
     total, weight = 0.0, 0.0
     with torch.inference_mode():

@@ -131,7 +131,7 @@ def _report(path: str, kind: str, values: Sequence[FloatArray]) -> FieldReport:
 
 
 def render_fields(report: FieldsOfLog, console: Console) -> None:
-    """Print a table a topic, for a terminal of 80 columns or more."""
+    """Print one table per topic, for a terminal of 80 columns or more."""
     console.print(Text(report.path, "bold"), soft_wrap=True)
     part = "all" if report.whole else "pieces"
     console.print(f"Values over {part} of the log, {report.seconds:.0f} s, in recorded units.")

@@ -134,10 +134,10 @@ class SignalReport:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The part of a log that was read.
+    """The part of a log that was read, ``chunks`` of ``of_chunks``.
 
-    ``times`` is the source of rates, jitter and gaps of topics: the ``index``, or the chunks that were read
-    (``sample``), as do delays, signals and ground truth in any case. Counts are the index's.
+    ``times``: source of the topics' rates, jitter and gaps: the ``index`` of the log, or the chunks that were read
+    (``sample``). Counts always come from the index; delays, signals and ground truth from the chunks.
     """
 
     chunks: int
@@ -145,7 +145,7 @@ class Sample:
     times: Literal["index", "sample"]
 
     def __str__(self) -> str:
-        """State it in a line."""
+        """Return the extent in one line for a report."""
         what, index = ("values", "counts and rates") if self.times == "index" else ("values and rates", "counts")
         return (
             f"{what} from {self.chunks} of {self.of_chunks} chunks, {index} from the index; "
@@ -331,7 +331,7 @@ def collapsed(fields: Sequence[FieldInfo]) -> list[tuple[str, str, list[str]]]:
 def _topic_reports(
     log: DriveLog, index: ColumnarLog | None, stamps: MappingABC[str, Sequence[Columns]]
 ) -> tuple[TopicReport, ...]:
-    """Return the reports of all topics; times are those of a local ``index``, else the ``stamps`` that were read."""
+    """Return the reports of all topics; times come from a local ``index``, else from the ``stamps`` that were read."""
     times = {topic: [c.log_time_ns for c in columns] for topic, columns in stamps.items()}
     if index is not None and not index.is_remote:
         times |= {topic: [whole] for topic, whole in index.index_times(log.start_ns, log.end_ns).items()}
