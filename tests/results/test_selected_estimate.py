@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from run_report import GNSS, MAIN, TRUTH, errors_deg, figures, ran, report, truth
+from run_report import GNSS, MAIN, MODEL, TRUTH, errors_deg, figures, ran, report, truth
 
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP
@@ -110,6 +110,11 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
     assert "friction assumed (no value given, 1);" in assumed["assumed"]
     assert "--friction" in assumed["next"]
     assert texts(replace(MAIN, name="zero"))["assumed"] == "no vehicle model (zero needs none)"
+    without = {**MODEL, "algorithm": "adaptive-physics", "options": {}}
+    unused = {n: texts(replace(MAIN, name=n), estimators=[ran(n, algorithm=without)]) for n in ("pd-hef", "physics")}
+    assert {n: "no network was trained" in said["assumed"] for n, said in unused.items()} == {
+        "pd-hef": True, "physics": False,
+    }  # fmt: skip
 
 
 def test_the_next_steps_are_few_and_the_most_important_first() -> None:
