@@ -146,6 +146,7 @@ train-default: $(VENV)/installed-dev $(VENV)/compiled
 
 # No --quiet: it hides the warnings that cause a failure.
 docs: $(VENV)/installed-docs
+	$(BIN)/python -m studies.documentation_tables
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 	@echo "Site: out/site/index.html"
 

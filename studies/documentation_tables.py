@@ -1,6 +1,6 @@
-"""Tables of the documentation that are made of the code when the site is built: a hook of MkDocs.
+"""Tables of the documentation that are made of the code: ``python -m studies.documentation_tables`` writes them.
 
-In a page, ``<!-- table: metrics -->`` becomes the table of all metrics; the names of the others are in :data:`_TABLES`.
+A table is between ``<!-- table: metrics -->`` and ``<!-- end -->``; the names of the others are in :data:`_TABLES`.
 """
 
 from __future__ import annotations
@@ -20,13 +20,18 @@ from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.opened_run import TABLES
 from pdhef_logtool.runs.config import RunConfig
+from studies.pages import DOCS, write
 from truthsim.manoeuvres import MANOEUVRES
 from truthsim.sensors import SensorNoise
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
+def with_tables(markdown: str) -> str:
     """Return a page with its tables; raises KeyError for one of an unknown name."""
-    return re.sub(r"<!-- table: (\w+) -->", lambda match: "\n".join(_lines(*_TABLES[match[1]])), markdown)
+
+    def table(match: re.Match[str]) -> str:
+        return "\n".join([match[1], "", *_lines(*_TABLES[match[2]]), "", match[3]])
+
+    return re.sub(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", table, markdown, flags=re.DOTALL)
 
 
 def _lines(columns: str, rows: Callable[[], Iterable[tuple[str, ...]]]) -> Iterator[str]:
@@ -93,3 +98,10 @@ _TABLES: dict[str, tuple[str, Callable[[], Iterable[tuple[str, ...]]]]] = {
     "estimates": ("column, unit, meaning", partial(_columns, "estimates")),
     "residuals": ("column, unit, meaning", partial(_columns, "residuals")),
 }  # fmt: skip
+
+
+if __name__ == "__main__":
+    for page in DOCS.glob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        if (made := with_tables(text)) != text:
+            write(page, made)

@@ -9,7 +9,7 @@ import pytest
 from pdhef_logtool.car.assumed_values import RULES
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.records.errors import VehicleError
-from studies.documentation_tables import on_page_markdown
+from studies.documentation_tables import with_tables
 
 #: Mass, wheelbase and front share of a 1:10 car, a 1:5 car, a small car, a saloon, a van, a 40 t truck.
 VEHICLES = [
@@ -92,5 +92,5 @@ def test_wrong_entries_are_named(tmp_path: Path, entries: dict[str, float], name
 
 
 def test_the_documentation_has_every_rule() -> None:
-    page = on_page_markdown((Path(__file__).parents[2] / "docs" / "formats.md").read_text())
+    page = with_tables((Path(__file__).parents[2] / "docs" / "formats.md").read_text())
     assert all(f"| `{rule.entry}` | {rule.text} |" in page for rule in RULES)

@@ -18,7 +18,7 @@ from pdhef_logtool.records.checks import Check
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.inspection import inspect_log
-from studies.documentation_tables import on_page_markdown
+from studies.documentation_tables import with_tables
 from tests.command_line import rendered
 
 NAME = "speed_m_s.range"
@@ -84,7 +84,7 @@ def test_inspect_shows_it(toy: str, sample_logs_dir: Path) -> None:
 
 
 def test_the_documentation_lists_it(toy: str) -> None:
-    found = on_page_markdown((DOCS / "formats.md").read_text(encoding="utf-8"))
+    found = with_tables((DOCS / "formats.md").read_text(encoding="utf-8"))
     for name, entry in TABLE.items():
         assert f"| `{name}` | {entry['compares']} | {entry['fails']} |" in found
 

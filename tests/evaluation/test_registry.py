@@ -24,7 +24,7 @@ from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
-from studies.documentation_tables import on_page_markdown
+from studies.documentation_tables import with_tables
 from tests.command_line import rendered
 
 NAME, LABEL = "interval_width", "interval width"
@@ -98,7 +98,7 @@ def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
 
 def test_the_documentation_defines_it(toy: str) -> None:
     text = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
-    found = on_page_markdown(text)
+    found = with_tables(text)
     for metric in registered().values():
         assert f"| `{metric.name}` |" in found
         assert metric.definition in found

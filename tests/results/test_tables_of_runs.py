@@ -20,7 +20,7 @@ from pdhef_logtool.results.querying import query
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal
-from studies.documentation_tables import on_page_markdown
+from studies.documentation_tables import with_tables
 from tests.results.made_run import entry
 from tests.run_report import report
 
@@ -114,9 +114,15 @@ def test_every_table_has_the_rows_of_all_logs_in_their_order(tmp_path: Path) -> 
     ]
 
 
+@pytest.mark.parametrize("page", (ROOT / "docs").glob("*.md"), ids=lambda page: page.name)
+def test_pages_have_the_tables_of_the_code(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert with_tables(text) == text, "run python -m studies.documentation_tables"
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_every_column_is_documented_and_of_its_kind(tmp_path: Path, name: str) -> None:
-    text = on_page_markdown((ROOT / "docs/formats.md").read_text())
+    text = with_tables((ROOT / "docs/formats.md").read_text())
     columns = [c["name"] for c in load_schema(f"{name}.parquet.json")["columns"]]
     (listed,) = re.findall(rf"^\| `{name}` \|[^|]*\|([^|]*)\|", text, re.MULTILINE)
     assert re.findall(r"`(\w+)`", listed) == columns
