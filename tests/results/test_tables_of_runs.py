@@ -114,7 +114,7 @@ def test_every_table_has_the_rows_of_all_logs_in_their_order(tmp_path: Path) -> 
     ]
 
 
-@pytest.mark.parametrize("page", (ROOT / "docs").glob("*.md"), ids=lambda page: page.name)
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
 def test_pages_have_the_tables_of_the_code(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert with_tables(text) == text, "run python -m studies.documentation_tables"
