@@ -29,7 +29,7 @@ from pdhef_logtool.results.opened_run import TABLES, TABLES_FOLDER, table_file
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.tables import drive_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal
-from studies.pages import DOCS, options, table, write
+from studies.pages import DOCS, options, table, template, write
 
 LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2
 COUNTS = (5, 10, 30, 100)
@@ -161,38 +161,19 @@ def page(times: int, planted: int, drives: int) -> str:
         false_alarms.append([str(count), *(f"{x:.1%}" for x in (*alarms, naive))])
         detected.append([str(count), *(f"{x:.1%}" for x in hits)])
     days = [[f"{x:.0%}", *(f"{y:.1%}" for y in shares_of_days(x, times, 4))] for x in SHARED]
-    return "\n".join(
-        (
-            "# Comparison of runs",
-            "",
-            "This page shows how often [`pdhef compare`](compare.md) reports a regression, with and without one. "
-            "Command: `python -m studies.comparing`.",
-            "",
-            f"## No change: how often the gate closes, of {times:,} relabellings",
-            "",
-            f"The paired log ratio of drives has a spread of {SPREAD}, the limit is {LIMIT:.0%}. The last column is "
-            "the gate that one would think of first: the ratio of the mean RMSE of both runs above the limit.",
-            "",
-            table(["drives", "normal", "heavy tails", "ratio of means"], false_alarms, right_from=0),
-            "",
-            f"## Every drive is worse by {PLANTED:.0%} beside that spread: how often the gate closes, of {planted:,}",
-            "",
-            table(["drives", "normal", "heavy tails"], detected, right_from=0),
-            "",
-            f"## No change, {DAYS * DRIVES_A_DAY} drives from {DAYS} days: how often B is called worse",
-            "",
-            "The first column is the share of the variance of log ratios between days. The limit is 0, at which the "
-            "nominal rate is 5%.",
-            "",
-            table(["between days", "--cluster none", "default: dependence is estimated"], days, right_from=0),
-            "",
-            "## A run compared with itself",
-            "",
-            "The whole command, from start to end; processor time on an idle core.",
-            "",
-            table(["drives", "figures", "verdict", "processor s", "MiB at most"], [cost(drives)], right_from=0),
-            "",
-        )
+    return template(
+        __file__,
+        times=f"{times:,}",
+        planted=f"{planted:,}",
+        spread=SPREAD,
+        limit=f"{LIMIT:.0%}",
+        worse=f"{PLANTED:.0%}",
+        drives=DAYS * DRIVES_A_DAY,
+        number_of_days=DAYS,
+        false_alarms=table(["drives", "normal", "heavy tails", "ratio of means"], false_alarms, right_from=0),
+        detected=table(["drives", "normal", "heavy tails"], detected, right_from=0),
+        days=table(["between days", "--cluster none", "default: dependence is estimated"], days, right_from=0),
+        cost=table(["drives", "figures", "verdict", "processor s", "MiB at most"], [cost(drives)], right_from=0),
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from studies.pages import number, table, write
+from studies.pages import number, table, template, write
 from studies.pictures import save, subplots
 from studies.table_maths import RESAMPLES, Bound, median, median_ratio, percentiles, pooled_rmse, verdict
 
@@ -31,31 +31,6 @@ _RATIOS = f"""With the 95 % CI of a paired bootstrap over drives ({RESAMPLES} re
 """
 _MARKS = {"better": "**<**", "not worse": "=", "worse": "**>**", "open": "?", "–": ""}
 
-PAGE = """# Simulated conditions
-
-This page shows the sideslip error of all estimators on simulated drives. Each row changes one condition.
-Command: `{command}`.
-
-Car: {car}; pdhef-logtool {version}. The vehicle file is the same in all rows. Estimators get the true friction, unless
-the row changes it. The ground truth is the state of the simulator.
-
-Sideslip RMSE in degrees, median over drives. `pd-hef-smoothed` is not causal: it uses later measurements.
-Coverage: share of samples in the 95 % confidence interval.
-
-{summary}
-
-All estimators, percentiles and pooled errors: `studies/results/conditions/tables.md`. All figures by drive:
-`metrics.parquet` in the same folder.
-
-![Sideslip RMSE by row](conditions/sideslip.png)
-
-Rows by the ratio of the median RMSE of `{subject}` to a reference, with 95 % CI of a paired bootstrap
-over drives. Better: the CI is below 1; not worse: below {margin}; worse: above {margin}; open: else.
-
-{counts}
-
-![Ratio of {subject} to its references](conditions/ratios.png)
-"""
 FloatArray = NDArray[np.float64]
 
 
@@ -105,7 +80,7 @@ def write_page(out: Path, folder: Path) -> None:
     plot(pictures / "ratios.png", rows, ratios, label, limits={1.0: "-", MARGIN: ":"})
     texts = {"summary": summary(figures, facts["rows"], rows, [*drawn]), "counts": counts(rows, bounds)}
     given = {key: facts[key] for key in ("command", "car", "version")}
-    write(out / "conditions.md", PAGE.format(**given, **texts, subject=SUBJECT, margin=MARGIN))
+    write(out / "conditions.md", template(__file__, **given, **texts, subject=SUBJECT, margin=MARGIN))
 
 
 def _deg(value: float, digits: int = 3) -> str:

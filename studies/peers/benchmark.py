@@ -22,15 +22,18 @@ import polars as pl
 
 import pdhef_logtool as pdhef
 from pdhef_logtool.evaluation.statistics import pooled
-from pdhef_logtool.evaluation.track_errors import NORMAL_95
+from pdhef_logtool.evaluation.track_errors import NORMAL_95, signal_error
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.mapping import Mapping
-from studies.pages import DOCS, DRIVES, RESULTS, number, options, table, write
+from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.model.intervals import drive_intervals
+from pdhef_logtool.runs.estimating import estimate_drive
+from studies.pages import DOCS, DRIVES, RESULTS, number, options, table, template, write
 from studies.peers.drives import OFFSET, PEER_DRIVES, REFERENCE, mapping_of, vehicle_of
+from studies.peers.scoring import SIDESLIP
 
 #: Factor of what exceeds a 95 % interval in its score, 2 / 0.05.
 PENALTY = 40.0
-PAGE = Path(__file__).with_suffix(".md")
 RUN_MAPPING = Path(__file__).with_name("published.toml")
 RUN_CAR = REFERENCE / "vehicles" / "f1tenth.toml"
 
@@ -84,30 +87,33 @@ def published(file: Path, folder: Path) -> Iterator[Entry]:
 
 
 def scores(entry: Entry) -> Iterator[dict[str, Any]]:
-    """Yield the scores of all estimators on a log; angles in degrees."""
+    """Yield the scores of all estimators on a log, with the car calibrated on it as in a run; angles in degrees."""
     with pdhef.read_drive(entry.log, entry.car, entry.mapping) as drive:
-        chosen = (e.name for group in ("all", "peers") for e in pdhef.choose(drive, [group])[0])
-        pdhef.estimate(drive, ["zero"])  # reads and calibrates
-        for name in dict.fromkeys(chosen):
+        model, whole = DriveModel.fit(drive), drive.whole()
+        given = [e for group in ("all", "peers") for e in pdhef.choose(drive, [group], model.car)[0]]
+        corrected, truth = model.apply(whole.signals), whole.truth
+        for name, estimator in {e.name: e for e in given}.items():
             begin = time.process_time()
-            estimates = pdhef.estimate(drive, [name])
+            intervals = drive_intervals(model.car, [estimator])
+            (track,) = estimate_drive(whole, corrected, [estimator], intervals=intervals).tracks.values()
             seconds = time.process_time() - begin
-            frame = estimates.frame(errors=True).filter(estimator=name)
-            error, std = (np.degrees(frame[c].to_numpy()) for c in ("error_sideslip_rad", "sideslip_std_rad"))
-            valid = np.isfinite(error)
-            if not valid.any():
+            if truth is None or track.name != name:
                 continue
-            error, half = np.abs(error[valid]), NORMAL_95 * std[valid]
-            length_s = float(np.ptp(frame["stamp_ns"].to_numpy()) * 1e-9)
+            error = signal_error(track, truth, SIDESLIP, entry.car.vehicle.low_speed_blend_m_s)
+            used = np.isfinite(error)
+            if not used.any():
+                continue
+            error, half = (np.degrees(x[used]) for x in (np.abs(error), NORMAL_95 * track.sideslip_std_rad))
+            length_s = float(np.ptp(track.stamps_ns) * 1e-9)
             yield {
                 "group": entry.group,
                 "log": entry.log.name,
                 "drive": entry.drive,
                 "car": entry.car.vehicle.name,
                 "estimator": name,
-                "scored_s": length_s * float(np.mean(valid)),
+                "scored_s": length_s * float(np.mean(used)),
                 "rmse_deg": float(np.sqrt(np.mean(error**2))),
-                "available": float(frame["valid"].mean()),  # type: ignore[arg-type]
+                "available": float(np.mean(track.valid)),
                 "coverage95": float(np.mean(error <= half)) if np.isfinite(half).any() else np.nan,
                 "winkler_deg": float(np.mean(2.0 * half + PENALTY * np.maximum(error - half, 0.0))),
                 "seconds_per_hour": 3600.0 * seconds / length_s,
@@ -167,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(tables)
     if not own:
         pl.DataFrame(rows).write_json(RESULTS / "peers" / "benchmark.json")
-        write(given.out, PAGE.read_text(encoding="utf-8").format(tables=tables))
+        write(given.out, template(__file__, tables=tables))
     return 3 if failed else 0
 
 

@@ -373,6 +373,8 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
     )
     with closing(ends):
         for ended in ends:
+            if isinstance(ended.result, OutputError):
+                raise ended.result
             result = ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
             results[ended.number] = result
             tell_drive(result.record, reporter.warn)
@@ -380,11 +382,12 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
     return tuple(results[number] for number in range(len(work)))
 
 
-def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
+def _extract_guarded(job: _Job, progress: Progress) -> DriveResult | OutputError:
+    """Extract a drive; a full disk, which all drives would meet, is returned and ends the command."""
     try:
         return _extract(job, partial(progress, job.log_input.stem))
     except PdhefError as error:
-        return _failure(job, str(error))
+        return error if isinstance(error, OutputError) and error.ends_run else _failure(job, str(error))
     except MemoryError:
         raise  # another process may have caused it: repeated alone
     except Exception as error:  # noqa: BLE001 (no error in one log may stop the others)
