@@ -5,9 +5,7 @@ Friction is the only input of an estimator from the ground truth.
 
 from __future__ import annotations
 
-import json
 import tempfile
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,8 +16,6 @@ from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.records import SignalSource
-from studies.independent_sim_logs import write_run
-from studies.pages import INDEPENDENT
 from truthsim.drive import Drive, write_drive
 
 _FRICTION = SignalSource("friction", "/truth/perfect/state", "friction")
@@ -46,12 +42,3 @@ def as_logged(drive: Drive, car: Car) -> reading.WholeDrive:
         write_drive(drive, path)
         with reading.read_drive(path, car, options=ReadOptions(friction=None)) as read:
             return read.whole()
-
-
-def independent_runs(folder: Path) -> Iterable[tuple[Path, Path, float]]:
-    """Write the independent simulator's runs as logs into a folder, once; yield run, log and friction of each."""
-    for source in sorted(INDEPENDENT.glob("*.parquet")):
-        log = folder / f"{source.stem}.mcap"
-        if not log.is_file():
-            write_run(source, log)
-        yield source, log, float(json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))["mu"])

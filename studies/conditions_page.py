@@ -1,4 +1,4 @@
-"""The page of the condition table: summary and figures in ``conditions.md``, all tables in ``studies/results``."""
+"""The page of the condition table: summary and figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from studies.pages import number, table, template, write
 from studies.pictures import save, subplots
-from studies.table_maths import RESAMPLES, Bound, median, median_ratio, percentiles, pooled_rmse, verdict
+from studies.table_maths import Bound, median, median_ratio, percentiles, verdict
 
 #: The estimator of interest, and the references of its RMSE ratios.
 SUBJECT = "pd-hef"
@@ -25,12 +24,6 @@ MARGIN = 1.05
 DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
 #: Okabe and Ito (2008), without yellow.
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
-_RATIOS = f"""With the 95 % CI of a paired bootstrap over drives ({RESAMPLES} resamples). **<** the CI is below 1;
-= it is below {MARGIN}; **>** it is above {MARGIN}; ? otherwise.
-
-"""
-_MARKS = {"better": "**<**", "not worse": "=", "worse": "**>**", "open": "?", "–": ""}
-
 FloatArray = NDArray[np.float64]
 
 
@@ -61,13 +54,12 @@ class Figures:
 
 
 def write_page(out: Path, folder: Path) -> None:
-    """Render the page, its two figures, and all tables (``tables.md``) from the results in a folder."""
+    """Render the page and its two figures from the results in a folder."""
     facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
     figures = Figures(pl.read_parquet(folder / "metrics.parquet"))
     names = [n for n in facts["order"] if n in figures.estimators]
     rows = [r for r in facts["rows"] if r in figures.rows]
     references = [r for r in REFERENCES if r in names] if SUBJECT in names else []
-    write(folder / "tables.md", tables(figures, rows, names, references))
     pictures = out / "conditions"
     pictures.mkdir(parents=True, exist_ok=True)
     spans = {n: np.degrees([percentiles(figures.get(r, n)[0]) for r in rows]).reshape(-1, 3) for n in names}
@@ -107,34 +99,6 @@ def counts(rows: Sequence[str], bounds: Mapping[str, Sequence[Bound]]) -> str:
         numbers = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
         body.append([reference, *numbers, ", ".join(above) or "none"])
     return table(["reference", "better", "not worse", "open", "worse", f"ratio above {MARGIN}"], body)
-
-
-def tables(figures: Figures, rows: Sequence[str], names: Sequence[str], references: Sequence[str]) -> str:
-    """Return all tables: a line for each row, a column for each estimator."""
-
-    def spread(row: str, name: str) -> str:
-        low, high = percentiles(figures.get(row, name)[0], (10.0, 90.0))
-        return f"{_deg(low)}–{_deg(high)}" if math.isfinite(low) else "–"
-
-    def ratio(row: str, reference: str) -> str:
-        bound = figures.ratio(row, reference)
-        span = f"[{number(bound.low, 2)}, {number(bound.high, 2)}] {_MARKS[verdict(bound)]}"
-        return f"{bound.value:.2f} {span}" if math.isfinite(bound.value) else "–"
-
-    sections: tuple[tuple[str, str, Sequence[str], Any], ...] = (
-        ("Sideslip RMSE in degrees: median over drives", "", names, lambda r, n: _deg(median(figures.get(r, n)[0]))),
-        ("Sideslip RMSE in degrees: 10th to 90th percentile over drives", "", names, spread),
-        ("Sideslip RMSE in degrees: pooled over all samples", "", names,
-         lambda r, n: _deg(pooled_rmse(*figures.get(r, n)))),
-        (f"`{SUBJECT}` against its references: ratio of the medians", _RATIOS, references, ratio),
-        ("Sideslip RMSE in degrees in the nonlinear range (|a_y| > 0.5 μ g): median over drives", "", names,
-         lambda r, n: _deg(median(figures.get(r, n, segment="nonlinear")[0]))),
-    )  # fmt: skip
-    texts = [
-        f"## {title}\n\n{text}{table(['row', *columns], [[r, *(cell(r, n) for n in columns)] for r in rows])}\n"
-        for title, text, columns, cell in sections
-    ]
-    return "\n".join(["# Tables of the simulated conditions\n", *texts])
 
 
 def plot(

@@ -1,4 +1,4 @@
-"""The maths of the condition table: pooling, percentiles, paired bootstrap over drives.
+"""The maths of the condition table: percentiles, paired bootstrap over drives.
 
 All functions take one figure a drive. Drives with NaN (without a scored sample) do not count.
 """
@@ -23,14 +23,6 @@ class Bound:
     low: float
     high: float
     drives: int
-
-
-def pooled_rmse(rmse: FloatArray, samples: FloatArray) -> float:
-    """Return the RMSE over all samples of all drives from each drive's RMSE [N] and number of samples [N]."""
-    finite = np.isfinite(rmse) & (samples > 0)
-    if not finite.any():
-        return float("nan")
-    return float(np.sqrt(np.sum(samples[finite] * rmse[finite] ** 2) / np.sum(samples[finite])))
 
 
 def percentiles(values: FloatArray, levels: tuple[float, ...] = (10.0, 50.0, 90.0)) -> tuple[float, ...]:

@@ -5,6 +5,7 @@ Each case plants a fault, goes on as a user would, and compares every file with 
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -35,6 +36,7 @@ PLACES, FEW = 10, 4
 _RUN = ("--car", "saloon", "--estimators", "zero,phy-ukf", "--keep", "estimates")
 _CAR = ("--car", "saloon", "--split")
 _LIMIT_S = 900.0
+_JOURNAL = "journal.jsonl"
 _DAY_S = 86_400
 #: Put before the modules of a command, the clock of Python is a day ahead.
 _AHEAD = f"""import time
@@ -84,7 +86,7 @@ class Fleet:
         self, output: Path, drives: int = 1, env: Mapping[str, str] | None = None
     ) -> Iterator[subprocess.Popen[bytes]]:
         """Start a run; the block begins when it has recorded some drives, and ends with the run."""
-        journal = output / "journal.jsonl"
+        journal = output / _JOURNAL
         words, quiet = ("run", str(self.logs), *_RUN, "-o", str(output)), subprocess.DEVNULL
         with start(*words, env=env, stderr=quiet, stdout=quiet) as process:
             while process.poll() is None and _lines(journal) < drives:
@@ -97,9 +99,12 @@ def _lines(journal: Path) -> int:
 
 
 def _comparable(folder: Path) -> dict[str, bytes]:
-    """Return the bytes of all files; the lines of a journal are in the order in which the drives ended."""
+    """Return the bytes of all files, and in place of the journal the last line of each drive that ``run.json`` names."""
     found = contents(folder)
-    return {p: b"".join(sorted(b.splitlines(True))) if p.endswith(".jsonl") else b for p, b in found.items()}
+    lines = found.pop(_JOURNAL, b"").splitlines()
+    last = {json.loads(line).get("label"): line for line in lines}
+    logs = json.loads(found["run.json"])["logs"] if lines else ()
+    return found | {f"{_JOURNAL}: {log['log']}": last.get(log["log"], b"") for log in logs}
 
 
 def compared(calm: Path, folder: Path, codes: Iterable[int], wrong: Iterable[str] = ()) -> Verdict:
@@ -259,7 +264,7 @@ def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Cal
     }
     deeds: dict[str, Deed] = {"replaced": partial(shutil.copy, other), "cut": cut, "removed": Path.unlink}
     harm: dict[str, Deed] = {"a flipped bit": flip, "half of it": cut, "nothing left": Path.unlink}
-    kinds = {"each file of a drive": _OF_DRIVES, "each file of the run": _OF_RUN, "the journal": ("journal.jsonl",)}
+    kinds = {"each file of a drive": _OF_DRIVES, "each file of the run": _OF_RUN, "the journal": (_JOURNAL,)}
     return {
         f"{count} kills in {drives} drives": partial(kills, fleet, count, seed),
         **{f"disk full at {PLACES} places of `{name}`": partial(full_disk, *disk) for name, disk in disks.items()},
