@@ -16,7 +16,7 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,9 @@ from studies.torture.hours import write_hours
 from studies.torture.logs import log_judge
 from studies.torture.outside import measured
 from studies.torture.table_seeds import FORMATS
-from studies.torture.workers import NO_VERDICT, Verdict, run_cases
+from studies.torture.workers import NO_VERDICT, Verdict, judge, run_cases
 
-_THREE = ("--estimators", "zero,kinematic,phy-ukf")
+_THREE = ("run", "--car", "saloon", "--annotate", "none", "--estimators", "zero,kinematic,phy-ukf")
 
 
 def mutations(work: Path, seed: int, jobs: int, logs: int) -> dict[str, Any]:
@@ -83,26 +83,14 @@ def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdi
     return collected
 
 
-def hours(work: Path, most: float) -> list[dict[str, Any]]:
-    """Measure the memory of ``inspect`` and of ``run`` with three estimators over an hour and over many."""
-    collected = []
-    for length in (1.0, most):
-        log = work / "hours.mcap"
-        write_hours(log, length)
-        for call in (("inspect", str(log)), ("run", str(log), "-o", str(work / "out"), "--annotate", "none", *_THREE)):
-            process = measured(*call, *(["--car", "saloon"] if call[0] == "run" else []), limit_s=3600.0)
-            entry = {
-                "command": call[0],
-                "hours": length,
-                "code": process.code,
-                "s": process.wall_s,
-                "bytes": process.peak_bytes,
-            }
-            collected.append(entry)
-            _say(f"hours: {entry}")
-        shutil.rmtree(work / "out", ignore_errors=True)
-        log.unlink()
-    return collected
+def long_log(hours: float, words: Sequence[str], folder: Path) -> Verdict:
+    """Measure the memory of a command over many hours."""
+    log, output = folder / "hours.mcap", ("-o", str(folder / "out")) if "run" in words else ()
+    write_hours(log, hours)
+    process = measured(words[0], str(log), *words[1:], *output, limit_s=3600.0)
+    return Verdict(
+        f"exit {process.code}", judge(process, (0, 3)).problem, {"s": process.wall_s, "bytes": process.peak_bytes}
+    )
 
 
 def _say(text: str) -> None:
@@ -114,12 +102,9 @@ def _say(text: str) -> None:
 
 def blocks(results: dict[str, Any]) -> dict[str, str]:
     """Return the tables of the page by name."""
-    lists = [name for name in ("bombs", "crashes", "shared") if results.get(name)]
+    lists = [name for name in ("bombs", "crashes", "hours", "shared") if results.get(name)]
     texts: dict[str, str] = {name: _list(results[name]) for name in lists}
     texts |= {name: _mutations(results[name]) for name in ("mutations", "formats") if results.get(name)}
-    if done := results.get("hours"):
-        rows = [[f"`{r['command']}`", f"{r['hours']:g}", str(r["code"]), *_costs(r)] for r in done]
-        texts["hours"] = table(["command", "hours", "exit code", "s", "MiB"], rows, right_from=1)
     return texts
 
 
@@ -190,7 +175,11 @@ def main() -> int:
         "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs),
         "formats": lambda: formats(work, given.seed, given.jobs, given.count, given.format or FORMATS),
         "crashes": lambda: one_by_one("crashes", work, crash_cases(work, given.drives, given.kills, given.seed)),
-        "hours": lambda: hours(work, given.hours),
+        "hours": lambda: one_by_one(
+            "hours",
+            work,
+            {f"`{w[0]}`, {h:g} h": partial(long_log, h, w) for h in (1.0, given.hours) for w in (("inspect",), _THREE)},
+        ),
     }
     if unknown := set(parts) - set(todo):
         parser.error(f"expected parts out of {', '.join(todo)}, got {', '.join(sorted(unknown))}")
@@ -216,7 +205,7 @@ def main() -> int:
 def _wrong(result: Any) -> bool:
     """Return whether anything in a part's results ended as it should not."""
     if isinstance(result, list):
-        return any(r.get("problem") or r.get("code", 0) not in (0, 3) for r in result)
+        return any(r["problem"] for r in result)
     return bool(result.get("problems")) or any(isinstance(r, dict) and r.get("problems") for r in result.values())
 
 

@@ -49,11 +49,8 @@ _OF_DRIVES = (
     "tables/parts/*",
 )
 _OF_RUN = ("run.json", "report.json", "report.html", "metrics.parquet", "tables/[!p]*.parquet")
-_RAY = {
-    "a Ray node is lost": "runs/test_fleet_on_ray.py::test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here",
-    "a Ray cluster is lost": "workers/test_ray_supervisor.py::"
-    "test_a_cluster_that_is_lost_is_one_error_and_no_failure_of_its_items",
-}
+#: Tests of a node and of a cluster that are lost.
+_RAY = ("tests/runs/test_fleet_on_ray.py", "tests/workers/test_ray_supervisor.py", "-k", "one_of_which_goes or is_lost")
 
 
 def _run(logs: Path | str, output: Path, *more: str) -> Process:
@@ -99,11 +96,11 @@ def _lines(journal: Path) -> int:
 
 
 def _comparable(folder: Path) -> dict[str, bytes]:
-    """Return the bytes of all files, and in place of the journal the last line of each drive that ``run.json`` names."""
+    """Return the bytes of all files, and of the journal the last line of each drive that ``run.json`` names."""
     found = contents(folder)
     lines = found.pop(_JOURNAL, b"").splitlines()
     last = {json.loads(line).get("label"): line for line in lines}
-    logs = json.loads(found["run.json"])["logs"] if lines else ()
+    logs = json.loads(found["run.json"])["logs"] if lines and "run.json" in found else ()
     return found | {f"{_JOURNAL}: {log['log']}": last.get(log["log"], b"") for log in logs}
 
 
@@ -236,11 +233,11 @@ def cut(path: Path) -> None:
     os.truncate(path, path.stat().st_size // 2)
 
 
-def lost_on_ray(test: str, _: Path) -> Verdict:
-    """Run the test of a fleet on Ray."""
+def lost_on_ray(_: Path) -> Verdict:
+    """Run the tests of a fleet on Ray."""
     if find_spec("ray") is None:
         return Verdict("skipped: Ray is not installed")
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "fleet", f"tests/{test}"]
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "fleet", *_RAY]
     environment = os.environ | {"PDHEF_FLEET": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     return Verdict(f"pytest {done.returncode}", done.stdout[-800:] if done.returncode else "")
@@ -276,5 +273,5 @@ def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Cal
             for what, patterns in kinds.items()
             for how, deed in harm.items()
         },
-        **{name: partial(lost_on_ray, test) for name, test in _RAY.items()},
+        "a Ray node, and a cluster, are lost": lost_on_ray,
     }
