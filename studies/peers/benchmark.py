@@ -32,7 +32,7 @@ from studies.pages import DOCS, DRIVES, RESULTS, number, options, table, templat
 from studies.peers.drives import OFFSET, PEER_DRIVES, REFERENCE, mapping_of, vehicle_of
 from studies.peers.scoring import SIDESLIP
 
-#: Factor of what exceeds a 95 % interval in its score, 2 / 0.05.
+#: Factor of the part of an error outside a 95 % interval in its score: 2 / 0.05.
 PENALTY = 40.0
 RUN_MAPPING = Path(__file__).with_name("published.toml")
 RUN_CAR = REFERENCE / "vehicles" / "f1tenth.toml"
@@ -42,7 +42,7 @@ RUN_CAR = REFERENCE / "vehicles" / "f1tenth.toml"
 class Entry:
     """A log of the benchmark.
 
-    ``group``: heading of its table; ``drive``: name of what it recorded; mapping None: recognised.
+    ``group``: heading of its table; ``drive``: name of the recorded drive; mapping None: recognised.
     """
 
     log: Path
@@ -53,7 +53,7 @@ class Entry:
 
 
 def recorded() -> Iterator[Entry]:
-    """Yield the recorded drives; those whose ground truth has an offset are no measure."""
+    """Yield the recorded drives, except for those with an offset in the ground truth."""
     for d in PEER_DRIVES:
         if d.group != OFFSET:
             car = pdhef.Car.of(vehicle_of(d))
@@ -151,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     own = bool(given.folder or given.published)
     if not own and not DRIVES.is_dir():
-        print("nothing is scored: needs ../shared beside the repository, or --folder")
+        print("needs ../shared beside the repository, or --folder")
         return 0
     rows, failed = list[dict[str, Any]](), 0
     with tempfile.TemporaryDirectory() as work:
@@ -160,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for i, entry in enumerate(entries if own else recorded()):
             try:
                 if not i:
-                    list(scores(entry))  # loads what is compiled, which no score may contain
+                    list(scores(entry))  # loads the compiled code, which no score may contain
                 rows += scores(entry)
             except pdhef.PdhefError as error:
                 failed += 1

@@ -1,6 +1,6 @@
 """Crashes in the middle of a fleet: kills, full disks, changed logs and clocks, damaged outputs, two runs at once.
 
-Each case plants a fault, goes on as a user would, and compares every file with those of an undisturbed command.
+Each case plants a fault, repeats the command as a user would, and compares every file with an undisturbed output.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from studies.torture.outside import Process, measured, start
 from studies.torture.workers import Verdict, judge
 from truthsim.suite import write_suite
 
-#: What is done to a file.
+#: A change of a file.
 Deed: TypeAlias = Callable[[Path], object]
 #: Length of a drive; `learn` needs drives of 20 s.
 DRIVE_S, TAUGHT_S = 4.0, 21.0
@@ -105,7 +105,7 @@ def _comparable(folder: Path) -> dict[str, bytes]:
 
 
 def compared(calm: Path, folder: Path, codes: Iterable[int], wrong: Iterable[str] = ()) -> Verdict:
-    """Judge a folder by that of an undisturbed command; ``wrong`` has further problems."""
+    """Judge a folder by the output of an undisturbed command; ``wrong`` has further problems."""
     wanted, found = _comparable(calm), _comparable(folder)
     differing = {
         "lost": wanted.keys() - found.keys(),
@@ -124,7 +124,7 @@ def compared(calm: Path, folder: Path, codes: Iterable[int], wrong: Iterable[str
 
 
 def kills(fleet: Fleet, count: int, seed: int, folder: Path) -> Verdict:
-    """Kill runs that go on with the same output; where one ends before its kill, the next begins anew."""
+    """Kill runs that continue one output; if a run ends before its kill, the next one starts with an empty folder."""
     output, codes, wrong = folder / "out", list[int](), list[str]()
     files = {p.name for p in next((fleet.calm / "logs").iterdir()).iterdir()}
     lasts_s, writes_s = fleet.lasts_s / 2.0, fleet.lasts_s / 4.0
@@ -188,7 +188,7 @@ def two_at_once(fleet: Fleet, folder: Path) -> Verdict:
 
 
 def clock_set_back(fleet: Fleet, folder: Path) -> Verdict:
-    """Kill a run whose clock is a day ahead, and go on at the right time; its files have times of tomorrow."""
+    """Kill a run with a clock that is a day ahead, and continue at the right time; its files have times of tomorrow."""
     output, tomorrow = folder / "out", time.time() + _DAY_S
     (folder / "sitecustomize.py").write_text(_AHEAD)
     environment = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
@@ -200,7 +200,7 @@ def clock_set_back(fleet: Fleet, folder: Path) -> Verdict:
 
 
 def changed_log(fleet: Fleet, deed: Deed, folder: Path) -> Verdict:
-    """Change the last log in the middle of a run: no other drive may suffer; ``--resume`` reads what it is then."""
+    """Change the last log in the middle of a run: no other drive may suffer; ``--resume`` reads the changed log."""
     mine = Fleet(Path(shutil.copytree(fleet.logs, folder / "logs")), fleet.calm, fleet.code, fleet.lasts_s)
     output, last = folder / "out", max(mine.logs.glob("*.mcap"))
     with mine.begun(output) as process:
@@ -244,7 +244,7 @@ def lost_on_ray(_: Path) -> Verdict:
 
 
 def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Callable[[Path], Verdict]]:
-    """Simulate the drives, run them undisturbed, and return the cases by what each plants."""
+    """Simulate the drives, run them undisturbed, and return the cases by their planted fault."""
     folders = {"fleet": (drives, DRIVE_S), "few": (FEW, DRIVE_S), "taught": (2, TAUGHT_S), "other": (1, DRIVE_S)}
     for i, (name, (number, length_s)) in enumerate(folders.items()):
         write_suite(work / name, count=number, seed=seed + i, duration_s=length_s)
