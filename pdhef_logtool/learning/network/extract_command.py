@@ -261,14 +261,7 @@ def _write(
     left_out = [r.record for r in results if r.record.left_out]
     failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
     copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
-    return write_manifest(
-        output,
-        entries,
-        failed,
-        settings=settings.to_dict(),
-        vehicles=vehicles,
-        duplicates=copies,
-    )
+    return write_manifest(output, entries, failed, settings=settings.to_dict(), vehicles=vehicles, duplicates=copies)
 
 
 def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
