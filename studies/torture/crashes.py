@@ -49,8 +49,11 @@ _OF_DRIVES = (
     "tables/parts/*",
 )
 _OF_RUN = ("run.json", "report.json", "report.html", "metrics.parquet", "tables/[!p]*.parquet")
-#: Tests of a node and of a cluster that are lost.
-_RAY = ("tests/runs/test_fleet_on_ray.py", "tests/workers/test_ray_supervisor.py", "-k", "one_of_which_goes or is_lost")
+#: Tests of a fleet on Ray: file and part of the name.
+_RAY = {
+    "a Ray node is lost": ("tests/runs/test_fleet_on_ray.py", "one_of_which_goes"),
+    "a Ray cluster is lost": ("tests/workers/test_ray_supervisor.py", "is_lost"),
+}
 
 
 def _run(logs: Path | str, output: Path, *more: str) -> Process:
@@ -233,11 +236,11 @@ def cut(path: Path) -> None:
     os.truncate(path, path.stat().st_size // 2)
 
 
-def lost_on_ray(_: Path) -> Verdict:
-    """Run the tests of a fleet on Ray."""
+def lost_on_ray(file: str, name: str, _: Path) -> Verdict:
+    """Run a test of a fleet on Ray."""
     if find_spec("ray") is None:
         return Verdict("skipped: Ray is not installed")
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "fleet", *_RAY]
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "fleet", file, "-k", name]
     environment = os.environ | {"PDHEF_FLEET": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     return Verdict(f"pytest {done.returncode}", done.stdout[-800:] if done.returncode else "")
@@ -273,5 +276,5 @@ def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Cal
             for what, patterns in kinds.items()
             for how, deed in harm.items()
         },
-        "a Ray node, and a cluster, are lost": lost_on_ray,
+        **{name: partial(lost_on_ray, *test) for name, test in _RAY.items()},
     }
