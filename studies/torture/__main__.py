@@ -109,22 +109,19 @@ def blocks(results: dict[str, Any]) -> dict[str, str]:
 
 
 def _list(rows: list[dict[str, Any]]) -> str:
-    head = ["case", "ended", *[_COSTS[key][0] for key in rows[0] if key in _COSTS]]
+    costs = [key for key in _COSTS if key in rows[0]]
     wrong = [f", **wrong**: {_cell(r['problem'])}" if r["problem"] else "" for r in rows]
-    body = [[r["name"], r["end"] + w, *_costs(r)] for r, w in zip(rows, wrong, strict=True)]
-    return table(head, body, right_from=2)
+    shown = [[_COSTS[key][1](r[key]) if key in r else "–" for key in costs] for r in rows]
+    body = [[r["name"], r["end"] + w, *cells] for r, w, cells in zip(rows, wrong, shown, strict=True)]
+    return table(["case", "ended", *(_COSTS[key][0] for key in costs)], body, right_from=2)
 
 
 #: Heading and format of the costs of a case.
 _COSTS: dict[str, tuple[str, Callable[[Any], str]]] = {
     "s": ("s", "{:.1f}".format),
     "bytes": ("MiB", lambda value: str(value >> 20)),
-    **{how: (how, str) for how in ("lost", "stale", "unequal")},
+    **{how: (how, "{:.0f}".format) for how in ("lost", "stale", "unequal")},
 }
-
-
-def _costs(row: dict[str, Any]) -> list[str]:
-    return [show(row[key]) for key, (_, show) in _COSTS.items() if key in row]
 
 
 def _cell(text: str) -> str:
