@@ -15,7 +15,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 # Tests run in random order. The first lines of the output show the seed: make test ORDER_SEED=17 repeats an order.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
-.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers torture \
+.PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers benchmark-sideslip torture \
   gates gates-quick gates-freeze recalibrate docs paper strangers wheel release lock clean
 
 help:
@@ -36,6 +36,7 @@ help:
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make peers    docs/peers.md: published sideslip estimators on the recorded drives in ../shared (three minutes)"
+	@echo "make benchmark-sideslip  docs/benchmark.md: every estimator on the recorded drives, or FOLDER=logs with ground truth"
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
 	@echo "make  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
@@ -165,6 +166,11 @@ conditions: $(VENV)/installed-dev $(VENV)/compiled
 
 peers: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.peers
+
+# Without FOLDER the recorded drives and the page; CAR and MAPPING are those of the folder.
+benchmark-sideslip: $(VENV)/installed-dev $(VENV)/compiled
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.peers.benchmark $(if $(FOLDER),--folder $(FOLDER)) \
+	  $(if $(filter command line,$(origin CAR)),--car $(CAR)) $(if $(MAPPING),--mapping $(MAPPING))
 
 torture: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.torture --jobs $(JOBS)

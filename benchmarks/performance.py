@@ -24,16 +24,6 @@ NAMES = ("hour", "reading", "reading_mdf", "fleet_drive", "starting")
 DOCUMENT = ROOT / "docs" / "performance.md"
 _HEADINGS = ("work", "figure", "target", "", "against peers")
 _SECTION = "\n## "
-_INTRODUCTION = """# Performance
-
-This page shows processor time and memory, also against peers. Command: `python -m benchmarks.performance
---write-docs`; `make bench` prints the tables. Seconds are processor seconds (user and system, with child processes),
-the best of several interleaved rounds unless stated otherwise. A ratio to a peer is measured in the same run.
-
-The gauge is the processor time of a fixed loop, measured beside each table: divide the figures of two days or machines
-by it to compare them. `python -m benchmarks.performance --against TREE` runs commands of this version and of another
-source tree in turns and prints the ratios.
-"""
 
 
 def cells(row: Row) -> tuple[str, ...]:
@@ -63,10 +53,10 @@ def section(name: str, rows: Sequence[Row]) -> str:
 
 
 def page(old: str, measured: dict[str, str]) -> str:
-    """Return the page with new sections; those that were not measured stay as they are."""
-    kept = {text.split("\n", 1)[0]: text for text in old.split(_SECTION)[1:]}
-    sections = {**kept, **measured}
-    return _SECTION.join([_INTRODUCTION, *(sections[name] for name in NAMES if name in sections)])
+    """Return the page with new sections; its beginning, and those that were not measured, stay as they are."""
+    beginning, *kept = old.split(_SECTION)
+    sections = {text.split("\n", 1)[0]: text for text in kept} | measured
+    return _SECTION.join([beginning, *(sections[name] for name in NAMES if name in sections)])
 
 
 def main() -> int:

@@ -25,7 +25,18 @@ import polars as pl
 from pdhef_logtool import Car, PdhefError
 from studies.drawn_cars import KINDS, DrawnCar, draw_car
 from studies.gates.tool import Tool, reports
-from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, write, write_toml, write_validated_car
+from studies.pages import (
+    DOCS,
+    ROOT,
+    SAMPLE_VEHICLE,
+    number,
+    options,
+    table,
+    template,
+    write,
+    write_toml,
+    write_validated_car,
+)
 from truthsim.batch import sensor_noise
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.vehicle import GRAVITY_M_S2
@@ -45,43 +56,6 @@ RIGHT, WRONG_FILE = "right", "wrong"
 _PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
 #: Half of the last printed decimal is added to a printed standard deviation.
 _ROUNDED = {"ay_m_s2.delay": 0.05, "yaw_rate_rad_s.delay": 0.05, "yaw_rate_rad_s.gain": 0.0005}
-
-PAGE = """# Calibration and confidence intervals
-
-This page shows the accuracy of calibrated cars and the coverage of their confidence intervals.
-Command: `python -m studies.calibration`. Sideslip RMSE in degrees. Method: [method.md](method.md).
-
-{cars} simulated saloons, SUVs and hatchbacks with random loads, heights, tyres and sensors (`studies.drawn_cars`), seed
-{seed}. No setting was chosen on these cars. The wrong vehicle file has a stiffness error of a factor of {low:g} to
-{high:g} at each axle, and errors of inertia, roll gradient, IMU position and steering ratio. Each car is calibrated on
-the scored drive, without ground truth.
-
-## Self-calibration
-
-Medians. The last column contains the median ratio and the 10 % and 90 % quantiles.
-
-{errors}
-
-## 95 % confidence intervals of self-calibrated cars
-
-Intervals of `physics`, calibrated from the wrong and from the right file. For normal errors, an interval with 95 %
-coverage is 3.92 times as wide as the RMSE.
-
-{intervals}
-
-## Lateral kinematic consistency and sideslip error
-
-The v̇_y residual (`d2`) needs no ground truth. The table compares each estimate with the estimate of the same drive that
-has the lowest residual.
-
-{d2}
-
-## Coverage of every ± that is printed
-
-A row shows how many true values are within 1.96 standard deviations, with the wrong file.
-
-{plus_minus}
-"""
 
 
 class Run(NamedTuple):
@@ -320,7 +294,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ]
     texts = {"errors": error_table(done), "intervals": interval_table(done), "d2": d2_table(done)}
     texts["plus_minus"] = coverage_table(scores)
-    write(given.out / "calibration.md", PAGE.format(cars=given.cars, seed=SEED, low=WRONG[0], high=WRONG[1], **texts))
+    write(
+        given.out / "calibration.md",
+        template(__file__, cars=given.cars, seed=SEED, low=WRONG[0], high=WRONG[1], **texts),
+    )
     return 0
 
 

@@ -11,9 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-import resource
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -22,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.measuring import command_cost
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.statistics import paired_change
 from pdhef_logtool.records.signals import FloatArray
@@ -29,7 +27,7 @@ from pdhef_logtool.results.opened_run import TABLES, TABLES_FOLDER, table_file
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.tables import drive_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal
-from studies.pages import DOCS, options, table, write
+from studies.pages import DOCS, options, table, template, write
 
 LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2
 COUNTS = (5, 10, 30, 100)
@@ -123,32 +121,10 @@ _PER_DRIVE = len(_ESTIMATORS) * len(_SIGNALS) * len(_SEGMENTS) * len(_METRICS)
 
 def cost(drives: int) -> list[str]:
     """Return the table row of a run of many drives compared with itself by the command line."""
-    code = (
-        "import resource, sys\nfrom pdhef_logtool.cli.app import app\n"
-        "app(sys.argv[1:], prog_name='pdhef', standalone_mode=False)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
-    )
     with tempfile.TemporaryDirectory() as place:
-        made = subprocess.run(
-            [sys.executable, "-c", f"from studies.comparing import make_run\nfrom pathlib import Path\n"
-             f"print(make_run(Path({place!r}), {drives}))"],
-            check=True, capture_output=True, text=True,
-        )  # fmt: skip
-        before = _processor_s()
-        done = subprocess.run(
-            [sys.executable, "-c", code, "compare", place, place, "--max-regression", "5%"],
-            check=True, capture_output=True, text=True,
-        )  # fmt: skip
-        seconds = _processor_s() - before
-    verdict, *_, peak_kib = done.stdout.strip().split("\n")
-    equal = "equal" if "Result   equal" in verdict else verdict
-    return [f"{drives:,}", f"{int(made.stdout):,}", equal, f"{seconds:.1f}", f"{int(peak_kib) / 1024:.0f}"]
-
-
-def _processor_s() -> float:
-    """Return the processor time of all commands so far: the time on a core without other load."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+        figures = make_run(Path(place), drives)
+        command = command_cost("compare", place, place, "--max-regression", "5%")
+    return [f"{drives:,}", f"{figures:,}", f"{command.seconds:.1f}", f"{command.peak_bytes / (1 << 20):.0f}"]
 
 
 def page(times: int, planted: int, drives: int) -> str:
@@ -161,38 +137,19 @@ def page(times: int, planted: int, drives: int) -> str:
         false_alarms.append([str(count), *(f"{x:.1%}" for x in (*alarms, naive))])
         detected.append([str(count), *(f"{x:.1%}" for x in hits)])
     days = [[f"{x:.0%}", *(f"{y:.1%}" for y in shares_of_days(x, times, 4))] for x in SHARED]
-    return "\n".join(
-        (
-            "# Comparison of runs",
-            "",
-            "This page shows how often [`pdhef compare`](compare.md) reports a regression, with and without one. "
-            "Command: `python -m studies.comparing`.",
-            "",
-            f"## No change: how often the gate closes, of {times:,} relabellings",
-            "",
-            f"The paired log ratio of drives has a spread of {SPREAD}, the limit is {LIMIT:.0%}. The last column is "
-            "the gate that one would think of first: the ratio of the mean RMSE of both runs above the limit.",
-            "",
-            table(["drives", "normal", "heavy tails", "ratio of means"], false_alarms, right_from=0),
-            "",
-            f"## Every drive is worse by {PLANTED:.0%} beside that spread: how often the gate closes, of {planted:,}",
-            "",
-            table(["drives", "normal", "heavy tails"], detected, right_from=0),
-            "",
-            f"## No change, {DAYS * DRIVES_A_DAY} drives from {DAYS} days: how often B is called worse",
-            "",
-            "The first column is the share of the variance of log ratios between days. The limit is 0, at which the "
-            "nominal rate is 5%.",
-            "",
-            table(["between days", "--cluster none", "default: dependence is estimated"], days, right_from=0),
-            "",
-            "## A run compared with itself",
-            "",
-            "The whole command, from start to end; processor time on an idle core.",
-            "",
-            table(["drives", "figures", "verdict", "processor s", "MiB at most"], [cost(drives)], right_from=0),
-            "",
-        )
+    return template(
+        __file__,
+        times=f"{times:,}",
+        planted=f"{planted:,}",
+        spread=SPREAD,
+        limit=f"{LIMIT:.0%}",
+        worse=f"{PLANTED:.0%}",
+        drives=DAYS * DRIVES_A_DAY,
+        number_of_days=DAYS,
+        false_alarms=table(["drives", "normal", "heavy tails", "ratio of means"], false_alarms, right_from=0),
+        detected=table(["drives", "normal", "heavy tails"], detected, right_from=0),
+        days=table(["between days", "--cluster none", "default: dependence is estimated"], days, right_from=0),
+        cost=table(["drives", "figures", "processor s", "MiB at most"], [cost(drives)], right_from=0),
     )
 
 

@@ -21,13 +21,13 @@ from typing import Any
 import polars as pl
 
 from pdhef_logtool import PdhefError, __version__
-from studies.condition_drives import independent_runs
 from studies.conditions_page import write_page
 from studies.gates.tool import Tool
-from studies.pages import DOCS, RESULTS, ROOT, options, write, write_toml
+from studies.pages import DOCS, INDEPENDENT, RESULTS, ROOT, options, write, write_toml
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
 INDEPENDENT_ROW = "independent-simulator"
+INDEPENDENT_MAPPING = Path(__file__).with_name("independent_sim.toml")
 ESTIMATORS = (
     "zero", "kinematic", "open-loop", "linear-regression", "phy-ukf", "phy-ukf:tuned", "physics", "pure-lstm",
     "pd-hef-paper", "pd-hef:fixed-r", "pd-hef", "pd-hef-smoothed",
@@ -85,10 +85,10 @@ def runs_of(tool: Tool, row: str, given: argparse.Namespace) -> Iterator[Path]:
         logs, assume = row_logs(given.work, row, given.drives, given.seed, given.jobs)
         yield tool.run(f"{row}-{given.seed}-{given.drives}", *logs, *common, *row_inputs(tool, row, logs[0], assume))
         return
-    folder = given.work / INDEPENDENT_ROW
-    folder.mkdir(parents=True, exist_ok=True)
-    for _, log, friction in independent_runs(folder):
-        yield tool.run(f"{row}-{log.stem}", log, *common, "--friction", str(friction))
+    for log in sorted(INDEPENDENT.glob("*.parquet")):
+        friction = json.loads(log.with_suffix(".json").read_text(encoding="utf-8"))["mu"]
+        given_files = ("--mapping", INDEPENDENT_MAPPING, "--friction", str(friction))
+        yield tool.run(f"{row}-{log.stem}", log, *common, *given_files)
 
 
 def run(given: argparse.Namespace) -> None:

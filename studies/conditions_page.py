@@ -1,21 +1,23 @@
-"""The page of the condition table: summary and figures in ``conditions.md``, all tables in ``studies/results``."""
+"""The page of the condition table: percentiles over drives, paired bootstrap, summary and figures.
+
+Drives with NaN (without a scored sample) do not count.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from studies.pages import number, table, write
+from studies.pages import number, table, template, write
 from studies.pictures import save, subplots
-from studies.table_maths import RESAMPLES, Bound, median, median_ratio, percentiles, pooled_rmse, verdict
 
 #: The estimator of interest, and the references of its RMSE ratios.
 SUBJECT = "pd-hef"
@@ -25,38 +27,63 @@ MARGIN = 1.05
 DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
 #: Okabe and Ito (2008), without yellow.
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
-_RATIOS = f"""With the 95 % CI of a paired bootstrap over drives ({RESAMPLES} resamples). **<** the CI is below 1;
-= it is below {MARGIN}; **>** it is above {MARGIN}; ? otherwise.
-
-"""
-_MARKS = {"better": "**<**", "not worse": "=", "worse": "**>**", "open": "?", "–": ""}
-
-PAGE = """# Simulated conditions
-
-This page shows the sideslip error of all estimators on simulated drives. Each row changes one condition.
-Command: `{command}`.
-
-Car: {car}; pdhef-logtool {version}. The vehicle file is the same in all rows. Estimators get the true friction, unless
-the row changes it. The ground truth is the state of the simulator.
-
-Sideslip RMSE in degrees, median over drives. `pd-hef-smoothed` is not causal: it uses later measurements.
-Coverage: share of samples in the 95 % confidence interval.
-
-{summary}
-
-All estimators, percentiles and pooled errors: `studies/results/conditions/tables.md`. All figures by drive:
-`metrics.parquet` in the same folder.
-
-![Sideslip RMSE by row](conditions/sideslip.png)
-
-Rows by the ratio of the median RMSE of `{subject}` to a reference, with 95 % CI of a paired bootstrap
-over drives. Better: the CI is below 1; not worse: below {margin}; worse: above {margin}; open: else.
-
-{counts}
-
-![Ratio of {subject} to its references](conditions/ratios.png)
-"""
 FloatArray = NDArray[np.float64]
+
+
+#: Resamples of a bootstrap, and the level of its intervals.
+RESAMPLES, LEVEL = 2000, 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A figure with its percentile interval; ``drives`` is how many it was taken over, NaN bounds below two."""
+
+    value: float
+    low: float
+    high: float
+    drives: int
+
+
+def percentiles(values: FloatArray, levels: tuple[float, ...] = (10.0, 50.0, 90.0)) -> tuple[float, ...]:
+    """Return percentiles over drives [N] by linear interpolation."""
+    finite = values[np.isfinite(values)]
+    return tuple(np.percentile(finite, levels).tolist()) if finite.size else (float("nan"),) * len(levels)
+
+
+def median(values: FloatArray) -> float:
+    """Return the median over drives [N]; NaN without any."""
+    return percentiles(values, (50.0,))[0]
+
+
+def median_ratio(rmse: FloatArray, other: FloatArray) -> Bound:
+    """Return median(rmse) / median(other) over drives [N], paired, with its bootstrap interval.
+
+    The bootstrap draws whole drives with replacement, the same for both sides.
+    """
+    finite = np.isfinite(rmse) & np.isfinite(other)
+    a, b = rmse[finite], other[finite]
+    drives, nan = len(a), float("nan")
+    if drives == 0:
+        return Bound(nan, nan, nan, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = float(np.median(a) / np.median(b))
+        if drives < 2:
+            return Bound(value, nan, nan, drives)
+        draw = np.random.default_rng(0).integers(drives, size=(RESAMPLES, drives))
+        resampled = np.median(a[draw], axis=1) / np.median(b[draw], axis=1)
+    low, high = np.nanpercentile(resampled, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
+    return Bound(value, float(low), float(high), drives)
+
+
+def verdict(bound: Bound, *, margin: float = 1.05) -> str:
+    """Return the verdict from the interval of a ratio: better, worse (by more than the margin), not worse, or open."""
+    if not np.isfinite(bound.low):
+        return "–"
+    if bound.high < 1.0:
+        return "better"
+    if bound.low > margin:
+        return "worse"
+    return "not worse" if bound.high <= margin else "open"
 
 
 class Figures:
@@ -86,13 +113,12 @@ class Figures:
 
 
 def write_page(out: Path, folder: Path) -> None:
-    """Render the page, its two figures, and all tables (``tables.md``) from the results in a folder."""
+    """Render the page and its two figures from the results in a folder."""
     facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
     figures = Figures(pl.read_parquet(folder / "metrics.parquet"))
     names = [n for n in facts["order"] if n in figures.estimators]
     rows = [r for r in facts["rows"] if r in figures.rows]
     references = [r for r in REFERENCES if r in names] if SUBJECT in names else []
-    write(folder / "tables.md", tables(figures, rows, names, references))
     pictures = out / "conditions"
     pictures.mkdir(parents=True, exist_ok=True)
     spans = {n: np.degrees([percentiles(figures.get(r, n)[0]) for r in rows]).reshape(-1, 3) for n in names}
@@ -105,7 +131,7 @@ def write_page(out: Path, folder: Path) -> None:
     plot(pictures / "ratios.png", rows, ratios, label, limits={1.0: "-", MARGIN: ":"})
     texts = {"summary": summary(figures, facts["rows"], rows, [*drawn]), "counts": counts(rows, bounds)}
     given = {key: facts[key] for key in ("command", "car", "version")}
-    write(out / "conditions.md", PAGE.format(**given, **texts, subject=SUBJECT, margin=MARGIN))
+    write(out / "conditions.md", template(__file__, **given, **texts, subject=SUBJECT, margin=MARGIN))
 
 
 def _deg(value: float, digits: int = 3) -> str:
@@ -132,34 +158,6 @@ def counts(rows: Sequence[str], bounds: Mapping[str, Sequence[Bound]]) -> str:
         numbers = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
         body.append([reference, *numbers, ", ".join(above) or "none"])
     return table(["reference", "better", "not worse", "open", "worse", f"ratio above {MARGIN}"], body)
-
-
-def tables(figures: Figures, rows: Sequence[str], names: Sequence[str], references: Sequence[str]) -> str:
-    """Return all tables: a line for each row, a column for each estimator."""
-
-    def spread(row: str, name: str) -> str:
-        low, high = percentiles(figures.get(row, name)[0], (10.0, 90.0))
-        return f"{_deg(low)}–{_deg(high)}" if math.isfinite(low) else "–"
-
-    def ratio(row: str, reference: str) -> str:
-        bound = figures.ratio(row, reference)
-        span = f"[{number(bound.low, 2)}, {number(bound.high, 2)}] {_MARKS[verdict(bound)]}"
-        return f"{bound.value:.2f} {span}" if math.isfinite(bound.value) else "–"
-
-    sections: tuple[tuple[str, str, Sequence[str], Any], ...] = (
-        ("Sideslip RMSE in degrees: median over drives", "", names, lambda r, n: _deg(median(figures.get(r, n)[0]))),
-        ("Sideslip RMSE in degrees: 10th to 90th percentile over drives", "", names, spread),
-        ("Sideslip RMSE in degrees: pooled over all samples", "", names,
-         lambda r, n: _deg(pooled_rmse(*figures.get(r, n)))),
-        (f"`{SUBJECT}` against its references: ratio of the medians", _RATIOS, references, ratio),
-        ("Sideslip RMSE in degrees in the nonlinear range (|a_y| > 0.5 μ g): median over drives", "", names,
-         lambda r, n: _deg(median(figures.get(r, n, segment="nonlinear")[0]))),
-    )  # fmt: skip
-    texts = [
-        f"## {title}\n\n{text}{table(['row', *columns], [[r, *(cell(r, n) for n in columns)] for r in rows])}\n"
-        for title, text, columns, cell in sections
-    ]
-    return "\n".join(["# Tables of the simulated conditions\n", *texts])
 
 
 def plot(

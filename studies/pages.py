@@ -47,6 +47,11 @@ def fill(page: str, blocks: Mapping[str, str], where: str) -> str:
     return page
 
 
+def template(module: str, **texts: object) -> str:
+    """Return the Markdown file beside a module (its ``__file__``) with texts in place of ``{name}``."""
+    return Path(module).with_suffix(".md").read_text(encoding="utf-8").format(**texts)
+
+
 def write(path: Path, text: str) -> None:
     """Write a page atomically and print its path."""
     path.parent.mkdir(parents=True, exist_ok=True)

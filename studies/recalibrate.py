@@ -54,17 +54,11 @@ def load_stages(file: Path = TABLE) -> tuple[Stage, ...]:
         for pattern in patterns:
             yield from expanded(sets[pattern[1:]]) if pattern.startswith("@") else (pattern,)
 
-    return tuple(
-        Stage(
-            name,
-            entry["command"],
-            tuple(expanded(entry["inputs"])),
-            tuple(entry["outputs"]),
-            entry.get("duration", "not measured"),
-            tuple(entry.get("work", ())),
-        )
-        for name, entry in document.items()
-    )
+    stages = []
+    for name, entry in document.items():
+        given: dict[str, Any] = {k: v if isinstance(v, str) else tuple(expanded(v)) for k, v in entry.items()}
+        stages.append(Stage(name, **given))
+    return tuple(stages)
 
 
 def input_digest(root: Path, inputs: Sequence[str]) -> str:

@@ -39,6 +39,7 @@ from studies.pages import (
     number,
     options,
     table,
+    template,
     write,
     write_toml,
     write_validated_car,
@@ -397,47 +398,6 @@ def rankings(folder: Path, errors: dict[str, float]) -> tuple[int, int, int, int
     return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)
 
 
-PAGE = """# Sideslip reference against ground truth
-
-How well the [sideslip reference](estimators.md#reference) agrees with ground truth, at all stamps above 3 m/s (1 m/s
-for 1:10 cars). Command: `python -m studies.reference`.
-
-RMSE and ± (RMS of the reference's own standard deviation) in degrees; coverage of its 95 % interval;
-share of valid stamps, and their RMSE. *refused*: why no stamp is valid. GNSS
-*{made}* of recorded drives is made from their ground truth. Constants were chosen on simulated drives, and recorded
-drives seen meanwhile: development figures. The ground truth of the RAV4 is turned by about 0.8°, the Polaris's
-by 0.5 to 2.3°.
-
-## Recorded drives
-{recorded}
-
-The V40's ground truth is documented as 0.32 m behind the CG. With it at the antenna, where the smoother puts that:
-
-{antenna}
-
-## Simulated drives
-{simulated}
-
-## Faults, simulated
-{faults}
-
-## GNSS in the causal filter
-`physics` without calibration, and with the GNSS velocity, which arrives {late:.0f} ms late. In {worse} of {all} rows it
-is worse with GNSS by more than 5 % and 0.003°.
-
-{causal}
-
-## Rankings
-Pairs of {ranked} on the drives above with GNSS, ranked by the reference where it
-[claims](metrics.md) a difference, and by the RMSE against ground truth. *Other cars*: not seen before.
-
-{rankings}
-
-## Targets
-{targets}
-
-`studies/results/reference/cases.json` contains all figures.
-"""
 _HEAD = ("drive", "GNSS", "true RMS", "RMSE", "±", "coverage", "valid", "RMSE there", "refused")
 
 
@@ -478,7 +438,8 @@ def page(results: dict[str, Figures]) -> str:
         for c, f in done
         if c.target_deg is not None
     ]
-    return PAGE.format(
+    return template(
+        __file__,
         made=MADE,
         late=1e3 * LATE_S,
         worse=worse,

@@ -23,7 +23,7 @@ import numpy as np
 import polars as pl
 
 from studies.gates.tool import Tool
-from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, write, write_toml
+from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, template, write, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 
 RESULTS_FILE = RESULTS / "teaching.json"
@@ -73,31 +73,6 @@ CARS = (
     TeachCar("1:10 DART", (TeachPart("dart_circles_fast.mcap"), TeachPart("dart_steer_rate.mcap"))),
     TeachCar("1:10 F1TENTH", tuple(map(TeachPart, _F1TENTH)), taught_on=5),
 )  # fmt: skip
-
-PAGE = """# Teaching on recorded drives
-
-This page shows the errors of a car that was taught on one drive with ground truth, on another drive of the same car.
-Command: `python -m studies.teaching`.
-
-Sideslip RMSE in degrees; in brackets without the constant of each drive, which may be an offset of the ground truth.
-Each drive calibrates its car on its own sensors, not causal. *untaught* and *taught*: `physics` without and with the
-prior from the teaching drive. *pd-hef*: with the residual as well. *active*: share of the scored stamps at which the
-residual acts. *paper*: `pd-hef-paper`, the ST-ResNet of the simulated saloon in the sigma points, on the vehicle file;
-it is not taught. *95 %*: coverage of the confidence intervals of untaught `physics` and of `pd-hef`.
-*reference*: the ratio if the [sideslip reference](reference.md) teaches (below).
-
-These are development figures: the settings were chosen on these pairs.
-
-{pairs}
-
-{summary}
-
-## Taught by the reference
-With `--set reference=on`, `learn` takes the [sideslip reference](reference.md) of drives without ground truth, weighted
-by its standard deviation, where GNSS makes it independent of the other sensors. Of the pairs above only those of the
-V40 have a recorded GNSS receiver; a dash there states that a drive has less than 20 s with such a reference.
-The default is off: teaching by the reference is not validated.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +288,7 @@ def stored_results(file: Path) -> list[PairResult]:
 
 def write_page(folder: Path, results: Sequence[PairResult]) -> None:
     """Write the page of results."""
-    write(folder / "teaching.md", PAGE.format(pairs=pair_table(results), summary=summary(results)))
+    write(folder / "teaching.md", template(__file__, pairs=pair_table(results), summary=summary(results)))
 
 
 if __name__ == "__main__":

@@ -131,38 +131,9 @@ def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, frictio
         for axle, fit in fits.items()
     )
     roads = " and ".join(f"{road:g}" for _, road in ROADS.values())
-    return f"""# Nominal vehicle of the simulated sample logs, made by studies/defaults/fit_nominal_tyres.py:
-# mass and geometry of the paper's Table 3; axle tyres and roll gradient fitted to
-# ramp steers at {SPEED_KM_H:g} km/h into the plateau of the front axle, on roads of friction {roads}.
-# Peak forces follow the friction, stiffness does not (reference_friction).
-name = "{name}"
-mass_kg = {CAR.mass_kg}
-yaw_inertia_kg_m2 = {CAR.yaw_inertia_kg_m2}
-cg_to_front_axle_m = {CAR.cg_to_front_axle_m}
-cg_to_rear_axle_m = {CAR.cg_to_rear_axle_m}
-track_m = {CAR.track_m}
-cg_height_m = {CAR.cg_height_m}
-wheel_radius_m = {CAR.wheel_radius_m}
-steering_ratio = 16.0
-roll_gradient_rad_per_m_s2 = {roll_gradient_rad_per_m_s2(motion):.5f}
-friction = {friction}
-imu_position_m = [0.0, 0.0, 0.0]
-truth_position_m = [0.0, 0.0, 0.0]
-low_speed_blend_m_s = 3.0
-
-[network]
-# It states that drives have validated this file: delete it in a copy for another car.
-gain = 1.0  # the shipped network was trained on drives of this simulated car (docs/model_card.md)
-
-[sensors]
-ax_std_m_s2 = {NOISE.acceleration_m_s2}
-ay_std_m_s2 = {NOISE.acceleration_m_s2}
-yaw_rate_std_rad_s = {NOISE.yaw_rate_rad_s}
-speed_std_m_s = {NOISE.wheel_speed_m_s}
-steer_std_rad = {NOISE.steer_rad}
-
-{tyres}
-"""
+    text = Path(__file__).with_name("nominal_vehicle.txt").read_text(encoding="utf-8")
+    given = {"name": name, "friction": friction, "car": CAR, "noise": NOISE, "speed_km_h": SPEED_KM_H}
+    return text.format(**given, roads=roads, tyres=tyres, roll_gradient=roll_gradient_rad_per_m_s2(motion))
 
 
 def main(folder: Path) -> None:

@@ -11,19 +11,42 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from pdhef_logtool.car.car import FIT_FILE, SHIPPED_CARS, Car
 from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.toml_files import part_toml
+from pdhef_logtool.drive import reading
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Tell
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from studies.condition_drives import read_drive
 from studies.defaults.axle_forces import FitDrive
 from studies.defaults.physics_fit import find_physics
 from studies.pages import options
 
 SEED, DRIVES = 5000, 24
 HEAD = "Written by python -m studies.defaults.fit_physics; [filter] by studies.defaults.train_default."
+
+
+_FRICTION = SignalSource("friction", "/truth/perfect/state", "friction")
+
+
+def read_drive(path: Path, car: Car) -> reading.WholeDrive:
+    """Read a simulated log with its true friction.
+
+    The exact ground truth has the clock of the sensors, so that no latency is estimated: a stuck gyro would bend it.
+    """
+
+    def with_true_friction(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
+        return replace(mapping, signals={**mapping.signals, "friction": _FRICTION})
+
+    with reading.read_drive(path, car, options=ReadOptions(friction=None), adjust=with_true_friction) as drive:
+        drive.plan = replace(drive.plan, latency=None)
+        return drive.whole()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -18,18 +18,19 @@ from functools import partial
 import numpy as np
 
 from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
 from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.drives import DriveRecord, DriveSet
+from pdhef_logtool.learning.drives import DriveRecord, DriveSet, no_true_sideslip, record_of
 from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
-from studies.defaults.drives import SEED, load_drive, scorable_stamps
 
+#: Seed of the random draws on validation drives.
+SEED = 0
 #: Filters with a searched noise; the noise of ``physics`` is identified together with its values.
 TUNED = ("phy-ukf:tuned",)
 #: Added to each drive's RMSE as squares.
@@ -69,11 +70,7 @@ def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
         No drive can be scored.
     """
     options, slow = task.settings.config.read_options, task.car.vehicle.low_speed_blend_m_s
-
-    def read(log: LogInput) -> tuple[DriveRecord, WholeDrive | None]:
-        return load_drive(log, task, needs=FEATURES, least_scored=MIN_SCORED_STAMPS)
-
-    _, drives = task.read(read)
+    _, drives = task.read(partial(load_drive, task))
     if not drives:
         raise SystemExit("noise: at least one drive with a true sideslip and the signals of the filters is needed")
 
@@ -107,6 +104,27 @@ def filter_noise(values: Point) -> FilterNoise:
     return FilterNoise(
         q_std=(PHY_UKF_Q_STD[0], q_vy, q_yaw_rate), r_std={"ay_m_s2": r_ay, "yaw_rate_rad_s": r_yaw_rate}
     )
+
+
+def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
+    """Return a mask [N]: sideslip of the ground truth available, speed above the low-speed limit."""
+    finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
+    return finite
+
+
+def load_drive(task: DriveSet, log: LogInput) -> tuple[DriveRecord, WholeDrive | None]:
+    """Read a drive with a true sideslip into memory; None with the reason in the record if it cannot be used."""
+    with read_drive(log, task.car, task.mapping, task.settings.config.read_options) as drive:
+        missing = ", ".join(sorted(FEATURES - drive.available))
+        if left_out := no_true_sideslip(drive.plan) or (f"the log has no {missing}" if missing else ""):
+            return record_of(drive, left_out=left_out), None
+        whole = drive.whole()
+        slow = task.car.vehicle.low_speed_blend_m_s
+        assert whole.truth is not None
+        scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))
+        if scored < MIN_SCORED_STAMPS:
+            return record_of(drive, left_out=f"{scored} stamps with a true sideslip above {slow:g} m/s"), None
+        return record_of(drive, whole=whole), whole
 
 
 def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> float:

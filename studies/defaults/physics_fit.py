@@ -44,7 +44,6 @@ from studies.defaults.axle_forces import (
     usable_seconds,
     usable_stamps,
 )
-from studies.defaults.prior import Prior
 
 #: Correlation time of the errors, s; settling time of the filter, excluded from the error, s.
 CORRELATION_S, SETTLE_S = 1.0, 2.0
@@ -62,6 +61,27 @@ NOISE_LOG_STD = 1.2
 Theta = dict[str, float]
 #: Start values of θ. The noise cost has two valleys: clean sensors, and a filter with a low gain on a_y.
 STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Prior of one parameter, normal in its own or, if ``log``, in logarithmic scale; ``low`` bounds the value."""
+
+    name: str
+    unit: str
+    mean: float
+    std: float
+    log: bool = False
+    low: float | None = None
+    tuning: bool = False  # belongs to the filter, not to the car: never put back to its prior
+
+    def value(self, theta: float) -> float:
+        """Return the parameter at a normalised distance from the prior."""
+        return self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
+
+    def theta(self, value: float) -> float:
+        """Return the normalised distance of a value."""
+        return math.log(value / self.mean) / self.std if self.log else (value - self.mean) / self.std
 
 
 def make_priors(

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from studies.calibration import errors_over_sd, true_values, wrong_file
+from studies.calibration import DRIVEN, errors_over_sd, true_values, wrong_file
 from studies.conditions import row_inputs, row_logs
 from studies.gates.tool import (
     Tool,
@@ -198,14 +198,7 @@ def reference_rows() -> Iterator[GateRow]:
 
 # ------------------------------------------------------------------------------------------------ ±
 
-_PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
-PLUS_MINUS_DRIVES = (
-    ("sine-sweep-wide", 90.0, 0.85, None),
-    ("road", 100.0, 0.85, 120.0),
-    ("dlc", 80.0, 0.85, None),
-    ("sine-with-dwell", 80.0, 0.85, None),
-    ("road", 60.0, 0.85, 60.0),
-)
+PLUS_MINUS_DRIVES = tuple((name, km_h, 0.85, duration_s) for name, km_h, duration_s in DRIVEN)
 
 
 def plus_minus(seeds: range, tool: Tool) -> Figures:

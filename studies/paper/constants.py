@@ -29,10 +29,9 @@ from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.service import NetworkService
-from studies.condition_drives import as_logged
 from studies.defaults.paper_drives import plan_drives
 from studies.pages import RESULTS, options, write
-from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, on_the_road
+from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, as_logged, on_the_road
 from truthsim.drive import Drive, simulate_drive
 
 FILE = RESULTS / "paper" / "constants.json"

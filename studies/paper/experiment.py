@@ -8,11 +8,14 @@ the drive. Noise seeds change the sensors alone.
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.presets import Options
@@ -22,9 +25,8 @@ from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import estimate_drive
-from studies.condition_drives import as_logged
 from studies.paper.schemes import ESP, SCHEMES
-from truthsim.drive import simulate_drive
+from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import MANOEUVRES
 
@@ -134,6 +136,15 @@ FIGURES: dict[str, tuple[str, str, str, float]] = {
 def on_the_road(car: Car, friction: float) -> Car:
     """Return a car with the friction of a drive."""
     return car.with_vehicle(car.vehicle.model_copy(update={"friction": friction}))
+
+
+def as_logged(drive: Drive, car: Car) -> WholeDrive:
+    """Return a simulated drive without friction, written as MCAP, mapped by recognition and read."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.mcap"
+        write_drive(drive, path)
+        with read_drive(path, car, options=ReadOptions(friction=None)) as read:
+            return read.whole()
 
 
 def read_simulated(scenario: Scenario, noise_seed: int, car: Car) -> ReadDrive:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from studies.pages import table
+from studies.pages import table, template
 from studies.paper import published
 from studies.paper.schemes import HYBRID, PAPER, SCHEMES
 from truthsim.sensors import SensorNoise
@@ -213,7 +213,8 @@ def _not_reproduced(d: Document) -> str:
 def write_page(d: Document, constants: Document) -> str:
     """Return the page: the gain, the scenarios, the sideslip errors, the constants, and the figures."""
     seeds = sorted({run["noise_seed"] for run in d["runs"]})
-    return PAGE.format(
+    return template(
+        __file__,
         summary=_summary(d),
         run=_scenarios(d),
         seeds=f"{len(seeds)} noise seeds ({seeds[0]} to {seeds[-1]})",
@@ -226,63 +227,3 @@ def write_page(d: Document, constants: Document) -> str:
         edges=_at_edges(constants),
         differences=_not_reproduced(d),
     )
-
-
-PAGE = """# The paper's experiment
-
-{summary}
-
-This page shows the experiment of the paper, repeated with our estimators on our simulator. Commands: `make paper`, and
-`python -m studies.paper.constants` for the constants.
-
-Paper: Zhou et al., *Physics-Driven Hybrid Framework for Vehicle State Estimation Using Residual Learning and Adaptive
-UKF*, Appl. Sci. 2026, 16(9), 4230. The paper uses CarSim and MATLAB, this page uses `truthsim`
-([simulated car](truthsim.md)). Therefore the order of the schemes is comparable, the level of the errors is not.
-
-{run}
-
-Sideslip RMSE in degrees: median (smallest … largest) over {seeds}, which are in no training or tuning set; after the
-dot, relative to the RMS of the true sideslip. All schemes get the true friction. `esp` is the paper's sensor set,
-without wheel speed.
-
-{errors}
-
-![Sideslip, double lane change](paper/figure12_sideslip_a.png)
-
-![Sideslip, sine sweep](paper/figure16_sideslip_b.png)
-
-Reduction of the sideslip RMSE, pooled over seeds, with the 95 % CI of a bootstrap over noise seeds:
-
-{gains}
-
-![RMSE](paper/figure22_rmse.png)
-
-## The paper's filter
-
-`pd-hef-paper` implements Eq 19 to 26 ([method](method.md#paper-adaptation)). Its network is trained by Table 1 (200
-epochs, batch 64, learning rate 0.001, dropout 0.2) on 250,000 samples of double lane change, sine sweep, fishhook and
-step steer, as in the paper's section 3.1.3. An epoch is one batch of windows of 6.4 s. No other estimator is trained on
-a fishhook.
-
-The paper gives no values for five constants. They are the result of one rule: a cyclic search for the lowest geometric
-mean of the sideslip RMSE over {drives} training drives of its network, each with and without wheel speed. The table
-shows the sideslip RMSE in degrees after each update, with one constant changed at a time: the geometric mean over the
-training drives, and over noise seeds {noise} of A and B, which have no part in the choice. Chosen values are
-bold; {edges} of 5 are at an edge of the grid. θ = 1 keeps C at its start, so that R is nearly constant.
-
-{sensitivity}
-
-![Convergence](paper/figure09_convergence.png)
-
-![Step time](paper/figure23_step_time.png)
-
-## What is not reproduced
-
-{differences}
-
-## Published values
-
-{published}
-
-The folder `studies/results/paper` contains Figures 9 to 23 with our data, and all numbers in `results.json`.
-"""

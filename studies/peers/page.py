@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
-from studies.pages import number, table
+from studies.pages import number, table, template
 from studies.peers.drives import FULL_SIZE, OFFSET, SMALL
 from studies.peers.scoring import (
     BEST_PEERS,
@@ -35,7 +34,6 @@ ESTIMATORS = {
 }
 #: Share of missing estimates from which a figure is marked.
 MARKED = 0.05
-PAGE = Path(__file__).with_suffix(".md")
 
 
 def page(errors: Sequence[DriveErrors], parameters: str) -> str:
@@ -43,7 +41,8 @@ def page(errors: Sequence[DriveErrors], parameters: str) -> str:
     groups = {group: [e for e in errors if e.drive.group == group] for group in (FULL_SIZE, SMALL, OFFSET)}
     full_size = groups[FULL_SIZE]
     offsets = ", ".join(f"{_name(e)} {number(e.offset_deg, 2)}°" for e in groups[OFFSET])
-    return PAGE.read_text(encoding="utf-8").format(
+    return template(
+        __file__,
         verdict=_verdict(full_size),
         logs=len(full_size),
         means=means_table(full_size),

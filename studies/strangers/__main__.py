@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain
@@ -26,25 +27,7 @@ from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import Score, look, score_log
 
 #: First results of held-out layouts, present and former.
-FIRST_RUNS = {
-    "held_out": "held-out layouts were built last",
-    "recorders": "layouts of recorders (first contact: tables and messages) were built last, too",
-    "contact": "layouts of recorders were built after that, and scored once",
-    "unseen": "layouts of documented tables and ROS messages were built last, and scored once",
-    "trackside": "layouts of track modes, cameras, simulators and receivers were built last, and scored once",
-    "vendors": "layouts of race loggers, INS, phones, data frames and ROS tables were built last, and scored once",
-    "later": "layouts of loggers, buses and exports in five languages were built after the causes were corrected, and "
-    "scored once",
-    "fresh": "layouts of 16 tables and buses and 10 ROS logs were built after that, and scored once",
-    "repositories": "layouts of files and messages in public repositories were held out before",
-    "phones": "layouts of phones, games, makers and plotting tools were held out before",
-    "stacks": "layouts of public stacks and loggers were held out before",
-    "exports": "layouts of exports and buses were held out before",
-    "fleets": "layouts of fleets and proving grounds (tables, buses, messages) were held out before",
-    "tables": "layouts of table formats were held out before",
-    "sensors": "layouts of sensors and controllers were held out before",
-    "vehicles": "layouts of vehicles, simulators and data sets were held out earlier",
-}
+FIRST_RUNS: dict[str, str] = tomllib.loads(Path(__file__).with_name("first_runs.toml").read_text(encoding="utf-8"))
 
 
 def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:

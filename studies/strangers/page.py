@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from studies.pages import table
+from studies.pages import table, template
 
 #: Outcomes of an item, the worst first.
 OUTCOMES = ("wrong, not reported", "wrong, reported", "missing", "right")
@@ -20,20 +20,6 @@ GROUPS = {
 }
 #: Groups with sound and excited logs: checks may neither fail nor stay undecided.
 SOUND = ("layout", "held-out", "recorders", "contact")
-
-_INTRO = """# Third-party logs
-
-This page shows how many signals the tool recognises without a mapping in logs with unknown layouts: <!-- counts -->.
-Command: `make strangers`; `python -m studies.strangers --only NAME` shows one log.
-
-**Scoring.** The expected values of each log are series in SI units and ISO 8855 axes. A mapped channel is right if its
-values agree (means of 0.25 s, within 4 % or the floor of the unit; accelerations up to a bias of 0.3 m/s²); field names
-do not count. Items: steering, a_x, a_y, yaw rate, speed, wheel speeds, and velocity and yaw rate of the ground truth;
-for layouts of recorders also position, course and heading. *Reported* means that a failed or undecided check, or a
-remark, names the wrong channel. Logs of one kind count as one, with the worst result of each item: the 24 mountings in
-steps of 90 degrees are one log. A cause counts as named if a message contains a word of it. Layouts have the fields,
-units and axes of their published definitions, without device status. The motion comes from truthsim: drives of three
-cars with noise, bias and delay of its usual sensors. """
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +93,7 @@ def page(results: Sequence[Result], remark: str) -> str:
     others = [r for r in results if r.group == "recording"]
     counts = f"{len(generated)} generated logs and {len(others)} third-party recordings"
     parts = [
-        _INTRO.replace("<!-- counts -->", counts),
+        template(__file__, counts=counts),
         "## Score\n",
         _score(results),
         _remarks(results),

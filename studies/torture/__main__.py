@@ -1,8 +1,9 @@
 """Fuzz and fault-injection tests, counted: ``docs/reliability.md``.
 
-    python -m studies.torture [--work out/torture] [--seed 1] [--logs 200000] [--kills 200]
-                              [--count 500] [--format blf ...] [--hours 10] [--jobs 2] [--only mutations ...]
-                              [--out docs/reliability.md]
+    python -m studies.torture [PART ...] [--work out/torture] [--seed 1] [--logs 200000] [--drives 24] [--kills 20]
+                              [--count 500] [--format blf ...] [--hours 10] [--jobs 2] [--out docs/reliability.md]
+
+Parts: bombs, shared, mutations, formats, crashes, hours; all without one.
 
 Resumable: results in the work folder are not computed again; remove it after a change of the code. Exit code 1:
 something ended as it should not.
@@ -15,7 +16,7 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,15 +24,15 @@ from typing import Any
 from pdhef_logtool.workers.supervisor import Limits
 from studies.pages import DOCS, ROOT, fill, options, table, write
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
+from studies.torture.crashes import crash_cases
 from studies.torture.formats import HANG_S, format_judge
 from studies.torture.hours import write_hours
-from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
 from studies.torture.logs import log_judge
 from studies.torture.outside import measured
 from studies.torture.table_seeds import FORMATS
-from studies.torture.workers import NO_VERDICT, Verdict, run_cases
+from studies.torture.workers import NO_VERDICT, Verdict, judge, run_cases
 
-_THREE = ("--estimators", "zero,kinematic,phy-ukf")
+_THREE = ("run", "--car", "saloon", "--annotate", "none", "--estimators", "zero,kinematic,phy-ukf")
 
 
 def mutations(work: Path, seed: int, jobs: int, logs: int) -> dict[str, Any]:
@@ -82,55 +83,14 @@ def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdi
     return collected
 
 
-def kills(work: Path, seed: int, count: int) -> dict[str, Any]:
-    """Kill runs into one folder; the next run must give the output of an undisturbed run, without leftovers."""
-    logs = [str(ROOT / "sample_logs" / name) for name in ("step.mcap", "dlc.mcap")]
-    call = [*logs, "--car", "saloon"]
-    calm, output = work / "calm", work / "killed"
-    begin = time.monotonic()
-    measured("run", *call, "-o", str(calm), limit_s=300.0)
-    lasts_s = time.monotonic() - begin
-    ends: Counter[str] = Counter()
-    wrong: list[str] = []
-    for killed in kill_many(call, output, count=count, lasts_s=lasts_s, writes_s=lasts_s / 3, seed=seed):
-        ends["done before" if killed.exit_code is None else f"signal {killed.number}: {killed.exit_code}"] += 1
-        wrong += faults(output)
-        if sum(ends.values()) % 20 == 0:
-            _say(f"kills: {sum(ends.values())} of {count}")
-    left = leftovers(output)
-    kill_run(call, output, after_s=300.0)
-    same, other = contents(calm), contents(output)
-    wrong += [
-        f"{p} differs from the undisturbed run's"
-        for p in sorted(same.keys() | other.keys())
-        if same.get(p) != other.get(p)
-    ]
-    wrong += [f"{p} was not swept" for p in leftovers(output)]
-    shutil.rmtree(calm)
-    shutil.rmtree(output)
-    return {"count": count, "seed": seed, "ends": dict(sorted(ends.items())), "left": len(left), "problems": wrong}
-
-
-def hours(work: Path, most: float) -> list[dict[str, Any]]:
-    """Measure the memory of ``inspect`` and of ``run`` with three estimators over an hour and over many."""
-    collected = []
-    for length in (1.0, most):
-        log = work / "hours.mcap"
-        write_hours(log, length)
-        for call in (("inspect", str(log)), ("run", str(log), "-o", str(work / "out"), "--annotate", "none", *_THREE)):
-            process = measured(*call, *(["--car", "saloon"] if call[0] == "run" else []), limit_s=3600.0)
-            entry = {
-                "command": call[0],
-                "hours": length,
-                "code": process.code,
-                "s": process.wall_s,
-                "bytes": process.peak_bytes,
-            }
-            collected.append(entry)
-            _say(f"hours: {entry}")
-        shutil.rmtree(work / "out", ignore_errors=True)
-        log.unlink()
-    return collected
+def long_log(hours: float, words: Sequence[str], folder: Path) -> Verdict:
+    """Measure the memory of a command over many hours."""
+    log, output = folder / "hours.mcap", ("-o", str(folder / "out")) if "run" in words else ()
+    write_hours(log, hours)
+    process = measured(words[0], str(log), *words[1:], *output, limit_s=3600.0)
+    return Verdict(
+        f"exit {process.code}", judge(process, (0, 3)).problem, {"s": process.wall_s, "bytes": process.peak_bytes}
+    )
 
 
 def _say(text: str) -> None:
@@ -142,29 +102,26 @@ def _say(text: str) -> None:
 
 def blocks(results: dict[str, Any]) -> dict[str, str]:
     """Return the tables of the page by name."""
-    lists = [name for name in ("bombs", "shared") if results.get(name)]
+    lists = [name for name in ("bombs", "crashes", "hours", "shared") if results.get(name)]
     texts: dict[str, str] = {name: _list(results[name]) for name in lists}
     texts |= {name: _mutations(results[name]) for name in ("mutations", "formats") if results.get(name)}
-    if done := results.get("kills"):
-        rows = [[end, str(n)] for end, n in done["ends"].items()]
-        wrong = "; ".join(sorted(set(done["problems"]))) or "none"
-        text = f"{done['count']} kills, seed {done['seed']}. Hidden paths left by the last: {done['left']}."
-        texts["kills"] = f"{text} Faults found: {wrong}.\n\n{table(['ended', 'times'], rows, right_from=1)}"
-    if done := results.get("hours"):
-        rows = [[f"`{r['command']}`", f"{r['hours']:g}", str(r["code"]), *_costs(r)] for r in done]
-        texts["hours"] = table(["command", "hours", "exit code", "s", "MiB"], rows, right_from=1)
     return texts
 
 
 def _list(rows: list[dict[str, Any]]) -> str:
-    head = ["case", "ended", *[name for key, name in (("s", "s"), ("bytes", "MiB")) if key in rows[0]]]
+    costs = [key for key in _COSTS if key in rows[0]]
     wrong = [f", **wrong**: {_cell(r['problem'])}" if r["problem"] else "" for r in rows]
-    body = [[r["name"], r["end"] + w, *_costs(r)] for r, w in zip(rows, wrong, strict=True)]
-    return table(head, body, right_from=2)
+    shown = [[_COSTS[key][1](r[key]) if key in r else "–" for key in costs] for r in rows]
+    body = [[r["name"], r["end"] + w, *cells] for r, w, cells in zip(rows, wrong, shown, strict=True)]
+    return table(["case", "ended", *(_COSTS[key][0] for key in costs)], body, right_from=2)
 
 
-def _costs(row: dict[str, Any]) -> list[str]:
-    return [*([f"{row['s']:.1f}"] if "s" in row else []), *([f"{row['bytes'] >> 20}"] if "bytes" in row else [])]
+#: Heading and format of the costs of a case.
+_COSTS: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "s": ("s", "{:.1f}".format),
+    "bytes": ("MiB", lambda value: str(value >> 20)),
+    **{how: (how, "{:.0f}".format) for how in ("lost", "stale", "unequal")},
+}
 
 
 def _cell(text: str) -> str:
@@ -196,14 +153,17 @@ def main() -> int:
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "torture")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--logs", type=int, default=200_000)
-    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--drives", type=int, default=24, help="simulated drives of the crashes")
+    parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--hours", type=float, default=10.0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--count", type=int, default=500, help="mutants of each table and CAN format")
     parser.add_argument("--format", action="append", choices=FORMATS, help="a table or CAN format; may be given again")
-    parser.add_argument("--only", action="append", help="a part; may be given again")
+    parser.add_argument("parts", nargs="*", help="parts; all without one")
+    parser.add_argument("--only", action="append", default=[], help="a part, as `make gates` asks for it")
     parser.add_argument("--out", type=Path, default=DOCS / "reliability.md")
     given = parser.parse_args()
+    parts = [*given.parts, *given.only]
     work: Path = given.work
     work.mkdir(parents=True, exist_ok=True)
     todo: dict[str, Callable[[], Any]] = {
@@ -211,16 +171,20 @@ def main() -> int:
         "shared": lambda: one_by_one("shared", work, {bomb.name: partial(judge_bomb, bomb) for bomb in former_cases()}),
         "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs),
         "formats": lambda: formats(work, given.seed, given.jobs, given.count, given.format or FORMATS),
-        "kills": lambda: kills(work, given.seed, given.kills),
-        "hours": lambda: hours(work, given.hours),
+        "crashes": lambda: one_by_one("crashes", work, crash_cases(work, given.drives, given.kills, given.seed)),
+        "hours": lambda: one_by_one(
+            "hours",
+            work,
+            {f"`{w[0]}`, {h:g} h": partial(long_log, h, w) for h in (1.0, given.hours) for w in (("inspect",), _THREE)},
+        ),
     }
-    if unknown := set(given.only or ()) - set(todo):
-        parser.error(f"--only: expected parts out of {', '.join(todo)}, got {', '.join(sorted(unknown))}")
+    if unknown := set(parts) - set(todo):
+        parser.error(f"expected parts out of {', '.join(todo)}, got {', '.join(sorted(unknown))}")
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
         again = name == "formats" and given.format
-        if (again or not kept.is_file()) and (given.only is None or name in given.only):
+        if (again or not kept.is_file()) and (not parts or name in parts):
             done = do()
             if again and kept.is_file():
                 done = json.loads(kept.read_text()) | done
@@ -228,8 +192,8 @@ def main() -> int:
         if kept.is_file():
             results[name] = json.loads(kept.read_text())
     if given.out.is_file():
-        counts = f"--logs {given.logs} --count {given.count} --kills {given.kills}"
-        counts += f" --hours {given.hours:g}"
+        counts = f"--logs {given.logs} --count {given.count}"
+        counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"
         asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
         write(given.out, fill(given.out.read_text(), blocks(results) | asked, str(given.out)))
     return int(any(_wrong(r) for r in results.values()))
@@ -238,7 +202,7 @@ def main() -> int:
 def _wrong(result: Any) -> bool:
     """Return whether anything in a part's results ended as it should not."""
     if isinstance(result, list):
-        return any(r.get("problem") or r.get("code", 0) not in (0, 3) for r in result)
+        return any(r["problem"] for r in result)
     return bool(result.get("problems")) or any(isinstance(r, dict) and r.get("problems") for r in result.values())
 
 

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,8 @@ import pyarrow.parquet as pq
 TIMED = (".rrd",)
 #: Bytes near the end of a complete file.
 ENDS = {".mcap": b"\x89MCAP0\r\n", ".rrd": b"RRF2FOOT"}
+#: Files of a drive at the least.
+WHOLE = ("estimates.parquet", "metrics.parquet", "recording.rrd", "report.json")
 #: Longest wait for the end of a command after a signal.
 LONGEST_END_S = 120.0
 
@@ -106,8 +108,8 @@ def kill_many(
         yield kill_run(arguments, output, after_s=after_s, number=draw.choice(signals), writing=writing)
 
 
-def faults(output: Path) -> list[str]:
-    """Return the problems of incomplete files under final names; empty after any kill."""
+def faults(output: Path, files: Collection[str] = WHOLE) -> list[str]:
+    """Return the problems of incomplete files under final names, and of drives without all ``files``."""
     problems = []
     for path in sorted(p for p in output.rglob("*") if p.is_file() and not hidden(p, output)):
         try:
@@ -121,7 +123,7 @@ def faults(output: Path) -> list[str]:
             problems.append(f"{path.name}: {error}")
     for folder in (output / "logs").glob("[!.]*"):
         names = {p.name for p in folder.iterdir()}
-        if not {"estimates.parquet", "metrics.parquet", "recording.rrd", "report.json"} <= names:
+        if not names.issuperset(files):
             problems.append(f"{folder.name}: only {', '.join(sorted(names))}")
     run = output / "run.json"
     if run.is_file():

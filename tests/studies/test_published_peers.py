@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
 from pdhef_logtool.records.tracks import make_track
 from studies.pages import DOCS, RESULTS
 from studies.peers import __main__ as peers
+from studies.peers import benchmark
 from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, PeerDrive, beside_mapping, beside_vehicle
 from studies.peers.page import page
 from studies.peers.parameters import pairs_table
@@ -72,3 +74,53 @@ def test_the_page_shows_the_stored_errors_of_every_drive():
     text = page([DriveErrors.of(d) for d in documents], pairs_table(parameters))
     assert (DOCS / "peers.md").read_text(encoding="utf-8") == text
     assert sum(drive.group == FULL_SIZE for drive in PEER_DRIVES) == 9
+
+
+def made_table(file: Path) -> Path:
+    """Write two runs in the layout of the tables of arXiv:2408.15610: times without a name, a column of runs."""
+    t = np.arange(1200) * 0.01
+    delta = 0.15 * np.sin(2.0 * t)
+    columns = {
+        "": np.concatenate([28.13 + t, 3.0 + t]),
+        "delta": np.tile(delta, 2),
+        "run_id": np.repeat([4, 7], len(t)),
+    }
+    columns |= {
+        "v_x": np.full(2 * len(t), 2.0),
+        "v_y": np.tile(0.1 * delta, 2),
+        "omega_wheels": np.full(2 * len(t), 2.05),
+    }
+    columns |= {name: np.tile(2.0 * delta / 0.33, 2) for name in ("r", "r_imu")}
+    columns |= {"ax_imu": np.zeros(2 * len(t)), "ay_imu": 2.0 * columns["r"], "Iq": np.zeros(2 * len(t))}
+    pl.DataFrame(columns | {"friction": np.full(2 * len(t), 0.6)}).write_csv(file)
+    return file
+
+
+def test_a_published_table_is_a_log_for_each_run(tmp_path: Path):
+    entries = list(benchmark.published(made_table(tmp_path / "hoons_all_test.csv"), tmp_path))
+    assert [e.log.name for e in entries] == ["hoons_all_test_4.csv", "hoons_all_test_7.csv"]
+    rows = {row["estimator"]: row for row in benchmark.scores(entries[1])}
+    assert {"zero", "kinematic", "linear-kf"} <= rows.keys()
+    sideslip = np.arctan2(0.015 * np.sin(2.0 * np.arange(1200) * 0.01), 2.0)
+    assert rows["zero"]["rmse_deg"] == pytest.approx(np.degrees(np.sqrt(np.mean(sideslip**2))), rel=0.01)
+    assert rows["zero"]["scored_s"] == pytest.approx(11.99, abs=0.05)
+
+
+def test_the_benchmark_weighs_drives_by_time_and_compares_with_zero_on_the_same_drives():
+    def row(log: str, estimator: str, rmse: float, seconds: float):
+        figures = {"available": 1.0, "coverage95": np.nan, "winkler_deg": np.nan, "seconds_per_hour": 2.0}
+        names = {"group": "g", "log": log, "drive": log, "car": "c", "estimator": estimator}
+        return names | {"scored_s": seconds, "rmse_deg": rmse} | figures
+
+    rows = [row("a", "zero", 4.0, 30.0), row("b", "zero", 2.0, 10.0), row("b", "half", 1.0, 10.0)]
+    head, _, half, zero = benchmark.table_of(pl.DataFrame(rows)).splitlines()
+    assert head.startswith("| estimator | drives | RMSE |")
+    assert half == "| `half` | 1 | 1.00 | – to – | 0.50 | 100% | – | – | 2.0 |"
+    assert [cell.strip() for cell in zero.split("|")[2:4]] == ["2", f"{np.sqrt((30 * 16 + 10 * 4) / 40):.2f}"]
+
+
+def test_the_benchmark_shows_the_stored_scores():
+    stored = pl.DataFrame(json.loads((RESULTS / "peers" / "benchmark.json").read_text(encoding="utf-8")))
+    page_text = (DOCS / "benchmark.md").read_text(encoding="utf-8")
+    for (group,), rows in stored.group_by("group", maintain_order=True):
+        assert f"## {group}\n\n{benchmark.table_of(rows)}\n" in page_text

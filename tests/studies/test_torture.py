@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.torture import outside
+from studies.torture import crashes, outside
 from studies.torture.bombs import BOMBS, Bomb, judge_bomb
 from studies.torture.formats import format_judge
 from studies.torture.logs import log_judge
@@ -94,6 +94,30 @@ def test_what_outlives_a_command_or_its_limit_is_ended(
     monkeypatch.setattr(outside, "END_S", 0.5 if left else 60.0)
     process = outside.measured(limit_s=1.0 if late else 600.0)
     assert (process.late, process.left, process.code) == (late, left, -signal.SIGKILL if late else 3)
+
+
+def test_what_a_crash_changed_is_lost_stale_or_unequal(tmp_path: Path) -> None:
+    for folder, files in {"calm": {"a": "1", "b": "2", "c": "3"}, "out": {"b": "4", "c": "3", "d": "5"}}.items():
+        (tmp_path / folder).mkdir()
+        for name, text in files.items():
+            (tmp_path / folder / name).write_text(text)
+    found = crashes.compared(tmp_path / "calm", tmp_path / "out", [-9, -9, 0], ["", "late"])
+    assert (found.end, found.problem) == ("-9 (2 x), 0", "late; lost: a; stale: d; unequal: b")
+    assert found.costs == {"lost": 1, "stale": 1, "unequal": 1}
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_extract_at_once(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(crashes, "PLACES", 1)
+    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
+    verdict = crashes.full_disk(
+        ("extract", *logs, "--car", "saloon", "--split", "train", "-o", "{}/data"), None, tmp_path
+    )
+    if verdict.end.startswith("skipped"):
+        pytest.skip(verdict.end)
+    assert (verdict.end, verdict.problem) == ("0, 1", "")
 
 
 @pytest.mark.parametrize(

@@ -261,14 +261,7 @@ def _write(
     left_out = [r.record for r in results if r.record.left_out]
     failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
     copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
-    return write_manifest(
-        output,
-        entries,
-        failed,
-        settings=settings.to_dict(),
-        vehicles=vehicles,
-        duplicates=copies,
-    )
+    return write_manifest(output, entries, failed, settings=settings.to_dict(), vehicles=vehicles, duplicates=copies)
 
 
 def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
@@ -373,6 +366,8 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
     )
     with closing(ends):
         for ended in ends:
+            if isinstance(ended.result, OutputError):
+                raise ended.result
             result = ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
             results[ended.number] = result
             tell_drive(result.record, reporter.warn)
@@ -380,11 +375,12 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
     return tuple(results[number] for number in range(len(work)))
 
 
-def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
+def _extract_guarded(job: _Job, progress: Progress) -> DriveResult | OutputError:
+    """Extract a drive; a full disk, which all drives would meet, is returned and ends the command."""
     try:
         return _extract(job, partial(progress, job.log_input.stem))
     except PdhefError as error:
-        return _failure(job, str(error))
+        return error if isinstance(error, OutputError) and error.ends_run else _failure(job, str(error))
     except MemoryError:
         raise  # another process may have caused it: repeated alone
     except Exception as error:  # noqa: BLE001 (no error in one log may stop the others)

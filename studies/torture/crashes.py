@@ -1,0 +1,280 @@
+"""Crashes in the middle of a fleet: kills, full disks, changed logs and clocks, damaged outputs, two runs at once.
+
+Each case plants a fault, repeats the command as a user would, and compares every file with an undisturbed output.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from itertools import groupby
+from pathlib import Path
+from typing import TypeAlias
+
+from studies.pages import ROOT
+from studies.torture.killing import contents, faults, kill_many
+from studies.torture.outside import Process, measured, start
+from studies.torture.workers import Verdict, judge
+from truthsim.suite import write_suite
+
+#: A change of a file.
+Deed: TypeAlias = Callable[[Path], object]
+#: Length of a drive; `learn` needs drives of 20 s.
+DRIVE_S, TAUGHT_S = 4.0, 21.0
+#: Full disks of each command, and logs of the cases that run more than one fleet.
+PLACES, FEW = 10, 4
+_RUN = ("--car", "saloon", "--estimators", "zero,phy-ukf", "--keep", "estimates")
+_CAR = ("--car", "saloon", "--split")
+_LIMIT_S = 900.0
+_JOURNAL = "journal.jsonl"
+_DAY_S = 86_400
+#: Put before the modules of a command, the clock of Python is a day ahead.
+_AHEAD = f"""import time
+now, now_ns = time.time, time.time_ns
+time.time, time.time_ns = lambda: now() + {_DAY_S}, lambda: now_ns() + {_DAY_S} * 10**9
+"""
+#: Files that are damaged together: one of each kind, of different drives.
+_OF_DRIVES = (
+    *(f"logs/*/{name}" for name in ("report.json", "metrics.parquet", "estimates.parquet", "model.toml")),
+    "tables/parts/*",
+)
+_OF_RUN = ("run.json", "report.json", "report.html", "metrics.parquet", "tables/[!p]*.parquet")
+#: Tests of a fleet on Ray: file and part of the name.
+_RAY = {
+    "a Ray node is lost": ("tests/runs/test_fleet_on_ray.py", "one_of_which_goes"),
+    "a Ray cluster is lost": ("tests/workers/test_ray_supervisor.py", "is_lost"),
+}
+
+
+def _run(logs: Path | str, output: Path, *more: str) -> Process:
+    return measured("run", str(logs), *_RUN, "-o", str(output), *more, limit_s=_LIMIT_S)
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """A folder of logs, and the output of an undisturbed run of them; ``code`` and ``lasts_s`` are of that run."""
+
+    logs: Path
+    calm: Path
+    code: int
+    lasts_s: float
+
+    @classmethod
+    def of(cls, logs: Path, calm: Path) -> Fleet:
+        """Run the logs undisturbed."""
+        shutil.rmtree(calm, ignore_errors=True)
+        ended = _run(logs, calm)
+        return cls(logs, calm, ended.code, ended.wall_s)
+
+    def finish(self, output: Path, codes: Iterable[int], wrong: Iterable[str] = ()) -> Verdict:
+        """Finish a run with ``--resume`` and compare it."""
+        ended = _run(self.logs, output, "--resume")
+        return compared(self.calm, output, [*codes, ended.code], [*wrong, judge(ended, (self.code,)).problem])
+
+    @contextmanager
+    def begun(
+        self, output: Path, drives: int = 1, env: Mapping[str, str] | None = None
+    ) -> Iterator[subprocess.Popen[bytes]]:
+        """Start a run; the block begins when it has recorded some drives, and ends with the run."""
+        journal = output / _JOURNAL
+        words, quiet = ("run", str(self.logs), *_RUN, "-o", str(output)), subprocess.DEVNULL
+        with start(*words, env=env, stderr=quiet, stdout=quiet) as process:
+            while process.poll() is None and _lines(journal) < drives:
+                time.sleep(0.002)
+            yield process
+
+
+def _lines(journal: Path) -> int:
+    return journal.read_bytes().count(b'"label"') if journal.is_file() else 0
+
+
+def _comparable(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of all files, and of the journal the last line of each drive that ``run.json`` names."""
+    found = contents(folder)
+    lines = found.pop(_JOURNAL, b"").splitlines()
+    last = {json.loads(line).get("label"): line for line in lines}
+    logs = json.loads(found["run.json"])["logs"] if lines and "run.json" in found else ()
+    return found | {f"{_JOURNAL}: {log['log']}": last.get(log["log"], b"") for log in logs}
+
+
+def compared(calm: Path, folder: Path, codes: Iterable[int], wrong: Iterable[str] = ()) -> Verdict:
+    """Judge a folder by the output of an undisturbed command; ``wrong`` has further problems."""
+    wanted, found = _comparable(calm), _comparable(folder)
+    differing = {
+        "lost": wanted.keys() - found.keys(),
+        "stale": found.keys() - wanted.keys(),
+        "unequal": {p for p in wanted.keys() & found.keys() if wanted[p] != found[p]},
+    }
+    problems = [
+        *filter(None, wrong),
+        *(f"{how}: {', '.join(sorted(paths))}" for how, paths in differing.items() if paths),
+    ]
+    end = ", ".join(f"{code} ({n} x)" if (n := len([*same])) > 1 else str(code) for code, same in groupby(codes))
+    return Verdict(end, "; ".join(problems), {how: len(paths) for how, paths in differing.items()})
+
+
+# --------------------------------------------------------------------------------------------------- the cases
+
+
+def kills(fleet: Fleet, count: int, seed: int, folder: Path) -> Verdict:
+    """Kill runs that continue one output; if a run ends before its kill, the next one starts with an empty folder."""
+    output, codes, wrong = folder / "out", list[int](), list[str]()
+    files = {p.name for p in next((fleet.calm / "logs").iterdir()).iterdir()}
+    lasts_s, writes_s = fleet.lasts_s / 2.0, fleet.lasts_s / 4.0
+    call = [str(fleet.logs), *_RUN, "--resume"]
+    for killed in kill_many(call, output, count=count, lasts_s=lasts_s, writes_s=writes_s, seed=seed):
+        codes.append(killed.exit_code or 0)
+        wrong += faults(output, files)
+        if killed.exit_code is None:
+            wrong.append(compared(fleet.calm, output, ()).problem)
+            shutil.rmtree(output)
+    return fleet.finish(output, sorted(codes), wrong)
+
+
+def full_disk(words: Sequence[str], run: Path | None, folder: Path) -> Verdict:
+    """Give a command 5 to 95 % of the space that it needs, then enough, and repeat it; ``run``: copied there before."""
+
+    def prepare(place: Path) -> Path:
+        if run is not None:
+            shutil.copytree(run, place / "out")
+        return place
+
+    def call(place: Path) -> Process:
+        return measured(*(word.format(place) for word in words), limit_s=_LIMIT_S)
+
+    if os.geteuid() != 0:
+        return Verdict("skipped: to fill a file system (mount -t tmpfs) needs root")
+    calm, disk = folder / "calm", folder / "disk"
+    calm.mkdir()
+    disk.mkdir()
+    had = _blocks(prepare(calm))
+    wrong, codes, costs = [judge(call(calm), (0,)).problem], list[int](), dict[str, float]()
+    needs = _blocks(calm) - had
+    for place in range(PLACES):
+        room = had + needs * (2 * place + 1) // (2 * PLACES)
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"nr_blocks={max(room, 1)}", "tmpfs", str(disk)], check=True)
+        try:
+            prepare(disk)
+            full = call(disk)
+            subprocess.run(["mount", "-o", "remount,nr_blocks=0", str(disk)], check=True)
+            again = call(disk)
+            verdict = compared(calm, disk, ())
+        finally:
+            subprocess.run(["umount", "--lazy", str(disk)], check=True)
+        codes += full.code, again.code
+        wrong += judge(full, (1,)).problem, judge(again, (0,)).problem, verdict.problem
+        costs = {how: costs.get(how, 0.0) + n for how, n in verdict.costs.items()}
+    return Verdict(compared(calm, calm, sorted(codes)).end, "; ".join(filter(None, wrong)), costs)
+
+
+def _blocks(folder: Path) -> int:
+    page = os.sysconf("SC_PAGE_SIZE")
+    return sum(-(-p.stat().st_size // page) for p in folder.rglob("*") if p.is_file())
+
+
+def two_at_once(fleet: Fleet, folder: Path) -> Verdict:
+    """Start a second run into the folder of a running one."""
+    output = folder / "out"
+    with fleet.begun(output) as first:
+        second = _run(fleet.logs, output)
+    return compared(fleet.calm, output, [first.returncode, second.code], [judge(second, (1,)).problem])
+
+
+def clock_set_back(fleet: Fleet, folder: Path) -> Verdict:
+    """Kill a run with a clock that is a day ahead, and continue at the right time; its files have times of tomorrow."""
+    output, tomorrow = folder / "out", time.time() + _DAY_S
+    (folder / "sitecustomize.py").write_text(_AHEAD)
+    environment = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    with fleet.begun(output, drives=FEW // 2, env=environment) as process, suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    for path in output.rglob("*"):
+        os.utime(path, (tomorrow, tomorrow))
+    return fleet.finish(output, [process.returncode])
+
+
+def changed_log(fleet: Fleet, deed: Deed, folder: Path) -> Verdict:
+    """Change the last log in the middle of a run: no other drive may suffer; ``--resume`` reads the changed log."""
+    mine = Fleet(Path(shutil.copytree(fleet.logs, folder / "logs")), fleet.calm, fleet.code, fleet.lasts_s)
+    output, last = folder / "out", max(mine.logs.glob("*.mcap"))
+    with mine.begun(output) as process:
+        deed(last)
+    wanted, found = contents(fleet.calm), contents(output)
+    others = [p for p in wanted if p.startswith("logs/") and last.stem not in p]
+    wrong = [f"{p} of the first run" for p in others if found.get(p) != wanted[p]]
+    wrong += [] if process.returncode in (0, 3) else [f"exit code {process.returncode}"]
+    return Fleet.of(mine.logs, folder / "calm").finish(output, [process.returncode], wrong)
+
+
+def damaged(fleet: Fleet, patterns: Sequence[str], deed: Deed, folder: Path) -> Verdict:
+    """Damage one output of each kind before ``--resume``."""
+    output = Path(shutil.copytree(fleet.calm, folder / "out"))
+    for i, pattern in enumerate(patterns):
+        found = sorted(output.glob(pattern))
+        deed(found[i % len(found)])
+    return fleet.finish(output, ())
+
+
+def flip(path: Path) -> None:
+    """Change a bit in the middle of a file."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def cut(path: Path) -> None:
+    """Cut the second half of a file off."""
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def lost_on_ray(file: str, name: str, _: Path) -> Verdict:
+    """Run a test of a fleet on Ray."""
+    if find_spec("ray") is None:
+        return Verdict("skipped: Ray is not installed")
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "fleet", file, "-k", name]
+    environment = os.environ | {"PDHEF_FLEET": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    return Verdict(f"pytest {done.returncode}", done.stdout[-800:] if done.returncode else "")
+
+
+def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Callable[[Path], Verdict]]:
+    """Simulate the drives, run them undisturbed, and return the cases by their planted fault."""
+    folders = {"fleet": (drives, DRIVE_S), "few": (FEW, DRIVE_S), "taught": (2, TAUGHT_S), "other": (1, DRIVE_S)}
+    for i, (name, (number, length_s)) in enumerate(folders.items()):
+        write_suite(work / name, count=number, seed=seed + i, duration_s=length_s)
+        (work / name / "manifest.json").unlink()
+    fleet, few = (Fleet.of(work / name, work / f"calm-{name}") for name in ("fleet", "few"))
+    other, bare = next((work / "other").iterdir()), work / "bare"
+    _run(few.logs, bare, "--no-report")
+    disks: dict[str, tuple[tuple[str, ...], Path | None]] = {
+        "run": (("run", str(few.logs), *_RUN, "-o", "{}/out"), None),
+        "learn": (("learn", str(work / "taught"), *_CAR, "any", "-o", "{}/car"), None),
+        "extract": (("extract", str(few.logs), *_CAR, "train", "-o", "{}/data"), None),
+        "report": (("report", "{}/out"), bare),
+        "compare": (("compare", str(few.calm), str(bare), "--html", "{}/a.html", "--junit", "{}/a.xml"), None),
+    }
+    deeds: dict[str, Deed] = {"replaced": partial(shutil.copy, other), "cut": cut, "removed": Path.unlink}
+    harm: dict[str, Deed] = {"a flipped bit": flip, "half of it": cut, "nothing left": Path.unlink}
+    kinds = {"each file of a drive": _OF_DRIVES, "each file of the run": _OF_RUN, "the journal": (_JOURNAL,)}
+    return {
+        f"{count} kills in {drives} drives": partial(kills, fleet, count, seed),
+        **{f"disk full at {PLACES} places of `{name}`": partial(full_disk, *disk) for name, disk in disks.items()},
+        "two runs into one folder": partial(two_at_once, few),
+        "clock set back by a day": partial(clock_set_back, few),
+        **{f"a log is {name} during the run": partial(changed_log, few, deed) for name, deed in deeds.items()},
+        **{
+            f"{what}: {how}, before `--resume`": partial(damaged, few, patterns, deed)
+            for what, patterns in kinds.items()
+            for how, deed in harm.items()
+        },
+        **{name: partial(lost_on_ray, *test) for name, test in _RAY.items()},
+    }
