@@ -33,10 +33,12 @@ class Estimates:
 
     Attributes
     ----------
+    model : of the drive; its car is calibrated on the drive as by a run.
     algorithms : by name. skipped : estimators that could not run, with reasons.
     """
 
     drive: Drive
+    model: DriveModel
     estimated: Estimated
     algorithms: dict[str, Algorithm]
     skipped: tuple[Skipped, ...]
@@ -92,7 +94,7 @@ class Estimates:
 
 
 def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
-    """Run estimators over a drive.
+    """Run estimators over a drive as ``pdhef run`` does, which calibrates the car if no drives have validated it.
 
     Parameters
     ----------
@@ -110,11 +112,11 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     >>> list(estimates.tracks), estimates.algorithms["phy-ukf"].algorithm, len(estimates.frame())
     (['truth', 'zero', 'phy-ukf'], 'vehicle-ukf', 2853)
     """
-    estimators, skipped = choose(drive, names)
-    whole = drive.whole()
-    corrected = DriveModel.of(drive).apply(whole.signals)
-    estimated = estimate_drive(whole, corrected, estimators, intervals=drive_intervals(drive.car, estimators))
-    return Estimates(drive, estimated, {e.name: resolve(e) for e in estimators}, tuple(skipped))
+    model, whole = DriveModel.fit(drive), drive.whole()
+    estimators, skipped = choose(drive, names, model.car)
+    intervals = drive_intervals(model.car, estimators)
+    estimated = estimate_drive(whole, model.apply(whole.signals), estimators, intervals=intervals)
+    return Estimates(drive, model, estimated, {e.name: resolve(e) for e in estimators}, tuple(skipped))
 
 
 def score(estimates: Estimates) -> pl.DataFrame:
@@ -128,6 +130,6 @@ def score(estimates: Estimates) -> pl.DataFrame:
     """
     import polars as pl
 
-    rows = evaluate(estimates.drive, estimates.estimated, DriveModel.of(estimates.drive)).rows
+    rows = evaluate(estimates.drive, estimates.estimated, estimates.model).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

@@ -46,3 +46,13 @@ def test_the_plot_has_a_line_of_each_track_in_degrees(estimates) -> None:
     lines = estimates.plot().get_lines()
     assert [line.get_label() for line in lines] == ["truth", "zero", "kinematic"]
     assert lines[0].get_xdata()[0] == pytest.approx(0.0, abs=0.1) and max(abs(lines[0].get_ydata())) > 1.0
+
+
+def test_a_car_that_no_drive_has_validated_is_calibrated_as_by_a_run(bare_vehicle: str, tmp_path: Path) -> None:
+    car = tmp_path / "car.toml"
+    car.write_text(bare_vehicle)
+    with pdhef.read_drive(_SAMPLE, car) as drive:
+        figures = pdhef.score(pdhef.estimate(drive, ["physics"]))
+    pdhef.run(_SAMPLE, tmp_path / "out", pdhef.RunConfig(car=car, estimators=("physics",), keep="metrics"))
+    of_run = pl.read_parquet(tmp_path / "out/metrics.parquet").select(figures.columns).cast(dict(figures.schema))
+    assert figures.equals(of_run)
