@@ -437,8 +437,8 @@ def _grid_stamps(channels: Mapping[str, Channel], plan: AlignmentPlan) -> IntArr
     """Return the union of the IMU channels' stamps, late samples included: time still passes."""
     present = [channels[name].stamps_ns for name in plan.grid_channels if name in channels]
     # Stamps are sorted in runs: a stable sort is a hundred times as fast as numpy's unique, which hashes them.
-    stamps = np.sort(np.concatenate([np.empty(0, dtype=np.int64), *present]), kind="stable")
-    return stamps[np.append(np.ones(min(len(stamps), 1), dtype=np.bool_), np.diff(stamps) > 0)]
+    stamps: IntArray = np.sort(np.concatenate([np.empty(0, dtype=np.int64), *present]), kind="stable")
+    return np.asarray(stamps[np.append(np.ones(min(len(stamps), 1), dtype=np.bool_), np.diff(stamps) > 0)])
 
 
 def _to_grid(channel: Channel, p: ChannelPlan, grid_ns: IntArray, grid_gap_ns: int) -> tuple[FloatArray, IntArray]:
