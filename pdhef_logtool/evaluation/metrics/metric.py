@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -15,6 +17,8 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signa
 from pdhef_logtool.records.tracks import StateTrack
 
 ALL = "all"
+#: Entries of :class:`Metric` beside its functions, by name.
+_TABLE = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +107,7 @@ Formula: TypeAlias = Callable[..., "float | None"]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric, as its file registers it; all outputs use this record.
+    """One metric, as its file registers it; all outputs use this record. ``metrics.toml`` has entries of our own.
 
     Attributes
     ----------
@@ -150,6 +154,21 @@ class Metric:
         if self.best is None or isinstance(self.best, str):
             return self.best or ""
         return f"closest to {self.best:g}"
+
+
+def described(
+    columns: Callable[[EvaluatedDrive], Iterable[Columns]], **formulas: Formula | tuple[Formula, str]
+) -> tuple[Metric, ...]:
+    """Return metrics over the same columns, with the entries of ``metrics.toml``.
+
+    ``formulas``: by the name of a metric, with the names of the columns that it needs unless there is only its own.
+    """
+    metrics = []
+    for name, stated in formulas.items():
+        formula, over = stated if isinstance(stated, tuple) else (stated, "")
+        entries: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in _TABLE[name].items()}
+        metrics.append(Metric(name, columns=columns, formula=formula, over=tuple(over.split()), **entries))
+    return tuple(metrics)
 
 
 def rms(values: FloatArray, *_: FloatArray) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, Metric, rms
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, described, rms
 from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -111,17 +111,4 @@ def _yaw_rates(inputs, tyres, out):  # type: ignore[no-untyped-def]
         out[k] = r
 
 
-METRICS = (
-    Metric(
-        "yaw_consistency",
-        "yaw consistency",
-        "signal `yaw_rate_rad_s`: RMS of the gyro minus the yaw rate that the car's tyres have at the estimated v_y "
-        "and the measured steering, above the low-speed blend; tyres, steering and gyro "
-        "bias as the log calibrated them",
-        columns=_columns,
-        formula=rms,
-        best="lower",
-        unit="rad/s",
-        brief=("yaw_rate_rad_s",),
-    ),
-)
+METRICS = described(_columns, yaw_consistency=rms)
