@@ -16,20 +16,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.statistics import (
-    FACTORS,
-    Bounded,
-    PairedChange,
-    Verdict,
-    holm,
-    log_ratios,
-    paired_change,
-    pooled,
-    quantile,
-)
 from pdhef_logtool.evaluation.units import SIGNALS, share_of
 from pdhef_logtool.evaluation.validation_plan import MEANS, RUN, SQUARES, Requirement, ValidationPlan, load_plan
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
@@ -43,7 +33,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 #: ``no figure``: no drive has it on both sides.
-FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
+FigureVerdict: TypeAlias = statistics.Verdict | Literal["no figure"]
 
 #: Value of ``cluster`` for drives that do not depend on one another.
 INDEPENDENT = "none"
@@ -88,7 +78,7 @@ class ComparedFigure:
 
     requirement: Requirement
     verdict: FigureVerdict
-    change: PairedChange
+    change: statistics.PairedChange
     unit: str
     drives: tuple[dict[str, Any], ...]
     only_a: tuple[str, ...] = ()
@@ -136,7 +126,7 @@ class HistoryRow:
     run: str
     version: str
     requirement: Requirement
-    figure: Bounded
+    figure: statistics.Bounded
     unit: str
     verdict: FigureVerdict | Literal[""] = ""
     step: ComparedFigure | None = None
@@ -363,17 +353,17 @@ class _Tables:
         import polars as pl
 
         run, key = self._runs[0], self._cluster
-        drives = run.table("drives").select("log", *FACTORS).collect()
+        drives = run.table("drives").select("log", *statistics.FACTORS).collect()
         pairs = self._labels.join(drives, left_on="a", right_on="log", how="left").sort("place")
         if key in (None, INDEPENDENT):
             return pairs
         metadata = pairs.select(log="a").join(run.table("metadata").collect(), on="log")
         stated = metadata.filter(key=key).select(a="log", cluster="value").unique("a", keep="last")
         keyed = pairs.join(stated, on="a", how="left").sort("place")
-        if key in FACTORS:
+        if key in statistics.FACTORS:
             keyed = pairs.with_columns(cluster=pl.col(str(key)))
         if keyed["cluster"].null_count() == len(keyed):
-            names = ", ".join(dict.fromkeys((*FACTORS, INDEPENDENT, *metadata["key"].unique().sort())))
+            names = ", ".join(dict.fromkeys((*statistics.FACTORS, INDEPENDENT, *metadata["key"].unique().sort())))
             raise UsageError(expected=f"a key of the drives: {names}", got=str(key), where="--cluster")
         return keyed
 
@@ -421,10 +411,10 @@ class _Tables:
         of_figure = {key: getattr(asked, key) for key in ("signal", "segment", "metric")}
         of_pairs = rows.filter(pl.col("estimator") == name, **of_figure)
         both = of_pairs.drop_nulls(["value", "value_b"])
-        ratios = log_ratios(both["value"].to_numpy(), both["value_b"].to_numpy())
+        ratios = statistics.log_ratios(both["value"].to_numpy(), both["value_b"].to_numpy())
         clusters = both["cluster"].to_list() if "cluster" in both.columns else None
-        factors = {f: both[f].to_list() for f in FACTORS} if self._cluster is None else None
-        change = paired_change(ratios, clusters, factors)
+        factors = {f: both[f].to_list() for f in statistics.FACTORS} if self._cluster is None else None
+        change = statistics.paired_change(ratios, clusters, factors)
         equal = both["value"].equals(both["value_b"]) and both["n"].equals(both["n_b"])
         verdict = change.verdict((asked.max_ratio or 1.0) - 1.0) if not equal else "equal" if len(both) else "no figure"
         drives = both.select(drive="a", drive_b="b", a="value", b="value_b", n_a="n", n_b="n_b")
@@ -483,7 +473,9 @@ def _beside(asked: Sequence[Requirement]) -> list[Requirement]:
 
 def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
     there = [f for f in figures if f.drives]
-    return tuple(replace(f, corrected_p=p) for f, p in zip(there, holm([f.change.sign_p for f in there]), strict=True))
+    return tuple(
+        replace(f, corrected_p=p) for f, p in zip(there, statistics.holm([f.change.sign_p for f in there]), strict=True)
+    )
 
 
 def _history(runs: Sequence[OpenedRun], steps: Sequence[Comparison], asked: Requirement) -> Iterator[HistoryRow]:
@@ -495,19 +487,19 @@ def _history(runs: Sequence[OpenedRun], steps: Sequence[Comparison], asked: Requ
         yield HistoryRow(run.place, version, asked, *_of_all(run, asked), verdict, next(iter(figures), None))
 
 
-def _of_all(run: OpenedRun, asked: Requirement) -> tuple[Bounded, str]:
+def _of_all(run: OpenedRun, asked: Requirement) -> tuple[statistics.Bounded, str]:
     """Return a figure over all drives of a run, and its unit: pooled, or the median of metrics that are no means."""
     import polars as pl
 
     rows = run.table("metrics").filter(pl.col("value").is_finite(), pl.col("independent"))
     rows = rows.filter(**{key: getattr(asked, key) for key in ("signal", "segment", "metric")})
-    drives = run.table("drives").select("log", *FACTORS, main="estimator")
+    drives = run.table("drives").select("log", *statistics.FACTORS, main="estimator")
     name = pl.col("main") if asked.estimator is None else pl.lit(asked.estimator)
     of_run = rows.join(drives, on="log").filter(pl.col("estimator") == name).collect().sort("log")
-    factors = {f: of_run[f].to_list() for f in FACTORS}
+    factors = {f: of_run[f].to_list() for f in statistics.FACTORS}
     n, values = (of_run[key].to_numpy().astype(np.float64) for key in ("n", "value"))
     unit = of_run["unit"][0] if len(of_run) else ""
     if asked.metric not in SQUARES | MEANS:
-        return quantile(values, 0.5, 0.95, factors), unit
+        return statistics.quantile(values, 0.5, 0.95, factors), unit
     squares = asked.metric in SQUARES
-    return pooled(n, values, None, squares=squares, positive=True, level=0.95, factors=factors), unit
+    return statistics.pooled(n, values, None, squares=squares, positive=True, level=0.95, factors=factors), unit

@@ -17,16 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
-from pdhef_logtool.evaluation.statistics import (
-    FACTORS,
-    Dependence,
-    PairedChange,
-    dependence,
-    holm,
-    log_ratios,
-    paired_change,
-)
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, breakdowns
@@ -173,7 +165,7 @@ class Fleet:
     distributions: tuple[Distribution, ...]
     ranking: tuple[Rank, ...]
     least_to_rank: int
-    dependence: Dependence
+    dependence: statistics.Dependence
     breakdowns: tuple[Breakdown, ...]
     space: Space | None
     failed: tuple[Failures, ...]
@@ -318,7 +310,7 @@ def _drive(row: Mapping[str, Any], errors: Mapping[tuple[str, str], float], keys
         naive_d2=number("naive_d2"),
         failed_checks=row["failed_checks"],
         keys=keys,
-        factors={factor: row[factor] for factor in FACTORS},
+        factors={factor: row[factor] for factor in statistics.FACTORS},
     )
 
 
@@ -348,17 +340,17 @@ def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
 def _of_all(drives: Sequence[FleetDrive], use: BoolArray | None = None) -> dict[str, list[str | None]]:
     """Return day, car and route of the drives to use (None: all)."""
     used = drives if use is None else [drives[i] for i in np.flatnonzero(use).tolist()]
-    return {f: [d.factors.get(f) for d in used] for f in FACTORS}
+    return {f: [d.factors.get(f) for d in used] for f in statistics.FACTORS}
 
 
-def _dependence(drives: Sequence[FleetDrive]) -> Dependence:
+def _dependence(drives: Sequence[FleetDrive]) -> statistics.Dependence:
     """Return the dependence of the selected estimate's errors."""
     errors = np.array([d.error() for d in drives])
     use = errors > 0.0
-    return dependence(np.log(errors[use]), _of_all(drives, use))
+    return statistics.dependence(np.log(errors[use]), _of_all(drives, use))
 
 
-def _median(change: PairedChange, scale: Callable[[float], float] = float) -> Median:
+def _median(change: statistics.PairedChange, scale: Callable[[float], float] = float) -> Median:
     return Median(*map(scale, (change.median, change.low, change.high)))
 
 
@@ -368,7 +360,7 @@ def _distributions(drives: Sequence[FleetDrive], names: Sequence[str]) -> Iterab
             values = np.array([d.error(name, signal) for d in drives])
             use = np.isfinite(values)
             if use.any():
-                median = _median(paired_change(values[use], None, _of_all(drives, use)))
+                median = _median(statistics.paired_change(values[use], None, _of_all(drives, use)))
                 yield Distribution(name, signal, unit, median, np.sort(values[use]))
 
 
@@ -376,15 +368,17 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
     """Return the estimators in order of how many others they beat, pair by pair on the drives of both."""
     errors = {name: np.array([d.error(name) for d in drives]) for name in (ANSWER, *names)}
 
-    def change(a: str, b: str) -> PairedChange:
+    def change(a: str, b: str) -> statistics.PairedChange:
         both = np.isfinite(errors[a]) & np.isfinite(errors[b])
-        return paired_change(log_ratios(errors[a][both], errors[b][both]), None, _of_all(drives, both))
+        return statistics.paired_change(
+            statistics.log_ratios(errors[a][both], errors[b][both]), None, _of_all(drives, both)
+        )
 
     pairs = [*combinations(names, 2)]
     changes = [change(a, b) for a, b in pairs]
     beats: dict[str, set[str]] = {name: set() for name in names}
     score = dict.fromkeys(names, 0)
-    for (a, b), of_pair, p in zip(pairs, changes, holm([c.sign_p for c in changes]), strict=True):
+    for (a, b), of_pair, p in zip(pairs, changes, statistics.holm([c.sign_p for c in changes]), strict=True):
         if p < SIGNIFICANT and of_pair.median != 0.0:
             better, worse = (a, b) if of_pair.median > 0.0 else (b, a)
             beats[better].add(worse)

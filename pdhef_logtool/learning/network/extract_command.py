@@ -33,27 +33,7 @@ from pdhef_logtool.learning.drives import (
     set_manifest,
     tell_drive,
 )
-from pdhef_logtool.learning.network.dataset import (
-    COLUMNS,
-    FORMAT_VERSION,
-    MANIFEST,
-    SPLITS,
-    drive_file,
-    read_dataset,
-    read_entry,
-    remove_unnamed,
-    split_folder,
-    write_drive,
-    write_manifest,
-)
-from pdhef_logtool.learning.network.residuals import (
-    GAP_PERIODS,
-    NEGLIGIBLE_NOISE,
-    SMOOTHING_HALF_S,
-    ResidualRows,
-    difference_noise,
-    residual_rows,
-)
+from pdhef_logtool.learning.network import dataset, residuals
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
 from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
@@ -178,7 +158,9 @@ class _Job:
     def target(self, split: str) -> Path:
         """Return the path of the drive in the dataset."""
         sha, vehicle = self.physics
-        return drive_file(self.output, {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha})
+        return dataset.drive_file(
+            self.output, {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha}
+        )
 
     @property
     def physics(self) -> tuple[str, VehicleParameters]:
@@ -221,26 +203,28 @@ def extract(
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
     read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
-    check_no_input(read, [output / MANIFEST])
+    check_no_input(read, [output / dataset.MANIFEST])
     kept = [d for d in before.get("drives", []) if d["name"] not in names]
     vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
     write = partial(_write, output, settings, kept, vehicles)
-    folders = {split_folder(s) for s in (*SPLITS, settings.split, *(job.listed_split for job in work)) if s}
+    folders = {
+        dataset.split_folder(s) for s in (*dataset.SPLITS, settings.split, *(job.listed_split for job in work)) if s
+    }
     with OutputFolder(output, sorted(folders)):
         # Until the new manifest is written, the old one must not name files that may change.
         if kept:
             write([])
         else:
             with writing(output):
-                (output / MANIFEST).unlink(missing_ok=True)
+                (output / dataset.MANIFEST).unlink(missing_ok=True)
         results = _without_copies(_extract_all(work, jobs, reporter), reporter.warn)
         for job in work:
             sha, vehicle = job.physics
             vehicles[sha] = {"name": vehicle.name, "sha256": sha, "parameters": vehicle.model_dump(mode="json")}
         manifest = write(results)
         with writing(output):
-            remove_unnamed(output, manifest)
-    empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
+            dataset.remove_unnamed(output, manifest)
+    empty = [s for s in dataset.SPLITS if not manifest["splits"][s]["drives"]]
     if empty and manifest["drives"] and settings.split is None:
         reporter.warn(f"no drive is in {' and '.join(empty)}: with few drives choose with --split")
     return ExtractResult(output, manifest, results)
@@ -261,7 +245,7 @@ def _write(
     left_out = [r.record for r in results if r.record.left_out]
     failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
     copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
-    return write_manifest(
+    return dataset.write_manifest(
         output,
         entries,
         failed,
@@ -315,11 +299,11 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
     UsageError
         The folder contains another manifest, or a dataset of another filter.
     """
-    if not (output / MANIFEST).exists():
+    if not (output / dataset.MANIFEST).exists():
         return {}
     expected, remedy = f"a new folder, or a residual dataset for {settings.model}", "choose another folder with -o"
     try:
-        data = read_dataset(output)
+        data = dataset.read_dataset(output)
     except OutputError as error:
         raise UsageError(expected=expected, got=error.got, where=str(output), remedy=remedy) from None
     if data.model != settings.model:
@@ -330,10 +314,10 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
 def _check(jobs: int, settings: ExtractSettings) -> None:
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
-    if settings.split is not None and settings.split not in SPLITS:
-        raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
+    if settings.split is not None and settings.split not in dataset.SPLITS:
+        raise UsageError(expected=f"one of {', '.join(dataset.SPLITS)}", got=repr(settings.split), where="--split")
     if settings.where is not None:
-        parse_condition(settings.where, COLUMNS, of_tracks=False)
+        parse_condition(settings.where, dataset.COLUMNS, of_tracks=False)
     if settings.model not in MODELS:
         raise UsageError(expected=f"one of {', '.join(MODELS)}", got=repr(settings.model), where="--filter")
 
@@ -432,7 +416,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             "friction_from": drive.friction.label,
             "losses": [asdict(x) for x in drive.losses],
         }
-        write_drive(target, rows, chosen, entry, truth_source=truth["kind"])
+        dataset.write_drive(target, rows, chosen, entry, truth_source=truth["kind"])
         if not entry["usable_rows"]:
             drive.tell("not one usable target: no ground truth above the low-speed limit")
         record = record_of(drive, split=split)
@@ -450,7 +434,7 @@ def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str]:
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
     """Return the drive written by an earlier command; None if its log or settings have changed."""
-    entry, name = read_entry(target), job.log_input.path.name
+    entry, name = dataset.read_entry(target), job.log_input.path.name
     if (
         entry is None
         or entry.get("settings_sha256") != fingerprint
@@ -464,13 +448,13 @@ def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) ->
 
 def _residuals(
     drive: Drive, physics: VehicleUkf, facts: Mapping[str, Any], model: DriveModel, reference: TruthAt | None
-) -> ResidualRows:
+) -> residuals.ResidualRows:
     """Return the residuals of a drive; ``facts`` on its ground truth."""
     whole = drive.whole()
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
     assert truth is not None, "the plan of the drive derives it"
     period_s, noise = drive.plan.alignment.grid_period_s, facts["difference_noise"]["vy_dot_m_s2"] or 0.0
-    return residual_rows(
+    return residuals.residual_rows(
         model.apply(whole.signals).calibrated if physics.equations == "forces" else whole.signals,
         truth,
         physics,
@@ -491,7 +475,7 @@ def choose_split(source_sha256: str, *, chosen: str | None = None, listed: str |
         return listed, "manifest"
     drawn = hashlib.sha256(f"0:{source_sha256}".encode()).digest()
     place = int.from_bytes(drawn[:8], "big") / 2.0**64
-    return SPLITS[sum(place >= end for end in SPLIT_ENDS)], "hash"
+    return dataset.SPLITS[sum(place >= end for end in SPLIT_ENDS)], "hash"
 
 
 def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> tuple[str | None, Path | None]:
@@ -507,7 +491,7 @@ def _strict_truth(plan: DrivePlan) -> DrivePlan:
     """Disable the interpolation of ground truth gaps: it is accurate enough for scoring, but not for derivatives."""
     if plan.truth is None:
         return plan
-    gaps = {name: gap * GAP_PERIODS / TRUTH_GAP_PERIODS for name, gap in plan.truth.max_gap_s.items()}
+    gaps = {name: gap * residuals.GAP_PERIODS / TRUTH_GAP_PERIODS for name, gap in plan.truth.max_gap_s.items()}
     return replace(plan, truth=replace(plan.truth, max_gap_s=gaps))
 
 
@@ -536,27 +520,27 @@ def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
     truth = derive_truth(plan.survey_truth, plan=plan.truth).track
-    noise = [difference_noise(truth.stamps_ns, column) for column in (truth.vy_m_s, truth.yaw_rate_rad_s)]
+    noise = [residuals.difference_noise(truth.stamps_ns, column) for column in (truth.vy_m_s, truth.yaw_rate_rad_s)]
     said = f"one-step noise of the ground truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
-    limits = f"{NEGLIGIBLE_NOISE[0]:g} m/s² and {NEGLIGIBLE_NOISE[1]:g} rad/s²"
-    within = all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True))  # False for NaN
+    limits = f"{residuals.NEGLIGIBLE_NOISE[0]:g} m/s² and {residuals.NEGLIGIBLE_NOISE[1]:g} rad/s²"
+    within = all(n <= limit for n, limit in zip(noise, residuals.NEGLIGIBLE_NOISE, strict=True))  # False for NaN
     return {
         "kind": ESTIMATED if estimated else "perfect" if perfect else "recorded",
         "quantities": dict(plan.derivation),
         "latency_s": plan.truth_latency_s,
-        "smoothing_half_s": 0.0 if within else SMOOTHING_HALF_S,
+        "smoothing_half_s": 0.0 if within else residuals.SMOOTHING_HALF_S,
         "smoothing_reason": f"{said}: {'' if within else 'not '}within {limits}",
         "difference_noise": _pair(noise),
         "not_independent": dict(plan.dependent),
     }
 
 
-def _chosen(rows: ResidualRows, where: str | None) -> BoolArray:
+def _chosen(rows: residuals.ResidualRows, where: str | None) -> BoolArray:
     """Return the rows [N] that meet the condition; all rows without one."""
     if where is None:
         return np.ones(len(rows), dtype=np.bool_)
-    columns = dict(zip(COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
-    return parse_condition(where, COLUMNS, of_tracks=False).is_true(columns)
+    columns = dict(zip(dataset.COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
+    return parse_condition(where, dataset.COLUMNS, of_tracks=False).is_true(columns)
 
 
 def _pair(values: Sequence[float]) -> dict[str, float | None]:
@@ -564,7 +548,7 @@ def _pair(values: Sequence[float]) -> dict[str, float | None]:
     return {n: float(v) if math.isfinite(v) else None for n, v in zip(names, values, strict=True)}
 
 
-def _counts(rows: ResidualRows, log_start_ns: int) -> dict[str, Any]:
+def _counts(rows: residuals.ResidualRows, log_start_ns: int) -> dict[str, Any]:
     """Return the span of a drive's rows in seconds from the log's start, and counts of rows."""
     use = rows.weight > 0.0
     first, last = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
@@ -585,7 +569,7 @@ def _fingerprint(job: _Job, split: str) -> str:
     """Return the hash of all inputs of a drive's file except the log."""
     mapping = job.settings.config.mapping
     document = {
-        "format": FORMAT_VERSION,
+        "format": dataset.FORMAT_VERSION,
         "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
         "split": split,
         "vehicle": [job.physics[0], {name: noise.model_dump(mode="json") for name, noise in job.car.noise.items()}],
