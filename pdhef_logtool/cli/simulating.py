@@ -64,13 +64,7 @@ def _incomplete(missing: str) -> UsageError:
 
 @options.command("simulate suite")
 def suite(
-    *,
-    output: Path,
-    count: int = 200,
-    seed: int = 0,
-    duration_s: float = 12.5,
-    vehicles: str = "default",
-    jobs: int = 1,
+    *, output: Path, count: int = 200, seed: int = 0, duration_s: float = 12.5, vehicles: str = "default", jobs: int = 1
 ) -> None:
     """Simulate a training set of drives."""
     from truthsim.suite import write_suite

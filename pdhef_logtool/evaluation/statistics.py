@@ -403,10 +403,7 @@ def log_ratios(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def paired_change(
-    ratios: FloatArray,
-    clusters: Sequence[object] | None = None,
-    factors: Factors | None = None,
-    level: float = 0.95,
+    ratios: FloatArray, clusters: Sequence[object] | None = None, factors: Factors | None = None, level: float = 0.95
 ) -> PairedChange:
     """Return the median log ratio of drives with its bounds.
 

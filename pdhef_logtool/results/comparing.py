@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+import polars as pl
 
 from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.metrics.registry import registered
@@ -28,9 +29,6 @@ from pdhef_logtool.results.opened_run import OpenedRun, open_run, table_file
 from pdhef_logtool.results.pairing import Pair, pair_logs, run_differences
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts, plan_verdicts_against
 from pdhef_logtool.storage.documents import unknown
-
-if TYPE_CHECKING:
-    import polars as pl
 
 #: ``no figure``: no drive has it on both sides.
 FigureVerdict: TypeAlias = statistics.Verdict | Literal["no figure"]
@@ -341,8 +339,6 @@ class _Tables:
     """Figures of two runs for their pairs; only requested rows are read."""
 
     def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair], cluster: str | None) -> None:
-        import polars as pl
-
         labels = {"a": [p.a.label for p in pairs], "b": [p.b.label for p in pairs], "main": [p.a.main() for p in pairs]}
         self._runs, self._cluster = (a, b), cluster
         self._labels = pl.DataFrame(labels).with_row_index("place")
@@ -350,8 +346,6 @@ class _Tables:
     @cached_property
     def _pairs(self) -> pl.DataFrame:
         """A row per pair: ``place``, labels ``a`` and ``b``, ``main``, day, car and route, and ``cluster``."""
-        import polars as pl
-
         run, key = self._runs[0], self._cluster
         drives = run.table("drives").select("log", *statistics.FACTORS).collect()
         pairs = self._labels.join(drives, left_on="a", right_on="log", how="left").sort("place")
@@ -369,8 +363,6 @@ class _Tables:
 
     def changed(self) -> int:
         """Return the number of drives with any figure that is not the same bit for bit."""
-        import polars as pl
-
         tables = [run.table("metrics") for run in self._runs]
         digests = {run.document.get("files", {}).get(table_file("metrics")) for run in self._runs}
         if len(digests) == 1 and None not in digests and self._labels["a"].equals(self._labels["b"]):
@@ -390,8 +382,6 @@ class _Tables:
 
     def _rows(self, figures: Sequence[Requirement]) -> pl.DataFrame:
         """Return the figures of the pairs, a row each: ``value``, ``n``, ``independent`` of A, and with ``_b`` of B."""
-        import polars as pl
-
         named = {f.estimator for f in figures if f.estimator} | set(self._pairs["main"])
         asked = [named, *({getattr(f, key) for f in figures} for key in _FIGURE[1:-1])]
         wanted = [pl.col(key).is_in(sorted(of)) for key, of in zip(_FIGURE, asked, strict=False)]
@@ -405,8 +395,6 @@ class _Tables:
         return both.join(self._pairs, on="place", how="left").sort("place")
 
     def _compared(self, asked: Requirement, rows: pl.DataFrame) -> ComparedFigure:
-        import polars as pl
-
         name = pl.col("main") if asked.estimator is None else pl.lit(asked.estimator)
         of_figure = {key: getattr(asked, key) for key in ("signal", "segment", "metric")}
         of_pairs = rows.filter(pl.col("estimator") == name, **of_figure)
@@ -489,8 +477,6 @@ def _history(runs: Sequence[OpenedRun], steps: Sequence[Comparison], asked: Requ
 
 def _of_all(run: OpenedRun, asked: Requirement) -> tuple[statistics.Bounded, str]:
     """Return a figure over all drives of a run, and its unit: pooled, or the median of metrics that are no means."""
-    import polars as pl
-
     rows = run.table("metrics").filter(pl.col("value").is_finite(), pl.col("independent"))
     rows = rows.filter(**{key: getattr(asked, key) for key in ("signal", "segment", "metric")})
     drives = run.table("drives").select("log", *statistics.FACTORS, main="estimator")

@@ -6,9 +6,10 @@ import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import polars as pl
 
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.smoothing import runs
@@ -20,9 +21,6 @@ from pdhef_logtool.results.condition import Condition, Reference, parse_conditio
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.parquet_sink import list_estimators
 from pdhef_logtool.results.sink import TRUTH
-
-if TYPE_CHECKING:
-    import polars as pl
 
 SPEED = "speed_m_s"
 #: Stored columns that are true or false.
@@ -198,8 +196,6 @@ def _events_of(
     log: OpenedLog, condition: Condition, main: str, drive: _Drive, least_s: float, pad_s: float
 ) -> list[FoundEvent]:
     """Return the events of one drive."""
-    import polars as pl
-
     frame = log.estimates()
     assert frame is not None
     named = [_column(reference, main, drive).alias(name) for name, reference in condition.references.items()]
@@ -238,7 +234,6 @@ def _joined(frame: pl.LazyFrame, tracks: Sequence[str]) -> pl.LazyFrame:
 
     Polars reads only those that are used later.
     """
-    import polars as pl
 
     def of(track: str) -> pl.LazyFrame:
         numbers = pl.col(sorted({*TRACK_COLUMNS} - {"stamp_ns", *FLAGS})).cast(pl.Float64).fill_nan(None)
@@ -253,7 +248,6 @@ def _joined(frame: pl.LazyFrame, tracks: Sequence[str]) -> pl.LazyFrame:
 
 def _column(reference: Reference, main: str, drive: _Drive) -> pl.Expr:
     """Return a column of a condition, of the columns of :func:`_joined`."""
-    import polars as pl
 
     def of(column: str, track: str = reference.track or main) -> pl.Expr:
         return pl.col(f"{track}.{column}")
@@ -279,8 +273,6 @@ def _column(reference: Reference, main: str, drive: _Drive) -> pl.Expr:
 
 def _within(spans: Sequence[tuple[int, int]]) -> pl.Expr:
     """Return where a stamp lies in a segment's intervals, which do not overlap."""
-    import polars as pl
-
     starts, ends = np.array(sorted(spans), dtype=np.int64).reshape(-1, 2).T
 
     def inside(stamps: pl.Series) -> pl.Series:

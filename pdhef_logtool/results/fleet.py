@@ -13,20 +13,19 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import polars as pl
 
 from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
+from pdhef_logtool.records.printable import gathered
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, breakdowns
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.selected_estimate import NAIVE
-
-if TYPE_CHECKING:
-    import polars as pl
 
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
@@ -205,22 +204,18 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     OutputError
         A table is damaged.
     """
-    import polars as pl
-
     rows = _rows(run)
     done = [row for row in rows if row["outcome"] != "failed"]
     faults = run.table("faults")
     sensors = faults.filter(pl.col("origin") == "sensor").group_by("log").agg(pl.col("kind").unique().sort())
     kinds = dict(sensors.collect().iter_rows())
     lost = faults.filter(severity="lost").select("log", "text").collect().rows()
-    metadata: dict[str, dict[str, str]] = {}
-    for log, key, value in run.table("metadata").collect().iter_rows():
-        metadata.setdefault(log, {})[key] = value
-    of_log: dict[str, dict[tuple[str, str], float]] = {}
-    for log, estimator, signal, value in sideslip_errors(run, [*SIGNALS]).collect().iter_rows():
-        of_log.setdefault(log, {})[estimator, signal] = value
+    metadata = gathered((log, entry) for log, *entry in run.table("metadata").collect().iter_rows())
+    figures = sideslip_errors(run, [*SIGNALS]).collect().iter_rows()
+    of_log = gathered((log, ((estimator, signal), value)) for log, estimator, signal, value in figures)
     drives = tuple(
-        _drive(r, of_log.get(r["log"], {}), metadata.get(r["log"], {}) | _keys(r, kinds.get(r["log"]))) for r in done
+        _drive(r, dict(of_log.get(r["log"], ())), dict(metadata.get(r["log"], ())) | _keys(r, kinds.get(r["log"])))
+        for r in done
     )
     errors = np.array([d.error() for d in drives])
     scored = [d for d in drives if d.truth]
@@ -250,8 +245,6 @@ def least_to_rank(estimators: int) -> int:
 
 def _space(run: OpenedRun) -> Space | None:
     """Return the operating space of all drives."""
-    import polars as pl
-
     cells = run.table("exposure").with_columns(scored=pl.when(pl.col("sideslip_mse_rad2").is_not_null()).then("scored"))
     squares = (pl.col("sideslip_mse_rad2") * pl.col("scored")).sum() / pl.col("scored").sum()
     sums = cells.group_by("speed_m_s", "ay_m_s2").agg(pl.col("seconds").sum(), squares.sqrt().alias("rmse"))
@@ -269,8 +262,6 @@ def _space(run: OpenedRun) -> Space | None:
 
 def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.LazyFrame:
     """Return the RMSE of drives, where the ground truth is independent: log, estimator, signal and value."""
-    import polars as pl
-
     there = pl.col("independent") & pl.col("value").is_finite() & pl.col("signal").is_in(signals)
     return (
         run.table("metrics").filter(there, segment="all", metric="rmse").select("log", "estimator", "signal", "value")
@@ -279,7 +270,6 @@ def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.La
 
 def _rows(run: OpenedRun) -> list[dict[str, Any]]:
     """Return the table of drives, with NIS per degree of freedom, v̇_y residual and the residual of sideslip 0."""
-    import polars as pl
 
     def value(metric: str) -> pl.Expr:
         return pl.col("value").filter(pl.col("metric") == metric).first()
@@ -293,24 +283,12 @@ def _rows(run: OpenedRun) -> list[dict[str, Any]]:
 
 def _drive(row: Mapping[str, Any], errors: Mapping[tuple[str, str], float], keys: Mapping[str, str]) -> FleetDrive:
     """Return a drive of its row."""
-
-    def number(key: str) -> float:
-        return math.nan if row[key] is None else float(row[key])
-
+    figures = (row[key] for key in ("sideslip_coverage95", "nis", "d2", "naive_d2"))
+    coverage, nis, d2, naive_d2 = (math.nan if x is None else float(x) for x in figures)
+    scored, factors = row["sideslip_rmse_rad"] is not None, {factor: row[factor] for factor in statistics.FACTORS}
+    main, unscored, failed = row["estimator"] or "", row["unscored"] or "", row["failed_checks"]
     return FleetDrive(
-        label=row["log"],
-        seconds=row["seconds"],
-        main=row["estimator"] or "",
-        truth=row["sideslip_rmse_rad"] is not None,
-        unscored=row["unscored"] or "",
-        errors=errors,
-        coverage=number("sideslip_coverage95"),
-        nis=number("nis"),
-        d2=number("d2"),
-        naive_d2=number("naive_d2"),
-        failed_checks=row["failed_checks"],
-        keys=keys,
-        factors={factor: row[factor] for factor in statistics.FACTORS},
+        row["log"], row["seconds"], main, scored, unscored, errors, coverage, nis, d2, naive_d2, failed, keys, factors
     )
 
 

@@ -309,8 +309,7 @@ def _blueprint() -> rrb.Blueprint:
         name="Drive",
     )
     errors = rrb.Vertical(
-        *(_track_view(f"error_{plot.name}", plot.error_title, states[1:]) for plot in ERRORS),
-        name="Errors",
+        *(_track_view(f"error_{plot.name}", plot.error_title, states[1:]) for plot in ERRORS), name="Errors"
     )
     filters = rrb.Vertical(
         *(_track_view(plot.name, plot.title, ("baseline", "main"), legend=plot is _HEALTH[0]) for plot in _HEALTH[:-1]),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.units import SIGNALS, read_unit
+from pdhef_logtool.records.printable import gathered
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -183,14 +184,11 @@ def mean(values: NDArray[Any], *_: FloatArray) -> float:
 
 def figures(drive: EvaluatedDrive, metrics: Iterable[Metric]) -> list[MetricRow]:
     """Return the rows of metrics by estimator, in the order of the tracks, then by metric, signal and segment."""
-    families: dict[Callable[[EvaluatedDrive], Iterable[Columns]], list[Metric]] = {}
-    for metric in metrics:
-        families.setdefault(metric.columns, []).append(metric)
     everywhere = [(ALL, slice(None))]
     stamps = _places(drive.masks)
     steps = _places({name: mask[1:] & mask[:-1] for name, mask in drive.masks.items()})
     rows: dict[str, list[MetricRow]] = {name: [] for name in drive.tracks}
-    for columns_of, family in families.items():
+    for columns_of, family in gathered((m.columns, m) for m in metrics).items():
         for columns in columns_of(drive):
             places = everywhere if columns.whole else steps if columns.of_steps else stamps
             for segment, place in places:

@@ -54,11 +54,7 @@ def _against_reference(drive: EvaluatedDrive) -> Iterator[Columns]:
         used = track.valid & reference.valid
         used &= (reference.vx_m_s > drive.low_speed_m_s) & ~(track.vx_m_s <= drive.low_speed_m_s)
         difference = np.where(used, wrap_angle(track.sideslip_rad - reference.sideslip_rad), np.nan)
-        values = {
-            "difference": difference,
-            "std": reference.sideslip_std_rad,
-            "independent": reference.independent,
-        }
+        values = {"difference": difference, "std": reference.sideslip_std_rad, "independent": reference.independent}
         yield Columns(name, "sideslip_rad", values)
 
 

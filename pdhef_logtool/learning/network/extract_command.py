@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
@@ -25,14 +25,7 @@ from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
-from pdhef_logtool.learning.drives import (
-    DriveRecord,
-    drives_document,
-    exit_code,
-    record_of,
-    set_manifest,
-    tell_drive,
-)
+from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, record_of, set_manifest, tell_drive
 from pdhef_logtool.learning.network import dataset, residuals
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
 from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log, identity_of
@@ -42,8 +35,9 @@ from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
+from pdhef_logtool.records.printable import gathered
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import BoolArray, Loss
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
@@ -198,14 +192,16 @@ def extract(
     output = local_path(output)
     _check(jobs, settings)
     inputs = logs_of(arguments, settings.config.read_options)
-    mapping = mapping_of(settings.config.mapping)
-    work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
+    work = _plan_jobs(inputs, output, settings, resume, reporter.warn)
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
     read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
     check_no_input(read, [output / dataset.MANIFEST])
     kept = [d for d in before.get("drives", []) if d["name"] not in names]
     vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
+    for job in work:
+        sha, vehicle = job.physics
+        vehicles[sha] = {"name": vehicle.name, "sha256": sha, "parameters": vehicle.model_dump(mode="json")}
     write = partial(_write, output, settings, kept, vehicles)
     folders = {
         dataset.split_folder(s) for s in (*dataset.SPLITS, settings.split, *(job.listed_split for job in work)) if s
@@ -218,9 +214,6 @@ def extract(
             with writing(output):
                 (output / dataset.MANIFEST).unlink(missing_ok=True)
         results = _without_copies(_extract_all(work, jobs, reporter), reporter.warn)
-        for job in work:
-            sha, vehicle = job.physics
-            vehicles[sha] = {"name": vehicle.name, "sha256": sha, "parameters": vehicle.model_dump(mode="json")}
         manifest = write(results)
         with writing(output):
             dataset.remove_unnamed(output, manifest)
@@ -246,12 +239,7 @@ def _write(
     failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
     copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
     return dataset.write_manifest(
-        output,
-        entries,
-        failed,
-        settings=settings.to_dict(),
-        vehicles=vehicles,
-        duplicates=copies,
+        output, entries, failed, settings=settings.to_dict(), vehicles=vehicles, duplicates=copies
     )
 
 
@@ -260,26 +248,20 @@ def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveRe
     first: dict[str, str] = {}
     for entry in sorted((r.entry for r in results if r.entry is not None), key=lambda e: str(e["name"])):
         first.setdefault(str(entry["signals_sha256"]), entry["name"])
-
-    def told(result: DriveResult) -> DriveResult:
-        entry = result.entry
-        if entry is None or entry["signals_sha256"] is None:
-            return result
-        other = first[entry["signals_sha256"]]
-        if other == entry["name"]:
-            return result
-        warn(f"{result.record.name} is left out: it contains the same signals as {other}")
-        return replace(result, entry=None, copy_of=other)
-
-    return tuple(told(r) for r in results)
+    told = []
+    for result in results:
+        entry = result.entry or {"name": "", "signals_sha256": None}
+        other = entry["name"] if entry["signals_sha256"] is None else first[entry["signals_sha256"]]
+        if other != entry["name"]:
+            warn(f"{result.record.name} is left out: it contains the same signals as {other}")
+            result = replace(result, entry=None, copy_of=other)
+        told.append(result)
+    return tuple(told)
 
 
 def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
     """Raise UsageError if overlapping slices of one log are in different splits: training data would be in the test."""
-    by_source: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for entry in entries:
-        by_source.setdefault((entry["log"], entry["source"]["sha256"]), []).append(entry)
-    for same in by_source.values():
+    for same in gathered(((e["log"], e["source"]["sha256"]), e) for e in entries).values():
         same.sort(key=lambda e: float(e["start_s"]))
         for earlier, other in pairwise(same):
             if earlier["split"] != other["split"] and other["start_s"] < earlier["end_s"]:
@@ -314,46 +296,36 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
 def _check(jobs: int, settings: ExtractSettings) -> None:
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
-    if settings.split is not None and settings.split not in dataset.SPLITS:
-        raise UsageError(expected=f"one of {', '.join(dataset.SPLITS)}", got=repr(settings.split), where="--split")
+    for option, value, allowed in (("--split", settings.split, dataset.SPLITS), ("--filter", settings.model, MODELS)):
+        if value is not None and value not in allowed:
+            raise UsageError(expected=f"one of {', '.join(allowed)}", got=repr(value), where=option)
     if settings.where is not None:
         parse_condition(settings.where, dataset.COLUMNS, of_tracks=False)
-    if settings.model not in MODELS:
-        raise UsageError(expected=f"one of {', '.join(MODELS)}", got=repr(settings.model), where="--filter")
 
 
 def _plan_jobs(
-    inputs: Sequence[LogInput],
-    output: Path,
-    settings: ExtractSettings,
-    mapping: SignalMapping | None,
-    resume: bool,
-    warn: Tell,
-) -> Iterator[_Job]:
+    inputs: Sequence[LogInput], output: Path, settings: ExtractSettings, resume: bool, warn: Tell
+) -> list[_Job]:
     cars, manifests = cache(partial(Car.load, network=NO_MODEL)), cache(set_manifest)
-    listed = [_listed(i, manifests(i.folder)) for i in inputs]
-    for log_input, (split, vehicle) in zip(inputs, listed, strict=True):
-        car = cars(settings.config.car or vehicle)
-        yield _Job(log_input, output, settings, car, mapping, split, resume)
+    mapping, listed = mapping_of(settings.config.mapping), [_listed(i, manifests(i.folder)) for i in inputs]
     if settings.config.car is None and any(vehicle is None for _, vehicle in listed):
         warn(f"no --car: residuals refer to the default {cars(None).vehicle.name}")
+    return [
+        _Job(log_input, output, settings, cars(settings.config.car or vehicle), mapping, split, resume)
+        for log_input, (split, vehicle) in zip(inputs, listed, strict=True)
+    ]
 
 
 def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
     """Return the result of each job; a crashed process loses only its own drive."""
     if len(work) == 1:
-        result = _extract(work[0], partial(reporter.progress, work[0].log_input.stem))
+        result = _extract(work[0], reporter.progress)
         tell_drive(result.record, reporter.warn)
         return (result,)
     results: dict[int, DriveResult] = {}
     progress, preload = FleetProgress(reporter.progress, len(work)), (__name__, *FILTERS)
     ends = supervise(
-        _extract_guarded,
-        work,
-        jobs=min(jobs, len(work)),
-        preload=preload,
-        progress=progress.update,
-        warn=reporter.warn,
+        _extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=progress.update, warn=reporter.warn
     )
     with closing(ends):
         for ended in ends:
@@ -366,7 +338,7 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
 
 def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
     try:
-        return _extract(job, partial(progress, job.log_input.stem))
+        return _extract(job, progress)
     except PdhefError as error:
         return _failure(job, str(error))
     except MemoryError:
@@ -379,7 +351,7 @@ def _failure(job: _Job, reason: str) -> DriveResult:
     return DriveResult(DriveRecord(job.log_input.stem, job.log_input.path.name, left_out=reason), None)
 
 
-def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
+def _extract(job: _Job, progress: Progress) -> DriveResult:
     settings, source = job.settings, identity_of(job.log_input)
     split, split_from = choose_split(source, chosen=settings.split, listed=job.listed_split)
     fingerprint, target = _fingerprint(job, split), job.target(split)
@@ -396,8 +368,11 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         rows = _residuals(drive, physics, truth, model, reference)
         if not len(rows):
             raise no_samples(job.log_input.path)
-        chosen = _chosen(rows, settings.where)
-        progress(1.0)
+        if settings.where is not None:
+            columns = dict(zip(dataset.COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
+            condition = parse_condition(settings.where, dataset.COLUMNS, of_tracks=False)
+            rows = replace(rows, chosen=condition.is_true(columns))
+        progress(job.log_input.stem, 1.0)
         entry = {
             "name": job.name,
             "log": job.log_input.stem,
@@ -416,7 +391,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             "friction_from": drive.friction.label,
             "losses": [asdict(x) for x in drive.losses],
         }
-        dataset.write_drive(target, rows, chosen, entry, truth_source=truth["kind"])
+        dataset.write_drive(target, rows, entry, truth_source=truth["kind"])
         if not entry["usable_rows"]:
             drive.tell("not one usable target: no ground truth above the low-speed limit")
         record = record_of(drive, split=split)
@@ -434,12 +409,9 @@ def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str]:
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
     """Return the drive written by an earlier command; None if its log or settings have changed."""
-    entry, name = dataset.read_entry(target), job.log_input.path.name
-    if (
-        entry is None
-        or entry.get("settings_sha256") != fingerprint
-        or entry.get("source") != {"file": name, "sha256": source}
-    ):
+    entry, name = dataset.read_entry(target) or {}, job.log_input.path.name
+    stated = entry.get("settings_sha256"), entry.get("source")
+    if stated != (fingerprint, {"file": name, "sha256": source}):
         return None
     losses = tuple(Loss(**x) for x in entry["losses"])
     record = DriveRecord(job.log_input.stem, name, source, split, entry["duration_s"], losses=losses)
@@ -533,14 +505,6 @@ def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:
         "difference_noise": _pair(noise),
         "not_independent": dict(plan.dependent),
     }
-
-
-def _chosen(rows: residuals.ResidualRows, where: str | None) -> BoolArray:
-    """Return the rows [N] that meet the condition; all rows without one."""
-    if where is None:
-        return np.ones(len(rows), dtype=np.bool_)
-    columns = dict(zip(dataset.COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
-    return parse_condition(where, dataset.COLUMNS, of_tracks=False).is_true(columns)
 
 
 def _pair(values: Sequence[float]) -> dict[str, float | None]:
