@@ -19,7 +19,7 @@ from pdhef_logtool.records.tracks import StateTrack
 
 ALL = "all"
 #: Entries of :class:`Metric` beside its functions, by name.
-_TABLE = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text(encoding="utf-8"))
+_TABLE = tomllib.loads((Path(__file__).parents[1] / "metrics.toml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, slots=True)
