@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.cli.console import table, three_lines
-from pdhef_logtool.records.printable import gathered, listed
+from pdhef_logtool.evaluation.statistics import gathered
+from pdhef_logtool.records.printable import listed
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -15,9 +15,10 @@ from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, 
 from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
-from pdhef_logtool.records.printable import all_printable, gathered, listed
+from pdhef_logtool.records.printable import all_printable, listed
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import diverged_line, faults_line
 from pdhef_logtool.results.selected_estimate import (

@@ -20,6 +20,7 @@ from pdhef_logtool.evaluation.statistics import (
     Factors,
     Outcome,
     decided,
+    gathered,
     least_drives,
     log_ratios,
     paired_change,
@@ -36,7 +37,6 @@ from pdhef_logtool.evaluation.validation_plan import (
     Requirement,
     shown,
 )
-from pdhef_logtool.records.printable import gathered
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.storage.templates import clauses, one_line, template
 

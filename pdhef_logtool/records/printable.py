@@ -7,7 +7,7 @@ warning, and a line break could fake one. All results and errors for users are e
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import PurePath
 from typing import Any, TypeVar
@@ -16,8 +16,6 @@ from typing import Any, TypeVar
 MOST_SIGNS = 1000
 
 _T = TypeVar("_T")
-_Key = TypeVar("_Key")
-_Value = TypeVar("_Value")
 
 
 def printable(text: object, most: int = MOST_SIGNS) -> str:
@@ -29,14 +27,6 @@ def printable(text: object, most: int = MOST_SIGNS) -> str:
         half = (most - 1) // 2
         line = f"{line[:half]}…{line[-half:]}"
     return line
-
-
-def gathered(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
-    """Return the values of each key, such as the names that share a text, both in order of their first appearance."""
-    groups: dict[_Key, list[_Value]] = {}
-    for key, value in pairs:
-        groups.setdefault(key, []).append(value)
-    return groups
 
 
 def listed(names: Sequence[str], most: int = 5, count: int | None = None) -> str:

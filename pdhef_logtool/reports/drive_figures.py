@@ -11,8 +11,8 @@ import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
 from pdhef_logtool.evaluation.largest_errors import ErrorPlace
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.records.geometry import DEGREES
-from pdhef_logtool.records.printable import gathered
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.printable import gathered, listed
+from pdhef_logtool.records.printable import listed
 from pdhef_logtool.reports.charts import Charts, TimeFigure
 from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.page import render

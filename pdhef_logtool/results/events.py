@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import polars as pl
 
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.smoothing import runs
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, IntArray
@@ -155,17 +156,15 @@ class _Drive:
 
     start_ns: int
     low_speed_m_s: float
-    spans: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+    spans: Mapping[str, Sequence[tuple[int, int]]]
 
 
 def _drives(run: OpenedRun) -> dict[str, _Drive]:
     """Return the drives of a run by log."""
+    events = run.table("events").select("log", "event", "start_ns", "end_ns").collect().iter_rows()
+    spans = gathered((log, (event, (start_ns, end_ns))) for log, event, start_ns, end_ns in events)
     rows = run.table("drives").select("log", "start_ns", "low_speed_m_s").collect().iter_rows()
-    drives = {log: _Drive(start_ns or 0, slow or 0.0) for log, start_ns, slow in rows}
-    events = run.table("events").select("log", "event", "start_ns", "end_ns").collect()
-    for log, event, *span in events.iter_rows():
-        drives[log].spans.setdefault(event, []).append((span[0], span[1]))
-    return drives
+    return {log: _Drive(start_ns or 0, slow or 0.0, gathered(spans.get(log, ()))) for log, start_ns, slow in rows}
 
 
 def _needed(condition: Condition, main: str) -> set[str]:

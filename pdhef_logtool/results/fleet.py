@@ -21,7 +21,6 @@ import polars as pl
 from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
-from pdhef_logtool.records.printable import gathered
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, breakdowns
 from pdhef_logtool.results.opened_run import OpenedRun
@@ -210,9 +209,9 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     sensors = faults.filter(pl.col("origin") == "sensor").group_by("log").agg(pl.col("kind").unique().sort())
     kinds = dict(sensors.collect().iter_rows())
     lost = faults.filter(severity="lost").select("log", "text").collect().rows()
-    metadata = gathered((log, entry) for log, *entry in run.table("metadata").collect().iter_rows())
+    metadata = statistics.gathered((log, entry) for log, *entry in run.table("metadata").collect().iter_rows())
     figures = sideslip_errors(run, [*SIGNALS]).collect().iter_rows()
-    of_log = gathered((log, ((estimator, signal), value)) for log, estimator, signal, value in figures)
+    of_log = statistics.gathered((log, ((estimator, signal), value)) for log, estimator, signal, value in figures)
     drives = tuple(
         _drive(r, dict(of_log.get(r["log"], ())), dict(metadata.get(r["log"], ())) | _keys(r, kinds.get(r["log"])))
         for r in done

@@ -86,6 +86,6 @@ METRICS = described(
     bias=(mean, "signed"),
     p95_abs=(_p95, "error"),
     max_abs=(lambda e: float(np.max(np.abs(e))), "error"),
-    rmse_relative=(_relative, "error truth"),
-    coverage95=(lambda std, e: float(np.mean(np.abs(e) <= NORMAL_95 * std)), "std error"),
+    rmse_relative=(_relative, "error", "truth"),
+    coverage95=(lambda std, e: float(np.mean(np.abs(e) <= NORMAL_95 * std)), "std", "error"),
 )

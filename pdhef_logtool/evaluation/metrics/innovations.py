@@ -74,5 +74,5 @@ def _autocorrelation(before: FloatArray, after: FloatArray) -> float | None:
 METRICS = (
     *described(_errors, nees=mean),
     *described(_innovations, nis=mean, nis_dof=mean, diverged=mean),
-    *described(_pairs, nis_autocorrelation=(_autocorrelation, "before after")),
+    *described(_pairs, nis_autocorrelation=(_autocorrelation, "before", "after")),
 )

@@ -50,6 +50,6 @@ def _rms_aligned(
 
 METRICS = described(
     errors_of_drive,
-    lag_s=(_lag_of_start, "error since_start_ns estimate truth"),
-    rmse_aligned=(_rms_aligned, "error since_start_ns estimate truth straight"),
+    lag_s=(_lag_of_start, "error", "since_start_ns", "estimate", "truth"),
+    rmse_aligned=(_rms_aligned, "error", "since_start_ns", "estimate", "truth", "straight"),
 )

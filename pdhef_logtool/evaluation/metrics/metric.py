@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import SIGNALS, read_unit
-from pdhef_logtool.records.printable import gathered
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -158,17 +158,17 @@ class Metric:
 
 
 def described(
-    columns: Callable[[EvaluatedDrive], Iterable[Columns]], **formulas: Formula | tuple[Formula, str]
+    columns: Callable[[EvaluatedDrive], Iterable[Columns]], **formulas: Formula | tuple[Any, ...]
 ) -> tuple[Metric, ...]:
     """Return metrics over the same columns, with the entries of ``metrics.toml``.
 
-    ``formulas``: by the name of a metric, with the names of the columns that it needs unless there is only its own.
+    ``formulas``: by the name of a metric; a tuple has the names of the columns after it, unless there is only its own.
     """
     metrics = []
     for name, stated in formulas.items():
-        formula, over = stated if isinstance(stated, tuple) else (stated, "")
+        formula, *over = stated if isinstance(stated, tuple) else (stated,)
         entries: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in _TABLE[name].items()}
-        metrics.append(Metric(name, columns=columns, formula=formula, over=tuple(over.split()), **entries))
+        metrics.append(Metric(name, columns=columns, formula=formula, over=tuple(over), **entries))
     return tuple(metrics)
 
 

@@ -88,8 +88,8 @@ METRICS = (
     *described(
         _against_reference,
         reference_rms=(rms, "difference"),
-        reference_std=(lambda _, std: rms(std), "difference std"),
-        reference_independent=(lambda _, independent: mean(independent), "difference independent"),
+        reference_std=(lambda _, std: rms(std), "difference", "std"),
+        reference_independent=(lambda _, independent: mean(independent), "difference", "independent"),
     ),
-    *described(_ranked, reference_further=(_further, "of_a of_b std block")),
+    *described(_ranked, reference_further=(_further, "of_a", "of_b", "std", "block")),
 )

@@ -25,6 +25,7 @@ from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, record_of, set_manifest, tell_drive
 from pdhef_logtool.learning.network import dataset, residuals
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
@@ -35,7 +36,6 @@ from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
-from pdhef_logtool.records.printable import gathered
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
@@ -248,15 +248,15 @@ def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveRe
     first: dict[str, str] = {}
     for entry in sorted((r.entry for r in results if r.entry is not None), key=lambda e: str(e["name"])):
         first.setdefault(str(entry["signals_sha256"]), entry["name"])
-    told = []
+    kept = []
     for result in results:
         entry = result.entry or {"name": "", "signals_sha256": None}
         other = entry["name"] if entry["signals_sha256"] is None else first[entry["signals_sha256"]]
         if other != entry["name"]:
             warn(f"{result.record.name} is left out: it contains the same signals as {other}")
             result = replace(result, entry=None, copy_of=other)
-        told.append(result)
-    return tuple(told)
+        kept.append(result)
+    return tuple(kept)
 
 
 def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
