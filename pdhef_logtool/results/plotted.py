@@ -36,7 +36,7 @@ class Plot:
 
 
 _SLIP_LIMITS, _RATE_LIMITS = ("sideslip_low_deg", "sideslip_high_deg"), ("yaw_rate_low_deg_s", "yaw_rate_high_deg_s")
-#: What recordings and layouts draw of each track.
+#: Quantities that recordings and layouts draw of each track.
 STATES = (
     Plot("sideslip_deg", "Sideslip [deg]", _SIDESLIP, DEGREES, "sideslip_std_rad", _SLIP_LIMITS, "sideslip_error_deg"),
     Plot(
