@@ -8,8 +8,10 @@ standard deviation over vehicles, which a calibration uses as its prior and inte
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -53,43 +55,21 @@ def stiffness_per_load(mass_kg: float) -> float:
 
 
 #: In the order of their dependence.
-RULES: tuple[Rule, ...] = (
-    Rule(
-        "yaw_inertia_kg_m2",
-        lambda v: v["mass_kg"] * v["cg_to_front_axle_m"] * v["cg_to_rear_axle_m"],
-        0.15,
-        "mass times the product of the axle distances (dynamic index 1)",
-    ),
-    Rule("track_m", lambda v: min(0.547 * v["wheelbase_m"], 2.1), 0.07, "0.547 of the wheelbase, 2.1 m at most"),
-    Rule("cg_height_m", lambda v: 0.2 * v["wheelbase_m"], 0.15, "0.2 of the wheelbase"),
-    Rule("wheel_radius_m", lambda v: 0.11 * v["wheelbase_m"], 0.1, "0.11 of the wheelbase"),
-    Rule("relaxation_length_m", lambda v: v["wheel_radius_m"] / 0.6, 0.4, "1.67 wheel radii"),
-    Rule("cg_over_roll_axis_m", lambda v: 0.625 * v["cg_height_m"], 0.2, "0.625 of the height of the CG"),
-    Rule(
-        "roll_frequency_rad_s",
-        lambda v: 11.0 * math.sqrt(2.87 / v["wheelbase_m"]),
-        0.15,
-        "11 rad/s at a wheelbase of 2.87 m, with the inverse square root of the wheelbase",
-    ),
-    Rule(
-        "low_speed_blend_m_s",
-        lambda v: 0.5655 * math.sqrt(GRAVITY_M_S2 * v["wheelbase_m"]),
-        0.3,
-        "0.566 times the square root of g times the wheelbase",
-    ),
-    Rule(
-        "tyres.front.cornering_stiffness_n_per_rad",
-        lambda v: 0.97 * stiffness_per_load(v["mass_kg"]) * v["front_load_n"],
-        0.4,
-        "14 per rad times the axle load for cars, 5.8 for heavy trucks and small models",
-    ),
-    Rule(
-        "tyres.rear.cornering_stiffness_n_per_rad",
-        lambda v: 1.03 * stiffness_per_load(v["mass_kg"]) * v["rear_load_n"],
-        0.4,
-        "15 per rad times the axle load for cars, 6.2 for heavy trucks and small models",
-    ),
-)
+_FORMULAS: dict[str, Callable[[Mapping[str, float]], float]] = {
+    "yaw_inertia_kg_m2": lambda v: v["mass_kg"] * v["cg_to_front_axle_m"] * v["cg_to_rear_axle_m"],
+    "track_m": lambda v: min(0.547 * v["wheelbase_m"], 2.1),
+    "cg_height_m": lambda v: 0.2 * v["wheelbase_m"],
+    "wheel_radius_m": lambda v: 0.11 * v["wheelbase_m"],
+    "relaxation_length_m": lambda v: v["wheel_radius_m"] / 0.6,
+    "cg_over_roll_axis_m": lambda v: 0.625 * v["cg_height_m"],
+    "roll_frequency_rad_s": lambda v: 11.0 * math.sqrt(2.87 / v["wheelbase_m"]),
+    "low_speed_blend_m_s": lambda v: 0.5655 * math.sqrt(GRAVITY_M_S2 * v["wheelbase_m"]),
+    "tyres.front.cornering_stiffness_n_per_rad": lambda v: 0.97 * stiffness_per_load(v["mass_kg"]) * v["front_load_n"],
+    "tyres.rear.cornering_stiffness_n_per_rad": lambda v: 1.03 * stiffness_per_load(v["mass_kg"]) * v["rear_load_n"],
+}
+#: The same with the spreads and words of ``assumed_values.toml``.
+_TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+RULES = tuple(Rule(entry, value, **_TABLE[entry]) for entry, value in _FORMULAS.items())
 
 
 def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValue, ...]]:

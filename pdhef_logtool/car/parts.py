@@ -149,10 +149,7 @@ def _axle_forces_belong_to_physics(tables: dict[str, FilterNoise]) -> dict[str, 
 
 #: Noise by filter.
 FilterTables = Annotated[
-    dict[
-        Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})],
-        FilterNoise,
-    ],
+    dict[Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise],
     AfterValidator(_axle_forces_belong_to_physics),
 ]
 

@@ -32,11 +32,7 @@ def check_output(source: Car, output: Path) -> None:
         return
     theirs = output / VEHICLE_FILE
     if not output.is_dir() or (any(output.iterdir()) and not theirs.is_file()):
-        raise UsageError(
-            expected="a new folder or a car's folder",
-            got=output.name,
-            where="--output",
-        )
+        raise UsageError(expected="a new folder or a car's folder", got=output.name, where="--output")
     if theirs.is_file() and theirs.read_bytes() != vehicle_file(source):
         raise UsageError(
             expected="a new folder, or the folder of the same car",

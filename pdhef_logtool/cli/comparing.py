@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
-
-from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
@@ -17,38 +14,17 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
 
 @options.command()
 def compare(
-    runs: Annotated[
-        list[str], Argument(metavar="RUN", help="Outputs of two or more runs, oldest first: folder or URL.")
-    ],
+    runs: list[str],
     *,
-    plan: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help='Validation plan for the last run. baseline = "run" means the run before. Exit code 4 if one fails.',
-        ),
-    ] = None,
-    max_regression: Annotated[
-        str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
-    ] = None,
-    estimator: Annotated[
-        str | None, Option(help="Estimator to compare. Default: the selected estimate of the first run, per drive.")
-    ] = None,
-    metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
-    cluster: Annotated[
-        str | None,
-        Option(
-            metavar="KEY",
-            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
-            "day, car and route is estimated.",
-        ),
-    ] = None,
-    allow_unpaired: Annotated[
-        bool, Option("--allow-unpaired", help="Accept drives that only one run contains.")
-    ] = False,
-    strict: Annotated[bool, Option("--strict", help="Inconclusive results fail.")] = False,
-    html: Annotated[Path | None, Option(help="HTML file for the comparison.")] = None,
-    junit: Annotated[Path | None, Option(help="JUnit XML file for the verdicts.")] = None,
+    plan: Path | None = None,
+    max_regression: str | None = None,
+    estimator: str | None = None,
+    metric: str | None = None,
+    cluster: str | None = None,
+    allow_unpaired: bool = False,
+    strict: bool = False,
+    html: Path | None = None,
+    junit: Path | None = None,
 ) -> None:
     """Compare two runs drive by drive: better, worse, or no significant difference; more runs as a history."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
@@ -77,26 +53,14 @@ def compare(
 
 @options.command()
 def events(
-    output: Annotated[str, Argument(metavar="OUTPUT", help="Output of a run: folder or URL.")],
+    output: str,
     *,
-    where: Annotated[str, Option(metavar="EXPR", help="Condition on columns; docs/compare.md describes it.")],
-    least: Annotated[str, Option("--for", metavar="TIME", help="Minimum duration of an event.")] = "0s",
-    pad: Annotated[
-        str | None,
-        Option(
-            metavar="TIME",
-            help="Time before and after an event; overlapping events are merged. Default: 0.25s, clips 5s.",
-        ),
-    ] = None,
-    estimator: Annotated[
-        str | None, Option(help="Estimator of the columns. Default: the selected estimate of each drive.")
-    ] = None,
-    clip: Annotated[
-        bool, Option("--clip", help="Write one MCAP file per event, with the source's topics and the estimates.")
-    ] = False,
-    source: Annotated[
-        Path | None, Option(metavar="DIR", help="Folder of the logs, for clips of a run without annotated copies.")
-    ] = None,
+    where: str,
+    least: str = "0s",
+    pad: str | None = None,
+    estimator: str | None = None,
+    clip: bool = False,
+    source: Path | None = None,
 ) -> None:
     """Find the times at which a condition is true, and cut clips there."""
     from pdhef_logtool.cli.event_tables import render_events

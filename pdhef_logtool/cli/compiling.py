@@ -13,7 +13,7 @@ gnss_longitude_deg = { topic = "/rtk/fix", field = "longitude" }
 """
 
 
-@options.command(name="compile")
+@options.command()
 def compile_() -> None:
     """Compile the filters in advance, so that the first run starts at once."""
     import time

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
-from typer import Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
@@ -16,13 +15,7 @@ if TYPE_CHECKING:
 
 
 @options.command()
-def convert(
-    log: options.Log,
-    config: RunConfig,
-    output: Annotated[
-        Path, Option("--output", "-o", help="MCAP file to write. An existing file is not overwritten.")
-    ] = Path("drive.mcap"),
-) -> None:
+def convert(log: str, *, config: RunConfig, output: Path = Path("drive.mcap")) -> None:
     """Convert a log of any format to MCAP."""
     from pdhef_logtool.logs.conversion import convert_log
     from pdhef_logtool.logs.discovery import one_place

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.cli.console import table, three_lines
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.records.printable import listed
 
 if TYPE_CHECKING:
@@ -34,10 +35,7 @@ def render_events(events: FoundEvents, console: Console) -> None:
         console.print(made)
         if (more := len(events.events) - _MOST_EVENTS) > 0:
             console.print(f"  and {more} more: --json")
-    reasons: dict[str, list[str]] = {}
-    for drive, reason in events.left_out.items():
-        reasons.setdefault(reason, []).append(drive)
-    for reason, names in reasons.items():
+    for reason, names in gathered((reason, drive) for drive, reason in events.left_out.items()).items():
         console.print(f"not searched, {reason}: {listed(names)}")
     for clip in events.clips:
         console.print(f"clip: {clip}", soft_wrap=True)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
-from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
@@ -19,24 +18,16 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.inspection.report import Inspection
 
 
-@options.command(shared="mapping")
+@options.command()
 def inspect(
-    log: options.Log,
+    log: str,
+    topic: str | None = None,
+    *,
     config: RunConfig,
-    write_mapping: Annotated[
-        Path | None, Option(help="Write a mapping.toml to edit. An existing file is not overwritten.")
-    ] = None,
-    report: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="HTML page: a plot of each candidate field, clocks, checks, mapping to paste."),
-    ] = None,
-    fields: Annotated[
-        bool, Option("--fields", help="Show the numeric fields of TOPIC, or of all topics, instead.")
-    ] = False,
-    topic: Annotated[str | None, Argument(metavar="[TOPIC]", help="Topic for --fields.", show_default=False)] = None,
-    whole: Annotated[
-        bool, Option("--all", help="Read a large log completely, to find damage inside its chunks.")
-    ] = False,
+    write_mapping: Path | None = None,
+    report: Path | None = None,
+    fields: bool = False,
+    whole: bool = False,
 ) -> None:
     """Show topics, rates, gaps and clocks of a log, and how its fields map to signals.
 
@@ -68,14 +59,8 @@ def inspect(
     console.finish(inspection, render_inspection, exit_code=exit_code)
 
 
-@options.command(name="map", shared="mapping")
-def map_(
-    log: options.Log,
-    config: RunConfig,
-    output: Annotated[Path, Option("--output", "-o", help="Mapping file. An existing file is not overwritten.")] = Path(
-        "mapping.toml"
-    ),
-) -> None:
+@options.command()
+def map_(log: str, *, config: RunConfig, output: Path = Path("mapping.toml")) -> None:
     """Build a mapping file interactively.
 
     Without a terminal, the file contains the recognised signals, and all candidates as comments.

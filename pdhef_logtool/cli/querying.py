@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from typer import Argument, Option
-
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.printable import printable
 
 
 @options.command()
-def query(
-    runs: Annotated[list[str], Argument(metavar="RUN", help="Output of a run: folder or URL.")],
-    sql: Annotated[str, Argument(metavar="SQL", help="Statement on the tables.")],
-    *,
-    csv: Annotated[bool, Option("--csv", help="Print CSV.")] = False,
-) -> None:
+def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
     """Ask about the drives of one or more runs, in SQL."""
     from pdhef_logtool.results import querying
 

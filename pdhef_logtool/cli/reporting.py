@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
-from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
@@ -20,16 +18,7 @@ if TYPE_CHECKING:
 
 @options.command()
 def report(
-    output: Annotated[Path, Argument(parser=options.local_folder, metavar="OUT", help="Output folder of a run.")],
-    show: Annotated[bool, Option("--open", help="Open the page in the browser.")] = False,
-    by: Annotated[
-        list[str] | None,
-        Option(metavar="KEY", help="Breakdown of the drives: car, folder, or a metadata key. Repeatable."),
-    ] = None,
-    pdf: Annotated[
-        bool, Option("--pdf", help="Write report.pdf to sign: cover, verdicts, drives, input hashes. Needs Chromium.")
-    ] = False,
-    positions: Annotated[bool, Option("--positions", help="Include the paths of the drives in report.pdf.")] = False,
+    output: str, *, show: bool = False, by: list[str] | None = None, pdf: bool = False, positions: bool = False
 ) -> None:
     """Write the HTML reports of a finished run again."""
     from pdhef_logtool.reports.pages import write_pages
@@ -38,13 +27,14 @@ def report(
 
     if positions and not pdf:
         raise UsageError(expected="--pdf", got="--positions alone", where="--positions")
-    open_run(output)  # before the folder is locked, which would create a missing one
-    with OutputFolder(output, (LOGS,)), console.reporter() as reporter:
-        result = write_pages(open_run(output), reporter.progress, by=by or ())
+    folder = options.local_folder(output)
+    open_run(folder)  # before it is locked, which would create a missing one
+    with OutputFolder(folder, (LOGS,)), console.reporter() as reporter:
+        result = write_pages(open_run(folder), reporter.progress, by=by or ())
         if pdf:
             from pdhef_logtool.reports.pdf import write_pdf
 
-            result = replace(result, pdf=write_pdf(open_run(output), positions=positions))
+            result = replace(result, pdf=write_pdf(open_run(folder), positions=positions))
     console.show(result, _render)
     for line in result.wrong:
         console.warn(line)

@@ -15,6 +15,7 @@ from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, 
 from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
@@ -99,10 +100,8 @@ def render_run(result: RunResult, console: Console) -> None:
     for log_result, report in reports_by_log:
         if report is None:
             console.print(Text.assemble((log_result.outcome.log, "bold"), f"  {log_result.outcome.outcome}\n"))
-        elif is_joint:
-            _render_one_of_several(report, assumed, console)
         else:
-            _render_log(report, console)
+            _render_log(report, console, assumed if is_joint else None)
     if result.requirements is not None:
         render_plan(result.requirements, console)
     failed = [r for r, report in reports_by_log if report is None]
@@ -200,43 +199,37 @@ def _print_outputs(output: Path | str, console: Console, labels: Sequence[str] =
     console.print(f"outputs in {output}{shown}", soft_wrap=True)
 
 
-def _render_one_of_several(report: _Report, assumed: Sequence[str], console: Console) -> None:
-    """Print details of a log that need attention and are not in the joint table; ``assumed``: common assumptions."""
-    texts, main, is_named = _texts(report), report["selected_estimate"], report["answer"]["named"]
-    is_scored = _figures(report).get((main, "sideslip_rad", "all", "rmse")) is not None
-    rest = [clause for clause in assumptions_of(report) if clause not in assumed]
-    shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
-    shown |= {"assumed": "; ".join(rest)} if rest else {}
-    lines = [*_checks(report, undecided=False), *_losses(report, notes=False)]
-    if shown or lines or is_named:
-        _print_log(report, lines, shown, _table(report, console) if is_named else None, console)
-        console.print()
+def _render_log(report: _Report, console: Console, common: Sequence[str] | None = None) -> None:
+    """Print the log of a run with one log.
 
-
-def _render_log(report: _Report, console: Console) -> None:
-    """Print the log of a run with one log."""
-    texts = _texts(report)
-    later = _clauses(texts, "next")[1:]  # the head contains the first one
-    shown = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
-    shown |= {"next": "; ".join(later)} if later else {}
-    _print_log(report, _checks(report), shown, _table(report, console), console)
-    for line in _below(report):
+    ``common``: assumptions of several logs; a table has their figures, and only what needs attention is printed.
+    """
+    texts, is_named = _texts(report), report["answer"] is not None and report["answer"]["named"]
+    if common is None:
+        later = _clauses(texts, "next")[1:]  # the head contains the first one
+        shown = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
+        shown |= {"next": "; ".join(later)} if later else {}
+        lines = [*_checks(report)]
+    else:
+        is_scored = _figures(report).get((report["selected_estimate"], "sideslip_rad", "all", "rmse")) is not None
+        rest = [clause for clause in assumptions_of(report) if clause not in common]
+        shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
+        shown |= {"assumed": "; ".join(rest)} if rest else {}
+        lines = [*_checks(report, undecided=False), *_losses(report, notes=False)]
+        if not (shown or lines or is_named):
+            return
+    log, has_table = report["log"], common is None or is_named
+    about = f"  {log['kind']}, {log['duration_s']:.1f} s" if has_table else ""
+    console.print(Text.assemble((log["name"], "bold"), about))
+    for line in lines:
+        print_indented(line, console)
+    if shown:
+        console.print(named_lines({f"  {_TEXTS[key]}": text for key, text in shown.items()}))
+    if has_table:
+        console.print(_table(report, console))
+    for line in _below(report) if common is None else ():
         print_indented(line, console)
     console.print()
-
-
-def _print_log(
-    report: _Report, above: Iterable[str], texts: Mapping[str, str], estimators: Table | None, console: Console
-) -> None:
-    log = report["log"]
-    about = "" if estimators is None else f"  {log['kind']}, {log['duration_s']:.1f} s"
-    console.print(Text.assemble((log["name"], "bold"), about))
-    for line in above:
-        print_indented(line, console)
-    if texts:
-        console.print(named_lines({f"  {_TEXTS[key]}": text for key, text in texts.items()}))
-    if estimators is not None:
-        console.print(estimators)
 
 
 def _texts(report: _Report) -> dict[str, str]:
@@ -259,19 +252,20 @@ def _checks(report: _Report, *, undecided: bool = True) -> Iterable[str]:
 
 def _losses(report: _Report, *, notes: bool = True) -> Iterable[str]:
     """Yield the losses of the input, then its notes, with one line for several channels with the same one."""
-    where: dict[tuple[str, str, str], list[str]] = {}
-    for loss in sorted(report["losses"], key=lambda x: x["severity"] != "lost"):
+
+    def text(loss: Mapping[str, Any]) -> tuple[str, str, str]:
         has_count = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
         what = loss["what"] if has_count else f"{loss['count']} × {loss['what']}"
         span = ""
         if loss["start_ns"] is not None and loss["end_ns"] is not None:
             start = report["log"]["start_ns"]
             span = f", {(loss['start_ns'] - start) / 1e9:.2f} to {(loss['end_ns'] - start) / 1e9:.2f} s"
-        where.setdefault(("lost" if loss["severity"] == "lost" else "note", what, span), []).append(loss["where"])
-    for (word, what, span), places in where.items():
-        if word == "note" and not notes:
-            continue
-        yield f"{word}: {what} ({listed(places, _MOST_PLACES)}{span})"
+        return ("lost" if loss["severity"] == "lost" else "note"), what, span
+
+    losses = sorted(report["losses"], key=lambda x: x["severity"] != "lost")
+    for (word, what, span), places in gathered((text(x), x["where"]) for x in losses).items():
+        if word == "lost" or notes:
+            yield f"{word}: {what} ({listed(places, _MOST_PLACES)}{span})"
 
 
 def _below(report: _Report) -> Iterable[str]:
@@ -281,19 +275,12 @@ def _below(report: _Report) -> Iterable[str]:
         yield "† the ground truth is an input or the estimate itself: not an independent check"
     if any(not e["causal"] for e in shown):
         yield "* not causal: uses later measurements"
-    skipped: dict[str, list[str]] = {}
-    for estimator in report["estimators"]:
-        if estimator["outcome"] == "skipped":
-            skipped.setdefault(estimator["reason"], []).append(estimator["name"])
-    for reason, names in skipped.items():
-        yield f"{', '.join(names)} skipped: {reason}"
-    yield from (f"{e['name']} {e['reason']}" for e in report["estimators"] if e["outcome"] == "failed")
-    happened: dict[str, list[str]] = {}
-    for estimator in shown:
-        if event := diverged_line(report, estimator["name"]):
-            happened.setdefault(event, []).append(estimator["name"])
-    for event, names in happened.items():
-        yield f"{', '.join(names)}: {event}"
+    estimators = report["estimators"]
+    skipped = gathered((e["reason"], e["name"]) for e in estimators if e["outcome"] == "skipped")
+    yield from (f"{', '.join(names)} skipped: {reason}" for reason, names in skipped.items())
+    yield from (f"{e['name']} {e['reason']}" for e in estimators if e["outcome"] == "failed")
+    diverged = gathered((diverged_line(report, e["name"]), e["name"]) for e in shown)
+    yield from (f"{', '.join(names)}: {event}" for event, names in diverged.items() if event)
     if faults := faults_line(report):
         yield f"faults of the sensors: {faults}"
     yield from _losses(report)

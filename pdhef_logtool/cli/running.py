@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import OutputError, UsageError
@@ -32,37 +32,18 @@ def _list_estimators(show: bool) -> None:
         raise typer.Exit
 
 
-@options.command(
-    shared="mapping start end estimators annotate keep friction plan network model reference gnss no_position waived",
-    car="Car of the logs (default: a sedan)",
-)
-def run(  # positional: one an option of the command line
-    logs: options.Logs,
-    output: Annotated[
-        str, options.output_option("--output", "-o", metavar="DIR|URL", help="Output folder, or s3:// URL.")
-    ],
+@options.command()
+def run(
+    logs: list[str],
+    *,
+    output: str,
     config: RunConfig,
-    junit: options.JunitFile = None,
-    report: Annotated[
-        bool, options.output_option(help="Write HTML reports: report.html per log and for the run.")
-    ] = True,
-    jobs: options.Jobs = 1,
-    ray: Annotated[
-        str | None,
-        options.work_option(
-            metavar="ADDRESS", help="Ray cluster (auto or HOST:PORT). The output must be a shared folder or a URL."
-        ),
-    ] = None,
-    resume: Annotated[
-        bool, options.work_option("--resume", help="Continue the run in the output: only new or changed logs.")
-    ] = False,
-    repeat: Annotated[
-        list[str] | None,
-        options.work_option(
-            metavar="failed|NAME",
-            help="Like --resume, and repeat failed logs; or repeat this log alone and keep all its files. Repeatable.",
-        ),
-    ] = None,
+    junit: Path | None = None,
+    report: bool = True,
+    jobs: int = 1,
+    ray: str | None = None,
+    resume: bool = False,
+    repeat: list[str] | None = None,
     list_estimators: Annotated[
         bool,
         Option("--list-estimators", callback=_list_estimators, is_eager=True, help="List the estimators and exit."),
@@ -78,32 +59,16 @@ def run(  # positional: one an option of the command line
     _finish(result)
 
 
-@options.command(
-    shared="mapping start end plan reference gnss",
-    car="Car of the log (position of the ground truth, friction, lowest speed)",
-)
-def metrics(  # positional: one an option of the command line
-    log: options.Log,
+@options.command()
+def metrics(
+    log: str,
+    *,
     config: RunConfig,
-    estimate: Annotated[
-        list[str] | None,
-        Option(
-            metavar="SOURCE", help="Estimate: [SIGNAL=]TOPIC[.FIELD]. Repeatable. Default: [estimates] of the mapping."
-        ),
-    ] = None,
-    truth: Annotated[
-        list[str] | None,
-        Option(
-            metavar="SOURCE", help="Ground truth: [SIGNAL=]TOPIC[.FIELD]. Repeatable. Default: mapped or recognised."
-        ),
-    ] = None,
-    name: Annotated[
-        str | None, Option(help="Name of the estimator in the results, or the one of [estimates] to score.")
-    ] = None,
-    output: Annotated[
-        Path | None, Option("--output", "-o", help="Output folder; pdhef report writes its pages. Default: print only.")
-    ] = None,
-    junit: options.JunitFile = None,
+    estimate: list[str] | None = None,
+    truth: list[str] | None = None,
+    name: str | None = None,
+    output: Path | None = None,
+    junit: Path | None = None,
 ) -> None:
     """Score an estimate that the log contains, with the metrics of pdhef run."""
     from pdhef_logtool.runs.recorded_estimates import score_log
@@ -123,23 +88,12 @@ def metrics(  # positional: one an option of the command line
 
 
 @options.command()
-def view(
-    output: Annotated[
-        Path,
-        Argument(
-            parser=options.local_folder,
-            metavar="OUTPUT",
-            help="Output folder of a run, folder of one log, or .rrd file.",
-        ),
-    ],
-    log: Annotated[list[str] | None, Option(metavar="NAME", help="Log of the run. Repeatable. Default: all.")] = None,
-    web: Annotated[bool, Option("--web", help="Open in the browser, for machines without a display.")] = False,
-    catalog: Annotated[bool, Option("--catalog", help="Serve a catalog to filter the recordings.")] = False,
-) -> None:
+def view(output: str, *, log: list[str] | None = None, web: bool = False, catalog: bool = False) -> None:
     """Open the recordings of a run in the Rerun viewer."""
-    recordings = find_recordings(output, log or ())
+    folder = options.local_folder(output)
+    recordings = find_recordings(folder, log or ())
     if catalog:
-        raise typer.Exit(serve_catalog(recordings, output.resolve().stem, web=web))
+        raise typer.Exit(serve_catalog(recordings, folder.resolve().stem, web=web))
     if not web and not console.has_display():
         raise UsageError(
             expected="a display to open the viewer on",
@@ -147,7 +101,7 @@ def view(
             where="pdhef view",
             remedy="add --web and open the address that it prints, or copy the .rrd files to a machine with a display",
         )
-    console.say(f"opening {recordings[0] if len(recordings) == 1 else f'{len(recordings)} recordings of {output}'}")
+    console.say(f"opening {recordings[0] if len(recordings) == 1 else f'{len(recordings)} recordings of {folder}'}")
     raise typer.Exit(open_viewer(recordings, web=web))
 
 

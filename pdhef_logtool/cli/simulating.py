@@ -4,45 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
-
-from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
-_Many = list[str] | None
-SetOutput = Annotated[Path, Option("--output", "-o", help="Output folder. Existing drives are kept.")]
-
 
 @options.command()
 def simulate(
+    manoeuvre: str | None = None,
     *,
-    manoeuvre: Annotated[
-        str | None, Argument(metavar="MANOEUVRE", help="Name of the manoeuvre; --list shows them.")
-    ] = None,
-    output: Annotated[Path | None, Option("--output", "-o", help="MCAP file to write.")] = None,
-    speed_km_h: Annotated[float | None, Option("--speed", help="Speed in km/h. Default: from the manoeuvre.")] = None,
-    friction: Annotated[float | None, Option("--mu", help="Friction. Default: from the manoeuvre.")] = None,
-    seed: Annotated[int, Option(help="Seed of noise and of random profiles.")] = 0,
-    duration_s: Annotated[
-        float | None, Option("--duration", help="Duration in s. Default: from the manoeuvre.")
-    ] = None,
-    amplitude: Annotated[float, Option(help="Factor on the manoeuvre's amplitude.")] = 1.0,
-    vehicle: Annotated[str | None, Option("--vehicle", "-v", help="Vehicle, see below. Default: sedan.")] = None,
-    faults: Annotated[_Many, Option("--fault", metavar="FAULT", help="Sensor fault, see below. Repeatable.")] = None,
-    sensors: Annotated[
-        _Many, Option("--sensor", metavar="NAME=VALUE", help="Sensor error parameter (docs/simulate.md). Repeatable.")
-    ] = None,
-    without: Annotated[
-        _Many, Option(metavar="WHAT", help="Omit imu, steering, wheels, rtk, perfect or events. Repeatable.")
-    ] = None,
-    rtk_rate_hz: Annotated[
-        int | None,
-        Option("--rtk-rate", help="Rate of the ground truth in Hz: 10, 20, 50 or 100. Default: from the manoeuvre."),
-    ] = None,
-    keep_spins: Annotated[bool, Option("--keep-spins", help="Keep |sideslip| > 20 degrees and lifted wheels.")] = False,
-    list_all: Annotated[bool, Option("--list", help="List the manoeuvres and their defaults.")] = False,
+    output: Path | None = None,
+    speed_km_h: float | None = None,
+    friction: float | None = None,
+    seed: int = 0,
+    duration_s: float | None = None,
+    amplitude: float = 1.0,
+    vehicle: str | None = None,
+    faults: list[str] | None = None,
+    sensors: list[str] | None = None,
+    without: list[str] | None = None,
+    rtk_rate_hz: int | None = None,
+    keep_spins: bool = False,
+    list_all: bool = False,
 ) -> None:
     """Simulate a drive and write it as MCAP, with noisy sensors, RTK and exact ground truth."""
     if list_all:
@@ -79,14 +62,9 @@ def _incomplete(missing: str) -> UsageError:
     return UsageError(expected="a manoeuvre and -o FILE", got=f"no {missing}", where="pdhef simulate", remedy=remedy)
 
 
-@options.command(name="simulate suite")
+@options.command("simulate suite")
 def suite(
-    output: SetOutput,
-    count: Annotated[int, Option(help="Number of drives.")] = 200,
-    seed: Annotated[int, Option(help="Seed of all draws.")] = 0,
-    duration_s: Annotated[float, Option("--duration", help="Duration of a drive in s.")] = 12.5,
-    vehicles: Annotated[str, Option(help="default, or randomised (a different one per drive).")] = "default",
-    jobs: options.Jobs = 1,
+    *, output: Path, count: int = 200, seed: int = 0, duration_s: float = 12.5, vehicles: str = "default", jobs: int = 1
 ) -> None:
     """Simulate a training set of drives."""
     from truthsim.suite import write_suite

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
 
 @options.command()
-def plan(
-    action: Annotated[str, Argument(metavar="init", help="init: write a commented plan.")],
-    *,
-    output: Annotated[Path, Option("--output", "-o", metavar="FILE", help="File for the plan.")],
-) -> None:
+def plan(action: str, *, output: Path) -> None:
     """Write a validation plan: requirements for run, metrics and compare."""
     from pdhef_logtool.evaluation.plan_example import EXAMPLE
     from pdhef_logtool.storage.files import write_bytes

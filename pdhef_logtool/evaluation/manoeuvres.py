@@ -137,27 +137,25 @@ RULES = ManoeuvreRules()
 
 
 @dataclass(frozen=True, slots=True)
-class Manoeuvre:
-    """A manoeuvre in [start_ns, end_ns): first side (1 left, -1 right), speed at the start, and peaks in SI units."""
+class Event:
+    """Something that happened in [start_ns, end_ns): a segment, a manoeuvre, a divergence."""
 
     name: str
     start_ns: int
     end_ns: int
-    side: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Manoeuvre(Event):
+    """A recognised manoeuvre: its first side (``left``, ``right``), the speed at its start, and its peaks."""
+
+    side: str
     speed_m_s: float
     peak_ay_m_s2: float
     peak_yaw_rate_rad_s: float
     peak_steer_rad: float
     lowest_ax_m_s2: float
-
-    @property
-    def text(self) -> str:
-        """Return side, speed and peaks as text."""
-        return (
-            f"{'left' if self.side > 0 else 'right'}, from {self.speed_m_s * 3.6:.0f} km/h, |a_y| to "
-            f"{self.peak_ay_m_s2:.1f} m/s², yaw rate to {np.degrees(self.peak_yaw_rate_rad_s):.0f}°/s, "
-            f"road-wheel angle to {np.degrees(self.peak_steer_rad):.1f}°"
-        )
 
 
 def find_manoeuvres(signals: Signals, vehicle: VehicleParameters, rules: ManoeuvreRules = RULES) -> list[Manoeuvre]:
@@ -312,19 +310,20 @@ def _manoeuvres_of(run: _Run, rules: ManoeuvreRules) -> list[Manoeuvre]:
 
 
 def _measured(run: _Run, name: str, a: int, b: int) -> Manoeuvre:
-    steer, peak = run.steer[a:b], np.abs(run.steer[a:b]).max()
-    first = int(np.argmax(np.abs(steer) >= 0.5 * peak))
-    return Manoeuvre(
-        name=name,
-        start_ns=run.start_ns + a * _STEP_NS,
-        end_ns=run.start_ns + b * _STEP_NS,
-        side=1 if steer[first] >= 0.0 else -1,
-        speed_m_s=float(run.speed[a]),
-        peak_ay_m_s2=float(np.abs(run.ay[a:b]).max()),
-        peak_yaw_rate_rad_s=float(np.abs(run.yaw_rate[a:b]).max()),
-        peak_steer_rad=float(peak),
-        lowest_ax_m_s2=float(run.ax[a:b].min()),
+    steer, speed, lowest = run.steer[a:b], float(run.speed[a]), float(run.ax[a:b].min())
+    ay, rate, angle = (float(np.abs(column[a:b]).max()) for column in (run.ay, run.yaw_rate, run.steer))
+    side = "left" if steer[int(np.argmax(np.abs(steer) >= 0.5 * angle))] >= 0.0 else "right"
+    text = (
+        f"{side}, from {speed * 3.6:.0f} km/h, |a_y| to {ay:.1f} m/s², yaw rate to {np.degrees(rate):.0f}°/s, "
+        f"road-wheel angle to {np.degrees(angle):.1f}°"
     )
+    start_ns, end_ns = (run.start_ns + row * _STEP_NS for row in (a, b))
+    return Manoeuvre(name, start_ns, end_ns, text, side, speed, ay, rate, angle, lowest)
+
+
+def _spans(mask: BoolArray) -> Iterator[tuple[int, int]]:
+    """Yield the rows [a, b) of each part of a run in which a mask is true."""
+    yield from runs(np.arange(len(mask), dtype=np.int64) * _STEP_NS, mask)
 
 
 # ---- swings ----
@@ -333,11 +332,10 @@ def _measured(run: _Run, name: str, a: int, b: int) -> Manoeuvre:
 def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
     """Return the swings with a sufficient peak, in order."""
     demand = run.steer * run.gain
-    stamps = np.arange(len(run), dtype=np.int64) * _STEP_NS
     swings = []
     for sign in (1, -1):
         side = sign * demand
-        for a, b in runs(stamps, side > rules.swing_m_s2):
+        for a, b in _spans(side > rules.swing_m_s2):
             row = a + int(np.argmax(side[a:b]))
             if side[row] >= rules.least_peak_m_s2:
                 half = side[a:b] >= 0.5 * side[row]
@@ -512,9 +510,8 @@ def _ramps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterat
 
 def _circles(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
     """Yield circles (ISO 4138): half a circle or more with a curvature within a share of its median."""
-    stamps = np.arange(len(run), dtype=np.int64) * _STEP_NS
     for sign in (1, -1):
-        for a, b in runs(stamps, sign * run.turn > rules.circle_m_s2):
+        for a, b in _spans(sign * run.turn > rules.circle_m_s2):
             start = a
             while start < b:
                 level = float(np.median(run.curvature[start : min(start + 150, b)]))
@@ -536,8 +533,7 @@ def _slowing(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iter
     rows = np.arange(pre, n - ahead - lag)
     before = (total[rows] - total[rows - pre]) / pre
     change = (total[rows + lag + ahead] - total[rows + lag]) / ahead - before
-    stamps = rows.astype(np.int64) * _STEP_NS
-    for a, b in runs(stamps, change < -rules.power_off_m_s2):
+    for a, b in _spans(change < -rules.power_off_m_s2):
         row = a + int(np.argmin(change[a:b]))
         onset = _onset(run, int(rows[row]), float(before[row]), float(change[row]), pre)
         fall, turn = -float(change[row]), float(np.mean(np.abs(run.turn[onset - pre : onset])))

@@ -20,6 +20,7 @@ from pdhef_logtool.evaluation.statistics import (
     Factors,
     Outcome,
     decided,
+    gathered,
     least_drives,
     log_ratios,
     paired_change,
@@ -361,19 +362,13 @@ def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
 
 def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
     """Return each note of the requirements once, with the ids of its requirements unless it applies to all."""
-    ids: dict[str, list[str]] = {}
-    for name, of_requirement in notes.items():
-        for note in of_requirement:
-            ids.setdefault(note.rstrip("."), []).append(name)
+    ids = gathered((note.rstrip("."), name) for name, of_requirement in notes.items() for note in of_requirement)
     return [note if len(names) == len(notes) else f"{', '.join(names)}: {note}" for note, names in ids.items()]
 
 
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:
     """Return the next steps of a document: failed requirements, inconclusive ones, ``more``."""
     requirements = sorted((plan or {}).get("requirements") or (), key=lambda r: r["outcome"] != "FAIL")
-    ids: dict[str, list[str]] = {}
-    for r in requirements:
-        if r["next"] and r["outcome"] != "PASS":
-            ids.setdefault(str(r["next"]), []).append(str(r["id"]))
+    ids = gathered((str(r["next"]), str(r["id"])) for r in requirements if r["next"] and r["outcome"] != "PASS")
     asked = [f"{', '.join(names)}: {text}" for text, names in ids.items()]
     return [*asked, *filter(None, more)]

@@ -22,12 +22,11 @@ manoeuvres            :mod:`~pdhef_logtool.evaluation.manoeuvres`, from sensors 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Manoeuvre, find_manoeuvres, manoeuvre_masks
+from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Event, Manoeuvre, find_manoeuvres, manoeuvre_masks
 from pdhef_logtool.evaluation.smoothing import median_step_ns, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
@@ -51,15 +50,6 @@ STANDSTILL_YAW_RATE_RAD_S, STANDSTILL_S = 0.05, 0.5
 STRAIGHT_M_S2, STRAIGHT_S = 0.5, 2.0
 CORNERING_M_S2, CORNERING_S = 1.0, 1.5
 BRAKING_M_S2, ACCELERATING_M_S2, PEDAL_S = -1.5, 1.0, 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Segment:
-    """A contiguous part of the drive, [start_ns, end_ns)."""
-
-    name: str
-    start_ns: int
-    end_ns: int
 
 
 def segment_masks(
@@ -139,14 +129,14 @@ def driven_speed(signals: Signals, truth: StateTrack | None) -> FloatArray:
     return last_known(signals.stamps_ns, signals.speed_m_s)
 
 
-def find_intervals(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]) -> list[Segment]:
+def find_intervals(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]) -> list[Event]:
     """Convert masks [N] to intervals in order of time; a step of more than ``smoothing.RUN_GAP_S`` ends an interval.
 
     ``end_ns`` is one past the last stamp inside.
     """
     stamps = stamped.stamps_ns
     spans = [
-        Segment(name, int(stamps[i]), int(stamps[j - 1]) + 1)
+        Event(name, int(stamps[i]), int(stamps[j - 1]) + 1, "")
         for name, mask in masks.items()
         for i, j in runs(stamps, mask)
     ]

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import combinations
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ from numpy.typing import NDArray
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.student import student_quantile
 
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 Verdict: TypeAlias = Literal["equal", "worse", "not worse", "better", "inconclusive"]
 
 Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
@@ -120,6 +122,14 @@ def numbered(values: Iterable[object]) -> IntArray:
         [numbers.setdefault(("alone", i) if v is None else v, len(numbers)) for i, v in enumerate(values)],
         dtype=np.int64,
     )
+
+
+def gathered(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
+    """Return the values of each key, such as the names that share a text, both in order of their first appearance."""
+    groups: dict[_Key, list[_Value]] = {}
+    for key, value in pairs:
+        groups.setdefault(key, []).append(value)
+    return groups
 
 
 def dependence(scores: FloatArray, factors: Factors, weights: FloatArray | None = None) -> Dependence:
@@ -403,10 +413,7 @@ def log_ratios(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def paired_change(
-    ratios: FloatArray,
-    clusters: Sequence[object] | None = None,
-    factors: Factors | None = None,
-    level: float = 0.95,
+    ratios: FloatArray, clusters: Sequence[object] | None = None, factors: Factors | None = None, level: float = 0.95
 ) -> PairedChange:
     """Return the median log ratio of drives with its bounds.
 

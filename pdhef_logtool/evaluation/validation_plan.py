@@ -31,7 +31,9 @@ _QUANTILE = re.compile(r"quantile (0\.\d+)")
 
 
 _Name = Annotated[str, Field(min_length=1, max_length=200)]
-_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Positive = Annotated[_Finite, Field(gt=0.0)]
+_Least = Annotated[_Finite, Field(ge=0.0)]
 _Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
 
 
@@ -45,7 +47,7 @@ class ExposureNeed(BaseModel):
     friction: Annotated[_Range, Field(description="Median friction of the drive from, to.")] = None
     car: Annotated[_Name | None, Field(description="Name of the car.")] = None
     drives: Annotated[int, Field(ge=0, description="Least number of drives.")] = 0
-    minutes: Annotated[float, Field(ge=0.0, allow_inf_nan=False, description="Least minutes.")] = 0.0
+    minutes: Annotated[_Least, Field(description="Least minutes.")] = 0.0
 
     @model_validator(mode="after")
     def _agrees(self) -> ExposureNeed:
@@ -187,11 +189,10 @@ class RequirementTable(BaseModel):
     segment: Annotated[_Name | None, Field(description="Segment of the drives. Default: all.")] = None
     manoeuvre: Annotated[_Name | None, Field(description="Manoeuvre, in place of segment.")] = None
     limit: Annotated[
-        float | None,
-        Field(allow_inf_nan=False, description="Limit in the SI unit of the metric; a minimum for coverage95."),
+        _Finite | None, Field(description="Limit in the SI unit of the metric; a minimum for coverage95.")
     ] = None
-    limit_deg: Annotated[float | None, Field(allow_inf_nan=False, description="Limit in degrees.")] = None
-    limit_deg_s: Annotated[float | None, Field(allow_inf_nan=False, description="Limit in degrees per second.")] = None
+    limit_deg: Annotated[_Finite | None, Field(description="Limit in degrees.")] = None
+    limit_deg_s: Annotated[_Finite | None, Field(description="Limit in degrees per second.")] = None
     baseline: Annotated[
         _Name | None,
         Field(
@@ -211,12 +212,8 @@ class RequirementTable(BaseModel):
         float, Field(ge=0.5, lt=1.0, description="Confidence level of the two-sided interval that decides.")
     ] = 0.95
     exposure_drives: Annotated[int, Field(ge=1, description="Least number of scored drives.")] = 1
-    exposure_minutes: Annotated[
-        float, Field(ge=0.0, allow_inf_nan=False, description="Least scored driving in minutes.")
-    ] = 0.0
-    exposure_km: Annotated[
-        float, Field(ge=0.0, allow_inf_nan=False, description="Least scored driving in kilometres.")
-    ] = 0.0
+    exposure_minutes: Annotated[_Least, Field(description="Least scored driving in minutes.")] = 0.0
+    exposure_km: Annotated[_Least, Field(description="Least scored driving in kilometres.")] = 0.0
     exposure: Annotated[list[ExposureNeed], Field(max_length=50, description="Least driving in conditions.")] = []
 
 

@@ -18,14 +18,7 @@ from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.drive.plan import Sensors
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.learning.drives import (
-    DriveRecord,
-    DriveSet,
-    LearnSettings,
-    drives_document,
-    exit_code,
-    tell_drive,
-)
+from pdhef_logtool.learning.drives import DriveRecord, DriveSet, LearnSettings, drives_document, exit_code, tell_drive
 from pdhef_logtool.learning.teach import LEAST_S, OpenedDrive, figures_of, learn_from, open_drive
 from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.model.drive_model import for_later_drives, lacking, model_of, read_driving

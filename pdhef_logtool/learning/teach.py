@@ -34,11 +34,7 @@ from pdhef_logtool.records.steps import release
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.features import SlowFeatures, slow_features
 from pdhef_logtool.residual_model.ladder import NONE
-from pdhef_logtool.residual_model.ladder_fit import (
-    LadderFit,
-    TaughtDrive,
-    fit_ladder,
-)
+from pdhef_logtool.residual_model.ladder_fit import LadderFit, TaughtDrive, fit_ladder
 from pdhef_logtool.runs.config import RunConfig
 
 #: Minimum driving with ground truth.

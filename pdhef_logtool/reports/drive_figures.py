@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
 from pdhef_logtool.evaluation.largest_errors import ErrorPlace
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -129,17 +130,16 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
             series[name] = gather(name, tracks, grid, error_of, whole=name in (TRUTH, roles.main))
     charts = Charts(grid, origin_ns)
     moves = bool(np.isfinite(series[roles.main].sideslip).any())
-    _add_sideslip(charts, series, roles)
-    _add_error(charts, series, roles, peaks, scored=scored)
-    _add_motion(charts, series, roles)
+    _add_over_time(charts, series, roles, peaks, scored=scored)
     rows = _rows(report, series, roles, stamps, origin_ns)
     charts.figures["strip"] = StripFigure("Faults, gaps and segments", rows)
     if TRUTH in series:
         _add_path(charts, series, roles, _axes(report))
-    clouds = [_cloud(series[n], origin_ns) for n in (TRUTH, roles.main) if n in series]
-    if drawn := [cloud for cloud in clouds if cloud is not None]:
-        charts.figures["ay_sideslip"] = PointsFigure("|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °", drawn)
-    _add_worst(charts, answer, reference, peaks, origin_ns)
+    in_plane = {n: thinned(series[n].ay_sideslip, _MOST_POINTS) for n in (TRUTH, roles.main) if n in series}
+    clouds = [Cloud(n, colour(n), x, y, _seconds(at_ns, charts)) for n, (at_ns, x, y) in in_plane.items() if len(x) > 1]
+    if clouds:
+        charts.figures["ay_sideslip"] = PointsFigure("|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °", clouds)
+    _add_worst(charts, answer, reference, peaks)
     absent = [n for n in roles.names if n not in tracks.names]
     return DriveFigures(charts, peaks, scored, moves, absent)
 
@@ -172,44 +172,31 @@ def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: 
     return lines
 
 
-def _add_sideslip(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
-    lines = _lines(series, roles, "sideslip", (TRUTH, *roles.names))
-    if not lines:
-        return
-    band = series[roles.main].band
-    bands = []
-    if band is not None and np.isfinite(band[0]).any():
-        bands = [Band(f"{roles.main}, 95 % confidence interval", colour(roles.main), *band)]
-    charts.figures["sideslip"] = TimeFigure(
-        "Sideslip", "°", lines, bands, level=0.0, resolution=_DEGREES_SEEN, height=260
-    )
-
-
-def _add_error(
+def _add_over_time(
     charts: Charts, series: Mapping[str, DriveSeries], roles: Roles, peaks: Sequence[Peak], *, scored: bool
 ) -> None:
-    lines = _lines(series, roles, "error", roles.names)
-    if not lines:
-        return
-    title = f"Disagreement: sideslip difference from {roles.main}, absolute"
-    if scored:
-        title = "Absolute error of sideslip, largest of each cell"
-    marks = [Mark(str(i + 1), p.at_s, abs(p.error_rad) * DEGREES) for i, p in enumerate(peaks)]
-    charts.figures["error"] = TimeFigure(title, "°", lines, marks=marks, level=0.0, resolution=_DEGREES_SEEN)
-
-
-def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
-    steer = series[roles.main].steer
+    """Add sideslip, its error or the estimators' disagreement, steering, yaw rate, lateral acceleration and speed."""
+    figures, band, steer = charts.figures, series[roles.main].band, series[roles.main].steer
+    if lines := _lines(series, roles, "sideslip", (TRUTH, *roles.names)):
+        bands = []
+        if band is not None and np.isfinite(band[0]).any():
+            bands = [Band(f"{roles.main}, 95 % confidence interval", colour(roles.main), *band)]
+        figures["sideslip"] = TimeFigure("Sideslip", "°", lines, bands, level=0.0, resolution=_DEGREES_SEEN, height=260)
+    if lines := _lines(series, roles, "error", roles.names):
+        apart = f"Disagreement: sideslip difference from {roles.main}, absolute"
+        title = "Absolute error of sideslip, largest of each cell" if scored else apart
+        marks = [Mark(str(i + 1), p.at_s, abs(p.error_rad) * DEGREES) for i, p in enumerate(peaks)]
+        figures["error"] = TimeFigure(title, "°", lines, marks=marks, level=0.0, resolution=_DEGREES_SEEN)
     if steer is not None and np.isfinite(steer).any():
         lines = [Series("measured", INK, steer)]
-        charts.figures["steer"] = TimeFigure("Steering, road-wheel angle", "°", lines, resolution=_SEEN, height=120)
+        figures["steer"] = TimeFigure("Steering, road-wheel angle", "°", lines, resolution=_SEEN, height=120)
     for key, title, unit in (
         ("yaw_rate", "Yaw rate", "°/s"),
         ("ay", "Lateral acceleration, specific force", "m/s²"),
         ("speed", "Speed, longitudinal", "m/s"),
     ):
         if lines := _lines(series, roles, key, (TRUTH, roles.main)):
-            charts.figures[key] = TimeFigure(title, unit, lines, resolution=_SEEN, height=120)
+            figures[key] = TimeFigure(title, unit, lines, resolution=_SEEN, height=120)
 
 
 def _rows(
@@ -236,39 +223,24 @@ def _rows(
     seer = next((n for n in roles.names if n in series and len(series[n].reason)), None)
     if seer is not None and len(reason := series[seer].reason) == len(stamps):
         rows += [Row(r.text, NOTE, spans((reason & r.bit) != 0, f"seen by {seer}")) for r in REASONS]
-    by_name: dict[str, list[Span]] = {}
-    for s in report["segments"]:
-        by_name.setdefault(s["name"], []).append(span(s["start_ns"], s["end_ns"], s["text"]))
+    by_name = gathered((s["name"], span(s["start_ns"], s["end_ns"], s["text"])) for s in report["segments"])
     for name in sorted(by_name, key=lambda n: (not n.endswith(" diverged"), n)):
         rows.append(Row(name, FAULT if name.endswith(" diverged") else PLAIN, by_name[name]))
-    rows = [Row(row.label, row.colour, joined(row.spans)) for row in rows if row.spans]
+    rows = [replace(row, spans=joined(row.spans)) for row in rows if row.spans]
     return rows or [Row("nothing", PLAIN, [])]
 
 
-def _cloud(series: DriveSeries, origin_ns: int) -> Cloud | None:
-    at_ns, x, y = thinned(series.ay_sideslip, _MOST_POINTS)
-    if len(x) < 2:
-        return None
-    at_s = np.asarray((at_ns - float(origin_ns)) * 1e-9, dtype=np.float64)
-    return Cloud(series.name, colour(series.name), x, y, at_s)
-
-
-def _add_worst(
-    charts: Charts, answer: StateTrack, reference: Reference | None, peaks: Sequence[Peak], origin_ns: int
-) -> None:
+def _add_worst(charts: Charts, answer: StateTrack, reference: Reference | None, peaks: Sequence[Peak]) -> None:
     """Add the sideslip around the largest error, the only figure of the first screen."""
     if reference is None or not peaks:
         return
     worst = peaks[0]
     clouds = []
     for track in (answer, reference.track):
-        around = slice(
-            *np.searchsorted(track.stamps_ns, [worst.stamp_ns - _AROUND_NS, worst.stamp_ns + _AROUND_NS + 1])
-        )
-        stamps, beta = track.stamps_ns[around], track.sideslip_rad[around] * DEGREES
+        near = track.between(worst.stamp_ns - _AROUND_NS, worst.stamp_ns + _AROUND_NS + 1)
+        stamps, beta = near.stamps_ns, near.sideslip_rad * DEGREES
         step = max(1, len(stamps) // _MOST_AROUND)
-        at_s = np.asarray((stamps[::step] - origin_ns) * 1e-9, dtype=np.float64)
-        clouds.append(Cloud(track.name, colour(track.name), at_s, beta[::step], line=True))
+        clouds.append(Cloud(track.name, colour(track.name), _seconds(stamps[::step], charts), beta[::step], line=True))
     kind = "error" if reference.scored else "difference"
     here = np.array([worst.at_s]), np.array([worst.estimate_rad * DEGREES])
     clouds.append(Cloud(f"largest {kind}", FAULT, *here))
@@ -319,5 +291,5 @@ def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, cha
     return clouds
 
 
-def _seconds(at_ns: FloatArray, charts: Charts) -> FloatArray:
-    return np.asarray((at_ns - float(charts.origin_ns)) * 1e-9, dtype=np.float64)
+def _seconds(at_ns: FloatArray | IntArray, charts: Charts) -> FloatArray:
+    return np.asarray((at_ns - charts.origin_ns) * 1e-9, dtype=np.float64)

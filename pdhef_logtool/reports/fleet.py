@@ -93,18 +93,15 @@ def _document(fleet: Fleet, texts: Mapping[str, Any]) -> dict[str, Any]:
 
 def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
     """Return the drive with the largest sideslip error; add the figure of the largest errors."""
-    ranked = sorted(((d.error(), d) for d in fleet.scored), key=lambda pair: -(pair[0] or 0.0))
+    ranked = sorted(fleet.scored, key=lambda d: -d.error())
     if not ranked:
         return (fleet.drives[0].label, None) if fleet.logs == 1 and fleet.drives else None
     if len(ranked) > 1:
         degree = math.degrees(1.0)
-        bars = [
-            Interval(d.label, math.nan, (error or 0.0) * degree, math.nan, colour(d.main or ""))
-            for error, d in ranked[:_WORST]
-        ]
+        bars = [Interval(d.label, math.nan, d.error() * degree, math.nan, colour(d.main)) for d in ranked[:_WORST]]
         title = f"The {len(bars)} drives with the largest sideslip RMSE"
         charts.figures["worst"] = IntervalsFigure(title, "RMSE in °", bars, zero=0.0)
-    return ranked[0][1].label, ranked[0][0]
+    return ranked[0].label, ranked[0].error()
 
 
 def _add_figures(charts: Charts, fleet: Fleet) -> None:

@@ -82,25 +82,15 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         finalize=_printed,
     )
-    made.filters |= {
-        "result_of": result_of,
-        "assumptions_of": assumptions_of,
-        "failed_checks": failed_checks,
-        "number": number,
-        "duration": duration,
+    of_results = result_of, assumptions_of, failed_checks, shown
+    of_numbers = number, duration, degrees, percent, change, stamp, seconds, unit
+    made.filters |= {function.__name__: function for function in (*of_results, *of_numbers)} | {
         "joint_notes": lambda plan: joint_notes({str(r["id"]): r.get("notes") or () for r in plan["requirements"]}),
         "reason": _reason,
-        "shown": shown,
         "minute": lambda stamp_ns: f"{stamp(stamp_ns)[:16].replace('T', ' ')} UTC" if is_dated(stamp_ns) else "",
         "range": _range,
         "signal": _signal,
         "topic_of": lambda source: str(source).partition(".")[0],
-        "degrees": degrees,
-        "percent": percent,
-        "change": change,
-        "stamp": stamp,
-        "seconds": seconds,
-        "unit": unit,
     }
     made.tests["topic"] = lambda source: str(source).startswith("/")
     return made

@@ -62,10 +62,7 @@ class WrittenPages:
 
 
 def _to_dict(page: WrittenPage) -> dict[str, Any]:
-    return {
-        "page": None if page.file is None else str(page.file),
-        "wrong": page.wrong or None,
-    }
+    return {"page": None if page.file is None else str(page.file), "wrong": page.wrong or None}
 
 
 def write_pages(

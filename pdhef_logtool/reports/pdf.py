@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.reports.charts import Charts, TimeFigure
@@ -130,10 +131,9 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
 
 def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
     """Return failed checks, then assumptions, each with the names of its drives; an empty text for all drives."""
-    labels: dict[str, list[str]] = {}
-    for label, report in reports:
-        for text in (*failed_checks(report), *assumptions_of(report)):
-            labels.setdefault(text, []).append(label)
+    labels = gathered(
+        (text, label) for label, report in reports for text in (*failed_checks(report), *assumptions_of(report))
+    )
     ranked = sorted(labels.items(), key=lambda of: (not of[0].startswith(("FAILED", "waived")), -len(of[1])))
     return {text: "" if len(of) == len(reports) else listed(of) for text, of in ranked}
 

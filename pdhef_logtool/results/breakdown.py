@@ -203,17 +203,10 @@ def _groups(errors: FloatArray, values: _Texts, effects: Mapping[str, Effect | s
         scored = errors[inside & (errors >= 0.0)]
         effect = effects.get(value, "")
         mean = float(np.exp(np.mean(np.log(scored)))) if scored.size and scored.min() > 0.0 else math.nan
-        groups.append(
-            Group(
-                "not given" if value is None else value,
-                int(np.count_nonzero(inside)),
-                len(scored),
-                mean,
-                float(scored.max()) if scored.size else math.nan,
-                effect if isinstance(effect, Effect) else None,
-                effect if isinstance(effect, str) else "",
-            )
-        )
+        worst = float(scored.max()) if scored.size else math.nan
+        shown, why_not = (effect, "") if isinstance(effect, Effect) else (None, effect)
+        name, drives = "not given" if value is None else value, int(np.count_nonzero(inside))
+        groups.append(Group(name, drives, len(scored), mean, worst, shown, why_not))
     return tuple(groups)
 
 

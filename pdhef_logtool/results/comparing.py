@@ -12,24 +12,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+import polars as pl
 
+from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.statistics import (
-    FACTORS,
-    Bounded,
-    PairedChange,
-    Verdict,
-    holm,
-    log_ratios,
-    paired_change,
-    pooled,
-    quantile,
-)
 from pdhef_logtool.evaluation.units import SIGNALS, share_of
 from pdhef_logtool.evaluation.validation_plan import MEANS, RUN, SQUARES, Requirement, ValidationPlan, load_plan
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
@@ -39,11 +30,8 @@ from pdhef_logtool.results.pairing import Pair, pair_logs, run_differences
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts, plan_verdicts_against
 from pdhef_logtool.storage.documents import unknown
 
-if TYPE_CHECKING:
-    import polars as pl
-
 #: ``no figure``: no drive has it on both sides.
-FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
+FigureVerdict: TypeAlias = statistics.Verdict | Literal["no figure"]
 
 #: Value of ``cluster`` for drives that do not depend on one another.
 INDEPENDENT = "none"
@@ -88,7 +76,7 @@ class ComparedFigure:
 
     requirement: Requirement
     verdict: FigureVerdict
-    change: PairedChange
+    change: statistics.PairedChange
     unit: str
     drives: tuple[dict[str, Any], ...]
     only_a: tuple[str, ...] = ()
@@ -136,7 +124,7 @@ class HistoryRow:
     run: str
     version: str
     requirement: Requirement
-    figure: Bounded
+    figure: statistics.Bounded
     unit: str
     verdict: FigureVerdict | Literal[""] = ""
     step: ComparedFigure | None = None
@@ -351,8 +339,6 @@ class _Tables:
     """Figures of two runs for their pairs; only requested rows are read."""
 
     def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair], cluster: str | None) -> None:
-        import polars as pl
-
         labels = {"a": [p.a.label for p in pairs], "b": [p.b.label for p in pairs], "main": [p.a.main() for p in pairs]}
         self._runs, self._cluster = (a, b), cluster
         self._labels = pl.DataFrame(labels).with_row_index("place")
@@ -360,27 +346,23 @@ class _Tables:
     @cached_property
     def _pairs(self) -> pl.DataFrame:
         """A row per pair: ``place``, labels ``a`` and ``b``, ``main``, day, car and route, and ``cluster``."""
-        import polars as pl
-
         run, key = self._runs[0], self._cluster
-        drives = run.table("drives").select("log", *FACTORS).collect()
+        drives = run.table("drives").select("log", *statistics.FACTORS).collect()
         pairs = self._labels.join(drives, left_on="a", right_on="log", how="left").sort("place")
         if key in (None, INDEPENDENT):
             return pairs
         metadata = pairs.select(log="a").join(run.table("metadata").collect(), on="log")
         stated = metadata.filter(key=key).select(a="log", cluster="value").unique("a", keep="last")
         keyed = pairs.join(stated, on="a", how="left").sort("place")
-        if key in FACTORS:
+        if key in statistics.FACTORS:
             keyed = pairs.with_columns(cluster=pl.col(str(key)))
         if keyed["cluster"].null_count() == len(keyed):
-            names = ", ".join(dict.fromkeys((*FACTORS, INDEPENDENT, *metadata["key"].unique().sort())))
+            names = ", ".join(dict.fromkeys((*statistics.FACTORS, INDEPENDENT, *metadata["key"].unique().sort())))
             raise UsageError(expected=f"a key of the drives: {names}", got=str(key), where="--cluster")
         return keyed
 
     def changed(self) -> int:
         """Return the number of drives with any figure that is not the same bit for bit."""
-        import polars as pl
-
         tables = [run.table("metrics") for run in self._runs]
         digests = {run.document.get("files", {}).get(table_file("metrics")) for run in self._runs}
         if len(digests) == 1 and None not in digests and self._labels["a"].equals(self._labels["b"]):
@@ -400,8 +382,6 @@ class _Tables:
 
     def _rows(self, figures: Sequence[Requirement]) -> pl.DataFrame:
         """Return the figures of the pairs, a row each: ``value``, ``n``, ``independent`` of A, and with ``_b`` of B."""
-        import polars as pl
-
         named = {f.estimator for f in figures if f.estimator} | set(self._pairs["main"])
         asked = [named, *({getattr(f, key) for f in figures} for key in _FIGURE[1:-1])]
         wanted = [pl.col(key).is_in(sorted(of)) for key, of in zip(_FIGURE, asked, strict=False)]
@@ -415,16 +395,14 @@ class _Tables:
         return both.join(self._pairs, on="place", how="left").sort("place")
 
     def _compared(self, asked: Requirement, rows: pl.DataFrame) -> ComparedFigure:
-        import polars as pl
-
         name = pl.col("main") if asked.estimator is None else pl.lit(asked.estimator)
         of_figure = {key: getattr(asked, key) for key in ("signal", "segment", "metric")}
         of_pairs = rows.filter(pl.col("estimator") == name, **of_figure)
         both = of_pairs.drop_nulls(["value", "value_b"])
-        ratios = log_ratios(both["value"].to_numpy(), both["value_b"].to_numpy())
+        ratios = statistics.log_ratios(both["value"].to_numpy(), both["value_b"].to_numpy())
         clusters = both["cluster"].to_list() if "cluster" in both.columns else None
-        factors = {f: both[f].to_list() for f in FACTORS} if self._cluster is None else None
-        change = paired_change(ratios, clusters, factors)
+        factors = {f: both[f].to_list() for f in statistics.FACTORS} if self._cluster is None else None
+        change = statistics.paired_change(ratios, clusters, factors)
         equal = both["value"].equals(both["value_b"]) and both["n"].equals(both["n_b"])
         verdict = change.verdict((asked.max_ratio or 1.0) - 1.0) if not equal else "equal" if len(both) else "no figure"
         drives = both.select(drive="a", drive_b="b", a="value", b="value_b", n_a="n", n_b="n_b")
@@ -483,7 +461,9 @@ def _beside(asked: Sequence[Requirement]) -> list[Requirement]:
 
 def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
     there = [f for f in figures if f.drives]
-    return tuple(replace(f, corrected_p=p) for f, p in zip(there, holm([f.change.sign_p for f in there]), strict=True))
+    return tuple(
+        replace(f, corrected_p=p) for f, p in zip(there, statistics.holm([f.change.sign_p for f in there]), strict=True)
+    )
 
 
 def _history(runs: Sequence[OpenedRun], steps: Sequence[Comparison], asked: Requirement) -> Iterator[HistoryRow]:
@@ -495,19 +475,17 @@ def _history(runs: Sequence[OpenedRun], steps: Sequence[Comparison], asked: Requ
         yield HistoryRow(run.place, version, asked, *_of_all(run, asked), verdict, next(iter(figures), None))
 
 
-def _of_all(run: OpenedRun, asked: Requirement) -> tuple[Bounded, str]:
+def _of_all(run: OpenedRun, asked: Requirement) -> tuple[statistics.Bounded, str]:
     """Return a figure over all drives of a run, and its unit: pooled, or the median of metrics that are no means."""
-    import polars as pl
-
     rows = run.table("metrics").filter(pl.col("value").is_finite(), pl.col("independent"))
     rows = rows.filter(**{key: getattr(asked, key) for key in ("signal", "segment", "metric")})
-    drives = run.table("drives").select("log", *FACTORS, main="estimator")
+    drives = run.table("drives").select("log", *statistics.FACTORS, main="estimator")
     name = pl.col("main") if asked.estimator is None else pl.lit(asked.estimator)
     of_run = rows.join(drives, on="log").filter(pl.col("estimator") == name).collect().sort("log")
-    factors = {f: of_run[f].to_list() for f in FACTORS}
+    factors = {f: of_run[f].to_list() for f in statistics.FACTORS}
     n, values = (of_run[key].to_numpy().astype(np.float64) for key in ("n", "value"))
     unit = of_run["unit"][0] if len(of_run) else ""
     if asked.metric not in SQUARES | MEANS:
-        return quantile(values, 0.5, 0.95, factors), unit
+        return statistics.quantile(values, 0.5, 0.95, factors), unit
     squares = asked.metric in SQUARES
-    return pooled(n, values, None, squares=squares, positive=True, level=0.95, factors=factors), unit
+    return statistics.pooled(n, values, None, squares=squares, positive=True, level=0.95, factors=factors), unit

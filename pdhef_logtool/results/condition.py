@@ -16,13 +16,11 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
+
+import polars as pl
 
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    import polars as pl
 
 #: Units of a condition: the unit of our columns, and the factor from it.
 _UNITS = {"_deg": ("_rad", math.degrees(1.0)), "_deg_s": ("_rad_s", math.degrees(1.0)), "_km_h": ("_m_s", 3.6)}
@@ -65,8 +63,6 @@ class Condition:
 
     def is_true(self, columns: Mapping[str, FloatArray]) -> BoolArray:
         """Return the mask [N] of the rows that fulfil it, for columns [N] of one track."""
-        import polars as pl
-
         frame = pl.DataFrame(dict(columns)).with_columns(
             (pl.col(r.column) * r.factor).fill_nan(None).alias(name) for name, r in self.references.items()
         )
@@ -88,8 +84,6 @@ def parse_condition(
     UsageError
         The condition does not parse, contains an unknown name, or is a number.
     """
-    import polars as pl
-
     names = _names(columns, flags)
     references: dict[str, Reference] = {}
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
+import polars as pl
 
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.smoothing import runs
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, IntArray
@@ -20,9 +22,6 @@ from pdhef_logtool.results.condition import Condition, Reference, parse_conditio
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.parquet_sink import list_estimators
 from pdhef_logtool.results.sink import TRUTH
-
-if TYPE_CHECKING:
-    import polars as pl
 
 SPEED = "speed_m_s"
 #: Stored columns that are true or false.
@@ -157,17 +156,15 @@ class _Drive:
 
     start_ns: int
     low_speed_m_s: float
-    spans: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+    spans: Mapping[str, Sequence[tuple[int, int]]]
 
 
 def _drives(run: OpenedRun) -> dict[str, _Drive]:
     """Return the drives of a run by log."""
+    events = run.table("events").select("log", "event", "start_ns", "end_ns").collect().iter_rows()
+    spans = gathered((log, (event, (start_ns, end_ns))) for log, event, start_ns, end_ns in events)
     rows = run.table("drives").select("log", "start_ns", "low_speed_m_s").collect().iter_rows()
-    drives = {log: _Drive(start_ns or 0, slow or 0.0) for log, start_ns, slow in rows}
-    events = run.table("events").select("log", "event", "start_ns", "end_ns").collect()
-    for log, event, *span in events.iter_rows():
-        drives[log].spans.setdefault(event, []).append((span[0], span[1]))
-    return drives
+    return {log: _Drive(start_ns or 0, slow or 0.0, gathered(spans.get(log, ()))) for log, start_ns, slow in rows}
 
 
 def _needed(condition: Condition, main: str) -> set[str]:
@@ -198,8 +195,6 @@ def _events_of(
     log: OpenedLog, condition: Condition, main: str, drive: _Drive, least_s: float, pad_s: float
 ) -> list[FoundEvent]:
     """Return the events of one drive."""
-    import polars as pl
-
     frame = log.estimates()
     assert frame is not None
     named = [_column(reference, main, drive).alias(name) for name, reference in condition.references.items()]
@@ -238,7 +233,6 @@ def _joined(frame: pl.LazyFrame, tracks: Sequence[str]) -> pl.LazyFrame:
 
     Polars reads only those that are used later.
     """
-    import polars as pl
 
     def of(track: str) -> pl.LazyFrame:
         numbers = pl.col(sorted({*TRACK_COLUMNS} - {"stamp_ns", *FLAGS})).cast(pl.Float64).fill_nan(None)
@@ -253,7 +247,6 @@ def _joined(frame: pl.LazyFrame, tracks: Sequence[str]) -> pl.LazyFrame:
 
 def _column(reference: Reference, main: str, drive: _Drive) -> pl.Expr:
     """Return a column of a condition, of the columns of :func:`_joined`."""
-    import polars as pl
 
     def of(column: str, track: str = reference.track or main) -> pl.Expr:
         return pl.col(f"{track}.{column}")
@@ -279,8 +272,6 @@ def _column(reference: Reference, main: str, drive: _Drive) -> pl.Expr:
 
 def _within(spans: Sequence[tuple[int, int]]) -> pl.Expr:
     """Return where a stamp lies in a segment's intervals, which do not overlap."""
-    import polars as pl
-
     starts, ends = np.array(sorted(spans), dtype=np.int64).reshape(-1, 2).T
 
     def inside(stamps: pl.Series) -> pl.Series:

@@ -13,28 +13,18 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import polars as pl
 
+from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
-from pdhef_logtool.evaluation.statistics import (
-    FACTORS,
-    Dependence,
-    PairedChange,
-    dependence,
-    holm,
-    log_ratios,
-    paired_change,
-)
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, breakdowns
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.selected_estimate import NAIVE
-
-if TYPE_CHECKING:
-    import polars as pl
 
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
@@ -173,7 +163,7 @@ class Fleet:
     distributions: tuple[Distribution, ...]
     ranking: tuple[Rank, ...]
     least_to_rank: int
-    dependence: Dependence
+    dependence: statistics.Dependence
     breakdowns: tuple[Breakdown, ...]
     space: Space | None
     failed: tuple[Failures, ...]
@@ -213,22 +203,18 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     OutputError
         A table is damaged.
     """
-    import polars as pl
-
     rows = _rows(run)
     done = [row for row in rows if row["outcome"] != "failed"]
     faults = run.table("faults")
     sensors = faults.filter(pl.col("origin") == "sensor").group_by("log").agg(pl.col("kind").unique().sort())
     kinds = dict(sensors.collect().iter_rows())
     lost = faults.filter(severity="lost").select("log", "text").collect().rows()
-    metadata: dict[str, dict[str, str]] = {}
-    for log, key, value in run.table("metadata").collect().iter_rows():
-        metadata.setdefault(log, {})[key] = value
-    of_log: dict[str, dict[tuple[str, str], float]] = {}
-    for log, estimator, signal, value in sideslip_errors(run, [*SIGNALS]).collect().iter_rows():
-        of_log.setdefault(log, {})[estimator, signal] = value
+    metadata = statistics.gathered((log, entry) for log, *entry in run.table("metadata").collect().iter_rows())
+    figures = sideslip_errors(run, [*SIGNALS]).collect().iter_rows()
+    of_log = statistics.gathered((log, ((estimator, signal), value)) for log, estimator, signal, value in figures)
     drives = tuple(
-        _drive(r, of_log.get(r["log"], {}), metadata.get(r["log"], {}) | _keys(r, kinds.get(r["log"]))) for r in done
+        _drive(r, dict(of_log.get(r["log"], ())), dict(metadata.get(r["log"], ())) | _keys(r, kinds.get(r["log"])))
+        for r in done
     )
     errors = np.array([d.error() for d in drives])
     scored = [d for d in drives if d.truth]
@@ -258,8 +244,6 @@ def least_to_rank(estimators: int) -> int:
 
 def _space(run: OpenedRun) -> Space | None:
     """Return the operating space of all drives."""
-    import polars as pl
-
     cells = run.table("exposure").with_columns(scored=pl.when(pl.col("sideslip_mse_rad2").is_not_null()).then("scored"))
     squares = (pl.col("sideslip_mse_rad2") * pl.col("scored")).sum() / pl.col("scored").sum()
     sums = cells.group_by("speed_m_s", "ay_m_s2").agg(pl.col("seconds").sum(), squares.sqrt().alias("rmse"))
@@ -277,8 +261,6 @@ def _space(run: OpenedRun) -> Space | None:
 
 def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.LazyFrame:
     """Return the RMSE of drives, where the ground truth is independent: log, estimator, signal and value."""
-    import polars as pl
-
     there = pl.col("independent") & pl.col("value").is_finite() & pl.col("signal").is_in(signals)
     return (
         run.table("metrics").filter(there, segment="all", metric="rmse").select("log", "estimator", "signal", "value")
@@ -287,7 +269,6 @@ def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.La
 
 def _rows(run: OpenedRun) -> list[dict[str, Any]]:
     """Return the table of drives, with NIS per degree of freedom, v̇_y residual and the residual of sideslip 0."""
-    import polars as pl
 
     def value(metric: str) -> pl.Expr:
         return pl.col("value").filter(pl.col("metric") == metric).first()
@@ -301,24 +282,12 @@ def _rows(run: OpenedRun) -> list[dict[str, Any]]:
 
 def _drive(row: Mapping[str, Any], errors: Mapping[tuple[str, str], float], keys: Mapping[str, str]) -> FleetDrive:
     """Return a drive of its row."""
-
-    def number(key: str) -> float:
-        return math.nan if row[key] is None else float(row[key])
-
+    figures = (row[key] for key in ("sideslip_coverage95", "nis", "d2", "naive_d2"))
+    coverage, nis, d2, naive_d2 = (math.nan if x is None else float(x) for x in figures)
+    scored, factors = row["sideslip_rmse_rad"] is not None, {factor: row[factor] for factor in statistics.FACTORS}
+    main, unscored, failed = row["estimator"] or "", row["unscored"] or "", row["failed_checks"]
     return FleetDrive(
-        label=row["log"],
-        seconds=row["seconds"],
-        main=row["estimator"] or "",
-        truth=row["sideslip_rmse_rad"] is not None,
-        unscored=row["unscored"] or "",
-        errors=errors,
-        coverage=number("sideslip_coverage95"),
-        nis=number("nis"),
-        d2=number("d2"),
-        naive_d2=number("naive_d2"),
-        failed_checks=row["failed_checks"],
-        keys=keys,
-        factors={factor: row[factor] for factor in FACTORS},
+        row["log"], row["seconds"], main, scored, unscored, errors, coverage, nis, d2, naive_d2, failed, keys, factors
     )
 
 
@@ -348,17 +317,17 @@ def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
 def _of_all(drives: Sequence[FleetDrive], use: BoolArray | None = None) -> dict[str, list[str | None]]:
     """Return day, car and route of the drives to use (None: all)."""
     used = drives if use is None else [drives[i] for i in np.flatnonzero(use).tolist()]
-    return {f: [d.factors.get(f) for d in used] for f in FACTORS}
+    return {f: [d.factors.get(f) for d in used] for f in statistics.FACTORS}
 
 
-def _dependence(drives: Sequence[FleetDrive]) -> Dependence:
+def _dependence(drives: Sequence[FleetDrive]) -> statistics.Dependence:
     """Return the dependence of the selected estimate's errors."""
     errors = np.array([d.error() for d in drives])
     use = errors > 0.0
-    return dependence(np.log(errors[use]), _of_all(drives, use))
+    return statistics.dependence(np.log(errors[use]), _of_all(drives, use))
 
 
-def _median(change: PairedChange, scale: Callable[[float], float] = float) -> Median:
+def _median(change: statistics.PairedChange, scale: Callable[[float], float] = float) -> Median:
     return Median(*map(scale, (change.median, change.low, change.high)))
 
 
@@ -368,7 +337,7 @@ def _distributions(drives: Sequence[FleetDrive], names: Sequence[str]) -> Iterab
             values = np.array([d.error(name, signal) for d in drives])
             use = np.isfinite(values)
             if use.any():
-                median = _median(paired_change(values[use], None, _of_all(drives, use)))
+                median = _median(statistics.paired_change(values[use], None, _of_all(drives, use)))
                 yield Distribution(name, signal, unit, median, np.sort(values[use]))
 
 
@@ -376,15 +345,17 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
     """Return the estimators in order of how many others they beat, pair by pair on the drives of both."""
     errors = {name: np.array([d.error(name) for d in drives]) for name in (ANSWER, *names)}
 
-    def change(a: str, b: str) -> PairedChange:
+    def change(a: str, b: str) -> statistics.PairedChange:
         both = np.isfinite(errors[a]) & np.isfinite(errors[b])
-        return paired_change(log_ratios(errors[a][both], errors[b][both]), None, _of_all(drives, both))
+        return statistics.paired_change(
+            statistics.log_ratios(errors[a][both], errors[b][both]), None, _of_all(drives, both)
+        )
 
     pairs = [*combinations(names, 2)]
     changes = [change(a, b) for a, b in pairs]
     beats: dict[str, set[str]] = {name: set() for name in names}
     score = dict.fromkeys(names, 0)
-    for (a, b), of_pair, p in zip(pairs, changes, holm([c.sign_p for c in changes]), strict=True):
+    for (a, b), of_pair, p in zip(pairs, changes, statistics.holm([c.sign_p for c in changes]), strict=True):
         if p < SIGNIFICANT and of_pair.median != 0.0:
             better, worse = (a, b) if of_pair.median > 0.0 else (b, a)
             beats[better].add(worse)

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
 from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.sink import TRUTH, rounded
@@ -170,26 +170,15 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
 
 
 def _track_from_table(name: str, table: pa.Table) -> StateTrack:
-    def numbers(column: str) -> FloatArray:
-        if column not in table.column_names:
-            return np.broadcast_to(np.nan, table.num_rows)
-        return np.asarray(table[column].to_numpy(), dtype=np.float64)
-
-    floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", *_FLAGS, *_STD_COLUMNS, *OPTIONAL_COLUMNS)}
-    optional = {c: table[c] for c in OPTIONAL_COLUMNS if c in table.column_names}
-    columns: dict[str, Any] = {c: v for c, v in optional.items() if v.null_count < table.num_rows}
-    columns |= {c: numbers(c) for c in columns if c != "reason"}
-    if "reason" in columns:
-        columns["reason"] = np.asarray(columns["reason"].fill_null(0).to_numpy(), dtype=np.int64)
-    flags = {c: np.asarray(table[c].to_numpy(), dtype=np.bool_) for c in _FLAGS if c in table.column_names}
-    return make_track(
-        name,
-        np.asarray(table["stamp_ns"].to_numpy(), dtype=np.int64),
-        covariance=diagonal_covariance([numbers(c) for c in _STD_COLUMNS]),
-        **floats,
-        **flags,
-        **columns,
-    )
+    unknown = np.broadcast_to(np.nan, table.num_rows)
+    columns: dict[str, Any] = {"sideslip_rad": unknown}
+    for column in [c for c in table.column_names if c != "stamp_ns"]:
+        values, is_reason = table[column], column == "reason"
+        if column not in OPTIONAL_COLUMNS or values.null_count < table.num_rows:
+            kind = np.bool_ if column in _FLAGS else np.int64 if is_reason else np.float64
+            columns[column] = np.asarray((values.fill_null(0) if is_reason else values).to_numpy(), dtype=kind)
+    columns["covariance"] = diagonal_covariance([columns.pop(c, unknown) for c in _STD_COLUMNS])
+    return make_track(name, np.asarray(table["stamp_ns"].to_numpy(), dtype=np.int64), **columns)
 
 
 def _names(file: pq.ParquetFile) -> list[str]:

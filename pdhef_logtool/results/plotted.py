@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, truth_speed
@@ -9,49 +11,86 @@ from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
+_SIDESLIP, _RATE = "sideslip_rad", "yaw_rate_rad_s"
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """One plotted quantity: component, title, column of the track, factor to the plotted unit, its deviation's column.
+
+    ``limits``, ``error``: fields of ``pdhef_msgs/msg/PlottedEstimate`` with the ends of its interval, and its error.
+    """
+
+    name: str
+    title: str
+    column: str
+    factor: float = 1.0
+    std: str = ""
+    limits: tuple[str, ...] = ()
+    error: str = ""
+
+    @property
+    def error_title(self) -> str:
+        """Title of its error."""
+        return f"Error of {self.title[0].lower()}{self.title[1:]}"
+
+
+_SLIP_LIMITS, _RATE_LIMITS = ("sideslip_low_deg", "sideslip_high_deg"), ("yaw_rate_low_deg_s", "yaw_rate_high_deg_s")
+#: Quantities that recordings and layouts draw of each track.
+STATES = (
+    Plot("sideslip_deg", "Sideslip [deg]", _SIDESLIP, DEGREES, "sideslip_std_rad", _SLIP_LIMITS, "sideslip_error_deg"),
+    Plot(
+        "yaw_rate_deg_s", "Yaw rate [deg/s]", _RATE, DEGREES, "yaw_rate_std_rad_s", _RATE_LIMITS, "yaw_rate_error_deg_s"
+    ),
+    Plot("ay_m_s2", "Lateral acceleration [m/s²]", "ay_m_s2"),
+    Plot("vx_m_s", "Longitudinal velocity [m/s]", "vx_m_s", std="vx_std_m_s"),
+    Plot("vy_m_s", "Lateral velocity [m/s]", "vy_m_s", std="vy_std_m_s", error="vy_error_m_s"),
+)
 #: Whose error is drawn; the other two errors show the same once more.
-ERRORS = {"sideslip_deg": "sideslip_rad", "yaw_rate_deg_s": "yaw_rate_rad_s", "vy_m_s": "vy_m_s"}
-#: Field of ``pdhef_msgs/msg/PlottedEstimate`` of each error.
-_ERROR_FIELDS = ("sideslip_error_deg", "yaw_rate_error_deg_s", "vy_error_m_s")
+ERRORS = tuple(plot for plot in STATES if plot.error)
+
+
+def drawn(track: StateTrack, plot: Plot, min_speed_m_s: float) -> FloatArray:
+    """Return the drawn values of a track, [N, 1] or, with the ends of the 95 % interval, [N, 3]; NaN if unknown.
+
+    ``min_speed_m_s``: sideslip is not drawn below.
+    """
+    values = np.asarray(getattr(track, plot.column), dtype=np.float64) * plot.factor
+    if len(values) != len(track):
+        return np.full((len(track), 1), np.nan)
+    shown = track.valid
+    if plot.column == _SIDESLIP:
+        shown = shown & (np.hypot(track.vx_m_s, track.vy_m_s) >= min_speed_m_s)
+    values = np.where(shown, values, np.nan)
+    if not plot.std:
+        return values[:, None]
+    half = NORMAL_95 * plot.factor * np.asarray(getattr(track, plot.std))
+    return np.stack([values, values - half, values + half], axis=1)
 
 
 def errors(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -> dict[str, FloatArray]:
-    """Return the errors [N] by the keys of :data:`ERRORS`, NaN where ground truth or estimate is not known.
+    """Return the errors [N] by the names of :data:`ERRORS`, NaN where ground truth or estimate is not known.
 
     ``min_speed_m_s``: of the ground truth, below which there is no error of sideslip.
     """
-    columns = {name: np.full(len(track), np.nan) for name in ERRORS}
+    columns = {plot.name: np.full(len(track), np.nan) for plot in ERRORS}
     if truth is None:
         return columns
     _, of_track, of_truth = np.intersect1d(track.stamps_ns, truth.stamps_ns, assume_unique=True, return_indices=True)
     valid = track.valid[of_track] & truth.valid[of_truth]
     fast = truth_speed(truth)[of_truth] >= min_speed_m_s
-    for name, column in ERRORS.items():
-        error = np.asarray(getattr(track, column))[of_track] - getattr(truth, column)[of_truth]
-        is_slip = column == "sideslip_rad"
-        error = (wrap_angle(error) if is_slip else error) * (1.0 if name == "vy_m_s" else DEGREES)
-        columns[name][of_track] = np.where(valid & fast if is_slip else valid, error, np.nan)
+    for plot in ERRORS:
+        error = np.asarray(getattr(track, plot.column))[of_track] - getattr(truth, plot.column)[of_truth]
+        is_slip = plot.column == _SIDESLIP
+        error = (wrap_angle(error) if is_slip else error) * plot.factor
+        columns[plot.name][of_track] = np.where(valid & fast if is_slip else valid, error, np.nan)
     return columns
 
 
 def plotted_fields(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -> dict[str, FloatArray]:
     """Return the fields [N] of ``pdhef_msgs/msg/PlottedEstimate`` but the header; no errors of ground truth."""
-    fast = np.hypot(track.vx_m_s, track.vy_m_s) >= min_speed_m_s
-    slip, rate = (
-        np.where(is_drawn, DEGREES * getattr(track, column), np.nan)
-        for column, is_drawn in (("sideslip_rad", track.valid & fast), ("yaw_rate_rad_s", track.valid))
-    )
-    slip_half, rate_half = (
-        NORMAL_95 * DEGREES * np.asarray(getattr(track, std)) for std in ("sideslip_std_rad", "yaw_rate_std_rad_s")
-    )
-    fields = {
-        "sideslip_deg": slip,
-        "sideslip_low_deg": slip - slip_half,
-        "sideslip_high_deg": slip + slip_half,
-        "yaw_rate_deg_s": rate,
-        "yaw_rate_low_deg_s": rate - rate_half,
-        "yaw_rate_high_deg_s": rate + rate_half,
-        **{c: np.where(track.valid, getattr(track, c), np.nan) for c in ("vx_m_s", "vy_m_s", "ay_m_s2")},
-    }
-    against = None if truth is None or truth.name == track.name else truth
-    return fields | dict(zip(_ERROR_FIELDS, errors(track, against, min_speed_m_s).values(), strict=True))
+    fields: dict[str, FloatArray] = {}
+    for plot in STATES:
+        fields |= zip((plot.name, *plot.limits), drawn(track, plot, min_speed_m_s).T, strict=False)
+    of_track = errors(track, None if truth is None or truth.name == track.name else truth, min_speed_m_s)
+    return fields | {plot.error: of_track[plot.name] for plot in ERRORS}

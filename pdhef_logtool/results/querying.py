@@ -6,13 +6,11 @@ import re
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import polars as pl
 
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.results.opened_run import TABLES, open_run
-
-if TYPE_CHECKING:
-    import polars as pl
 
 
 def query(runs: Path | str | Sequence[Path | str], sql: str) -> pl.DataFrame:
@@ -28,8 +26,6 @@ def query(runs: Path | str | Sequence[Path | str], sql: str) -> pl.DataFrame:
     OutputError : There is no finished run, or a table is damaged.
     UsageError : The statement cannot be executed.
     """
-    import polars as pl
-
     names = [runs] if isinstance(runs, Path | str) else runs
     opened = {str(name): open_run(name) for name in names}
     frames = {}

@@ -13,7 +13,6 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from pdhef_logtool.evaluation.reasons import reason_intervals
-from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
@@ -21,14 +20,9 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.log_lines import LEVEL_NAMES, log_lines
 from pdhef_logtool.results.palette import colour_rgb
-from pdhef_logtool.results.plotted import ERRORS, errors
+from pdhef_logtool.results.plotted import ERRORS, STATES, Plot, drawn, errors
 from pdhef_logtool.results.run_report import report_markdown
-from pdhef_logtool.results.sink import (
-    LONGEST_WHOLE_NS,
-    TRUTH,
-    Event,
-    first_of_slots,
-)
+from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots
 from pdhef_logtool.storage.files import open_new, writing
 
 #: Estimators beside the selected estimate and the baseline that the blueprint has places for, hidden until asked for.
@@ -50,39 +44,19 @@ LONG_STEP_NS, OTHERS_STEP_NS = 100_000_000, 200_000_000
 _CHUNK_ROWS = 6000
 
 
-@dataclass(frozen=True, slots=True)
-class _Plot:
-    """One plotted quantity: component, its title, track column, factor to the plotted unit, its deviation's column."""
-
-    name: str
-    title: str
-    column: str
-    factor: float = 1.0
-    std: str | None = None
-    from_low_speed: bool = True
-
-
-_STATES = (
-    _Plot("sideslip_deg", "sideslip [deg]", "sideslip_rad", DEGREES, "sideslip_std_rad", from_low_speed=False),
-    _Plot("yaw_rate_deg_s", "yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES, "yaw_rate_std_rad_s"),
-    _Plot("vx_m_s", "longitudinal velocity [m/s]", "vx_m_s", std="vx_std_m_s"),
-    _Plot("vy_m_s", "lateral velocity [m/s]", "vy_m_s", std="vy_std_m_s"),
-    _Plot("ay_m_s2", "lateral acceleration [m/s²]", "ay_m_s2"),
-)
-_ERRORS = tuple(plot for plot in _STATES if plot.name in ERRORS)
 _HEALTH = (
-    _Plot("nis", "normalised innovation squared", "nis"),
-    _Plot("network_trust", "residual gain", "network_trust"),
-    _Plot("r_scale", "factor on R", "r_scale"),
-    _Plot("mixture_weight", "weight of the filters with a force scale or a bank", "mixture_weight"),
-    _Plot("friction", "friction", "friction"),
+    Plot("nis", "normalised innovation squared", "nis"),
+    Plot("network_trust", "residual gain", "network_trust"),
+    Plot("r_scale", "factor on R", "r_scale"),
+    Plot("mixture_weight", "weight of the filters with a force scale or a bank", "mixture_weight"),
+    Plot("friction", "friction", "friction"),
 )
 _INPUTS = (
-    _Plot("speed_m_s", "speed [m/s]", "speed_m_s"),
-    _Plot("steer_deg", "road-wheel angle [deg]", "steer_rad", DEGREES),
-    _Plot("ax_m_s2", "measured a_x [m/s²]", "ax_m_s2"),
-    _Plot("ay_m_s2", "measured a_y [m/s²]", "ay_m_s2"),
-    _Plot("yaw_rate_deg_s", "measured yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES),
+    Plot("speed_m_s", "speed [m/s]", "speed_m_s"),
+    Plot("steer_deg", "road-wheel angle [deg]", "steer_rad", DEGREES),
+    Plot("ax_m_s2", "measured a_x [m/s²]", "ax_m_s2"),
+    Plot("ay_m_s2", "measured a_y [m/s²]", "ay_m_s2"),
+    Plot("yaw_rate_deg_s", "measured yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES),
 )
 #: Components of a track that are known at few stamps only.
 _SPARSE = frozenset({"nis"})
@@ -225,32 +199,17 @@ class _Drawing:
         colours = [rgb, *[(*rgb, 110)] * len(band)]
         style = rr.SeriesLines(names=[track.name, *band], colors=colours, widths=widths[: len(colours)])
         self._log_static(f"/{place}", style)
-        columns = self._columns(track, _STATES + _HEALTH if place in ("main", "baseline") else _STATES)
-        if track.name != TRUTH:
+        # The blueprint needs all components: those that a track does not have are NaN.
+        plots = STATES + _HEALTH if place in ("main", "baseline") else STATES
+        columns = {p.name: drawn(track, p, self.min_speed_m_s) for p in plots}
+        if track.name == TRUTH:
+            columns = {name: values[:, :1] for name, values in columns.items()}
+        else:
             by_name = errors(track, truth, self.min_speed_m_s)
             columns |= {f"error_{name}": values[:, None] for name, values in by_name.items()}
         self._send_sparse(f"/{place}", _TRACK, track.stamps_ns, {n: columns.pop(n) for n in _SPARSE & columns.keys()})
         self._send_rows(f"/{place}", _TRACK, track.stamps_ns, columns)
         self._draw_path(track, place, rgb)
-
-    def _columns(self, track: StateTrack, plots: Sequence[_Plot]) -> dict[str, FloatArray]:
-        """Return the drawn values of a track by component, [N, 1] or, with a 95 % interval, [N, 3]; NaN if unknown.
-
-        The blueprint needs all components: those that a track does not have are NaN.
-        """
-        fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self.min_speed_m_s
-        columns = {}
-        for plot in plots:
-            values = np.asarray(getattr(track, plot.column), dtype=np.float64) * plot.factor
-            if len(values) != len(track):
-                values = np.full(len(track), np.nan)
-            shown = track.valid if plot.from_low_speed else track.valid & fast
-            drawn = [np.where(shown, values, np.nan)]
-            if plot.std is not None and track.name != TRUTH:
-                half = NORMAL_95 * plot.factor * np.asarray(getattr(track, plot.std))
-                drawn += [drawn[0] - half, drawn[0] + half]
-            columns[plot.name] = np.stack(drawn, axis=1)
-        return columns
 
     def _send_sparse(self, entity: str, archetype: str, stamps_ns: IntArray, columns: Mapping[str, FloatArray]) -> None:
         """Send each component [N, k] where it is known, so that its line continues between; unknown at one stamp."""
@@ -337,7 +296,7 @@ def _blueprint() -> rrb.Blueprint:
     states = ("truth", "baseline", "main", *(f"other/{number}" for number in range(1, MOST_OTHERS + 1)))
     drive = rrb.Horizontal(
         rrb.Vertical(
-            *(_track_view(_STATES[i].name, _STATES[i].title, states, legend=i == 0) for i in (0, 1, 4)),
+            *(_track_view(plot.name, plot.title, states, legend=plot is STATES[0]) for plot in STATES[:3]),
             *(_input_view(plot) for plot in _INPUTS[:2]),
             row_shares=[4, 2, 2, 1.5, 1.5],
         ),
@@ -350,13 +309,12 @@ def _blueprint() -> rrb.Blueprint:
         name="Drive",
     )
     errors = rrb.Vertical(
-        *(_track_view(f"error_{plot.name}", f"error of {plot.title}", states[1:]) for plot in _ERRORS),
-        name="Errors",
+        *(_track_view(f"error_{plot.name}", plot.error_title, states[1:]) for plot in ERRORS), name="Errors"
     )
     filters = rrb.Vertical(
         *(_track_view(plot.name, plot.title, ("baseline", "main"), legend=plot is _HEALTH[0]) for plot in _HEALTH[:-1]),
         rrb.StateTimelineView(origin="/reasons", name="Why samples were not used as usual"),
-        *(_track_view(plot.name, plot.title, states) for plot in _STATES[2:4]),
+        *(_track_view(plot.name, plot.title, states) for plot in STATES[3:]),
         name="Filter",
     )
     report = rrb.TextDocumentView(origin="/report", name="Report")
@@ -380,7 +338,7 @@ def _track_view(component: str, title: str, places: Sequence[str], *, legend: bo
     return _plot_view(title, overrides, legend=legend)
 
 
-def _input_view(plot: _Plot) -> rrb.TimeSeriesView:
+def _input_view(plot: Plot) -> rrb.TimeSeriesView:
     style = rr.SeriesLines(names=[plot.title], colors=[(0x56, 0xB4, 0xE9)], widths=[1.5])
     return _plot_view(plot.title, {"/inputs": [_line_of(f"{_SIGNALS}:{plot.name}", style)]}, legend=False)
 

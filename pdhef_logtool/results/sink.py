@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from pdhef_logtool.evaluation.manoeuvres import Event as Event
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Name of the track that contains the ground truth.
@@ -31,28 +30,6 @@ _STEPS = {
 _SINGLE = frozenset({"friction", "network_trust", "r_scale"})
 #: Bits that are cleared in single-precision values of other columns, which leaves 12 bits of mantissa.
 _BITS_OUT = 11
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """An event in [start_ns, end_ns): a segment, a divergence or a loss."""
-
-    name: str
-    start_ns: int
-    end_ns: int
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class ManoeuvreEvent(Event):
-    """A recognised manoeuvre: its first side (``left``, ``right``), the speed at its start, and its peaks."""
-
-    side: str
-    speed_m_s: float
-    peak_ay_m_s2: float
-    peak_yaw_rate_rad_s: float
-    peak_steer_rad: float
-    lowest_ax_m_s2: float
 
 
 def rounded(name: str, values: FloatArray) -> FloatArray:

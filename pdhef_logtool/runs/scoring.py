@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segme
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.sink import Event, ManoeuvreEvent
+from pdhef_logtool.results.sink import Event
 from pdhef_logtool.runs.estimating import Estimated
 
 
@@ -75,11 +75,7 @@ def _events(
     The whole drive and ``linear`` are no events.
     """
     spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
-    events = [Event(s.name, s.start_ns, s.end_ns, "") for s in spans]
-    events += [
-        ManoeuvreEvent(**{**asdict(m), "text": m.text, "side": "left" if m.side > 0 else "right"}) for m in manoeuvres
-    ]
-    return in_order([*events, *divergences(tracks)])
+    return in_order([*spans, *manoeuvres, *divergences(tracks)])
 
 
 def divergences(tracks: Iterable[StateTrack]) -> Iterator[Event]:

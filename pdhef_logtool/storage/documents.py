@@ -52,11 +52,7 @@ def read_json(
 
 
 def read_sealed(
-    path: Path,
-    what: str,
-    error: type[PdhefError],
-    remedy: str = "",
-    max_bytes: int = MAX_BYTES,
+    path: Path, what: str, error: type[PdhefError], remedy: str = "", max_bytes: int = MAX_BYTES
 ) -> dict[str, Any]:
     """Return a document that :func:`seal` made, without its digest; otherwise as :func:`read_json`.
 
@@ -89,12 +85,7 @@ def file_sha256(path: Path) -> str:
 
 
 def _read(
-    path: Path,
-    parse: Callable[[str], Any],
-    what: str,
-    error: type[PdhefError],
-    remedy: str,
-    max_bytes: int = MAX_BYTES,
+    path: Path, parse: Callable[[str], Any], what: str, error: type[PdhefError], remedy: str, max_bytes: int = MAX_BYTES
 ) -> dict[str, Any]:
     try:
         document = parse(read_text(path, max_bytes))

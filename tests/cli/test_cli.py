@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import rerun
+import typer
 
 from pdhef_logtool import __version__
 from pdhef_logtool.storage.documents import seal
@@ -48,6 +49,16 @@ def test_help_says_what_each_command_does() -> None:
             assert all(len(line) <= width for line in text.splitlines()), command
             examples = text[text.index("Examples:") :].splitlines()[1:]
             assert f"{examples[0]} ".startswith(f"    pdhef {command} ")
+
+
+def test_the_table_of_commands_describes_each_option_and_no_other() -> None:
+    from pdhef_logtool.cli import options
+    from pdhef_logtool.cli.app import app
+
+    for name, command in typer.main.get_command(app).commands.items():  # type: ignore[attr-defined]
+        described = {p.name: p.help for p in command.params}
+        assert all(described.values()), name
+        assert options._texts()[name].get("options", {}).keys() <= described.keys(), name
 
 
 @pytest.mark.slow

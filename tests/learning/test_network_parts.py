@@ -11,15 +11,15 @@ import pytest
 import torch
 from residual_car import START_NS
 
-from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.fit import FeatureSequence, Recipe, normalisation_of
+from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.learning.network.train_command import LEAD_STEPS, gap_free_runs, make_recipe, weights_of
 from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
 from studies.defaults.train_baselines import SideslipSequence, fit_linear
 
 
-def arrays(count: int = 200, **changes: Any) -> DriveArrays:
+def arrays(count: int = 200, **changes: Any) -> ResidualRows:
     """Return the rows of a drive at 100 Hz with random features, all usable."""
     columns: dict[str, Any] = {
         "stamps_ns": START_NS + np.arange(count) * 10_000_000,
@@ -30,7 +30,7 @@ def arrays(count: int = 200, **changes: Any) -> DriveArrays:
         "segment": np.zeros(count, dtype=np.int64),
         "truth_velocity": np.tile(np.float32([20.0, 0.1]), (count, 1)),
     }
-    return DriveArrays(**{**columns, **changes})
+    return ResidualRows(**{**columns, **changes})
 
 
 def sequence(count: int, value: float = 1.0, drive: str = "a") -> FeatureSequence:

@@ -12,7 +12,6 @@ from reference_car import Drive
 from residual_car import CAR, START_NS, Measured, Motion, Wave, drive, pick, truth_of, window
 
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter
-from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,
     residual_rows,
@@ -118,7 +117,7 @@ def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
     whole = oracle_window(oracle, made, steer_rad=off)
     rows = residual_rows(whole.signals, whole.truth, VehicleUkf(oracle.as_vehicle()), period_s=0.01)
     use = rows.weight > 0
-    arrays = DriveArrays(
+    arrays = ResidualRows(
         rows.stamps_ns[use],
         rows.features[use].astype(np.float32),
         rows.targets[use].astype(np.float32),

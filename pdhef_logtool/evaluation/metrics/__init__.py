@@ -1,7 +1,7 @@
 """Metrics: formulas over columns of a drive. Files, terminal, pages, plans and documentation use these entries.
 
-To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`) and add its name to ``MODULES`` of
-:mod:`~.registry`. Example, ``interval_width.py``::
+To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`; the words of our own are in
+``metrics.toml``) and add its name to ``MODULES`` of :mod:`~.registry`. Example, ``interval_width.py``::
 
     from pdhef_logtool.evaluation.metrics.errors import errors_of_drive
     from pdhef_logtool.evaluation.metrics.metric import Metric

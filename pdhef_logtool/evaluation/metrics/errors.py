@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, pose_known, position_error
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, mean, rms
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean, rms
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, raw_error, scorable, total_std
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -79,48 +78,14 @@ def _relative(error: FloatArray, truth: FloatArray) -> float:
     return rms(error) / size if size > 0 else float("nan")
 
 
-_ALWAYS = ("vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2", "lateral_1s_m")
-_ERROR = partial(Metric, columns=errors_of_drive, over=("error",), best="lower", of_truth=True)
-METRICS = (
-    _ERROR(
-        "availability",
-        "available",
-        "share of the stamps with scorable ground truth at which the estimate is valid and finite; n = all of them",
-        formula=mean,
-        over=("available",),
-        best="higher",
-        unit="1",
-    ),
-    _ERROR("rmse", "RMSE", "√ mean e²", formula=rms, terminal=("sideslip_rad", *_ALWAYS), brief=("sideslip_rad",)),
-    _ERROR("mae", "MAE", "mean abs e", formula=lambda e: float(np.mean(np.abs(e)))),
-    _ERROR("bias", "bias", "mean e; positive = estimate too large", formula=mean, over=("signed",), best=0.0),
-    _ERROR("p95_abs", "p95", "95th percentile of abs e", formula=_p95, terminal=("sideslip_rad",)),
-    _ERROR(
-        "max_abs",
-        "max",
-        "maximum of abs e",
-        formula=lambda e: float(np.max(np.abs(e))),
-        digits=2,
-        terminal=("sideslip_rad",),
-    ),
-    _ERROR(
-        "rmse_relative",
-        "relative",
-        "rmse / √ mean truth² over the same stamps",
-        formula=_relative,
-        over=("error", "truth"),
-        unit="1",
-    ),
-    _ERROR(
-        "coverage95",
-        "in 95 % CI",
-        "share of stamps with abs e ≤ 1.96 σ; σ² is the variance of the estimate plus, if known, of ground truth",
-        formula=lambda std, e: float(np.mean(np.abs(e) <= NORMAL_95 * std)),
-        over=("std", "error"),
-        best=0.95,
-        unit="1",
-        digits=2,
-        terminal=("sideslip_rad",),
-        brief=("sideslip_rad",),
-    ),
+METRICS = described(
+    errors_of_drive,
+    availability=(mean, "available"),
+    rmse=(rms, "error"),
+    mae=(lambda e: float(np.mean(np.abs(e))), "error"),
+    bias=(mean, "signed"),
+    p95_abs=(_p95, "error"),
+    max_abs=(lambda e: float(np.max(np.abs(e))), "error"),
+    rmse_relative=(_relative, "error", "truth"),
+    coverage95=(lambda std, e: float(np.mean(np.abs(e) <= NORMAL_95 * std)), "std", "error"),
 )

@@ -16,7 +16,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.manoeuvres import RULES
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 #: Sine with dwell: driving after it, share of its peak below which steering is at zero, steering-wheel angle at its
@@ -180,35 +180,9 @@ _KINDS: tuple[tuple[str, str, Callable[..., _Figures]], ...] = (
     ("sine-sweep", "yaw_rate_rad_s", _sweep),
 )
 
-
-def _figure(name: str, label: str, unit: str | None, signals: str, definition: str) -> Metric:
-    """Return a metric with one value for a drive."""
-    brief = tuple(signals.split())
-    return Metric(name, label, definition, responses, lambda v: float(v[0]), whole=True, unit=unit, brief=brief)
-
-
-_RATE, _BOTH, _STEP = "yaw_rate_rad_s", "yaw_rate_rad_s ay_m_s2", "of the first step steer: from half of the steady "
-_RATIO = "of the first sine with dwell: yaw rate {} s after completion of steer over its peak after the reversal"
-_DISPLACED = "of the first sine with dwell: lateral displacement 1.07 s after the steering wheel reaches 5°; "
-_CURVATURE = "of the first braking in a turn: curvature r / v_x 1 s after the onset over that of the circle before"
-_SLOPE = "slope of the road-wheel angle less L r / v over a_y up to 4 m/s², of the first ramp or steady circle"
-_GAIN = "of the first sine sweep: yaw rate over road-wheel angle at the lowest frequency with 5 % of the densest"
-METRICS = (
-    _figure("step_response_time", "response time", "s", _BOTH, f"{_STEP}steering to 90 % of the steady response"),
-    _figure("step_peak_time", "peak response time", "s", _BOTH, f"{_STEP}steering to the peak of the response"),
-    _figure("step_tb", "TB", "rad*s", "sideslip_rad", "`step_peak_time` of the yaw rate times the steady sideslip"),
-    _figure("step_peak", "peak of step", None, _BOTH, "largest response to the first step steer"),
-    _figure("step_overshoot", "overshoot", "1", _BOTH, "`step_peak` over the steady response, less 1"),
-    _figure("dwell_ratio_1s", "yaw-rate ratio 1 s", "1", _RATE, _RATIO.format("1")),
-    _figure("dwell_ratio_1_75s", "yaw-rate ratio 1.75 s", "1", _RATE, _RATIO.format("1.75")),
-    _figure("dwell_displacement", "displacement", None, "position_m", f"{_DISPLACED}positive to the first side"),
-    _figure("understeer_gradient", "understeer gradient", "rad/(m/s^2)", "ay_m_s2", _SLOPE),
-    _figure("entry_speed", "entry speed", None, "vx_m_s", "v_x at the start of the first severe lane change"),
-    _figure("sweep_gain", "yaw gain", "1/s", _RATE, _GAIN),
-    _figure("sweep_phase", "yaw phase at 1 Hz", "rad", _RATE, "of the yaw rate against the steering; negative: late"),
-    _figure("sweep_bandwidth", "bandwidth", "Hz", _RATE, "frequency at which the gain is 3 dB below `sweep_gain`"),
-    _figure("sweep_coherence", "coherence", "1", _RATE, "of steering and yaw rate, mean of the swept frequencies"),
-    _figure("brake_yaw_ratio", "curvature after 1 s", "1", _RATE, _CURVATURE),
-    _figure("brake_deceleration", "deceleration", "m/s^2", "vx_m_s", "mean from the onset to the end of braking"),
-    _figure("brake_sideslip", "sideslip by braking", None, "sideslip_rad", "largest change from the circle before"),
-)
+_NAMES = """
+step_response_time step_peak_time step_tb step_peak step_overshoot dwell_ratio_1s dwell_ratio_1_75s dwell_displacement
+understeer_gradient entry_speed sweep_gain sweep_phase sweep_bandwidth sweep_coherence brake_yaw_ratio
+brake_deceleration brake_sideslip
+"""
+METRICS = described(responses, **dict.fromkeys(_NAMES.split(), lambda v: float(v[0])))

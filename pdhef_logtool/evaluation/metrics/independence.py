@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, mean
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean
 from pdhef_logtool.evaluation.track_errors import scorable
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 
@@ -22,15 +22,4 @@ def _marks(drive: EvaluatedDrive) -> Iterator[Columns]:
             yield Columns(name, signal, {NOT_INDEPENDENT: np.where(has_truth, 1.0, np.nan)})
 
 
-METRICS = (
-    Metric(
-        NOT_INDEPENDENT,
-        "not independent",
-        "1 where the ground truth of this signal is one of the estimators' inputs: keep it out of rankings",
-        columns=_marks,
-        formula=mean,
-        unit="1",
-        whole=True,
-        of_truth=True,
-    ),
-)
+METRICS = described(_marks, not_independent=mean)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 
 import numpy as np
 
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, mean
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -72,39 +71,8 @@ def _autocorrelation(before: FloatArray, after: FloatArray) -> float | None:
     return float(np.sum(x * y)) / power if power > 0 else float("nan")
 
 
-_NIS = partial(Metric, columns=_innovations, formula=mean, unit="1")
 METRICS = (
-    Metric(
-        "nees",
-        "NEES",
-        "mean eᵀ (P + P_truth)⁻¹ e over [v_x, v_y, r]; 3 when P is right. Signal `state`",
-        columns=_errors,
-        formula=mean,
-        best=3.0,
-        unit="1",
-    ),
-    _NIS("nis", "NIS", "mean normalized innovation squared. Signal `state`", brief=("state",)),
-    _NIS(
-        "nis_dof",
-        "degrees of freedom",
-        "mean of the degrees of freedom of NIS, which `nis` should equal. Signal `state`",
-        brief=("state",),
-    ),
-    _NIS(
-        "diverged",
-        "diverged",
-        "share of stamps at which the estimator itself reports divergence. Signal `state`",
-        best="lower",
-    ),
-    Metric(
-        "nis_autocorrelation",
-        "whiteness",
-        "autocorrelation of NIS per degree of freedom from one stamp to the next, signal `state`; 0 for white "
-        "innovations, beyond ± 2/√n they are not white",
-        columns=_pairs,
-        formula=_autocorrelation,
-        over=("before", "after"),
-        best=0.0,
-        unit="1",
-    ),
+    *described(_errors, nees=mean),
+    *described(_innovations, nis=mean, nis_dof=mean, diverged=mean),
+    *described(_pairs, nis_autocorrelation=(_autocorrelation, "before", "after")),
 )

@@ -6,7 +6,7 @@ import numpy as np
 
 from pdhef_logtool.drive.correlation import find_shift, on_common_grid
 from pdhef_logtool.evaluation.metrics.errors import errors_of_drive
-from pdhef_logtool.evaluation.metrics.metric import Metric, rms
+from pdhef_logtool.evaluation.metrics.metric import described, rms
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
@@ -48,33 +48,8 @@ def _rms_aligned(
     return rms(np.asarray(wrap_angle(estimate[covered] - shifted), dtype=np.float64))
 
 
-METRICS = (
-    Metric(
-        "lag_s",
-        "lag",
-        "shift, within ± 0.3 s, at which the estimate correlates best with ground truth; positive = estimate late. "
-        "Segment `all` only, its first ten minutes; NaN when the correlation stays below 0.5 or has no peak",
-        columns=errors_of_drive,
-        formula=_lag_of_start,
-        over=("error", "since_start_ns", "estimate", "truth"),
-        best=0.0,
-        unit="s",
-        whole=True,
-        of_truth=True,
-        digits=0,
-        terminal=("sideslip_rad",),
-    ),
-    Metric(
-        "rmse_aligned",
-        "RMSE aligned",
-        "`rmse` of sideslip after two corrections of ground truth: less its mean on straights, and shifted in time by "
-        "`lag_s`. Segment `all` only; absent without straights",
-        columns=errors_of_drive,
-        formula=_rms_aligned,
-        over=("error", "since_start_ns", "estimate", "truth", "straight"),
-        best="lower",
-        whole=True,
-        of_truth=True,
-        brief=("sideslip_rad",),
-    ),
+METRICS = described(
+    errors_of_drive,
+    lag_s=(_lag_of_start, "error", "since_start_ns", "estimate", "truth"),
+    rmse_aligned=(_rms_aligned, "error", "since_start_ns", "estimate", "truth", "straight"),
 )

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
-from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, Metric, rms
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, described, rms
 from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -84,17 +84,4 @@ class _Driven:
         return self.change(self.carried_vy(track)) - self._gained
 
 
-METRICS = (
-    Metric(
-        "d2",
-        "consistency",
-        "signal `vy_m_s`: RMS of the change of the estimated v_y over 2 s minus the integral of a_y − v_x r, above the "
-        "low-speed blend; a_y without bias, roll gain and lever arm of the calibrated vehicle; large with a wrong "
-        "model. Not meaningful for `kinematic`, which integrates the same quantities",
-        columns=_columns,
-        formula=rms,
-        best="lower",
-        unit="m/s",
-        brief=("vy_m_s",),
-    ),
-)
+METRICS = described(_columns, d2=rms)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import SIGNALS, read_unit
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 ALL = "all"
+#: Entries of :class:`Metric` beside its functions, by name.
+_TABLE = tomllib.loads((Path(__file__).parents[1] / "metrics.toml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +108,7 @@ Formula: TypeAlias = Callable[..., "float | None"]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric, as its file registers it; all outputs use this record.
+    """One metric, as its file registers it; all outputs use this record. ``metrics.toml`` has entries of our own.
 
     Attributes
     ----------
@@ -152,6 +157,21 @@ class Metric:
         return f"closest to {self.best:g}"
 
 
+def described(
+    columns: Callable[[EvaluatedDrive], Iterable[Columns]], **formulas: Formula | tuple[Any, ...]
+) -> tuple[Metric, ...]:
+    """Return metrics over the same columns, with the entries of ``metrics.toml``.
+
+    ``formulas``: by the name of a metric; a tuple has the names of the columns after it, unless there is only its own.
+    """
+    metrics = []
+    for name, stated in formulas.items():
+        formula, *over = stated if isinstance(stated, tuple) else (stated,)
+        entries: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in _TABLE[name].items()}
+        metrics.append(Metric(name, columns=columns, formula=formula, over=tuple(over), **entries))
+    return tuple(metrics)
+
+
 def rms(values: FloatArray, *_: FloatArray) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
@@ -164,14 +184,11 @@ def mean(values: NDArray[Any], *_: FloatArray) -> float:
 
 def figures(drive: EvaluatedDrive, metrics: Iterable[Metric]) -> list[MetricRow]:
     """Return the rows of metrics by estimator, in the order of the tracks, then by metric, signal and segment."""
-    families: dict[Callable[[EvaluatedDrive], Iterable[Columns]], list[Metric]] = {}
-    for metric in metrics:
-        families.setdefault(metric.columns, []).append(metric)
     everywhere = [(ALL, slice(None))]
     stamps = _places(drive.masks)
     steps = _places({name: mask[1:] & mask[:-1] for name, mask in drive.masks.items()})
     rows: dict[str, list[MetricRow]] = {name: [] for name in drive.tracks}
-    for columns_of, family in families.items():
+    for columns_of, family in gathered((m.columns, m) for m in metrics).items():
         for columns in columns_of(drive):
             places = everywhere if columns.whole else steps if columns.of_steps else stamps
             for segment, place in places:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from itertools import combinations
 
 import numpy as np
 
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, mean, rms
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean, rms
 from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, IntArray
@@ -55,11 +54,7 @@ def _against_reference(drive: EvaluatedDrive) -> Iterator[Columns]:
         used = track.valid & reference.valid
         used &= (reference.vx_m_s > drive.low_speed_m_s) & ~(track.vx_m_s <= drive.low_speed_m_s)
         difference = np.where(used, wrap_angle(track.sideslip_rad - reference.sideslip_rad), np.nan)
-        values = {
-            "difference": difference,
-            "std": reference.sideslip_std_rad,
-            "independent": reference.independent,
-        }
+        values = {"difference": difference, "std": reference.sideslip_std_rad, "independent": reference.independent}
         yield Columns(name, "sideslip_rad", values)
 
 
@@ -87,61 +82,14 @@ def _further(of_a: FloatArray, of_b: FloatArray, std: FloatArray, block: IntArra
     return float(np.sqrt(np.mean(of_a)) - np.sqrt(np.mean(of_b)))
 
 
-_REFERENCE = partial(Metric, columns=_against_reference)
 METRICS = (
-    Metric(
-        "disagreement_rms",
-        "RMS difference",
-        "RMS of the difference of two estimates' sideslip, both above the low-speed blend; estimator `a~b`. Without "
-        "ground truth only",
-        columns=_disagreement,
-        formula=rms,
-        over=("difference",),
-        best="lower",
+    *described(_disagreement, disagreement_rms=(rms, "difference")),
+    *described(_activity, residual_active=mean),
+    *described(
+        _against_reference,
+        reference_rms=(rms, "difference"),
+        reference_std=(lambda _, std: rms(std), "difference", "std"),
+        reference_independent=(lambda _, independent: mean(independent), "difference", "independent"),
     ),
-    Metric(
-        "residual_active",
-        "residual active",
-        "share of the stamps above the low-speed blend at which the residual acts, for a residual with a region of "
-        "validity",
-        columns=_activity,
-        formula=mean,
-        best="higher",
-        unit="1",
-    ),
-    _REFERENCE(
-        "reference_rms",
-        "RMS from reference",
-        "RMS of the difference of an estimate's sideslip from the sideslip reference, where the reference is valid and "
-        "both are above the low-speed blend. The reference is estimated: no error, and never mixed with ground truth",
-        formula=rms,
-        over=("difference",),
-        best="lower",
-    ),
-    _REFERENCE(
-        "reference_std",
-        "reference ±",
-        "RMS of the 1-sigma of the sideslip reference at these stamps: smaller differences are not significant",
-        formula=lambda _, std: rms(std),
-        over=("difference", "std"),
-    ),
-    _REFERENCE(
-        "reference_independent",
-        "reference independent",
-        "share of these stamps at which GNSS has more than half of the reference's information; at the others axle law "
-        "and kinematics of the same IMU prevail",
-        formula=lambda _, independent: mean(independent),
-        over=("difference", "independent"),
-        unit="1",
-    ),
-    Metric(
-        "reference_further",
-        "further from reference",
-        "RMS difference of estimate `a` from the sideslip reference minus the one of `b`, for pairs `a~b`. Only "
-        "if the difference of their mean squares exceeds 1.96 of its standard deviations, which follows from the "
-        "1-sigma of the reference with one error in each 10 s: other pairs are not ranked",
-        columns=_ranked,
-        formula=_further,
-        over=("of_a", "of_b", "std", "block"),
-    ),
+    *described(_ranked, reference_further=(_further, "of_a", "of_b", "std", "block")),
 )

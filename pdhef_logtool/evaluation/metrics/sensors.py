@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pdhef_logtool.drive.interpolation import Bracket
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described
 from pdhef_logtool.evaluation.segments import driven_speed
 from pdhef_logtool.evaluation.smoothing import median_step_ns
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -32,24 +32,8 @@ def _exposure(drive: EvaluatedDrive) -> Iterator[Columns]:
     yield Columns(SENSORS, "state", {"step_s": step_s, "way_m": np.abs(speed) * step_s})
 
 
-_WORDS = "of the drive in a segment; n = its stamps. Estimator `sensors`"
-METRICS = (
-    Metric(
-        "exposure_s",
-        "time",
-        f"time {_WORDS}",
-        columns=_exposure,
-        formula=lambda step_s: len(step_s) * float(step_s[0]),
-        over=("step_s",),
-        unit="s",
-    ),
-    Metric(
-        "exposure_m",
-        "way",
-        f"distance {_WORDS}",
-        columns=_exposure,
-        formula=lambda way_m: float(np.sum(way_m)),
-        over=("way_m",),
-        unit="m",
-    ),
+METRICS = described(
+    _exposure,
+    exposure_s=(lambda step_s: len(step_s) * float(step_s[0]), "step_s"),
+    exposure_m=(lambda way_m: float(np.sum(way_m)), "way_m"),
 )

@@ -15,19 +15,18 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
@@ -53,26 +52,18 @@ _EXPECTED = f"a residual dataset with its {MANIFEST}"
 _REMEDY = "write one with pdhef extract LOG... -o DATASET (--resume finishes an interrupted one)"
 _SCHEMA = "residuals.parquet.json"
 
-FloatArray32: TypeAlias = NDArray[np.float32]
 
-
-def write_drive(
-    path: Path,
-    rows: ResidualRows,
-    chosen: BoolArray,
-    entry: Mapping[str, Any],
-    *,
-    truth_source: str = "",
-) -> None:
+def write_drive(path: Path, rows: ResidualRows, entry: Mapping[str, Any], *, truth_source: str = "") -> None:
     """Write the Parquet file of one drive, with the drive's entry.
 
-    ``chosen`` : rows [N] for training; ``truth_source`` : source of the true sideslip.
+    ``truth_source`` : source of the true sideslip.
 
     Raises
     ------
     OutputError
         When the file cannot be written.
     """
+    chosen = np.ones(len(rows), dtype=np.bool_) if rows.chosen is None else rows.chosen
     schema = arrow_schema(_SCHEMA)
     columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
     columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
@@ -149,12 +140,10 @@ def write_manifest(
         path = drive_file(folder, entry)
         sha256 = _checked_sha256(path, entry.get("file_sha256"))
         drives.append({**entry, "file": path.relative_to(folder).as_posix(), "file_sha256": sha256})
-    splits: dict[str, dict[str, int]] = {name: {"drives": 0, "rows": 0, "usable_rows": 0} for name in SPLITS}
-    for d in drives:
-        total = splits.setdefault(d["split"], {"drives": 0, "rows": 0, "usable_rows": 0})
-        total["drives"] += 1
-        total["rows"] += d["rows"]
-        total["usable_rows"] += d["usable_rows"]
+    splits = {}
+    for name in dict.fromkeys((*SPLITS, *(d["split"] for d in drives))):
+        of = [d for d in drives if d["split"] == name]
+        splits[name] = {"drives": len(of)} | {key: sum(d[key] for d in of) for key in ("rows", "usable_rows")}
     document = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
@@ -200,31 +189,6 @@ def _checked_sha256(path: Path, named: str | None) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DriveArrays:
-    """One drive for training, in time order, without rows at which the parallel filter has no state.
-
-    Attributes
-    ----------
-    stamps_ns : int64 [N]. features : float32 [N, 15], finite.
-    targets : float32 [N, 2], increments to the next stamp in m/s and rad/s; 0 where ``weight`` is 0.
-    step_s : float64 [N], duration of a target's increment: target / step is the residual rate; the period at the last
-        row.
-    weight : float32 [N]. segment : int64 [N]; the recurrent state is reset where it changes.
-    truth_velocity : float32 [N, 2], true v_x and v_y; NaN where unknown.
-    chosen : bool [N], rows selected for training, in addition to a weight above 0; None: all.
-    """
-
-    stamps_ns: IntArray
-    features: FloatArray32
-    targets: FloatArray32
-    step_s: FloatArray
-    weight: FloatArray32
-    segment: IntArray
-    truth_velocity: FloatArray32
-    chosen: BoolArray | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class DatasetDrive:
     """One drive of a dataset. Its arrays are read on every access, as a dataset may exceed the memory.
 
@@ -234,8 +198,8 @@ class DatasetDrive:
     path: Path
     entry: Mapping[str, Any]
 
-    def load(self) -> DriveArrays:
-        """Read the drive's file.
+    def load(self) -> ResidualRows:
+        """Read the rows of the drive at which the parallel filter has a state; targets are 0 where the weight is.
 
         Raises
         ------
@@ -254,7 +218,7 @@ class DatasetDrive:
         targets = np.stack([column[name] for name, _ in TARGETS], axis=1).astype(np.float32)
         targets[weight == 0.0] = 0.0
         chosen: BoolArray = column["chosen"]
-        return DriveArrays(
+        return ResidualRows(
             stamps_ns=stamps[rows],
             features=np.stack([column[name] for name in FEATURES], axis=1).astype(np.float32),
             targets=targets,

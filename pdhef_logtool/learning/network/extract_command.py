@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
@@ -25,35 +25,9 @@ from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
-from pdhef_logtool.learning.drives import (
-    DriveRecord,
-    drives_document,
-    exit_code,
-    record_of,
-    set_manifest,
-    tell_drive,
-)
-from pdhef_logtool.learning.network.dataset import (
-    COLUMNS,
-    FORMAT_VERSION,
-    MANIFEST,
-    SPLITS,
-    drive_file,
-    read_dataset,
-    read_entry,
-    remove_unnamed,
-    split_folder,
-    write_drive,
-    write_manifest,
-)
-from pdhef_logtool.learning.network.residuals import (
-    GAP_PERIODS,
-    NEGLIGIBLE_NOISE,
-    SMOOTHING_HALF_S,
-    ResidualRows,
-    difference_noise,
-    residual_rows,
-)
+from pdhef_logtool.evaluation.statistics import gathered
+from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, record_of, set_manifest, tell_drive
+from pdhef_logtool.learning.network import dataset, residuals
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
 from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
@@ -63,7 +37,7 @@ from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import BoolArray, Loss
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
@@ -178,7 +152,9 @@ class _Job:
     def target(self, split: str) -> Path:
         """Return the path of the drive in the dataset."""
         sha, vehicle = self.physics
-        return drive_file(self.output, {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha})
+        return dataset.drive_file(
+            self.output, {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha}
+        )
 
     @property
     def physics(self) -> tuple[str, VehicleParameters]:
@@ -216,31 +192,32 @@ def extract(
     output = local_path(output)
     _check(jobs, settings)
     inputs = logs_of(arguments, settings.config.read_options)
-    mapping = mapping_of(settings.config.mapping)
-    work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
+    work = _plan_jobs(inputs, output, settings, resume, reporter.warn)
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
     read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
-    check_no_input(read, [output / MANIFEST])
+    check_no_input(read, [output / dataset.MANIFEST])
     kept = [d for d in before.get("drives", []) if d["name"] not in names]
     vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
+    for job in work:
+        sha, vehicle = job.physics
+        vehicles[sha] = {"name": vehicle.name, "sha256": sha, "parameters": vehicle.model_dump(mode="json")}
     write = partial(_write, output, settings, kept, vehicles)
-    folders = {split_folder(s) for s in (*SPLITS, settings.split, *(job.listed_split for job in work)) if s}
+    folders = {
+        dataset.split_folder(s) for s in (*dataset.SPLITS, settings.split, *(job.listed_split for job in work)) if s
+    }
     with OutputFolder(output, sorted(folders)):
         # Until the new manifest is written, the old one must not name files that may change.
         if kept:
             write([])
         else:
             with writing(output):
-                (output / MANIFEST).unlink(missing_ok=True)
+                (output / dataset.MANIFEST).unlink(missing_ok=True)
         results = _without_copies(_extract_all(work, jobs, reporter), reporter.warn)
-        for job in work:
-            sha, vehicle = job.physics
-            vehicles[sha] = {"name": vehicle.name, "sha256": sha, "parameters": vehicle.model_dump(mode="json")}
         manifest = write(results)
         with writing(output):
-            remove_unnamed(output, manifest)
-    empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
+            dataset.remove_unnamed(output, manifest)
+    empty = [s for s in dataset.SPLITS if not manifest["splits"][s]["drives"]]
     if empty and manifest["drives"] and settings.split is None:
         reporter.warn(f"no drive is in {' and '.join(empty)}: with few drives choose with --split")
     return ExtractResult(output, manifest, results)
@@ -261,7 +238,9 @@ def _write(
     left_out = [r.record for r in results if r.record.left_out]
     failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
     copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
-    return write_manifest(output, entries, failed, settings=settings.to_dict(), vehicles=vehicles, duplicates=copies)
+    return dataset.write_manifest(
+        output, entries, failed, settings=settings.to_dict(), vehicles=vehicles, duplicates=copies
+    )
 
 
 def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
@@ -269,26 +248,20 @@ def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveRe
     first: dict[str, str] = {}
     for entry in sorted((r.entry for r in results if r.entry is not None), key=lambda e: str(e["name"])):
         first.setdefault(str(entry["signals_sha256"]), entry["name"])
-
-    def told(result: DriveResult) -> DriveResult:
-        entry = result.entry
-        if entry is None or entry["signals_sha256"] is None:
-            return result
-        other = first[entry["signals_sha256"]]
-        if other == entry["name"]:
-            return result
-        warn(f"{result.record.name} is left out: it contains the same signals as {other}")
-        return replace(result, entry=None, copy_of=other)
-
-    return tuple(told(r) for r in results)
+    kept = []
+    for result in results:
+        entry = result.entry or {"name": "", "signals_sha256": None}
+        other = entry["name"] if entry["signals_sha256"] is None else first[entry["signals_sha256"]]
+        if other != entry["name"]:
+            warn(f"{result.record.name} is left out: it contains the same signals as {other}")
+            result = replace(result, entry=None, copy_of=other)
+        kept.append(result)
+    return tuple(kept)
 
 
 def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
     """Raise UsageError if overlapping slices of one log are in different splits: training data would be in the test."""
-    by_source: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for entry in entries:
-        by_source.setdefault((entry["log"], entry["source"]["sha256"]), []).append(entry)
-    for same in by_source.values():
+    for same in gathered(((e["log"], e["source"]["sha256"]), e) for e in entries).values():
         same.sort(key=lambda e: float(e["start_s"]))
         for earlier, other in pairwise(same):
             if earlier["split"] != other["split"] and other["start_s"] < earlier["end_s"]:
@@ -308,11 +281,11 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
     UsageError
         The folder contains another manifest, or a dataset of another filter.
     """
-    if not (output / MANIFEST).exists():
+    if not (output / dataset.MANIFEST).exists():
         return {}
     expected, remedy = f"a new folder, or a residual dataset for {settings.model}", "choose another folder with -o"
     try:
-        data = read_dataset(output)
+        data = dataset.read_dataset(output)
     except OutputError as error:
         raise UsageError(expected=expected, got=error.got, where=str(output), remedy=remedy) from None
     if data.model != settings.model:
@@ -323,46 +296,36 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
 def _check(jobs: int, settings: ExtractSettings) -> None:
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
-    if settings.split is not None and settings.split not in SPLITS:
-        raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
+    for option, value, allowed in (("--split", settings.split, dataset.SPLITS), ("--filter", settings.model, MODELS)):
+        if value is not None and value not in allowed:
+            raise UsageError(expected=f"one of {', '.join(allowed)}", got=repr(value), where=option)
     if settings.where is not None:
-        parse_condition(settings.where, COLUMNS, of_tracks=False)
-    if settings.model not in MODELS:
-        raise UsageError(expected=f"one of {', '.join(MODELS)}", got=repr(settings.model), where="--filter")
+        parse_condition(settings.where, dataset.COLUMNS, of_tracks=False)
 
 
 def _plan_jobs(
-    inputs: Sequence[LogInput],
-    output: Path,
-    settings: ExtractSettings,
-    mapping: SignalMapping | None,
-    resume: bool,
-    warn: Tell,
-) -> Iterator[_Job]:
+    inputs: Sequence[LogInput], output: Path, settings: ExtractSettings, resume: bool, warn: Tell
+) -> list[_Job]:
     cars, manifests = cache(partial(Car.load, network=NO_MODEL)), cache(set_manifest)
-    listed = [_listed(i, manifests(i.folder)) for i in inputs]
-    for log_input, (split, vehicle) in zip(inputs, listed, strict=True):
-        car = cars(settings.config.car or vehicle)
-        yield _Job(log_input, output, settings, car, mapping, split, resume)
+    mapping, listed = mapping_of(settings.config.mapping), [_listed(i, manifests(i.folder)) for i in inputs]
     if settings.config.car is None and any(vehicle is None for _, vehicle in listed):
         warn(f"no --car: residuals refer to the default {cars(None).vehicle.name}")
+    return [
+        _Job(log_input, output, settings, cars(settings.config.car or vehicle), mapping, split, resume)
+        for log_input, (split, vehicle) in zip(inputs, listed, strict=True)
+    ]
 
 
 def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
     """Return the result of each job; a crashed process loses only its own drive."""
     if len(work) == 1:
-        result = _extract(work[0], partial(reporter.progress, work[0].log_input.stem))
+        result = _extract(work[0], reporter.progress)
         tell_drive(result.record, reporter.warn)
         return (result,)
     results: dict[int, DriveResult] = {}
     progress, preload = FleetProgress(reporter.progress, len(work)), (__name__, *FILTERS)
     ends = supervise(
-        _extract_guarded,
-        work,
-        jobs=min(jobs, len(work)),
-        preload=preload,
-        progress=progress.update,
-        warn=reporter.warn,
+        _extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=progress.update, warn=reporter.warn
     )
     with closing(ends):
         for ended in ends:
@@ -378,7 +341,7 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
 def _extract_guarded(job: _Job, progress: Progress) -> DriveResult | OutputError:
     """Extract a drive; a full disk, which all drives would meet, is returned and ends the command."""
     try:
-        return _extract(job, partial(progress, job.log_input.stem))
+        return _extract(job, progress)
     except PdhefError as error:
         return error if isinstance(error, OutputError) and error.ends_run else _failure(job, str(error))
     except MemoryError:
@@ -391,7 +354,7 @@ def _failure(job: _Job, reason: str) -> DriveResult:
     return DriveResult(DriveRecord(job.log_input.stem, job.log_input.path.name, left_out=reason), None)
 
 
-def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
+def _extract(job: _Job, progress: Progress) -> DriveResult:
     settings, source = job.settings, identity_of(job.log_input)
     split, split_from = choose_split(source, chosen=settings.split, listed=job.listed_split)
     fingerprint, target = _fingerprint(job, split), job.target(split)
@@ -408,8 +371,11 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         rows = _residuals(drive, physics, truth, model, reference)
         if not len(rows):
             raise no_samples(job.log_input.path)
-        chosen = _chosen(rows, settings.where)
-        progress(1.0)
+        if settings.where is not None:
+            columns = dict(zip(dataset.COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
+            condition = parse_condition(settings.where, dataset.COLUMNS, of_tracks=False)
+            rows = replace(rows, chosen=condition.is_true(columns))
+        progress(job.log_input.stem, 1.0)
         entry = {
             "name": job.name,
             "log": job.log_input.stem,
@@ -428,7 +394,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             "friction_from": drive.friction.label,
             "losses": [asdict(x) for x in drive.losses],
         }
-        write_drive(target, rows, chosen, entry, truth_source=truth["kind"])
+        dataset.write_drive(target, rows, entry, truth_source=truth["kind"])
         if not entry["usable_rows"]:
             drive.tell("not one usable target: no ground truth above the low-speed limit")
         record = record_of(drive, split=split)
@@ -446,12 +412,9 @@ def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str]:
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
     """Return the drive written by an earlier command; None if its log or settings have changed."""
-    entry, name = read_entry(target), job.log_input.path.name
-    if (
-        entry is None
-        or entry.get("settings_sha256") != fingerprint
-        or entry.get("source") != {"file": name, "sha256": source}
-    ):
+    entry, name = dataset.read_entry(target) or {}, job.log_input.path.name
+    stated = entry.get("settings_sha256"), entry.get("source")
+    if stated != (fingerprint, {"file": name, "sha256": source}):
         return None
     losses = tuple(Loss(**x) for x in entry["losses"])
     record = DriveRecord(job.log_input.stem, name, source, split, entry["duration_s"], losses=losses)
@@ -460,13 +423,13 @@ def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) ->
 
 def _residuals(
     drive: Drive, physics: VehicleUkf, facts: Mapping[str, Any], model: DriveModel, reference: TruthAt | None
-) -> ResidualRows:
+) -> residuals.ResidualRows:
     """Return the residuals of a drive; ``facts`` on its ground truth."""
     whole = drive.whole()
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
     assert truth is not None, "the plan of the drive derives it"
     period_s, noise = drive.plan.alignment.grid_period_s, facts["difference_noise"]["vy_dot_m_s2"] or 0.0
-    return residual_rows(
+    return residuals.residual_rows(
         model.apply(whole.signals).calibrated if physics.equations == "forces" else whole.signals,
         truth,
         physics,
@@ -487,7 +450,7 @@ def choose_split(source_sha256: str, *, chosen: str | None = None, listed: str |
         return listed, "manifest"
     drawn = hashlib.sha256(f"0:{source_sha256}".encode()).digest()
     place = int.from_bytes(drawn[:8], "big") / 2.0**64
-    return SPLITS[sum(place >= end for end in SPLIT_ENDS)], "hash"
+    return dataset.SPLITS[sum(place >= end for end in SPLIT_ENDS)], "hash"
 
 
 def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> tuple[str | None, Path | None]:
@@ -503,7 +466,7 @@ def _strict_truth(plan: DrivePlan) -> DrivePlan:
     """Disable the interpolation of ground truth gaps: it is accurate enough for scoring, but not for derivatives."""
     if plan.truth is None:
         return plan
-    gaps = {name: gap * GAP_PERIODS / TRUTH_GAP_PERIODS for name, gap in plan.truth.max_gap_s.items()}
+    gaps = {name: gap * residuals.GAP_PERIODS / TRUTH_GAP_PERIODS for name, gap in plan.truth.max_gap_s.items()}
     return replace(plan, truth=replace(plan.truth, max_gap_s=gaps))
 
 
@@ -532,27 +495,19 @@ def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
     truth = derive_truth(plan.survey_truth, plan=plan.truth).track
-    noise = [difference_noise(truth.stamps_ns, column) for column in (truth.vy_m_s, truth.yaw_rate_rad_s)]
+    noise = [residuals.difference_noise(truth.stamps_ns, column) for column in (truth.vy_m_s, truth.yaw_rate_rad_s)]
     said = f"one-step noise of the ground truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
-    limits = f"{NEGLIGIBLE_NOISE[0]:g} m/s² and {NEGLIGIBLE_NOISE[1]:g} rad/s²"
-    within = all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True))  # False for NaN
+    limits = f"{residuals.NEGLIGIBLE_NOISE[0]:g} m/s² and {residuals.NEGLIGIBLE_NOISE[1]:g} rad/s²"
+    within = all(n <= limit for n, limit in zip(noise, residuals.NEGLIGIBLE_NOISE, strict=True))  # False for NaN
     return {
         "kind": ESTIMATED if estimated else "perfect" if perfect else "recorded",
         "quantities": dict(plan.derivation),
         "latency_s": plan.truth_latency_s,
-        "smoothing_half_s": 0.0 if within else SMOOTHING_HALF_S,
+        "smoothing_half_s": 0.0 if within else residuals.SMOOTHING_HALF_S,
         "smoothing_reason": f"{said}: {'' if within else 'not '}within {limits}",
         "difference_noise": _pair(noise),
         "not_independent": dict(plan.dependent),
     }
-
-
-def _chosen(rows: ResidualRows, where: str | None) -> BoolArray:
-    """Return the rows [N] that meet the condition; all rows without one."""
-    if where is None:
-        return np.ones(len(rows), dtype=np.bool_)
-    columns = dict(zip(COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
-    return parse_condition(where, COLUMNS, of_tracks=False).is_true(columns)
 
 
 def _pair(values: Sequence[float]) -> dict[str, float | None]:
@@ -560,7 +515,7 @@ def _pair(values: Sequence[float]) -> dict[str, float | None]:
     return {n: float(v) if math.isfinite(v) else None for n, v in zip(names, values, strict=True)}
 
 
-def _counts(rows: ResidualRows, log_start_ns: int) -> dict[str, Any]:
+def _counts(rows: residuals.ResidualRows, log_start_ns: int) -> dict[str, Any]:
     """Return the span of a drive's rows in seconds from the log's start, and counts of rows."""
     use = rows.weight > 0.0
     first, last = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
@@ -581,7 +536,7 @@ def _fingerprint(job: _Job, split: str) -> str:
     """Return the hash of all inputs of a drive's file except the log."""
     mapping = job.settings.config.mapping
     document = {
-        "format": FORMAT_VERSION,
+        "format": dataset.FORMAT_VERSION,
         "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
         "split": split,
         "vehicle": [job.physics[0], {name: noise.model_dump(mode="json") for name, noise in job.car.noise.items()}],

@@ -183,15 +183,17 @@ def train(
             )
     if init is not None:
         recipe = replace(recipe, **{name: getattr(init, name) for name in (*_SHAPE, "target")})
-    normalisation = (
-        init.normalisation if init is not None else normalisation_of(training, recipe.feature_names, odd=recipe.odd)
+    empty = ModelBundle(
+        **{name: getattr(recipe, name) for name in (*_SHAPE, "period_s", "target")},
+        normalisation=init.normalisation if init else normalisation_of(training, recipe.feature_names, odd=recipe.odd),
+        weights={},
     )
     network = _new_network(recipe, init).to(device)
     optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
-    signs = _signs(recipe)
-    train_pieces = Pieces(training, lambda s: _pieces(s, recipe, normalisation))
-    validation_pieces = Pieces(validation, lambda s: [_balanced(_scaled(s, recipe, normalisation))])
-    document = {"recipe": asdict(recipe), "normalisation": asdict(normalisation), "init": init and init.sha256}
+    signs = torch.tensor(empty.signs, dtype=torch.float32) if recipe.odd else None
+    train_pieces = Pieces(training, lambda s: _pieces(s, recipe.piece_steps, empty))
+    validation_pieces = Pieces(validation, lambda s: [_balanced(_scaled(s, empty))])
+    document = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
     document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
     identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
     history, best, best_loss = _resume(work, identity, network, optimiser, device)
@@ -199,29 +201,23 @@ def train(
         if len(history) - 1 - _best_epoch(history) >= recipe.patience:
             break
         began = time.perf_counter()
-        train_loss, rate = _train_epoch(network, optimiser, train_pieces, recipe, epoch, device)
-        loss = _validate(network, validation_pieces, device, signs if recipe.odd else None)
+        train_loss, rate = _train_epoch(network, optimiser, train_pieces, recipe, epoch, signs, device)
+        loss = _validate(network, validation_pieces, device, signs)
         history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
         if loss < best_loss:
             best, best_loss = _weights(network), loss
         _write_checkpoint(work, identity, history, network, optimiser, best)
         progress(history[-1], recipe.epochs)
-    bundle = ModelBundle(
-        **{name: getattr(recipe, name) for name in (*_SHAPE, "period_s")},
-        normalisation=normalisation,
-        weights=best,
-        provenance={
-            "recipe": asdict(recipe),
-            "epochs": len(history),
-            "best_epoch": _best_epoch(history) + 1,
-            "validation_loss": best_loss,
-            "training_sequences": train_pieces.sequences,
-            "validation_sequences": validation_pieces.sequences,
-            "training_hours": round(train_pieces.steps * recipe.period_s / 3600.0, 3),
-        },
-        target=recipe.target,
-    )
-    return bundle, history
+    provenance = {
+        "recipe": asdict(recipe),
+        "epochs": len(history),
+        "best_epoch": _best_epoch(history) + 1,
+        "validation_loss": best_loss,
+        "training_sequences": train_pieces.sequences,
+        "validation_sequences": validation_pieces.sequences,
+        "training_hours": round(train_pieces.steps * recipe.period_s / 3600.0, 3),
+    }
+    return replace(empty, weights=best, provenance=provenance), history
 
 
 # ---- data ----
@@ -257,29 +253,18 @@ class Pieces(list[_Piece]):
         self.sha256 = content.hexdigest()
 
 
-def _signs(recipe: Recipe) -> torch.Tensor:
-    return torch.tensor([-1.0 if name in ODD_FEATURES else 1.0 for name in recipe.feature_names])
+def _scaled(s: FeatureSequence, bundle: ModelBundle) -> _Piece:
+    """Return a sequence as the network of a bundle receives and predicts it."""
+    target = s.target / np.array(bundle.normalisation.target_std)
+    return _Piece(*(torch.from_numpy(c.astype(np.float32)) for c in (bundle.normalise(s.features), target, s.weight)))
 
 
-def _mirrored(piece: _Piece, signs: torch.Tensor) -> _Piece:
-    return _Piece(piece.features * signs, -piece.target, piece.weight)
-
-
-def _scaled(s: FeatureSequence, recipe: Recipe, n: Normalisation) -> _Piece:
-    scratch = ModelBundle(recipe.feature_names, recipe.hidden, recipe.layers, recipe.head, recipe.period_s, n, {})
-    return _Piece(
-        torch.from_numpy(scratch.normalise(s.features).astype(np.float32)),
-        torch.from_numpy((s.target / np.array(n.target_std)).astype(np.float32)),
-        torch.from_numpy(s.weight.astype(np.float32)),
-    )
-
-
-def _pieces(sequence: FeatureSequence, recipe: Recipe, n: Normalisation) -> Iterator[_Piece]:
-    whole = _scaled(sequence, recipe, n)
-    for first in range(0, whole.features.shape[0], recipe.piece_steps):
-        part = slice(first, first + recipe.piece_steps)
-        if float(whole.weight[part].sum()) > 0.0:
-            yield _balanced(_Piece(*(column[part] for column in whole)))
+def _pieces(sequence: FeatureSequence, steps: int, bundle: ModelBundle) -> Iterator[_Piece]:
+    whole = _scaled(sequence, bundle)
+    for first in range(0, whole.features.shape[0], steps):
+        part = _Piece(*(column[first : first + steps] for column in whole))
+        if float(part.weight.sum()) > 0.0:
+            yield _balanced(part)
 
 
 def _balanced(piece: _Piece) -> _Piece:
@@ -303,13 +288,17 @@ def _train_epoch(
     pieces: Sequence[_Piece],
     recipe: Recipe,
     epoch: int,
+    signs: torch.Tensor | None,
     device: str,
 ) -> tuple[float, float]:
-    """Train once on the pieces of an epoch in a seeded random order; return mean loss and last learning rate."""
+    """Train once on the pieces of an epoch in a seeded random order; return mean loss and last learning rate.
+
+    ``signs``: of the features when left and right are exchanged, for pieces that are as often mirrored as not.
+    """
     # All randomness of an epoch depends on seed and epoch number only, so that a resumed training is identical.
     torch.manual_seed(recipe.seed * 1_000_003 + epoch)
     order = torch.randperm(len(pieces)).tolist()[: recipe.pieces_per_epoch]
-    batches, signs = max(1, math.ceil(len(order) / recipe.batch)), _signs(recipe)
+    batches = max(1, math.ceil(len(order) / recipe.batch))
     network.train()
     losses = []
     for b in range(batches):
@@ -317,18 +306,15 @@ def _train_epoch(
         for group in optimiser.param_groups:
             group["lr"] = rate
         chosen = [pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
-        if recipe.odd:
-            chosen = [_mirrored(p, signs) if torch.rand(()) < 0.5 else p for p in chosen]
+        if signs is not None:
+            mirrored = [p._replace(features=p.features * signs, target=-p.target) for p in chosen]
+            chosen = [m if torch.rand(()) < 0.5 else p for m, p in zip(mirrored, chosen, strict=True)]
         losses.append(_train_batch(network, optimiser, chosen, recipe.chunk_steps, device))
     return float(np.mean(losses)), rate
 
 
 def _train_batch(
-    network: ResidualNetwork,
-    optimiser: torch.optim.Optimizer,
-    pieces: Sequence[_Piece],
-    chunk_steps: int,
-    device: str,
+    network: ResidualNetwork, optimiser: torch.optim.Optimizer, pieces: Sequence[_Piece], chunk_steps: int, device: str
 ) -> float:
     batch = _padded(pieces, device)
     state: State | None = None
@@ -408,11 +394,13 @@ def _write_checkpoint(
 ) -> None:
     from safetensors.numpy import save
 
-    tensors = {f"network.{k}": v for k, v in _weights(network).items()}
-    tensors |= {f"best.{k}": v for k, v in best.items()}
-    for i, state in optimiser.state_dict()["state"].items():
-        for key, value in state.items():
-            tensors[f"optimiser.{i}.{key}"] = np.asarray(value.cpu().numpy()).copy()
+    states = optimiser.state_dict()["state"]
+    groups = {
+        "network": _weights(network),
+        "best": best,
+        "optimiser": {f"{i}.{key}": value.cpu().numpy() for i, of in states.items() for key, value in of.items()},
+    }
+    tensors = {f"{group}.{name}": np.array(value) for group, of in groups.items() for name, value in of.items()}
     document = seal({"identity": identity, "history": [asdict(e) for e in history], "sha256": _sha256(tensors)})
     # Tensors and document are in one file, so that an interrupted write cannot leave an inconsistent pair.
     data = save(tensors, metadata={"document": json.dumps(document)})
@@ -427,11 +415,7 @@ def _sha256(tensors: Mapping[str, Any]) -> str:
 
 
 def _resume(
-    work: Path,
-    identity: dict[str, Any],
-    network: ResidualNetwork,
-    optimiser: torch.optim.Optimizer,
-    device: str,
+    work: Path, identity: dict[str, Any], network: ResidualNetwork, optimiser: torch.optim.Optimizer, device: str
 ) -> tuple[list[Epoch], dict[str, Any], float]:
     from safetensors import SafetensorError, safe_open
 
@@ -455,17 +439,15 @@ def _resume(
             where=str(file),
             remedy="train into another folder, or remove the checkpoint",
         )
-    network.load_state_dict(
-        {k.removeprefix("network."): torch.from_numpy(v) for k, v in tensors.items() if k.startswith("network.")}
-    )
-    states: dict[int, dict[str, torch.Tensor]] = {}
+    groups: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
     for name, value in tensors.items():
-        if name.startswith("optimiser."):
-            _, index, key = name.split(".", 2)
-            states.setdefault(int(index), {})[key] = torch.from_numpy(np.array(value)).to(
-                "cpu" if key == "step" else device
-            )
+        group, _, key = name.partition(".")
+        groups[group][key] = value
+    network.load_state_dict({key: torch.from_numpy(value) for key, value in groups["network"].items()})
+    states: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in groups["optimiser"].items():
+        index, _, key = name.partition(".")
+        states.setdefault(int(index), {})[key] = torch.from_numpy(value).to("cpu" if key == "step" else device)
     optimiser.load_state_dict({"state": states, "param_groups": optimiser.state_dict()["param_groups"]})
     history = [Epoch(**e) for e in document["history"]]
-    best = {k.removeprefix("best."): v for k, v in tensors.items() if k.startswith("best.")}
-    return history, best, min(e.validation_loss for e in history)
+    return history, groups["best"], min(e.validation_loss for e in history)

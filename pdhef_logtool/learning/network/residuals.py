@@ -22,8 +22,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.compiled.cache import njit
@@ -47,6 +49,8 @@ SMOOTHING_HALF_S = 0.15
 #: below the variation of training targets (0.2 and more).
 NEGLIGIBLE_NOISE = (0.05, 0.05)
 
+#: Of double precision, or single as in files.
+_Numbers: TypeAlias = NDArray[Any]
 _CHUNK = 16384
 #: Variance of third differences of white noise, as a multiple of its variance.
 _THIRD_DIFFERENCE_GAIN = 20.0
@@ -56,28 +60,31 @@ _NOISE_QUANTILE, _NOISE_POINT = 0.8, 1.2815515655446004
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualRows:
-    """Rows of a residual dataset on the IMU's stamps, in time order.
+    """Rows of a residual dataset on the IMU's stamps, in time order; of a drive's file in single precision.
 
     Attributes
     ----------
     stamps_ns : int64 [N]. features : [N, 15] at the stamp, NaN where the parallel filter has no state.
     targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
-    step_s : [N], time to the next stamp; NaN at the last row.
+        Divided by the step they are the residual rates.
+    step_s : float64 [N], time to the next stamp; NaN at the last row, of a file the period.
     weight : [N], 0 unless target and features are usable and the next row is in the same segment; 1 for exact ground
         truth, 1/2 if the uncertainty of its sideslip equals the error of a single track (:func:`~..truth.weight_of`).
     segment : int64 [N], changes wherever the parallel filter restarts: sequences must not cross it.
     truth_velocity : [N, 2], true v_x and v_y at the stamp, as targets of other networks; NaN where unknown.
     truth_std_rad : [N], 1-sigma of the true sideslip.
+    chosen : bool [N], rows selected for training, in addition to a weight above 0; None: all.
     """
 
     stamps_ns: IntArray
-    features: FloatArray
-    targets: FloatArray
+    features: _Numbers
+    targets: _Numbers
     step_s: FloatArray
-    weight: FloatArray
+    weight: _Numbers
     segment: IntArray
-    truth_velocity: FloatArray
-    truth_std_rad: FloatArray
+    truth_velocity: _Numbers
+    truth_std_rad: _Numbers | None = None
+    chosen: BoolArray | None = None
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -167,13 +174,7 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
 
 
 def physics_increments(
-    stamps_ns: IntArray,
-    state: FloatArray,
-    x: FloatArray,
-    inputs: FloatArray,
-    physics: VehicleUkf,
-    *,
-    max_step_s: float,
+    stamps_ns: IntArray, state: FloatArray, x: FloatArray, inputs: FloatArray, physics: VehicleUkf, *, max_step_s: float
 ) -> FloatArray:
     """Return the motion of the ground truth minus the motion of the ``physics`` model between stamps, [N − 1, 2].
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, DriveArrays, read_dataset
+from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
+from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import (
@@ -147,10 +148,8 @@ def train_on(
     splits = {name: SplitSequences(data, name, recipe.target, recipe.odd) for name in SPLITS}
 
     def tell(epoch: Epoch, of: int) -> None:
-        progress(
-            f"epoch {epoch.epoch}: train {epoch.train_loss:.4f}, validation {epoch.validation_loss:.4f}",
-            epoch.epoch / of,
-        )
+        losses = f"train {epoch.train_loss:.4f}, validation {epoch.validation_loss:.4f}"
+        progress(f"epoch {epoch.epoch}: {losses}", epoch.epoch / of)
 
     bundle, history = train(
         splits["train"], splits["validation"], recipe, output, init=init, device=device, progress=tell
@@ -189,7 +188,7 @@ def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> fl
     return total / weight
 
 
-def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
+def gap_free_runs(drive: ResidualRows) -> Iterable[slice]:
     """Yield the runs between restarts of the parallel filter that are long enough for training.
 
     With a selection of rows, runs end with a selected stretch and begin :data:`LEAD_STEPS` before it.
@@ -205,7 +204,7 @@ def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
             yield slice(a, b)
 
 
-def weights_of(drive: DriveArrays, part: slice) -> FloatArray:
+def weights_of(drive: ResidualRows, part: slice) -> FloatArray:
     """Return the weights of a part of a drive, 0 for rows that are not selected."""
     weight = drive.weight[part].astype(np.float64)
     return weight if drive.chosen is None else weight * drive.chosen[part]
@@ -218,7 +217,7 @@ def _near(chosen: BoolArray) -> BoolArray:
     return np.asarray(following - index <= LEAD_STEPS, dtype=np.bool_)
 
 
-def steering_offset(rows: DriveArrays, vehicle: VehicleParameters) -> FloatArray:
+def steering_offset(rows: ResidualRows, vehicle: VehicleParameters) -> FloatArray:
     """Return the residual rates [2] due to an offset of the steering angle, which no network can predict.
 
     The offset is constant over the drive, fitted to calm driving, and shrunk if there is little of it.
