@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference_car import cut, make_signals
+from reference_car import make_signals
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
@@ -113,7 +113,7 @@ def test_what_comes_later_changes_no_flag() -> None:
     wrong = off_by(truth, 20.0, 5.0, 7.0)
     whole = flags(wrong, signals)
     end = 600
-    part = wrong_branch(_cut_track(wrong, 0, end), cut(signals, 0, end), VEHICLE)
+    part = flags(wrong.rows(0, end), signals.rows(0, end))
     assert whole[:end].any()
     np.testing.assert_array_equal(part, whole[:end])
 
@@ -175,8 +175,3 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
         assert line in markdown
     assert not table.filter(pl.col("estimator") == "zero")["diverged"].any()
     assert diverged_line(report, "zero") == ""
-
-
-def _cut_track(track: StateTrack, first: int, end: int) -> StateTrack:
-    whole = {f.name: getattr(track, f.name) for f in fields(track) if f.name != "name"}
-    return replace(track, **{n: c[first:end] if len(c) == len(track) else c for n, c in whole.items()})
