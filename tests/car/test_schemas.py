@@ -72,13 +72,3 @@ def test_what_pdhef_wrote_is_valid_and_what_it_refuses_is_not(part: str) -> None
     if part != "vehicle":
         assert not valid(part, written | {"version": 99})
         assert not valid(part, written | {"format": "pdhef-else"})
-
-
-def test_misspelt_filters_and_measurements_are_seen_by_an_editor() -> None:
-    fit = document("fit")
-    (name, one), *_ = fit["filter"].items()
-    assert not valid("fit", fit | {"filter": {name.replace("-", "_"): one}})
-    assert not valid("fit", fit | {"filter": {name: one | {"r_std": {"ay": 1.0}}}})
-    assert not valid("vehicle", document("vehicle") | {"mass_kg": 1e6})
-    assert valid("vehicle", {"mass_kg": 1440.0, "wheelbase_m": 2.87, "front_weight_share": 0.6})
-    assert not valid("vehicle", {"mass_kg": 1440.0, "wheelbase_m": 2.87, "front_weight_share": 60})
