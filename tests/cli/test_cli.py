@@ -16,7 +16,6 @@ from pdhef_logtool import __version__
 from pdhef_logtool.storage.documents import seal
 from tests.command_line import called
 
-ROOT = Path(__file__).parents[2]
 COMMANDS = (
     *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "query", "events", "view"),
     *("simulate", "simulate suite"),

@@ -66,26 +66,6 @@ def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> N
     assert _pdhef("compare", runs[0], runs[0], "--plan", str(plan), "--strict")[0] == 4
 
 
-@pytest.mark.parametrize("width", ["80", "120"])
-@pytest.mark.parametrize(
-    ("command", "result"),
-    [
-        (("compare", "A", "B"), "B is worse"),
-        (("events", "B", "--where", "sideslip_deg > 0.5"), "1 event in 1 of 1 drives, 0.49 s in all"),
-        (("report", "A"), "pages of the run and of 10 logs"),
-    ],
-    ids=lambda value: value[0] if isinstance(value, tuple) else "",
-)
-def test_three_lines_come_first(
-    command: tuple[str, ...], result: str, width: str, runs: tuple[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", width)
-    _, text = _pdhef(*({"A": runs[0], "B": runs[1]}.get(word, word) for word in command))
-    head = re.split(r"\n *\n", text)[0]
-    assert re.findall(r"^(\w+) +\S", head, re.MULTILINE) == ["Result", "Assumed", "Next"]
-    assert result in " ".join(head.split())
-
-
 def test_a_history_is_a_table_of_runs_in_every_output(runs: tuple[str, str], tmp_path: Path) -> None:
     code, text = _pdhef("compare", *runs, runs[1], "--html", str(tmp_path / "history.html"))
     assert code == 0 and "Result   equal: all figures" in text
