@@ -72,16 +72,6 @@ def test_an_odd_network_is_odd_to_the_last_digits() -> None:
     np.testing.assert_array_equal(np.concatenate([first, second]), out)
 
 
-def test_a_bundle_of_an_older_version_says_how_to_make_it_anew(tmp_path: Path) -> None:
-    make_bundle().save(tmp_path)
-    document = json.loads((tmp_path / DOCUMENT_FILE).read_text())
-    del document["model"], document["physics_sha256"], document["odd"]
-    (tmp_path / DOCUMENT_FILE).write_text(json.dumps({**document, "version": 1}))
-    with pytest.raises(ModelError, match=r"pdhef extract .* pdhef train") as refused:
-        load_bundle(tmp_path)
-    assert "\n" not in str(refused.value)
-
-
 def test_bundle_round_trip_and_hash(tmp_path: Path) -> None:
     bundle = make_bundle()
     bundle.save(tmp_path / "model")
