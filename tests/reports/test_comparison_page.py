@@ -35,12 +35,6 @@ def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
     assert page.count('data-figure="') == 2
 
 
-def test_an_equal_run_has_a_page_that_says_so(tmp_path: Path) -> None:
-    a = write_run(tmp_path / "a", TEN)
-    assert "equal: all figures of all pairs are the same bit for bit" in _text(_page(a, a))
-    assert "No figure of the drives in both runs changed." in _text(_page(a, a))
-
-
 def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp_path: Path) -> None:
     a = write_run(tmp_path / "a", {HOSTILE: float("nan"), "d": 0.1}, config={HOSTILE: 1})
     entries = [entry(HOSTILE), entry("d", main=HOSTILE)]

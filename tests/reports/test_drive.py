@@ -17,11 +17,8 @@ from made_runs import START_NS, drive_tracks, write_run
 
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.reports.drive import OVER_TIME, drive_page
-from pdhef_logtool.reports.page import _environment, stamp
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.storage.documents import seal
-from tests.command_line import called
 
 
 def page_of(folder: Path, wrong: int = 0) -> str:
@@ -99,19 +96,6 @@ def test_without_usable_estimates_the_page_says_so_and_shows_the_rest(tmp_path, 
     assert "Errors over the whole drive" in text
 
 
-def test_a_damaged_report_stops_no_other_page(tmp_path):
-    folder = write_run(tmp_path, drive_tracks())
-    other = folder / "logs" / "other"
-    other.mkdir()
-    (other / "report.json").write_text("{}")
-    document = json.loads((folder / "run.json").read_text())
-    document["logs"].insert(0, {**document["logs"][0], "log": "other"})
-    (folder / "run.json").write_text(json.dumps(seal({k: v for k, v in document.items() if k != "digest"})))
-    result = write_pages(open_run(folder))
-    assert result.exit_code in (0, 3)
-    assert result.pages[1].file.is_file()
-
-
 def plan_of(*outcomes: str) -> dict:
     """Return the plan of a report with one requirement per outcome."""
     return {
@@ -141,13 +125,6 @@ def test_the_first_screen_has_answer_verdicts_what_was_tested_the_worst_place_an
     places = [text.find(part) for part in order]
     assert -1 not in places and places == sorted(places), dict(zip(order, places, strict=True))
     assert re.search(r'<li class="requirement fail">\s*<span class="chip">FAIL', page)
-
-
-def test_every_figure_has_a_role_and_a_text_and_those_over_time_take_the_keyboard(tmp_path):
-    page = page_of(write_run(tmp_path, drive_tracks()))
-    canvases = re.findall(r'<div class="canvas" aria-label="([^"]+)"( tabindex="0")?>', page)
-    assert len(canvases) == page.count("data-figure=") - page.count("dataset.figure") or len(canvases) > 8
-    assert any(label.startswith("Sideslip [°] over time: pd-hef ") and keys for label, keys in canvases)
 
 
 def test_the_path_is_aligned_at_the_start_and_its_drift_is_stated(tmp_path):
@@ -201,12 +178,6 @@ def test_steering_and_motion_are_drawn_over_time(tmp_path):
     assert line.label == "measured" and np.nanmax(line.values) == pytest.approx(2.0, abs=1e-3)
 
 
-@pytest.mark.parametrize(("start_s", "dated"), [(86_400, False), (1_700_000_000, True)])
-def test_a_log_without_dates_is_not_of_1970(start_s, dated):
-    assert ("1970" in stamp(start_s * 10**9)) is False
-    assert ("UTC" in _environment().filters["minute"](start_s * 10**9)) is dated
-
-
 HOSTILE = (
     "</script><script>document.title='ran'</script>",
     '"><img src=x onerror="document.title=\'ran\'">',
@@ -253,23 +224,3 @@ def test_hostile_names_are_text_and_nothing_is_written_outside(tmp_path):
     assert {p.name for p in (tmp_path / "a").iterdir()} == {"b"}
     assert {p.name for p in (tmp_path / "a" / "b").iterdir()} == {"out"}
     assert len(list(inside.rglob("report.html"))) == 2  # the drive's and the run's
-
-
-@pytest.mark.slow
-def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path, monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    folder = write_run(tmp_path, drive_tracks())
-    result = called("report", str(folder), "--open", "--json")
-    assert result.returncode == 0
-    document = json.loads(result.stdout)
-    assert document["logs"] == [{"log": "drive", "page": str(folder / "logs" / "drive" / "report.html"), "wrong": None}]
-    assert "no browser is available" in result.stderr
-
-
-@pytest.mark.slow
-def test_a_folder_that_is_no_run_is_one_line_and_is_not_made(tmp_path):
-    result = called("report", str(tmp_path / "nothing"))
-    assert result.returncode == 2
-    assert "pdhef run LOG -o OUT writes one" in result.stderr
-    assert not (tmp_path / "nothing").exists()
