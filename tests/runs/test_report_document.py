@@ -102,18 +102,6 @@ def test_first_screen_and_first_sheet_name_what_the_terminal_names(
 
 
 @pytest.mark.slow
-def test_the_page_of_a_step_has_its_key_figures_of_estimate_and_ground_truth(
-    sample_logs_dir: Path, tmp_path: Path
-) -> None:
-    config = RunConfig(car=Path("saloon"), keep="estimates")
-    run_logs([str(sample_logs_dir / "step.mcap")], tmp_path, config, report=False)
-    (log,) = open_run(tmp_path).logs
-    text = words(drive_page(log).html.decode()).partition("Key figures of manoeuvres")[2]
-    times = re.search(r"^ truth pd-hef physics zero yaw rate: response time ms ([\d.]+) ([\d.]+)", text)
-    assert times is not None and 50.0 < float(times[1]) == pytest.approx(float(times[2]), abs=10.0)
-
-
-@pytest.mark.slow
 def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path) -> None:
     plan = tmp_path / "plan.toml"
     plan.write_text('[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit_deg = 90.0\n')

@@ -80,21 +80,6 @@ def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(annotated: Path,
         assert again[key][0] == (value if value is None else pytest.approx(value, rel=1e-3, abs=1e-6)), key
 
 
-def test_key_figures_of_manoeuvres_are_those_of_the_run(sample_logs_dir: Path, tmp_path: Path) -> None:
-    config = RunConfig(car=sample_logs_dir / "vehicle.toml", estimators=("zero",))
-    run_logs([str(sample_logs_dir / "step.mcap")], tmp_path, config)
-
-    def steps(metrics: list[dict[str, Any]]) -> dict[Key, float]:
-        chosen = [m for m in metrics if m["metric"].startswith("step_")]
-        return {(m["estimator"], m["signal"], m["metric"]): m["value"] for m in chosen}
-
-    of_run = steps(pl.read_parquet(tmp_path / "logs/step/metrics.parquet").to_dicts())
-    (log,) = score_log(str(tmp_path / "logs/step/annotated.mcap"), config, estimates=["/pdhef/zero/state"]).results
-    assert log.report is not None
-    assert steps(log.report["metrics"]) == pytest.approx(of_run, rel=1e-5)
-    assert {estimator for estimator, *_ in of_run} == {"zero", "truth"}
-
-
 @pytest.mark.slow
 def test_named_fields_and_a_table_with_scale_give_the_same(
     annotated: Path, sample_logs_dir: Path, tmp_path: Path, config: RunConfig
@@ -141,14 +126,6 @@ def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path
             if a.schema[column] == pl.Float64:
                 close = pytest.approx(b[column].to_numpy(), rel=1e-7, abs=1e-3, nan_ok=True)
                 assert a[column].to_numpy() == close, (name, column)
-
-
-def test_slice_scores_its_stamps_alone(annotated: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
-    config = RunConfig(car=sample_logs_dir / "vehicle.toml", start="3", end="6")
-    report = _scored(annotated, config, "/pdhef/zero/state", output=tmp_path)
-    stamps = pl.read_parquet(tmp_path / "logs/annotated/estimates.parquet")["stamp_ns"]
-    assert report["log"]["start_ns"] <= stamps.min() <= stamps.max() < report["log"]["end_ns"]
-    assert report["log"]["duration_s"] == pytest.approx(3.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(
