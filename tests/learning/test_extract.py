@@ -12,12 +12,13 @@ import numpy as np
 import polars as pl
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
-from residual_car import CAR, Motion, Wave, drive
+from reference_car import Drive
+from residual_car import PULL_M_S2, weaving
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.toml_files import vehicle_toml
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
@@ -47,9 +48,10 @@ def _topic(stamps: np.ndarray, **columns: np.ndarray) -> FakeTopic:
     return FakeTopic("vendor/msg/Any", stamps + 5_000_000, {"stamp": stamps, **columns})
 
 
-def _log(motion: Motion, sigma: float = 0.0) -> FakeLog:
+def _log(made: Drive, sigma: float = 0.0) -> FakeLog:
     """The drive as recorded, its truth noisy, and bad for a second."""
-    stamps, s = motion.stamps_ns, motion.state
+    signals = made.signals
+    stamps, s = signals.stamps_ns, np.stack([made.vx, made.vy, made.r], axis=1)
     rng = np.random.default_rng(2)
     noise = rng.normal(0.0, [sigma, sigma, 0.2 * sigma], s.shape)
     fix = np.full(len(stamps), 4.0)
@@ -57,8 +59,8 @@ def _log(motion: Motion, sigma: float = 0.0) -> FakeLog:
     bad = np.where(fix == 4.0, 0.0, 3.0)
     return FakeLog(
         {
-            "/steer": _topic(stamps, angle=motion.steer),
-            "/imu": _topic(stamps, ax=motion.ax, ay=motion.ay, r=s[:, 2]),
+            "/steer": _topic(stamps, angle=signals.steer_rad),
+            "/imu": _topic(stamps, ax=signals.ax_m_s2, ay=signals.ay_m_s2, r=s[:, 2]),
             "/speed": _topic(stamps[::2], v=s[::2, 0]),
             "/ins": _topic(
                 stamps,
@@ -71,17 +73,10 @@ def _log(motion: Motion, sigma: float = 0.0) -> FakeLog:
     )
 
 
-@pytest.fixture(scope="module")
-def motion() -> Motion:
-    return drive(30.0, lateral=Wave(0.5, 0.7), yaw=Wave(0.3, 1.1))
-
-
-def _extract(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: FakeLog, car: VehicleParameters = CAR, **settings: Any
-) -> ExtractResult:
+def _extract(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: FakeLog, **settings: Any) -> ExtractResult:
     (tmp_path / "drive.mcap").write_bytes(b"in memory")
     (tmp_path / "m.toml").write_text(MAPPING)
-    (tmp_path / "v.toml").write_text(vehicle_toml(car))
+    (tmp_path / "v.toml").write_text(vehicle_toml(default_vehicle()))
     monkeypatch.setattr(reading, "open_log", lambda *_, **__: log)
     monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
     monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
@@ -91,25 +86,17 @@ def _extract(
     )
 
 
-def _errors(result: ExtractResult, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Usable rows: errors of the residual rates, and indices."""
-    (found,) = (d.load() for d in read_dataset(result.output).drives)
-    index = np.round((found.stamps_ns - motion.stamps_ns[0]) / 1e7).astype(int)
-    use = found.weight > 0
-    error = found.targets[use] / found.step_s[use, None] - motion.residual[index[use]] / 0.01
-    return error, index[use]
-
-
 @pytest.mark.slow
-def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = _log(motion, 0.01)
-    result = _extract(tmp_path, monkeypatch, log)
+def test_noisy_truth_is_smoothed_and_unbiased(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _extract(tmp_path, monkeypatch, _log(weaving(30.0), 0.01))
     (entry,) = result.manifest["drives"]
     assert entry["truth"]["smoothing_half_s"] == 0.15
     assert entry["truth"]["difference_noise"]["vy_dot_m_s2"] == pytest.approx(np.sqrt(2), rel=0.1)
-    error, index = _errors(result, motion)
+    (found,) = (d.load() for d in read_dataset(result.output).drives)
+    use = found.weight > 0
     # The second without a fix gives no target, nor do stamps whose window of smoothing reaches into it.
-    assert not set(index.tolist()) & set(range(999, 1100))
+    assert not use[990:1110].any() and use.mean() > 0.9
+    error = found.targets[use] / found.step_s[use, None] - [PULL_M_S2, 0.0]
     assert np.abs(error.mean(axis=0)).max() < 0.02
     smoothed = np.sqrt(np.mean(error**2, axis=0))
     assert smoothed[0] < 0.12, "the noise of one-step differences is above 1"
@@ -118,11 +105,11 @@ def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, mo
 def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = _extract(tmp_path, monkeypatch, _log(drive(4.0, speed=2.0)))
+    result = _extract(tmp_path, monkeypatch, _log(weaving(4.0, speed=2.0)))
     (one,) = result.results
-    assert one.entry is not None and one.entry["rows"] == 400 and one.entry["usable_rows"] == 0
+    assert one.entry is not None and one.entry["rows"] == 401 and one.entry["usable_rows"] == 0
     assert "not one usable target: no ground truth above the low-speed limit" in one.record.notes
-    assert one.record.seconds == pytest.approx(3.99) and result.exit_code == 0
+    assert one.record.seconds == pytest.approx(4.0) and result.exit_code == 0
 
 
 # ---- files ----
