@@ -123,24 +123,6 @@ def test_settings_are_those_of_the_file_and_options_win(tmp_path: Path) -> None:
     assert (config.friction, config.estimators) == (0.9, ("zero", "phy-ukf"))
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("budgt=2", r"--set: expected KEY=VALUE .*, got budgt=2; did you mean budget\?"),
-        ("budget", "--set: expected KEY=VALUE"),
-        ("budget=high", "got budget: should be a valid number, got 'high'"),
-        ("sensors=all", "sensors: should be 'full' or 'esp'"),
-    ],
-)
-def test_a_wrong_setting_is_one_line(text: str, expected: str) -> None:
-    from pdhef_logtool.cli.options import run_config
-    from pdhef_logtool.records.errors import UsageError
-
-    with pytest.raises(UsageError, match=expected) as error:
-        run_config({"assignments": [text]})
-    assert "\n" not in str(error.value)
-
-
 def test_quiet_leaves_errors_and_results_and_verbose_shows_progress(sample_logs_dir: Path, tmp_path: Path) -> None:
     car, log = str(sample_logs_dir / "vehicle.toml"), str(sample_logs_dir / "no_truth.mcap")
     run = ("run", log, "--car", car, "-e", "zero", "--end", "2", "--annotate", "none", "--no-report", "-o")

@@ -66,16 +66,6 @@ def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> N
     assert _pdhef("compare", runs[0], runs[0], "--plan", str(plan), "--strict")[0] == 4
 
 
-def test_a_history_is_a_table_of_runs_in_every_output(runs: tuple[str, str], tmp_path: Path) -> None:
-    code, text = _pdhef("compare", *runs, runs[1], "--html", str(tmp_path / "history.html"))
-    assert code == 0 and "Result   equal: all figures" in text
-    assert re.search(r"unknown +10 .*\+14\.5 %.*worse", text.replace("\n", " "))
-    page = (tmp_path / "history.html").read_text()
-    assert "<h2>History</h2>" in page and page.count('data-figure="') == 1
-    with pytest.raises(UsageError, match="two runs or more, got one"):
-        _pdhef("compare", runs[0])
-
-
 @pytest.mark.parametrize("option", ["--html", "--junit"])
 def test_an_output_that_is_an_input_is_refused(runs: tuple[str, str], option: str) -> None:
     with pytest.raises(UsageError, match="an output that is no input"):

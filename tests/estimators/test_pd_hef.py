@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_models import random_network
 from physics_oracle import Oracle, parts
-from reference_car import FRICTION
+from reference_car import FRICTION, drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
@@ -25,21 +25,11 @@ VEHICLE = default_vehicle()
 COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis", "valid")
 
 
-def _signals(count: int = 800, seed: int = 0, speed: float = 25.0) -> Signals:
-    rng = np.random.default_rng(seed)
-    stamps = 10**18 + np.cumsum(rng.integers(8_000_000, 12_000_000, count))
-    return Signals(
-        stamps_ns=stamps,
-        ready_ns=stamps + 10_000_000,
-        steer_rad=0.02 * np.sin(np.arange(count) / 60),
-        ax_m_s2=rng.normal(0, 0.1, count),
-        ay_m_s2=2.0 * np.sin(np.arange(count) / 60) + rng.normal(0, 0.1, count),
-        yaw_rate_rad_s=0.08 * np.sin(np.arange(count) / 60) + rng.normal(0, 0.004, count),
-        speed_m_s=speed + rng.normal(0, 0.05, count),
-        friction=np.full(count, np.nan),
-        wheel_speed_m_s=np.full((count, 4), np.nan),
-        available=frozenset(ALIGNED_SIGNALS),
-    )
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    made = drive(slalom(0.02, 0.3), 8.0, step_s=np.random.default_rng(0).uniform(0.008, 0.012, 800), speed_every=1)
+    noisy = with_noise(made.signals, 0)
+    return replace(noisy, ready_ns=noisy.stamps_ns + 10_000_000, available=frozenset(ALIGNED_SIGNALS))
 
 
 def _same(a: StateTrack, b: StateTrack) -> bool:
@@ -52,8 +42,7 @@ def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) 
 
 
 @pytest.mark.parametrize("parts", [(), ("lag", "roll", "biases", "bank"), tuple(PhysicsParts.model_fields)])
-def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...]) -> None:
-    signals = _signals()
+def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...], signals: Signals) -> None:
     trusted = hybrid(*parts)
     physics, _ = run_window(AdaptivePhysics(trusted.physics, name="physics"), signals)
     for change in ({"trust": 0.0}, {"network": NetworkService(random_network(constant=(0.0, 0.0)))}):
@@ -64,9 +53,11 @@ def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...]) -> None:
     assert not _same(run_window(trusted, signals)[0], physics)
 
 
-def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none() -> None:
+def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none(
+    signals: Signals,
+) -> None:
     estimator = hybrid("bank", "force_scale", network=random_network(constant=(0.4, 0.1)), trust=0.5)
-    steps, _ = estimator.run(_signals(), None)
+    steps, _ = estimator.run(signals, None)
     unchanged, other_vehicle, banked = (f.residual_rate for f in steps.filters)
     np.testing.assert_allclose(unchanged[100:], np.tile([0.2, 0.05], (len(unchanged) - 100, 1)))
     np.testing.assert_array_equal(other_vehicle, 0.5 * unchanged)

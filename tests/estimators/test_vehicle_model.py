@@ -175,17 +175,6 @@ def test_at_low_speed_it_rolls_without_slip(names, speed):
     np.testing.assert_allclose(end[[0, 1, 2]], want[[0, 1, 2]], atol=2e-3)
 
 
-def test_a_vanishing_lag_is_no_lag():
-    """From one limit to the other without a jump, and stable where the lag is far below the step."""
-    ends = []
-    for v in (vehicle(), *(vehicle("lag", relaxation_length_m=s) for s in (1e-3, 1e-9))):
-        x = np.array([25.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        for k in range(100):
-            x = moved(v, x, HeldInputs(0.03 * math.sin(0.06 * k), 0.0, True, FRICTION), 0.01)
-        ends.append(x)
-    np.testing.assert_allclose(ends[1:], [ends[0]] * 2, rtol=2e-3, atol=2e-3)
-
-
 @pytest.mark.parametrize("ay", [0.0, 3.0, -6.0, 30.0])
 @pytest.mark.parametrize("sensitivity", [0.0, 0.2])
 def test_load_transfer_takes_a_share_of_its_square(ay, sensitivity):

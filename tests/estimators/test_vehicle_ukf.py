@@ -291,32 +291,7 @@ def test_standstill_holds_and_lets_go(bias, estimator):
     assert steps.valid.all()
 
 
-def test_standstill_determines_the_biases_of_the_sensors():
-    made = stop_and_go()
-    signals = still_noise(made.signals, (made.time_s >= 5.0) & (made.time_s <= 9.0))
-    signals = replace(signals, ax_m_s2=signals.ax_m_s2 + 0.5)  # 3 degrees of grade
-    assert posteriors(signals).x[850, 3] == pytest.approx(0.5, abs=0.15)
-    with_biases = VehicleUkf(vehicle("biases", "roll", "lag"))
-    signals = replace(signals, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.004)
-    steps, layout = posteriors(signals, with_biases), with_biases.layout
-    assert steps.x[880, layout.sensor_bias + 1] == pytest.approx(0.004, abs=0.0012)
-    contained = [0, 1, 2, 4, 5, layout.roll, layout.roll + 1]
-    assert (steps.x[550:900, contained] == 0.0).all()
-
-
 # --- gaps and missing channels ---------------------------------------------------------------------------------------
-
-
-def test_steering_is_held_for_a_fifth_of_a_second(good):
-    signals = edited(good.signals, "steer_rad", (good.time_s > 3.0) & (good.time_s < 3.5), np.nan)
-    steps = posteriors(signals)
-    held = (good.time_s > 3.0) & (good.time_s < 3.195)
-    lost = (good.time_s > 3.215) & (good.time_s < 3.495)
-    assert steps.valid[held].all()
-    assert not steps.valid[lost].any()
-    assert steps.valid[good.time_s > 3.505].all()
-    last = good.signals.steer_rad[int(np.argmax(good.time_s > 3.0)) - 1]
-    assert (steps.inputs[held, 0] == last).all()
 
 
 def test_esp_suite_ignores_the_speed_after_the_start(good):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tarfile
 import tomllib
@@ -51,28 +50,6 @@ def test_every_dependency_is_locked_and_a_run_needs_no_torch() -> None:
     assert not [name for name in pinned if name.startswith(("nvidia-", "cuda-")) or name == "triton"]
     assert not any("torch" in requirement for requirement in PROJECT["dependencies"])
     assert any("train" in requirement for requirement in extras["dev"])
-
-
-def _bill(file: Path, **versions: str | None) -> list[str]:
-    """Return the problems of a bill of materials of the installed packages, with changed versions."""
-    needed = {re.split(r"[<>=~\[]", r)[0]: "" for r in PROJECT["dependencies"]} | versions
-    pinned = check_sbom.locked()
-    parts = [
-        {"name": name, "version": version or min(pinned[check_sbom.normalized(name)])}
-        for name, version in needed.items()
-        if version is not None
-    ]
-    root = {"name": PROJECT["name"], "version": __version__}
-    file.write_text(json.dumps({"bomFormat": "CycloneDX", "metadata": {"component": root}, "components": parts}))
-    return check_sbom.problems(file)
-
-
-def test_a_bill_of_materials_is_checked(tmp_path: Path) -> None:
-    file = tmp_path / "sbom.cdx.json"
-    assert _bill(file, pip="1.0") == []
-    assert _bill(file, mcap=None) == ["mcap is missing"]
-    assert _bill(file, scipy="0.1") == ["scipy 0.1 is not in constraints.txt"]
-    assert _bill(file, torch="") == ["torch is no dependency of a run"]
 
 
 def _archives(folder: Path, without: str = "", besides: str = "") -> Path:

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs import byte_source
-from pdhef_logtool.logs.byte_source import ChangedError
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.runs import fleet, working
 from pdhef_logtool.runs.config import RunConfig
@@ -31,16 +29,6 @@ def logs(sample_logs_dir: Path, tmp_path: Path) -> Path:
     for name in ("dlc", "step"):
         shutil.copy(sample_logs_dir / f"{name}.mcap", folder)
     return folder
-
-
-def test_a_log_that_is_replaced_by_one_of_equal_size_while_it_is_read_is_refused(logs: Path) -> None:
-    log, other = logs / "dlc.mcap", logs / "other"
-    shutil.copy2(log, other)
-    with read_drive(log, "saloon") as drive:
-        assert len(drive.sha256) == 64
-        other.replace(log)
-        with pytest.raises(ChangedError, match="got one that was changed while it was read"):
-            _ = drive.sha256
 
 
 @pytest.mark.slow

@@ -29,16 +29,20 @@ def _text(page: str) -> str:
     return html.unescape(" ".join(re.sub(r"<[^>]*>", " ", body).split()))
 
 
-def write_log(path: Path, topics: dict[str, dict[str, np.ndarray]]) -> Path:
-    """Write JSON messages at 20 Hz."""
+def write_log(
+    path: Path, topics: dict[str, dict[str, np.ndarray]], stamps_ns: dict[str, np.ndarray] | None = None
+) -> Path:
+    """Write JSON messages, at 20 Hz if no stamps are given."""
     with mcap_writer(path) as writer:
         for topic, columns in topics.items():
             kinds = {name: {"type": "number"} for name in columns}
             schema = writer.register_schema(f"t{topic}", "jsonschema", json.dumps({"properties": kinds}).encode())
             channel = writer.register_channel(topic, "json", schema)
-            for i in range(len(next(iter(columns.values())))):
+            count = len(next(iter(columns.values())))
+            stamps = (stamps_ns or {}).get(topic, 10**18 + np.arange(count) * 50_000_000)
+            for i, stamp in enumerate(stamps.tolist()):
                 data = json.dumps({name: float(column[i]) for name, column in columns.items()}).encode()
-                writer.add_message(channel, 10**18 + i * 50_000_000, data, 10**18 + i * 50_000_000)
+                writer.add_message(channel, stamp, data, stamp)
     return path
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from tests.run_report import follows
+from tests.runs.test_inspection_page import write_log
 
 ERRORS = ("rmse", "rmse_relative", "mae", "bias", "p95_abs", "max_abs", "coverage95", "lag_s", "availability", "nees")
 
@@ -173,33 +173,6 @@ def test_an_estimate_that_is_the_truth_is_marked(annotated: Path, config: RunCon
     assert "not_independent" not in {m["metric"] for m in honest["metrics"]}
 
 
-def _write_log(
-    path: Path, topics: dict[str, dict[str, np.ndarray[Any, Any]]], stamps_ns: dict[str, np.ndarray[Any, Any]]
-) -> None:
-    writer = McapLogWriter(path, profile="ros2")
-    for name in topics:
-        writer.add_topic(name, "nav_msgs/msg/Odometry", constants={"header.frame_id": "map", "child_frame_id": "base"})
-    writer.write(
-        [
-            TopicBatch(name, stamps_ns[name], stamps_ns[name], {"header.stamp": stamps_ns[name], **fields})
-            for name, fields in topics.items()
-        ]
-    )
-    writer.close()
-
-
-def _odometry(vx: np.ndarray[Any, Any], vy: np.ndarray[Any, Any], rate: np.ndarray[Any, Any]) -> dict[str, Any]:
-    zero = np.zeros_like(vx)
-    n = vx.shape[0]
-    return {
-        "pose.pose.position": np.zeros((n, 3)),
-        "pose.pose.orientation": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-        "twist.twist.linear": np.stack([vx, vy, zero], axis=1),
-        "twist.twist.angular": np.stack([zero, zero, rate], axis=1),
-        "twist.covariance": np.zeros((n, 36)),
-    }
-
-
 def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
     """A straight line in closed form: linear truth at 50 Hz, an estimate at odd stamps with a known error."""
     start = 1_700_000_000_000_000_000
@@ -211,18 +184,16 @@ def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
 
     t = seconds(at_estimate)
     bias, noise = 0.02, 0.05 * np.where(np.arange(310) % 2 == 0, 1.0, -1.0)
-    _write_log(
-        tmp_path / "line.mcap",
-        {
-            "/ins/odometry": _odometry(10.0 + seconds(at_truth), 0.1 * seconds(at_truth), 0.3 * np.ones(500)),
-            "/mine": _odometry(10.0 + t + noise, 0.1 * t + bias, 0.3 * np.ones(310)),
-        },
-        {"/ins/odometry": at_truth, "/mine": at_estimate},
+    log, with_error = tmp_path / "line.mcap", {"vx": 10.0 + t + noise, "vy": 0.1 * t + bias, "r": 0.3 + 0.0 * t}
+    right = {"vx": 10.0 + seconds(at_truth), "vy": 0.1 * seconds(at_truth), "r": 0.3 + 0.0 * at_truth}
+    write_log(log, {"/ins": right, "/mine": with_error}, {"/ins": at_truth, "/mine": at_estimate})
+    estimates, truth = (
+        [f"{signal}={topic}.{field}" for signal, field in (("vx_m_s", "vx"), ("vy_m_s", "vy"), ("yaw_rate_rad_s", "r"))]
+        for topic in ("/mine", "/ins")
     )
     said: list[str] = []
-    result = score_log(
-        str(tmp_path / "line.mcap"), RunConfig(), estimates=["/mine"], reporter=Reporter(warn=said.append)
-    )
+    reporter = Reporter(warn=said.append)
+    result = score_log(str(log), RunConfig(), estimates=estimates, truth=truth, name="mine", reporter=reporter)
     (log,) = result.results
     assert log.report is not None
     report = log.report | {"metrics": [asdict(row) for row in log.rows]}

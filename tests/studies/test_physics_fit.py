@@ -14,9 +14,8 @@ from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, Drive, drive, keep, wi
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD
 from pdhef_logtool.records.tracks import make_track
-from studies.defaults import physics_fit
 from studies.defaults.axle_forces import FitDrive, axle_samples, part_of
-from studies.defaults.physics_fit import STARTS, build_car, choose_parts, drive_errors, fit_physics, make_priors
+from studies.defaults.physics_fit import STARTS, build_car, drive_errors, fit_physics, make_priors
 
 STATIC = PhysicsParts()
 #: Slope of the true tyres at no slip, N/rad at friction 0.85.
@@ -132,17 +131,3 @@ def test_the_car_at_theta_has_its_values_and_keeps_the_rest() -> None:
 
 
 # ---- parts ----
-
-
-@pytest.mark.slow
-def test_a_car_without_parts_is_given_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = {"ORDER": ("biases", "lag", "roll"), "MAX_ITERATIONS": 4, "TRIAL_ITERATIONS": 3, "STARTS": STARTS[:1]}
-    for name, value in {**few, "LEAST_FOLD_S": 5.0}.items():
-        monkeypatch.setattr(physics_fit, name, value)
-    one, other = [static_drive(1, 8.0)], [static_drive(2, 8.0)]
-    told: list[str] = []
-    found, tried = choose_parts([(one, other), (other, one)], guess(), progress=lambda text, _share: told.append(text))
-    assert set(found.names) == set()
-    assert [set(t.parts) for t in tried[:2]] == [set(), {"lag", "roll", "biases"}]
-    assert all(len(t.held_out_deg) == 2 for t in tried)
-    assert told[0] == "is biases worth having"

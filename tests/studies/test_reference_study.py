@@ -41,15 +41,6 @@ def test_a_made_receiver_has_its_rate_and_error_and_the_velocity_of_the_antenna(
     assert 0.03 < error.std() < 0.08
 
 
-def test_faults_change_gnss_where_they_say():
-    stamps, sound = study.made_gnss(motion(), study.RECEIVERS[study.MADE])
-    with_outage, _ = study.made_gnss(motion(), study.RECEIVERS[study.MADE], study.OUTAGE)
-    absent = np.setdiff1d(stamps, with_outage) * 1e-9
-    assert (absent.min(), absent.max()) == (pytest.approx(20.0, abs=0.11), pytest.approx(39.9, abs=0.11))
-    _, jumped = study.made_gnss(motion(), study.RECEIVERS[study.MADE], study.MULTIPATH)
-    assert np.hypot(*(jumped - sound).T).max() == pytest.approx(0.5)
-
-
 def test_added_gnss_is_read_as_a_topic_of_the_log(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = sample_logs_dir / "step.mcap"
     start = inspect_log(log).to_dict()["start_ns"]
