@@ -115,6 +115,14 @@ def test_several_logs_have_one_table_and_say_once_what_holds_for_all() -> None:
     assert "4 logs: 3 done, 1 failed, 1 with input lost" in text
 
 
+def test_estimators_that_were_skipped_are_named_with_the_reason_once() -> None:
+    drive = named("drive")
+    skipped = {"outcome": "skipped", "reason": "needs a gyro"}
+    drive["estimators"] += [{**drive["estimators"][0], "name": name, **skipped} for name in ("one", "two")]
+    (line,) = (line for line in shown(drive).splitlines() if "skipped" in line)
+    assert line.strip() == "one, two skipped: needs a gyro"
+
+
 def test_a_fleet_is_told_in_a_few_lines_within_80_columns() -> None:
     spread = {"drives": 290, "median_rad": 0.001, "p90_rad": 0.003, "max_rad": 0.01}
     errors_rad = {"pd-hef": 0.01, "zero": 0.2}

@@ -11,8 +11,6 @@ from pdhef_logtool import inspect_log
 from studies import reference as study
 from studies.pages import DOCS, RESULTS
 
-N = 6000
-T = np.arange(N) * 0.01
 
 
 def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
