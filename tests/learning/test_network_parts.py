@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from residual_car import START_NS
+from reference_car import START_NS
 
 from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.fit import FeatureSequence, Recipe, normalisation_of

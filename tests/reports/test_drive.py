@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import re
 import sys
@@ -19,17 +18,13 @@ from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.reports.drive import OVER_TIME, drive_page
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
+from tests.run_report import text_of
 
 
 def page_of(folder: Path, wrong: int = 0) -> str:
     result = write_pages(open_run(folder))
     assert (len(result.wrong), result.exit_code) == ((1, 3) if wrong else (0, 0))
     return result.pages[0].file.read_text(encoding="utf-8")
-
-
-def words(page: str) -> str:
-    body = page[page.index("<main>") : page.index("</main>")]
-    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
 
 
 def figures(page: str) -> dict:
@@ -51,7 +46,7 @@ def test_a_one_sample_error_is_in_the_table_with_its_exact_stamp_and_in_the_figu
     tracks[1].sideslip_rad[12_345] += np.radians(5.0)
     run = open_run(write_run(tmp_path, tracks))
     page = drive_page(run.logs[0])
-    text = words(page.html.decode())
+    text = text_of(page.html)
     stamp = START_NS + 123_450_000_000
     assert re.search(rf"1 (4\.9|5\.0)\d° \S+ \S+ 123\.450 s 2023-11-14T22:15:23\.450000000Z {stamp}", text)
     errors = next(s for s in page.charts.figures["error"].series if s.label == "pd-hef")
@@ -69,7 +64,7 @@ def test_sideslip_below_the_low_speed_blend_is_a_gap(tmp_path):
 
 def test_without_truth_the_page_says_why_there_is_no_score_and_shows_disagreement(tmp_path):
     page = page_of(write_run(tmp_path, drive_tracks(truth=False)))
-    text = words(page)
+    text = text_of(page)
     assert "The log has no ground truth" in text
     assert "Largest disagreements of pd-hef" in text
     assert "estimator NIS pd-hef 1.03" in text  # NIS of 3.1 at 3 degrees of freedom
@@ -91,7 +86,7 @@ def test_without_usable_estimates_the_page_says_so_and_shows_the_rest(tmp_path, 
         file.unlink()
     else:
         file.write_bytes(b"" if damage == "empty" else file.read_bytes()[:1000])
-    text = words(page_of(folder, wrong=damage != "absent"))
+    text = text_of(page_of(folder, wrong=damage != "absent"))
     assert "estimates.parquet is not in the folder" in text if damage == "absent" else "cannot be drawn" in text
     assert "Errors over the whole drive" in text
 
@@ -114,7 +109,7 @@ def test_the_first_screen_has_answer_verdicts_what_was_tested_the_worst_place_an
     answer = {"why": "", "texts": {"result": "Sideslip RMSE 0.1°", "assumed": "not causal"}}
     plan = plan_of("PASS", "FAIL", "INCONCLUSIVE")
     page = page_of(write_run(tmp_path, drive_tracks(), plan=plan, checks=[check], answer=answer))
-    text = words(page)
+    text = text_of(page)
     order = [
         "Result Sideslip RMSE 0.1° Assumed: not causal.", "Check FAILED: a.sign: gain -1",
         "Plan plan.toml: 1 FAIL, 1 INCONCLUSIVE, 1 PASS (this drive alone)", "FAIL sideslip RMSE ≤ 0.5° SR-1 reason 1",
@@ -137,7 +132,7 @@ def test_the_path_is_aligned_at_the_start_and_its_drift_is_stated(tmp_path):
     tracks[1] = replace(tracks[1], x_m=longer[0], y_m=longer[1])
     made = path_drift(tracks[1], tracks[0])
     page = drive_page(open_run(write_run(tmp_path, tracks, path_drift=asdict(made))).logs[0])
-    text = words(page.html.decode())
+    text = text_of(page.html)
     length = float(np.hypot(np.diff(x), np.diff(y)).sum())
     drift = float(re.search(r"Drift: ([\d.]+) m", text)[1])
     assert drift == pytest.approx(0.02 * np.hypot(x[-1] - x[0], y[-1] - y[0]), rel=0.1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import re
 import shutil
 import sys
@@ -21,11 +20,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.pdf import pdf_page, write_pdf
 from pdhef_logtool.results.opened_run import open_run
-
-
-def text_of(page: bytes) -> str:
-    body = page.decode().partition("<main>")[2]
-    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
+from tests.run_report import text_of
 
 
 def test_the_document_has_a_cover_contents_verdicts_figures_and_hashes_but_no_positions(tmp_path):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import html
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from pdhef_logtool.runs.run_result import RunResult
 from tests.command_line import rendered
-from tests.run_report import follows
+from tests.run_report import follows, text_of
 from tests.runs.wrong_mapping import wrong_sign
 
 #: Entries whose keys are names: of parameters, of quantities, of reasons, of packages, of the recorder.
@@ -71,10 +69,6 @@ def told(result: RunResult) -> list[str]:
     ]
 
 
-def words(page: str) -> str:
-    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.partition("<main>")[2])).split())
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("logs", [("sweep",), ("fishhook", "dlc"), ()])
 def test_first_screen_and_first_sheet_name_what_the_terminal_names(
@@ -89,7 +83,7 @@ def test_first_screen_and_first_sheet_name_what_the_terminal_names(
         result = score_log(log, RunConfig(), estimates=("/rtk/odometry",), output=tmp_path / "out")
     said, run = told(result), open_run(tmp_path / "out")
     assert len(said) >= 2 and any(text.startswith("FAILED") for text in said) == fails
-    sheet = words(pdf_page(run).decode().partition('<section class="sheet">')[0])
+    sheet = text_of(pdf_page(run).partition(b'<section class="sheet">')[0])
     assert [text for text in said if text not in sheet] == []
-    screens = [words(drive_page(log).html.decode().partition('<dl class="facts"')[0]) for log in run.logs]
+    screens = [text_of(drive_page(log).html.partition(b'<dl class="facts"')[0]) for log in run.logs]
     assert [text for text in said if all(text not in screen for screen in screens)] == []

@@ -12,7 +12,6 @@ from studies import reference as study
 from studies.pages import DOCS, RESULTS
 
 
-
 def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
     names = [case.name for case in study.cases()]
     assert len(set(names)) == len(names)
