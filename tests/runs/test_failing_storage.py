@@ -10,7 +10,7 @@ import pytest
 
 from pdhef_logtool.logs import byte_source
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.runs import fleet, working
+from pdhef_logtool.runs import working
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, run_drive
 from pdhef_logtool.storage.files import write_bytes
@@ -97,19 +97,11 @@ def full_disk(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
     raise AssertionError
 
 
-@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int
-) -> None:
-    monkeypatch.setattr(fleet, "_PRELOAD", (__name__,))  # no compiled code
-    folder, out = named_logs(tmp_path / "logs", "a", "b", "c", "d"), tmp_path / "out"
+def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(tmp_path: Path) -> None:
+    folder, out, work = named_logs(tmp_path / "logs", "a", "b", "c", "d"), tmp_path / "out", Counted(full_disk)
     run(folder, tmp_path / "undisturbed")
-    work = Counted(full_disk) if jobs == 1 else full_disk
-    with pytest.raises(OutputError, match=r"No space left.*of 4 logs are done; --resume goes on$") as raised:
-        run(folder, out, work=work, jobs=jobs)
-    assert raised.value.exit_code == 1
-    if isinstance(work, Counted):
-        assert work.asked == ["a", "b"]
-        assert "; 1 of 4 logs are done" in str(raised.value)
+    with pytest.raises(OutputError, match=r"No space left.*; 1 of 4 logs are done; --resume goes on$") as raised:
+        run(folder, out, work=work)
+    assert (raised.value.exit_code, work.asked) == (1, ["a", "b"])
     assert run(folder, out, resume=True).exit_code == 0
     assert contents(out) == contents(tmp_path / "undisturbed")

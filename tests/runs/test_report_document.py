@@ -70,7 +70,7 @@ def told(result: RunResult) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("logs", [("sweep",), ("fishhook", "dlc"), ()])
+@pytest.mark.parametrize("logs", [("sweep",), ()])
 def test_first_screen_and_first_sheet_name_what_the_terminal_names(
     logs: tuple[str, ...], sample_logs_dir: Path, tmp_path: Path
 ) -> None:
