@@ -25,17 +25,7 @@ COLOURS = {"phy-ukf": 0x123456}
 #: The third track that is written, zero, is neither.
 SHOWN = ["phy-ukf"]
 START_NS = 1_700_000_000_000_000_123
-REPORT = {
-    "log": {"name": "drive", "file": "drive.mcap", "kind": "mcap", "duration_s": 6.0, "sha256": HASH},
-    "vehicle": {"name": "sedan"},
-    "warnings": ["a warning"],
-    "losses": [],
-    "truth": {"available": False, "quantities": {}, "latency_s": None, "not_independent": [], "notes": []},
-    "metrics": [],
-    "estimators": [],
-    "mapping": {"missing": []},
-    "versions": {"python": "3"},
-}
+REPORT = run_report.report(None)
 EVENTS = (
     Event("nonlinear", START_NS + 10**9, START_NS + 3 * 10**9, "|ay| above 0.5 g"),
     Event("start", START_NS, START_NS + 1, ""),
