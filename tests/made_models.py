@@ -25,6 +25,7 @@ def random_network(
     seed: int = 0,
     names: tuple[str, ...] = FEATURES,
     *,
+    hidden: int = 8,
     layers: int = 1,
     head: tuple[int, ...] = (4,),
     outputs: int = 2,
@@ -32,17 +33,17 @@ def random_network(
     constant: tuple[float, float] | None = None,
     **settings: str,
 ) -> ModelBundle:
-    """Return a network of 8 units with random weights, scaled by an input and an output; or with a constant output."""
+    """Return a network with random weights, scaled by an input and an output; or with a constant output."""
     torch.manual_seed(seed)
     size = len(names)
-    network = ResidualNetwork(size, 8, layers, head, outputs=outputs)
+    network = ResidualNetwork(size, hidden, layers, head, outputs=outputs)
     weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
     if constant is not None:
         last = max(k for k in weights if k.startswith("head") and k.endswith("bias"))
         weights[last.replace("bias", "weight")][:] = 0.0
         weights[last][:] = constant
     normalisation = Normalisation((0.0,) * size, (scales[0],) * size, (scales[1],) * outputs)
-    return ModelBundle(names, 8, layers, head, 0.01, normalisation, weights, **settings)
+    return ModelBundle(names, hidden, layers, head, 0.01, normalisation, weights, **settings)
 
 
 def full_network(seed: int = 1) -> ModelBundle:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import html
+import re
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,12 @@ def follows(document: Any, schema: str = "report.schema.json") -> None:
     """Raise a ``ValidationError`` if a document does not follow a schema."""
     if error := best_match(_validator(schema).iter_errors(document)):
         raise error
+
+
+def text_of(page: str | bytes) -> str:
+    """Return the text that a page shows."""
+    body = (page if isinstance(page, str) else page.decode()).partition("<main>")[2].partition("</main>")[0]
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
 
 
 def truth(*quantities: tuple[str, str, str], **changes: Any) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import pdhef_logtool as pdhef
 from pdhef_logtool.logs.definitions import read_definitions
 
 MAPPING = '[signals.yaw_rate_rad_s]\ntopic = "/imu/data"\nfield = "angular_velocity.z"\n'
-FILES = ("car", "cars", "mapping", "msgs", "plan", "network")
 
 
 @pytest.fixture(scope="module")
@@ -40,16 +39,6 @@ def test_inspect_log(dlc: Path, mapping: Path, tmp_path: Path) -> None:
     assert set(found.signals) > {"yaw_rate_rad_s", "ay_m_s2"}
     assert set(pdhef.load_mapping(str(mapping)).signals) < set(found.mapping.signals)
     assert read_definitions(str(tmp_path)).files == read_definitions(tmp_path).files
-
-
-def test_car_load(sample_logs_dir: Path) -> None:
-    car = pdhef.Car.load(str(sample_logs_dir / "vehicle.toml"), network=Path("default"))
-    assert car.network is not None
-
-
-def test_run_config() -> None:
-    config: Any = pdhef.RunConfig(**dict.fromkeys(FILES, "a/b.toml"))
-    assert {getattr(config, entry) for entry in FILES} == {Path("a/b.toml")}
 
 
 def test_run(dlc: Path, mapping: Path, sample_logs_dir: Path, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Any
 import pytest
 
 from pdhef_logtool.car import store
-from pdhef_logtool.car.assumed_values import completed
 from pdhef_logtool.car.car import (
     FIT_FILE,
     NETWORK_FOLDER,
@@ -30,19 +28,17 @@ from pdhef_logtool.car.parts import (
     FittedValues,
     LearntOn,
     Record,
-    TriedParts,
     car_folder,
     physics_sha256,
 )
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import of_car
 from pdhef_logtool.records.errors import OutputError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 from pdhef_logtool.storage import outputs
-from pdhef_logtool.storage.documents import digest
 
 #: A vehicle file written by hand: with comments, entries in any order, and a blank line.
 PERSONS = """# My car, weighed on 3 May.
@@ -62,7 +58,7 @@ cornering_stiffness_n_per_rad = 108000.0
 # end
 """
 DRIVES = (LearntOn(name="lap", sha256="cd" * 32, start_s=0.0, end_s=80.0),)
-TUNED, OURS = "phy-ukf:tuned", "physics"
+TUNED = "phy-ukf:tuned"
 
 
 @pytest.fixture
@@ -99,13 +95,6 @@ def edit(folder: Path, old: str, new: str) -> None:
 
 
 # --- reading -------------------------------------------------------------------------------------------------------
-
-
-def test_a_folder_with_a_persons_file_alone_is_a_car(folder: Path) -> None:
-    car = load(folder)
-    assert (car.vehicle, car.source) == (car.datasheet, folder)
-    assert car.vehicle == load(folder / VEHICLE_FILE).vehicle
-    assert (dict(car.noise), car.network, car.learnt_on, car.notes) == ({}, None, (), ())
 
 
 def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> None:
@@ -160,10 +149,6 @@ FOUND = FittedPhysics(
         physics=PhysicsParts(lag=True, roll=True),
     ),
     noise=FilterNoise(q_std=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6), r_std={"ay_m_s2": 0.5}),
-    tried=(
-        TriedParts(parts=(), held_out_deg=(0.3, 0.4), taken=True),
-        TriedParts(parts=("lag",), held_out_deg=(0.2, 0.3), taken=True),
-    ),
 )
 
 
@@ -230,15 +215,6 @@ def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str
     assert car.physics_sha256 == before.physics_sha256
 
 
-def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -> None:
-    """The hash omits entries with default values, and includes entries computed from mass and wheelbase."""
-    (tmp_path / "mine.toml").write_text(PERSONS)
-    entries, _ = completed(tomllib.loads(PERSONS))
-    defaults = {k: f.default for k, f in VehicleParameters.model_fields.items()}
-    said = {k: v for k, v in entries.items() if k not in ("name", "truth_position_m") and v != defaults[k]}
-    assert load(tmp_path / "mine.toml").physics_sha256 == digest(said)
-
-
 # --- rejected inputs -------------------------------------------------------------------------------------------------
 
 
@@ -283,12 +259,6 @@ def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: st
     assert said in str(caught.value)
     assert str(folder / name) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_tables_of_parts_have_no_place_in_vehicle_toml(tmp_path: Path) -> None:
-    (tmp_path / "old.toml").write_text(PERSONS + '[filter."phy-ukf:tuned"]\nq_std = [0.1, 0.1, 0.1]\n')
-    with pytest.raises(VehicleError, match=r"old\.toml: expected the entries of vehicle\.toml, got filter: unknown"):
-        load(tmp_path / "old.toml")
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------

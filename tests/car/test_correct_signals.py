@@ -38,14 +38,6 @@ def test_what_the_sensors_read_too_much_is_taken_off_and_nothing_else() -> None:
     assert corrected.available == true.available
 
 
-def test_a_missing_sample_stays_missing() -> None:
-    true = drive(slalom(0.03, 0.5), speed=20.0, step_s=np.full(49, 0.01)).signals
-    gone = {name: np.where(np.arange(50) == 7, np.nan, getattr(true, name)) for name in TOO_MUCH}
-    corrected = correct_signals(replace(true, **gone), CAR)
-    for name in TOO_MUCH:
-        assert np.flatnonzero(np.isnan(getattr(corrected, name))).tolist() == [7]
-
-
 def biased(offset: float, ratio: float, *biases: float) -> VehicleParameters:
     names = ("ax_bias_m_s2", "ay_bias_m_s2", "yaw_rate_bias_rad_s")
     sensors = Sensors(**dict(zip(names, biases, strict=True)))

@@ -6,8 +6,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_of_entries
@@ -113,22 +111,16 @@ def test_all_problems_are_reported_together(tmp_path):
     [
         ("E = 0.30", "E = 0.30\ncornering_stiffness_n_per_rad = 9e4", "tyres.front"),
         ("E = 0.30\n", "", "tyres.front"),
-        ("cornering_stiffness_n_per_rad = 108000.0", "", "tyres.rear"),
         ("E = 0.30", "E = 1.5", "tyres.front.E"),
         ("mass_kg = 1440.0", "mass_kg = nan", "mass_kg"),
-        ("mass_kg = 1440.0", "mass_kg = inf", "mass_kg"),
-        ("mass_kg = 1440.0", "mass_kg = 0", "mass_kg"),
         ("friction = 0.85", "friction = 0.0", "friction"),
         ("imu_position_m = [0.1, 0.0, 0.2]", "imu_position_m = [0.1, 0.0]", "imu_position_m"),
-        ("imu_position_m = [0.1, 0.0, 0.2]", "imu_position_m = [0.1, nan, 0.2]", "imu_position_m.1"),
         ("yaw_rate_std_rad_s = 0.004", "yaw_rate_std_rad_s = 0", "sensors.yaw_rate_std_rad_s"),
         ("yaw_rate_std_rad_s = 0.004", "yaw_rate_std_deg_s = 0.2", "sensors.yaw_rate_std_deg_s"),
         ("[tyres.rear]", "[tyres.back]", "tyres.back"),
         ("mass_kg = 1440.0", 'mass_kg = "1440"', "mass_kg: should be a valid number, got '1440'"),
-        ("mass_kg = 1440.0", "mass_kg = true", "mass_kg: should be a valid number, got True"),
         ("imu_position_m = [0.1, 0.0, 0.2]", 'imu_position_m = "100"', "imu_position_m: should be a list, got '100'"),
         ("imu_position_m = [0.1, 0.0, 0.2]", "imu_position_m = [100.0, 0.0, 200.0]", "imu_position_m.0"),
-        ('name = "sedan"', "name = 3", "name: should be a valid string, got 3"),
         ("friction = 0.85", "friction = 85.0", "friction"),
         ("roll_gradient_rad_per_m_s2 = 0.0105", "roll_gradient_rad_per_m_s2 = 0.6", "roll_gradient_rad_per_m_s2"),
         ("ay_std_m_s2 = 0.12", "ay_std_m_s2 = 120.0", "sensors.ay_std_m_s2"),
@@ -137,13 +129,6 @@ def test_all_problems_are_reported_together(tmp_path):
 def test_a_wrong_entry_is_named(tmp_path, old, new, named):
     assert EXAMPLE.count(old) >= 1
     assert named in problem(write(tmp_path, EXAMPLE.replace(old, new, 1)))
-
-
-def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
-    said = problem(write(tmp_path, EXAMPLE.replace("mass_kg = 1440.0", "mass_kg = 1.44")))
-    assert "mass_kg, yaw_inertia_kg_m2, cg_to_front_axle_m, cg_to_rear_axle_m contradict one another" in said
-    assert "I_z / (m l_f l_r) is 533, plausible is 0.15 to 8" in said
-    assert "tyres.front.D_n, mass_kg, cg_to_front_axle_m, cg_to_rear_axle_m contradict one another" in said
 
 
 @pytest.mark.parametrize(
@@ -178,46 +163,6 @@ def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor,
 @pytest.mark.parametrize("path", [*sorted(FILES.glob("*.toml")), *sorted(SAMPLES.glob("vehicle*.toml"))], ids=str)
 def test_the_files_of_the_project_are_taken(path):
     read_vehicle_file(path)
-
-
-@pytest.mark.slow
-@settings(derandomize=True, deadline=None, max_examples=200)
-@given(
-    size=st.floats(0.1, 2.6),
-    density=st.floats(0.6, 1.6),
-    balance=st.floats(0.3, 0.7),
-    inertia=st.floats(0.5, 2.0),
-    stiffness=st.floats(4.0, 40.0),
-    peak=st.floats(0.3, 2.0),
-    friction=st.floats(0.1, 1.5),
-    shape=st.floats(1.0, 2.0),
-    keeps=st.booleans(),
-)
-def test_plausible_vehicles_of_any_size_are_taken(
-    size, density, balance, inertia, stiffness, peak, friction, shape, keeps
-):
-    """A sedan of 1440 kg scaled like its volume: 1.4 kg at 1:10, 25 t and, dense, 40 t at 2.6:1."""
-    mass, wheelbase = 1440.0 * size**3 * density, 2.7 * size
-    front, rear = wheelbase * (1.0 - balance), wheelbase * balance
-
-    def tyre(load):
-        curve = {"B": stiffness / (shape * peak), "C": shape, "D_n": peak * load, "E": -0.5}
-        return curve | ({"reference_friction": 1.0} if keeps else {})
-
-    raw = {
-        "mass_kg": mass,
-        "yaw_inertia_kg_m2": inertia * mass * front * rear,
-        "cg_to_front_axle_m": front,
-        "cg_to_rear_axle_m": rear,
-        "track_m": 1.5 * size**0.8,
-        "cg_height_m": 0.6 * size,
-        "low_speed_blend_m_s": 3.0 * size**0.5,
-        "friction": friction,
-        "tyres": {"front": tyre(mass * 9.81 * balance), "rear": tyre(mass * 9.81 * (1.0 - balance))},
-    }
-    vehicle = vehicle_of_entries(raw, where="scaled").vehicle
-    again = vehicle_of_entries(as_plain(vehicle.model_dump(exclude_none=True)), where="again").vehicle
-    assert again == vehicle
 
 
 @pytest.mark.parametrize("content", ["mass_kg = ", "just words\n", b"\xff\xfe\x00", b"\x89MCAP0\r\n"])

@@ -17,7 +17,6 @@ from pdhef_logtool import __version__
 from pdhef_logtool.storage.documents import seal
 from tests.command_line import called
 
-ROOT = Path(__file__).parents[2]
 COMMANDS = (
     *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "query", "events", "view"),
     *("simulate", "simulate suite"),
@@ -133,24 +132,6 @@ def test_settings_are_those_of_the_file_and_options_win(tmp_path: Path) -> None:
     config = run_config({**given, "friction": "0.9", "estimators": "zero, phy-ukf,"})
     assert (config.sensors, config.budget, config.waived, config.msgs) == ("esp", 3.5, ("imu.mounting",), Path("types"))
     assert (config.friction, config.estimators) == (0.9, ("zero", "phy-ukf"))
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("budgt=2", r"--set: expected KEY=VALUE .*, got budgt=2; did you mean budget\?"),
-        ("budget", "--set: expected KEY=VALUE"),
-        ("budget=high", "got budget: should be a valid number, got 'high'"),
-        ("sensors=all", "sensors: should be 'full' or 'esp'"),
-    ],
-)
-def test_a_wrong_setting_is_one_line(text: str, expected: str) -> None:
-    from pdhef_logtool.cli.options import run_config
-    from pdhef_logtool.records.errors import UsageError
-
-    with pytest.raises(UsageError, match=expected) as error:
-        run_config({"assignments": [text]})
-    assert "\n" not in str(error.value)
 
 
 def test_quiet_leaves_errors_and_results_and_verbose_shows_progress(sample_logs_dir: Path, tmp_path: Path) -> None:

@@ -41,15 +41,6 @@ def _plan(tmp_path: Path, limit: float) -> str:
     return str(path)
 
 
-def test_table_and_assumptions_go_to_stdout(annotated: str) -> None:
-    result = called("metrics", annotated, *ESTIMATE)
-    assert result.returncode == 0
-    assert "phy-ukf" in result.stdout
-    assert "no car given" in result.stdout
-    assert "outputs in" not in result.stdout
-    assert all(len(line) <= 100 for line in result.stdout.splitlines())
-
-
 def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -> None:
     junit = tmp_path / "gate.xml"
     passed = called("metrics", annotated, *ESTIMATE, "--plan", _plan(tmp_path, 10.0), "--junit", str(junit))

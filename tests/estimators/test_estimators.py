@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_models import full_network, linear_residual
-from reference_car import cut, drive, keep, rolling_drive, slalom, tanh_tyre, with_noise
+from reference_car import cut, drive, keep, rolling_drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
@@ -169,18 +169,6 @@ def test_nothing_that_arrives_later_changes_an_output(name, rough, of_rough, j, 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_arrived_sample_is_used(name, rough, of_rough):
-    """The counterpart of the causality test: from its arrival on, a sample does change the output."""
-    j = 150
-    columns = {c: getattr(rough, c).copy() for c in ("steer_rad", "yaw_rate_rad_s", "ay_m_s2")}
-    for values in columns.values():
-        values[j : j + 5] = 0.02
-    at = int(np.searchsorted(rough.stamps_ns, rough.ready_ns[j], side="left"))
-    a, b = of_rough(name), run(name, replace(rough, **columns))
-    assert not np.array_equal(a.yaw_rate_rad_s[at : at + 5], b.yaw_rate_rad_s[at : at + 5])
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_left_and_right_are_mirrored(name, rough, of_rough):
     mirrored = replace(rough, **{c: sign * getattr(rough, c) for c, sign in SIGNS.items()})
     left, right = of_rough(name), run(name, mirrored)
@@ -205,13 +193,6 @@ def test_output_is_predicted_by_the_whole_delay_and_only_once(name):
     assert worst(track.sideslip_rad - undelayed.sideslip, settled) < 0.1 * stale
     stale = worst(np.diff(undelayed.r), settled[1:])
     assert worst(track.yaw_rate_rad_s - undelayed.r, settled) < 0.1 * stale
-
-
-def test_speed_is_predicted_by_the_delay():
-    made = drive(lambda _: 0.0, 5.0, speed=15.0, acceleration=lambda _: 3.0)
-    track = run("phy-ukf", replace(made.signals, ready_ns=made.signals.stamps_ns + 50_000_000))
-    settled = made.time_s > 1.0
-    assert worst(track.vx_m_s - made.vx, settled) < 0.005  # 0.15 m/s without prediction
 
 
 @pytest.mark.parametrize("name", ["zero", "zero:no-lateral"])
@@ -326,26 +307,20 @@ def test_no_fault_breaks_an_estimator(fault, plain):
         assert len(faulty) < 2 or track.valid[-50:].all(), f"{name} must run again after the fault"
 
 
-#: Faults that end by 6 s at the latest.
-PASSING = [f for f in FAULTS if f not in ("one stamp", "nothing", "noise x20") and "spikes" not in f]
+#: Spikes, and faults that end by 6 s at the latest.
+PASSING = [f for f in FAULTS if f not in ("one stamp", "nothing", "noise x20")]
 
 
 @pytest.mark.parametrize("fault", PASSING)
 def test_the_filter_recovers_from_every_fault(fault, plain):
-    """Two seconds after the last bad sample, the estimate equals the estimate without the fault."""
+    """Two seconds after the last bad sample, and between spikes, the estimate equals the estimate without the fault."""
     faulty = FAULTS[fault](plain)
     reference, track = run("phy-ukf", plain), run("phy-ukf", faulty)
     at = np.searchsorted(plain.stamps_ns, faulty.stamps_ns)
-    late = faulty.stamps_ns - plain.stamps_ns[0] > 7.9e9
-    assert worst(track.sideslip_rad - reference.sideslip_rad[at], late) < math.radians(0.1)
-
-
-@pytest.mark.parametrize("fault", [f for f in FAULTS if "spikes" in f])
-def test_spikes_do_no_harm(fault, plain):
-    reference, track = run("phy-ukf", plain), run("phy-ukf", FAULTS[fault](plain))
-    settled = plain.stamps_ns - plain.stamps_ns[0] > 1e9
-    assert worst(track.sideslip_rad - reference.sideslip_rad, settled) < math.radians(0.2)
-    assert worst(track.vx_m_s - reference.vx_m_s, settled) < 0.3
+    late = faulty.stamps_ns - plain.stamps_ns[0] > (1e9 if "spikes" in fault else 7.9e9)
+    assert worst(track.sideslip_rad - reference.sideslip_rad[at], late) < math.radians(
+        0.2 if "spikes" in fault else 0.1
+    )
 
 
 @pytest.mark.parametrize("name", ["open-loop", "phy-ukf"])
@@ -382,17 +357,6 @@ def test_only_what_no_vehicle_can_do_is_dropped(limit, plain):
     assert without_impossible(plain) is plain
 
 
-@settings(derandomize=True, deadline=None, max_examples=10)
-@given(seed=st.integers(0, 2**32 - 1), log_low=st.floats(-4, -1), speed=st.floats(4.0, 50.0))
-def test_covariance_is_definite_on_any_clock(seed, log_low, speed):
-    """Steps from 0.1 ms to 0.3 s, in any order."""
-    rng = np.random.default_rng(seed)
-    dt = 10 ** rng.uniform(log_low, math.log10(0.3), 120)
-    made = drive(slalom(min(0.3, 8.0 / speed**2), 0.5), speed=speed, step_s=dt)
-    signals = with_noise(made.signals, seed % 1000)
-    check_sane(run("phy-ukf", signals), "phy-ukf", signals)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_reverse_and_manoeuvring_are_finite_and_signed(name):
     made = rolling_drive(lambda t: -2.0 * np.sin(0.8 * t), lambda t: 0.3 * np.cos(0.5 * t), 12.0)
@@ -413,13 +377,3 @@ def test_signals_hold_no_truth():
     sensor_fields = {f.name for f in fields(Signals)}
     only_truth = set(TRUTH_UNITS) - set(ALIGNED_SIGNALS)
     assert not sensor_fields & only_truth
-
-
-def test_baselines_claim_what_they_say(plain):
-    made = drive(slalom(0.03, 0.6), 6.0, tyre=tanh_tyre)
-    assert (run("zero", plain).vy_m_s[run("zero", plain).valid] == 0).all()
-    assert np.isnan(run("zero:no-lateral", plain).vy_m_s).all()
-    error = {n: worst(run(n, made.signals).sideslip_rad - made.sideslip, made.time_s > 1) for n in (*CLAIMING, "zero")}
-    assert error["phy-ukf"] < error["zero"] / 4
-    assert error["open-loop"] < error["zero"]
-    assert error["kinematic"] < error["zero"]

@@ -73,15 +73,6 @@ def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(low_grip, bar
     assert coverage > 0.7
 
 
-@pytest.mark.parametrize("manoeuvre", ["fishhook, 70 km/h", "double lane change, 100 km/h"])
-def test_an_accelerometer_that_is_not_where_the_file_has_it_costs_nothing(bare, manoeuvre):
-    drive = gnss_drive(replace(study.SIMULATED[manoeuvre], sensors=study.REAR_IMU))
-    signals = drive.aided
-    plain, _ = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
-    aided, _ = _error_deg(drive, run_window(_aided(bare), signals)[0])
-    assert aided < 1.05 * plain
-
-
 @settings(max_examples=8, deadline=None)
 @given(share=st.floats(0.1, 0.8), late_s=st.floats(0.0, 0.4))
 def test_a_sample_acts_when_it_arrives_and_not_before(low_grip, bare, share, late_s):

@@ -9,17 +9,14 @@ import pytest
 from made_models import random_network
 from reference_car import drive, forces, runge_kutta, slalom, with_noise
 
-from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.hybrid_paper import Constants, PaperHybridUkf
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.parallel_physics import run_features
-from pdhef_logtool.estimators.table import check_names, runnable
 from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
-from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL, ModelBundle
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.service import NetworkService
 
@@ -171,21 +168,3 @@ def test_it_says_when_the_network_is_not_the_papers():
 
 
 # --- the table -------------------------------------------------------------------------------------------------------
-
-
-def test_the_table_makes_it_with_a_network_and_skips_it_without():
-    names = ("pd-hef-paper", "pd-hef:gain=1", "pd-hef")
-    available = frozenset(ALIGNED_SIGNALS)
-    papers = replace(make_bundle(), model=NOMINAL_MODEL)
-    both = replace(make_bundle(), paper_network=papers)
-    for network, ran in (
-        (both, names),
-        (papers, ("pd-hef-paper", "pd-hef")),
-        (make_bundle(), ("pd-hef:gain=1", "pd-hef")),
-        (None, ("pd-hef",)),
-    ):
-        estimators, skipped = runnable(names, Car.of(VEHICLE, network=network), available)
-        assert tuple(e.name for e in estimators) == ran
-        assert all("--network" in s.reason or "pdhef train" in s.reason for s in skipped)
-    with pytest.raises(UsageError, match="pd-hef-paper"):
-        check_names(("pd-hef-paper", "pd-hef", "pd-hef-paper"))

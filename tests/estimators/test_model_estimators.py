@@ -13,17 +13,12 @@ from reference_car import drive, make_signals, slalom
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.table import make_estimator, runnable
-from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.residual_model.linear_model import LinearModel
 
 pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
-NAMES = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")
-
-
 MODEL = full_network()
 
 
@@ -64,15 +59,3 @@ def test_linear_regression_is_its_equation():
     after, _ = run_window(make_estimator("linear-regression", Car.of(VEHICLE, network=model)), step)
     share = 1.0 - math.exp(-2.0 * math.pi * 2.0 * 0.01 * 8)  # eight steps behind the jump
     assert after.sideslip_rad[1007] == pytest.approx(0.004 + 0.02 * share, abs=1e-9)
-
-
-def test_what_the_model_has_is_named_by_its_hash_and_what_it_has_not_is_skipped_with_the_reason():
-    for name, part in (("pure-lstm", MODEL.pure_lstm), ("linear-regression", MODEL.linear_regression)):
-        assert part.sha256 in make_estimator(name, Car.of(VEHICLE, network=MODEL)).notes[0]
-    bare = replace(MODEL, pure_lstm=None, linear_regression=None)
-    estimators, skipped = runnable(NAMES, Car.of(VEHICLE, network=bare), frozenset(ALIGNED_SIGNALS))
-    assert [e.name for e in estimators] == ["pd-hef", "pd-hef-paper"]
-    assert [s.name for s in skipped] == ["pure-lstm", "linear-regression"]
-    assert all("no such baseline" in s.reason for s in skipped)
-    with pytest.raises(UsageError, match="no such baseline"):
-        make_estimator("pure-lstm", Car.of(VEHICLE, network=bare))

@@ -16,7 +16,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter, physics_filter
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, physics_filter
 from pdhef_logtool.records.signals import Signals
 
 pytestmark = pytest.mark.slow
@@ -27,22 +27,6 @@ def sideslip_rmse(estimator, made: Drive, signals: Signals) -> float:
     late = made.time_s > 1.0
     assert track.valid[late].all()
     return float(np.sqrt(np.mean((track.sideslip_rad - made.sideslip)[late] ** 2)))
-
-
-@pytest.mark.parametrize(
-    ("names", "without", "share"),
-    [(("lag",), (), 0.8), (("roll",), (), 0.7), (("lag", "roll"), ("lag",), 0.7), (("lag", "roll"), ("roll",), 0.9)],
-    ids=str,
-)
-def test_the_parts_that_a_car_has_are_worth_having(names, without, share):
-    oracle = Oracle(parts(*names), relaxation_m=0.7, swing_m=0.45)
-    made = oracle.drive(slalom(0.03, 1.0), 8.0)
-    for seed in (1, 2):
-        noisy = with_noise(made.signals, seed)
-        right = sideslip_rmse(physics_filter(oracle.as_vehicle()), made, noisy)
-        wrong = sideslip_rmse(physics_filter(oracle.as_vehicle(physics=parts(*without))), made, noisy)
-        assert right < share * wrong
-        assert right < sideslip_rmse(nominal_filter(oracle.as_vehicle()), made, noisy)
 
 
 def with_soft_tyres(v: VehicleParameters) -> VehicleParameters:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 import pytest
 from reference_car import drive, slalom
 
@@ -20,10 +19,8 @@ from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps, make_steps
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Spec, runnable
-from pdhef_logtool.records.errors import EXIT_PARTIAL, EstimatorError
+from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import run_logs
 
 
 @dataclass(frozen=True)
@@ -115,11 +112,6 @@ def test_what_a_plug_in_prints_goes_to_stderr_and_its_folder_is_left_again(
     assert capsys.readouterr() == ("", "hello\n")
 
 
-def _spec(name: str, misbehave: Callable[[Signals, Any], Any]) -> Spec:
-    needs = frozenset({"speed_m_s", "yaw_rate_rad_s"})
-    return Spec(name, "a plug-in", lambda name, _car, _options: PlugIn(misbehave, name), needs, 0x123456)
-
-
 def test_a_plug_in_that_cannot_be_built_is_left_out_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
     unbuilt = Spec("plug", "a plug-in", lambda *_: sys.exit(0), frozenset(), 0x123456)
     monkeypatch.setattr(table, "all_specs", lambda: (*table.SPECS, unbuilt))
@@ -127,21 +119,3 @@ def test_a_plug_in_that_cannot_be_built_is_left_out_with_its_error(monkeypatch: 
     ready, (skipped,) = runnable(("zero", "plug"), Car.of(default_vehicle()), available)
     assert [e.name for e in ready] == ["zero"]
     assert skipped.is_error and "plug (plug-in test_plug_ins): expected an estimator that runs" in skipped.reason
-
-
-def test_a_plug_in_that_fails_costs_only_its_own_estimates(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sample_logs_dir: Path
-) -> None:
-    specs = (*table.SPECS, _spec("late", raise_error), _spec("ends", end_process))
-    monkeypatch.setattr(table, "all_specs", lambda: specs)
-    config = RunConfig(car=Path("saloon"), estimators=("zero",), keep="estimates", model="off", reference="off")
-    log = [str(sample_logs_dir / "dlc.mcap")]
-    run_logs(log, tmp_path / "alone", config, report=False)
-    result = run_logs(log, tmp_path / "out", replace(config, estimators=("zero", "late", "ends")), report=False)
-    assert result.exit_code == EXIT_PARTIAL
-    lost = result.results[0].outcome.lost
-    assert any("late failed" in text and "KeyError: 'boom'" in text for text in lost)
-    assert any("ends failed" in text and "SystemExit: 0" in text for text in lost)
-    rows, alone = (pl.read_parquet(tmp_path / o / "logs/dlc/estimates.parquet") for o in ("out", "alone"))
-    assert rows.filter(pl.col("estimator") == "zero").equals(alone.filter(pl.col("estimator") == "zero"))
-    assert not {"late", "ends"} & set(rows["estimator"])

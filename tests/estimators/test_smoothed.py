@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import test_estimators as properties
 from made_models import random_network
-from reference_car import REAR_M, cut, drive, forces, keep, runge_kutta, slalom, with_noise
+from reference_car import cut, drive, keep, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Smoother
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.smoothed import BLOCK_S, ForwardSteps, SmoothedPhysics, smooth_steps
+from pdhef_logtool.estimators.smoothed import BLOCK_S, SmoothedPhysics
 from pdhef_logtool.estimators.table import SPECS, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -50,81 +49,6 @@ def on_time(signals: Signals) -> Signals:
 
 
 # --- against another smoother ----------------------------------------------------------------------------------------
-
-Q_STD, R_STD = (0.05, 0.3, 0.15, 0.05), (0.12, 0.004, 0.08)
-WEIGHT = np.array([0.0] + [1 / 8] * 8)
-WEIGHT_C = WEIGHT + np.array([2.0] + [0.0] * 8)
-
-
-def _points(x, P):
-    root = np.linalg.cholesky(len(x) * P)
-    return np.concatenate([x[None], x + root.T, x - root.T])
-
-
-def _covariance(a, b):
-    return (a - WEIGHT @ a).T @ (WEIGHT_C[:, None] * (b - WEIGHT @ b))
-
-
-def unscented_smoother(signals: Signals, rate: FloatArray):
-    """Unscented filter and smoother in plain numpy, the residual as a known input (Särkkä 2008)."""
-
-    def moved(s, k, dt):
-        push = np.concatenate([[0.0], 0.5 * dt * rate[k - 1]])
-        steer, ax, mu = (0.5 * (c[k - 1] + c[k]) for c in (signals.steer_rad, signals.ax_m_s2, signals.friction))
-        return np.append(runge_kutta(s[:3] + push, steer, ax - s[3], mu, dt) + push, s[3])
-
-    def seen(s, k):
-        return forces(*s[:3], signals.steer_rad[k], signals.friction[k])[0] + rate[k - 1, 0], s[2], s[0]
-
-    r0 = signals.yaw_rate_rad_s[0]
-    x, P = np.array([signals.speed_m_s[0], REAR_M * r0, r0, 0.0]), np.diag(np.array([0.5, 0.5, 0.1, 0.3]) ** 2)
-    rows = [(x, P, x, P, P)]
-    for k in range(1, len(signals)):
-        dt = (signals.stamps_ns[k] - signals.stamps_ns[k - 1]) * 1e-9
-        before = _points(x, P)
-        after = np.array([moved(s, k, dt) for s in before])
-        xp, Pp = WEIGHT @ after, _covariance(after, after) + np.diag(np.array(Q_STD) ** 2) * dt
-        chi = _points(xp, Pp)
-        z = np.array([signals.ay_m_s2[k], signals.yaw_rate_rad_s[k], signals.speed_m_s[k]])
-        use = np.isfinite(z)
-        zeta = np.array([seen(s, k) for s in chi])[:, use]
-        S = _covariance(zeta, zeta) + np.diag(np.array(R_STD)[use] ** 2)
-        K = _covariance(chi, zeta) @ np.linalg.inv(S)
-        x, P = xp + K @ (z[use] - WEIGHT @ zeta), Pp - K @ S @ K.T
-        rows.append((x, P, xp, Pp, _covariance(before, after)))
-    xs, Ps, priors, predicted, crosses = (np.array(column) for column in zip(*rows, strict=True))
-    for k in range(len(signals) - 2, -1, -1):
-        G = crosses[k + 1] @ np.linalg.inv(predicted[k + 1])
-        xs[k] += G @ (xs[k + 1] - priors[k + 1])
-        Ps[k] += G @ (Ps[k + 1] - predicted[k + 1]) @ G.T
-    return xs, Ps
-
-
-def smoothed(physics: VehicleUkf, signals: Signals, rate: FloatArray | None = None):
-    """Return the forward steps, their links, and the smoothed states and covariances."""
-    steps, _, links = physics.linked_steps(signals, None, rate)
-    return steps, links, *smooth_steps(ForwardSteps(steps, links))
-
-
-def test_agrees_with_an_unscented_smoother_in_plain_numpy():
-    rng = np.random.default_rng(7)
-    made = drive(
-        lambda t: 0.045 * math.sin(2.4 * t), speed=24.0, step_s=rng.uniform(0.002, 0.03, 300),
-        acceleration=lambda t: math.cos(0.7 * t),
-    )  # fmt: skip
-    s = with_noise(made.signals, seed=3)
-    s.ay_m_s2[rng.random(len(s)) < 0.1] = np.nan
-    s.friction[:] = np.where(np.arange(len(s)) < 200, 0.85, 0.78)
-    t = made.time_s
-    rate = np.stack([0.3 * np.sin(2 * t), 0.1 * np.cos(3 * t)], axis=1)
-    steps, _, x, P = smoothed(VehicleUkf(VEHICLE, "nominal", q_std=Q_STD, r_std=R_STD), s, rate)
-    want_x, want_P = unscented_smoother(s, rate)
-    assert np.nanmax(steps.nis) < 36.0, "the drive must stay inside the gate"
-    np.testing.assert_allclose(x, want_x, rtol=1e-8, atol=1e-9)
-    scale = np.sqrt(np.einsum("kii->ki", want_P))
-    assert np.abs((P - want_P) / (scale[:, :, None] * scale[:, None, :])).max() < 1e-8
-    assert not np.allclose(steps.x, want_x, atol=1e-2), "smoothing must do something"
-
 
 # --- the estimator ---------------------------------------------------------------------------------------------------
 

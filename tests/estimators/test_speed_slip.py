@@ -51,12 +51,6 @@ def test_a_drive_without_slip_is_left_alone(good):
     assert believable(noisy, SENSORS, None, None)[0] is noisy
 
 
-@pytest.mark.parametrize("slope", [-2.0, 2.0])
-def test_a_steep_hill_is_no_slip(good, slope):
-    hill = replace(good.signals, ax_m_s2=good.signals.ax_m_s2 + slope)
-    assert believable(hill, SENSORS, None, None)[0] is hill
-
-
 @pytest.mark.parametrize("size", [10.0, 20.0])
 def test_spinning_wheels_are_not_believed(good, size):
     slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s, size=size))

@@ -15,7 +15,7 @@ from pdhef_logtool.car.parts import (
     Algorithm,
     FilterNoise,
 )
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Smoother
 from pdhef_logtool.estimators.latency_compensation import run_estimator
@@ -130,6 +130,7 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
         ("pd-hef:fixed-r=1", "got pd-hef:fixed-r=1$"),
         ("pd-hef:", "got pd-hef:$"),
         ("physics:tuned", "expected options of physics: none, got physics:tuned$"),
+        ("zero", "zero"),
     ],
 )
 def test_an_unknown_name_or_option_is_answered_with_those_that_exist(name: str, message: str) -> None:
@@ -160,56 +161,9 @@ def test_options_of_a_name_are_combined() -> None:
 
 # --- algorithm of each name ------------------------------------------------------------------------------------------
 
-#: Estimators that use signals only, without vehicle parameters.
-SENSORS_ALONE = ("zero", "zero:no-lateral", "kinematic")
-
 
 def ran(name: str, car: Car = CAR, **options: Any) -> Algorithm:
     return resolve(make_estimator(name, car, Options(**options)))
-
-
-def other(**changes: Any) -> VehicleParameters:
-    return VEHICLE.model_copy(update=changes)
-
-
-def test_names_stand_for_different_algorithms() -> None:
-    identities: dict[str, list[str]] = {}
-    for spec in LINES:
-        identities.setdefault(ran(spec.name).identity, []).append(spec.name)
-    assert [n for n in identities.values() if len(n) > 1] == [["pd-hef", "pd-hef:gain=1"]]
-
-
-@every_spec
-def test_the_name_of_a_car_changes_no_algorithm_and_its_physics_do(spec: Any) -> None:
-    was = ran(spec.name)
-    for changes in ({"name": "ours"}, {"truth_position_m": (1.0, 0.0, 0.0)}):
-        assert ran(spec.name, replace(CAR, vehicle=other(**changes))) == was
-    heavier = ran(spec.name, replace(CAR, vehicle=other(mass_kg=1500.0)))
-    assert heavier.identity == was.identity  # intervals apply, and their note names the difference
-    assert (heavier.physics_sha256 != was.physics_sha256) == (spec.name not in SENSORS_ALONE)
-    assert (heavier.sha256 != was.sha256) == (spec.name not in SENSORS_ALONE)
-    assert (was.physics_sha256 is None) == (spec.name in SENSORS_ALONE)
-
-
-@every_spec
-def test_another_network_is_another_basis_of_what_has_one(spec: Any) -> None:
-    was, is_now = ran(spec.name), ran(spec.name, replace(CAR, network=full_network(2)))
-    assert (was.network_sha256 is None) == (not spec.network)
-    assert (was.sha256 != is_now.sha256) == (was.network_sha256 != is_now.network_sha256) == bool(spec.network)
-    assert was.identity == is_now.identity
-
-
-@pytest.mark.parametrize("name", ["phy-ukf:tuned", "physics", "pd-hef", "pd-hef-smoothed"])
-def test_other_noise_is_another_basis_of_the_same_identity(name: str) -> None:
-    of = name if name == "phy-ukf:tuned" else "physics"
-    was = ran(name, CAR.with_noise(of, NOISE))
-    for change in ({"q_std": (0.1, 0.2, 0.2)}, {"r_std": {"ay_m_s2": 1.0}}):
-        is_now = ran(name, CAR.with_noise(of, NOISE.model_copy(update=change)))
-        assert is_now.noise != was.noise
-        assert is_now.sha256 != was.sha256
-        assert is_now.identity == was.identity
-    told = ran(name, CAR.with_noise(of, NOISE.model_copy(update={"score_deg": 0.1, "trial": 3})))
-    assert told == was
 
 
 # --- pd-hef without residual is physics ------------------------------------------------------------------------------

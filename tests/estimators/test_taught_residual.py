@@ -21,7 +21,7 @@ from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.ladder import SPEED_NONE, LadderModel
+from pdhef_logtool.residual_model.ladder import LadderModel
 
 SEDAN = default_vehicle()
 
@@ -48,16 +48,6 @@ def track_of(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
         track, state = run_window(estimator, part, state)
         tracks.append(track)
     return tracks
-
-
-def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
-    (physics,), (hybrid,) = (
-        track_of(name, taught_car(linear_residual(0.0)), signals) for name in ("physics", "pd-hef")
-    )
-    assert np.array_equal(hybrid.vx_m_s, physics.vx_m_s, equal_nan=True)
-    assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
-    assert np.allclose(hybrid.vy_m_s, physics.vy_m_s, atol=1e-12, equal_nan=True)
-    assert np.nanmax(hybrid.network_trust) == 1.0
 
 
 def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:
@@ -90,21 +80,6 @@ def test_beyond_the_taught_speed_it_is_physics(signals: Signals) -> None:
     (physics,), (hybrid,) = (track_of(name, car, signals) for name in ("physics", "pd-hef"))
     assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
     assert np.nanmax(hybrid.network_trust) == 0.0
-
-
-def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signals) -> None:
-    fast = with_noise(drive(slalom(0.02, 0.5), 8.0, speed=40.0).signals, seed=4)
-    step_ns = int(signals.stamps_ns[-1] - signals.stamps_ns[0]) + 10_000_000
-    moved = {name: getattr(fast, name) + step_ns for name in ("stamps_ns", "ready_ns")}
-    fast = replace(fast, friction=np.full(len(fast), 0.85), **moved)
-    car = taught_car(linear_residual(fastest_m_s=21.0))
-    inside, outside = track_of("pd-hef", car, signals, fast)
-    _, physics = track_of("physics", car, signals, fast)
-    assert np.nanmean(inside.network_trust > 0.0) > 0.5
-    left = int(np.flatnonzero(physics.vx_m_s > SPEED_NONE * 21.0)[0])  # the filter takes the jump of the speed slowly
-    assert len(physics) > left + 250
-    assert np.all(outside.network_trust[left + 200 :] == 0.0)
-    assert np.allclose(outside.sideslip_rad[left + 200 :], physics.sideslip_rad[left + 200 :], atol=1e-5)
 
 
 def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signals) -> None:

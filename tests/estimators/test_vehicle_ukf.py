@@ -16,7 +16,6 @@ from reference_car import (
     Drive,
     drive,
     forces,
-    keep,
     rolling_drive,
     runge_kutta,
     slalom,
@@ -37,7 +36,6 @@ from pdhef_logtool.estimators.vehicle_ukf import (
     PosteriorSteps,
     VehicleUkf,
     nominal_filter,
-    sideslip_std,
 )
 from pdhef_logtool.records.signals import Signals
 
@@ -217,23 +215,6 @@ def test_it_is_the_unscented_kalman_filter_of_filterpy(made, irregular):
     np.testing.assert_array_equal(links.linked, np.arange(len(irregular)) > 0)
 
 
-@models
-def test_linked_steps_are_the_steps_and_their_links_end_where_the_filter_starts(estimator):
-    """With a gap that restarts the filter, and a fault that opens the gate."""
-    made = drive(slalom(0.035, 0.5), 8.0, speed=22.0)
-    s, t = with_noise(made.signals, 3), made.time_s
-    s.yaw_rate_rad_s[(t > 5.0) & (t < 5.6)] += 0.6
-    kept = (t < 2.0) | (t > 2.8)
-    s, t = keep(s, kept), t[kept]
-    steps, (linked, _, links) = posteriors(s, estimator), estimator.linked_steps(s, None)
-    for column in ("x", "P", "nis", "nis_dof", "log_likelihood", "innovation", "valid", "diverged", "prior"):
-        np.testing.assert_array_equal(getattr(linked, column), getattr(steps, column))
-    assert np.flatnonzero(~links.linked).tolist() == [0, int(np.argmax(np.diff(t))) + 1]
-    opened = int(np.argmax((t > 5.0) & ~rejected(steps) & np.isfinite(steps.innovation[:, 1])))
-    assert 5.19 < t[opened] < 5.3
-    assert links.predicted_P[opened, 2, 2] > 5.0 * links.predicted_P[opened - 1, 2, 2]
-
-
 @pytest.fixture(scope="module")
 def good() -> Drive:
     made = drive(slalom(0.03, 0.5), 8.0)
@@ -310,63 +291,7 @@ def test_standstill_holds_and_lets_go(bias, estimator):
     assert steps.valid.all()
 
 
-def test_standstill_determines_the_biases_of_the_sensors():
-    made = stop_and_go()
-    signals = still_noise(made.signals, (made.time_s >= 5.0) & (made.time_s <= 9.0))
-    signals = replace(signals, ax_m_s2=signals.ax_m_s2 + 0.5)  # 3 degrees of grade
-    assert posteriors(signals).x[850, 3] == pytest.approx(0.5, abs=0.15)
-    with_biases = VehicleUkf(vehicle("biases", "roll", "lag"))
-    signals = replace(signals, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.004)
-    steps, layout = posteriors(signals, with_biases), with_biases.layout
-    assert steps.x[880, layout.sensor_bias + 1] == pytest.approx(0.004, abs=0.0012)
-    contained = [0, 1, 2, 4, 5, layout.roll, layout.roll + 1]
-    assert (steps.x[550:900, contained] == 0.0).all()
-
-
 # --- gaps and missing channels ---------------------------------------------------------------------------------------
-
-
-@models
-def test_it_starts_anew_behind_a_gap_and_converges(estimator):
-    made = drive(slalom(0.03, 0.5), 12.0)
-    mask = (made.time_s < 4.0) | (made.time_s > 4.8)
-    whole, broken = posteriors(made.signals, estimator), posteriors(keep(made.signals, mask), estimator)
-    restarted = int(np.argmax(mask & (made.time_s > 4.5))) - int((~mask).sum())
-    assert broken.x[restarted, 0] == made.vx[mask][restarted]  # the first speed sample as it is
-    assert broken.x[restarted, 1] == pytest.approx(REAR_M * made.r[mask][restarted], abs=1e-12)
-    beta = [np.arctan2(s.x[:, 1], s.x[:, 0]) for s in (whole, broken)]
-    late = made.time_s > 4.8 + 5.0
-    difference = np.abs(beta[0][late] - beta[1][late[mask]])
-    assert difference.max() < 0.05 * DEGREE
-    assert np.abs(beta[0] - made.sideslip)[late].max() < 0.05 * DEGREE
-
-
-def test_steering_is_held_for_a_fifth_of_a_second(good):
-    signals = edited(good.signals, "steer_rad", (good.time_s > 3.0) & (good.time_s < 3.5), np.nan)
-    steps = posteriors(signals)
-    held = (good.time_s > 3.0) & (good.time_s < 3.195)
-    lost = (good.time_s > 3.215) & (good.time_s < 3.495)
-    assert steps.valid[held].all()
-    assert not steps.valid[lost].any()
-    assert steps.valid[good.time_s > 3.505].all()
-    last = good.signals.steer_rad[int(np.argmax(good.time_s > 3.0)) - 1]
-    assert (steps.inputs[held, 0] == last).all()
-
-
-def test_with_axle_forces_a_lost_steering_angle_is_a_state(good):
-    """The rear axle, a_y and yaw rate determine v_y; without them too, the filter waits for its steering."""
-    lost = (good.time_s > 3.0) & (good.time_s < 6.0)
-    signals = edited(good.signals, "steer_rad", lost, np.nan)
-    steps, bias = posteriors(signals, PHYSICS), PHYSICS.layout.steer_bias
-    unknown, known = (good.time_s > 3.215) & (good.time_s < 6.0), (good.time_s < 3.195) | (good.time_s >= 6.0)
-    assert steps.valid.all()
-    assert (steps.P[unknown, bias, bias] > 0.0).all() and (steps.P[known, bias, bias] == 0.0).all()
-    error = np.arctan2(steps.x[:, 1], steps.x[:, 0]) - good.sideslip
-    assert np.abs(error[unknown]).max() < 0.5 * DEGREE
-    for column in ("ay_m_s2", "yaw_rate_rad_s"):
-        signals = edited(signals, column, lost, np.nan)
-    blind = posteriors(signals, PHYSICS).valid
-    assert not blind[(good.time_s > 4.5) & (good.time_s < 6.0)].any() and blind[good.time_s > 6.05].all()
 
 
 def test_esp_suite_ignores_the_speed_after_the_start(good):
@@ -416,19 +341,3 @@ def test_a_hopelessly_wrong_model_is_flagged(column):
     signals = with_noise(made.signals, 6)
     track, _ = run_window(UKF, replace(signals, **{column: -getattr(signals, column)}), None)
     assert track.diverged[300:].mean() > 0.6
-
-
-def test_sideslip_std_is_the_first_order_band():
-    """Compare with finite differences of atan2, for a covariance with a significant correlation."""
-    vx, vy = np.array([12.0, 9.0]), np.array([4.0, -6.0])
-    covariance = np.array([[[0.5, 0.4, 0], [0.4, 0.6, 0], [0, 0, 1]], [[0.5, -0.3, 0], [-0.3, 0.2, 0], [0, 0, 1]]])
-    h = 1e-6
-    gradient = np.stack(
-        [
-            (np.arctan2(vy, vx + h) - np.arctan2(vy, vx - h)) / (2 * h),
-            (np.arctan2(vy + h, vx) - np.arctan2(vy - h, vx)) / (2 * h),
-        ],
-        axis=1,
-    )
-    want = np.sqrt(np.einsum("ki,kij,kj->k", gradient, covariance[:, :2, :2], gradient))
-    np.testing.assert_allclose(sideslip_std(vx, vy, covariance), want, rtol=1e-6)

@@ -14,7 +14,6 @@ from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consiste
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.runs.selection import FACTOR, contradiction
 
 T = np.arange(0, 60, 0.01)
 STAMPS = 1_700_000_000_000_000_000 + np.round(T * 1e9).astype(np.int64)
@@ -74,26 +73,3 @@ def test_it_is_the_change_of_the_error_over_two_seconds() -> None:
     found = d2(signals(), VY + error).value
     assert found == pytest.approx(float(np.sqrt(np.mean(change**2))), rel=0.01)
     assert d2(signals(), VY + 5.0).value < 2e-3  # a constant is not seen
-
-
-def rows(yaw: dict[str, float], **values: float) -> list[MetricRow]:
-    lateral = [("vy_m_s", "d2", "m/s", k.replace("_", "-"), v) for k, v in values.items()]
-    of_yaw = [("yaw_rate_rad_s", "yaw_consistency", "rad/s", k.replace("_", "-"), v) for k, v in yaw.items()]
-    return [MetricRow("drive", e, s, "all", m, v, u, 100) for s, m, u, e, v in (*lateral, *of_yaw)]
-
-
-def test_an_estimate_that_is_much_worse_than_one_that_explains_the_yaw_rate_is_contradicted() -> None:
-    yaw = {"zero": 0.1, "phy_ukf": 0.01, "pd_hef": 0.01}
-    assert contradiction(rows(yaw, phy_ukf=1.0, pd_hef=FACTOR * 0.99)) is None
-    found = contradiction(rows(yaw, zero=0.1, phy_ukf=0.5, pd_hef=FACTOR))
-    assert found is not None
-    assert found.best == "phy-ukf"  # zero agrees better, but explains no yaw rate
-    assert "pd-hef contradicts the sensors" in found.text
-
-
-def test_without_something_to_compare_with_nothing_is_contradicted() -> None:
-    assert contradiction(rows({"pd_hef": 1.0}, pd_hef=3.0)) is None
-    assert contradiction(rows({}, phy_ukf=1.0, pd_hef=3.0)) is None  # no steering, no yaw-rate test
-    # kinematic integrates the reference of the test
-    assert contradiction(rows({"kinematic": 0.01, "pd_hef": 0.01}, kinematic=0.01, pd_hef=3.0)) is None
-    assert contradiction(rows({"zero": 0.01}, zero=1.0)) is None

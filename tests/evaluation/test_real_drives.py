@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.drive.alignment import align, plan_alignment
-from pdhef_logtool.drive.truth import Attitude, derive_truth, plan_truth, truth_at
 from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, load_mapping, read_signals
@@ -42,19 +40,6 @@ def drive(shared_dir):
 
 def aligned(channels, vehicle):
     return align(channels.signals, plan_alignment(channels.signals, vehicle))[0]
-
-
-def test_the_phones_velocity_is_turned_into_the_car(drive):
-    channels, vehicle = drive("comma2k19_segment.mcap")
-    plan = plan_truth(channels.truth)
-    assert plan.attitude == Attitude("ECEF", "FLU", has_roll=True)
-    signals = aligned(channels, vehicle)
-    truth = truth_at(derive_truth(channels.truth, plan=plan), signals.stamps_ns)
-    assert np.nanmean(truth.vx_m_s) == pytest.approx(16.83, abs=0.1)
-    assert np.nanmean(truth.vy_m_s) == pytest.approx(-0.24, abs=0.02)
-    both = np.isfinite(truth.vx_m_s) & np.isfinite(signals.speed_m_s)
-    speed = np.hypot(truth.vx_m_s[both], truth.vy_m_s[both])
-    assert np.sqrt(np.mean((speed - signals.speed_m_s[both]) ** 2)) < 0.25
 
 
 @pytest.mark.parametrize(

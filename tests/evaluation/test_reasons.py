@@ -14,7 +14,7 @@ from pdhef_logtool.evaluation.reasons import (
     reason_intervals,
     sensor_faults,
 )
-from pdhef_logtool.records.reasons import REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
+from pdhef_logtool.records.reasons import REASONS, SPIKE_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 STEP_NS = 10_000_000
@@ -52,13 +52,6 @@ def test_intervals_are_those_found_by_hand(samples: list[tuple[int, int]]) -> No
     track = track_of(stamps_ns, reason)
     expected = {r.name: by_hand(stamps_ns, reason, r.bit) for r in REASONS}
     assert reason_intervals(track) == {name: spans for name, spans in expected.items() if spans}
-
-
-def test_a_break_longer_than_half_a_second_parts_two_intervals() -> None:
-    for samples, intervals in ((49, 1), (50, 2)):
-        # So many stamps without the bit between two with it: 0.5 s and 0.51 s apart.
-        reason = np.array([STUCK_AY, *[0] * samples, STUCK_AY])
-        assert len(reason_intervals(track_of(stamps(len(reason)), reason))["stuck_ay"]) == intervals
 
 
 def test_faults_are_told_by_sensor_and_kind_with_the_longest_intervals() -> None:

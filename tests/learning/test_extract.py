@@ -12,12 +12,13 @@ import numpy as np
 import polars as pl
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
-from residual_car import CAR, Motion, Wave, drive
+from reference_car import Drive
+from residual_car import PULL_M_S2, weaving
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.toml_files import vehicle_toml
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
@@ -28,7 +29,6 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.outputs import OutputFolder
-from tests.command_line import called
 from tests.run_report import follows
 
 MAPPING = "".join(
@@ -48,12 +48,10 @@ def _topic(stamps: np.ndarray, **columns: np.ndarray) -> FakeTopic:
     return FakeTopic("vendor/msg/Any", stamps + 5_000_000, {"stamp": stamps, **columns})
 
 
-def _log(
-    motion: Motion, *, arm: tuple[float, float] = (0.0, 0.0), latency_s: float = 0.0, sigma: float = 0.0
-) -> FakeLog:
-    """The drive as recorded, its truth measured ``arm`` from the CG, late, noisy, and bad for a second."""
-    stamps, s = motion.stamps_ns, motion.state
-    late = stamps + round(latency_s * 1e9)
+def _log(made: Drive, sigma: float = 0.0) -> FakeLog:
+    """The drive as recorded, its truth noisy, and bad for a second."""
+    signals = made.signals
+    stamps, s = signals.stamps_ns, np.stack([made.vx, made.vy, made.r], axis=1)
     rng = np.random.default_rng(2)
     noise = rng.normal(0.0, [sigma, sigma, 0.2 * sigma], s.shape)
     fix = np.full(len(stamps), 4.0)
@@ -61,13 +59,13 @@ def _log(
     bad = np.where(fix == 4.0, 0.0, 3.0)
     return FakeLog(
         {
-            "/steer": _topic(stamps, angle=motion.steer),
-            "/imu": _topic(stamps, ax=motion.ax, ay=motion.ay, r=s[:, 2]),
+            "/steer": _topic(stamps, angle=signals.steer_rad),
+            "/imu": _topic(stamps, ax=signals.ax_m_s2, ay=signals.ay_m_s2, r=s[:, 2]),
             "/speed": _topic(stamps[::2], v=s[::2, 0]),
             "/ins": _topic(
-                late,
-                vx=s[:, 0] - s[:, 2] * arm[1] + noise[:, 0],
-                vy=s[:, 1] + s[:, 2] * arm[0] + noise[:, 1] + bad,
+                stamps,
+                vx=s[:, 0] + noise[:, 0],
+                vy=s[:, 1] + noise[:, 1] + bad,
                 r=s[:, 2] + noise[:, 2] + (0.0 if sigma else 1e-5 * np.sin(np.arange(len(stamps)))),
                 fix=fix,
             ),
@@ -75,17 +73,10 @@ def _log(
     )
 
 
-@pytest.fixture(scope="module")
-def motion() -> Motion:
-    return drive(30.0, lateral=Wave(0.5, 0.7), yaw=Wave(0.3, 1.1))
-
-
-def _extract(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: FakeLog, car: VehicleParameters = CAR, **settings: Any
-) -> ExtractResult:
+def _extract(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: FakeLog, **settings: Any) -> ExtractResult:
     (tmp_path / "drive.mcap").write_bytes(b"in memory")
     (tmp_path / "m.toml").write_text(MAPPING)
-    (tmp_path / "v.toml").write_text(vehicle_toml(car))
+    (tmp_path / "v.toml").write_text(vehicle_toml(default_vehicle()))
     monkeypatch.setattr(reading, "open_log", lambda *_, **__: log)
     monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
     monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
@@ -95,38 +86,17 @@ def _extract(
     )
 
 
-def _errors(result: ExtractResult, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Usable rows: errors of the residual rates, and indices."""
-    (found,) = (d.load() for d in read_dataset(result.output).drives)
-    index = np.round((found.stamps_ns - motion.stamps_ns[0]) / 1e7).astype(int)
-    use = found.weight > 0
-    error = found.targets[use] / found.step_s[use, None] - motion.residual[index[use]] / 0.01
-    return error, index[use]
-
-
 @pytest.mark.slow
-def test_clean_truth_is_differenced_as_it_is(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = _extract(tmp_path, monkeypatch, _log(motion))
-    error, index = _errors(result, motion)
-    assert np.abs(error).max() < 6e-3
-    (entry,) = result.manifest["drives"]
-    assert entry["truth"]["smoothing_half_s"] == 0.0
-    assert entry["truth"]["kind"] == "recorded"
-    # The second without a fix gives no target; everything else but the last row does.
-    assert set(range(2999)) - set(index.tolist()) == set(range(999, 1100))
-    rms = entry["residual_rms"]
-    assert rms["vy_dot_m_s2"] == pytest.approx(0.5 / np.sqrt(2), rel=0.05)
-    assert rms["yaw_acceleration_rad_s2"] == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
-
-
-@pytest.mark.slow
-def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = _log(motion, sigma=0.01)
-    result = _extract(tmp_path, monkeypatch, log)
+def test_noisy_truth_is_smoothed_and_unbiased(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _extract(tmp_path, monkeypatch, _log(weaving(30.0), 0.01))
     (entry,) = result.manifest["drives"]
     assert entry["truth"]["smoothing_half_s"] == 0.15
     assert entry["truth"]["difference_noise"]["vy_dot_m_s2"] == pytest.approx(np.sqrt(2), rel=0.1)
-    error, _ = _errors(result, motion)
+    (found,) = (d.load() for d in read_dataset(result.output).drives)
+    use = found.weight > 0
+    # The second without a fix gives no target, nor do stamps whose window of smoothing reaches into it.
+    assert not use[990:1110].any() and use.mean() > 0.9
+    error = found.targets[use] / found.step_s[use, None] - [PULL_M_S2, 0.0]
     assert np.abs(error.mean(axis=0)).max() < 0.02
     smoothed = np.sqrt(np.mean(error**2, axis=0))
     assert smoothed[0] < 0.12, "the noise of one-step differences is above 1"
@@ -135,11 +105,11 @@ def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, mo
 def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = _extract(tmp_path, monkeypatch, _log(drive(4.0, speed=2.0)))
+    result = _extract(tmp_path, monkeypatch, _log(weaving(4.0, speed=2.0)))
     (one,) = result.results
-    assert one.entry is not None and one.entry["rows"] == 400 and one.entry["usable_rows"] == 0
+    assert one.entry is not None and one.entry["rows"] == 401 and one.entry["usable_rows"] == 0
     assert "not one usable target: no ground truth above the low-speed limit" in one.record.notes
-    assert one.record.seconds == pytest.approx(3.99) and result.exit_code == 0
+    assert one.record.seconds == pytest.approx(4.0) and result.exit_code == 0
 
 
 # ---- files ----
@@ -373,30 +343,6 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir: Path, tmp_path: Path) ->
 
 
 # ---- command line ----
-
-
-@pytest.mark.slow
-def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
-    out = tmp_path / "residuals"
-    log = str(sample_logs_dir / "dlc.mcap")
-    result = called("extract", log, "-o", str(out), "--car", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
-    assert result.returncode == 0, result.stderr
-    assert "usable rows" in result.stdout and "train" in result.stdout
-    assert result.stderr.splitlines() == ["warning: dlc: perfect ground truth used; /rtk/fix, /rtk/odometry not used"]
-    (drive,) = read_dataset(out).drives
-    assert drive.entry["usable_rows"] > 0.99 * drive.entry["rows"]
-    rtk = called("extract", log, "-o", str(tmp_path / "rtk"), "--set", "prefer_truth=rtk", "--split", "train", "--json")
-    assert rtk.returncode == 0, rtk.stderr
-    document = json.loads(rtk.stdout)
-    follows(document["manifest"], "dataset.schema.json")
-    (entry,) = document["manifest"]["drives"]
-    assert entry["truth"]["kind"] == "recorded" and entry["truth"]["smoothing_half_s"] > 0
-    # The two truths of one drive tell of the same residual.
-    found = drive.load()
-    (other,) = (d.load() for d in read_dataset(tmp_path / "rtk").drives)
-    both = (found.weight > 0) & (other.weight > 0)
-    for i in range(2):
-        assert np.corrcoef(found.targets[both, i], other.targets[both, i])[0, 1] > 0.95
 
 
 def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir: Path, tmp_path: Path) -> None:

@@ -6,62 +6,56 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import reference_car
 from physics_oracle import Oracle, parts
-from reference_car import Drive
-from residual_car import CAR, START_NS, Measured, Motion, Wave, drive, pick, truth_of, window
+from reference_car import FRICTION, START_NS, Drive, keep, with_noise
+from residual_car import truth_of, weaving
 
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter
-from pdhef_logtool.learning.network.residuals import (
-    ResidualRows,
-    residual_rows,
-)
+from pdhef_logtool.learning.network.residuals import ResidualRows, residual_rows
 from pdhef_logtool.learning.network.train_command import steering_offset
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
 
-LATERAL, YAW = Wave(0.5, 0.7), Wave(0.3, 1.1)
+
+def state_of(made: Drive) -> np.ndarray:
+    return np.stack([made.vx, made.vy, made.r], axis=1)
 
 
 @pytest.fixture(scope="module")
-def motion() -> Motion:
-    return drive(lateral=LATERAL, yaw=YAW)
+def made() -> Drive:
+    return weaving()
 
 
 @pytest.fixture(scope="module")
-def noisy(motion: Motion) -> Measured:
+def noisy(made: Drive) -> tuple[Signals, StateTrack]:
     """With noise, a lost stretch of 0.8 s, single lost stamps, and truth and steering that fail for a while."""
-    whole = window(motion, seed=3)
-    steer = whole.signals.steer_rad.copy()
-    steer[900:905] = np.nan
-    truth = motion.state.copy()
-    truth[700:720] = np.nan
-    whole = Measured(replace(whole.signals, steer_rad=steer), truth_of(motion.stamps_ns, truth))
-    kept = np.ones(len(motion.t), dtype=bool)
+    signals, state = with_noise(made.signals, 3, 0.5), state_of(made)
+    signals.steer_rad[900:905] = np.nan
+    state[700:720] = np.nan
+    kept = np.ones(len(signals), dtype=bool)
     kept[300:380] = kept[500] = kept[1203] = False
-    return pick(whole, np.flatnonzero(kept))
+    return keep(signals, kept), truth_of(signals.stamps_ns[kept], state[kept])
 
 
-def rows_of(made: Measured, half_window: int = 0, **changes: float) -> ResidualRows:
-    car = CAR.model_copy(update=changes)
-    return residual_rows(made.signals, made.truth, nominal_filter(car), period_s=0.01, half_window=half_window)
+def rows_of(signals: Signals, truth: StateTrack) -> ResidualRows:
+    return residual_rows(signals, truth, nominal_filter(default_vehicle()), period_s=0.01)
 
 
 def rates(rows: ResidualRows) -> np.ndarray:
     return rows.targets / rows.step_s[:, None]
 
 
-def test_residual_is_taken_at_the_true_state_not_at_the_estimate(motion: Motion) -> None:
-    whole = window(motion)
-    signals = whole.signals
-    lost = replace(
-        whole, signals=replace(signals, ay_m_s2=signals.ay_m_s2 + 3.0, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.1)
-    )
-    good, bad = rows_of(whole), rows_of(lost)
+def test_residual_is_taken_at_the_true_state_not_at_the_estimate(made: Drive) -> None:
+    signals, truth = made.signals, truth_of(made.signals.stamps_ns, state_of(made))
+    lost = replace(signals, ay_m_s2=signals.ay_m_s2 + 3.0, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.1)
+    good, bad = rows_of(signals, truth), rows_of(lost, truth)
     assert np.abs(bad.features[:, 6] - good.features[:, 6]).max() > 0.3  # the filter is far off
     np.testing.assert_array_equal(bad.targets, good.targets)
 
 
-def test_no_target_across_gaps_or_without_truth_or_steering(noisy: Measured) -> None:
-    rows = rows_of(noisy)
+def test_no_target_across_gaps_or_without_truth_or_steering(noisy: tuple[Signals, StateTrack]) -> None:
+    rows = rows_of(*noisy)
     index = np.round((rows.stamps_ns - START_NS) / 1e7).astype(int)
     gone = set(index[np.isnan(rows.targets).any(axis=1)].tolist())
     expected = {299, 499, 1202, *range(699, 720), *range(899, 905), int(index[-1])}
@@ -69,13 +63,10 @@ def test_no_target_across_gaps_or_without_truth_or_steering(noisy: Measured) -> 
     assert not rows.weight[np.isin(index, list(expected))].any()
 
 
-def test_features_do_not_see_the_truth(noisy: Measured) -> None:
-    truth = noisy.truth
-    assert truth is not None
+def test_features_do_not_see_the_truth(noisy: tuple[Signals, StateTrack]) -> None:
+    signals, truth = noisy
     state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
-    shuffled = np.random.default_rng(1).permutation(state)
-    a = rows_of(noisy)
-    b = rows_of(replace(noisy, truth=truth_of(truth.stamps_ns, shuffled)))
+    a, b = rows_of(*noisy), rows_of(signals, truth_of(truth.stamps_ns, np.random.default_rng(1).permutation(state)))
     np.testing.assert_array_equal(a.features, b.features)
     np.testing.assert_array_equal(a.segment, b.segment)
     assert not np.array_equal(a.targets, b.targets, equal_nan=True)
@@ -84,10 +75,9 @@ def test_features_do_not_see_the_truth(noisy: Measured) -> None:
 # --- missing residual of physics -------------------------------------------------------------------------------------
 
 
-def oracle_window(oracle: Oracle, made: Drive, **signals: np.ndarray) -> Measured:
-    state = np.stack([made.vx, made.vy, made.r], axis=1)
-    whole = replace(made.signals, friction=np.full(len(made.signals), reference_car.FRICTION), **signals)
-    return Measured(whole, truth_of(whole.stamps_ns, state))
+def oracle_window(made: Drive, **signals: np.ndarray) -> tuple[Signals, StateTrack]:
+    whole = replace(made.signals, friction=np.full(len(made.signals), FRICTION), **signals)
+    return whole, truth_of(whole.stamps_ns, state_of(made))
 
 
 @pytest.mark.slow
@@ -97,13 +87,12 @@ def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_come
     oracle = Oracle(parts(*names))
     made = oracle.drive(lambda t: 0.03 * np.sin(3.0 * t), 6.0)
     physics = VehicleUkf(oracle.as_vehicle())
-    window_ = oracle_window(oracle, made)
-    right = rates(residual_rows(window_.signals, window_.truth, physics, period_s=0.01))
+    signals, truth = oracle_window(made)
+    right = rates(residual_rows(signals, truth, physics, period_s=0.01))
     late = slice(100, -1)
     assert np.abs(right[late]).max() < 0.02
-    slippery = np.full(len(made.signals), 0.9 * reference_car.FRICTION)
-    told = replace(window_.signals, friction=slippery)
-    lacks = rates(residual_rows(told, window_.truth, physics, period_s=0.01))[late, 0]
+    told = replace(signals, friction=np.full(len(signals), 0.9 * FRICTION))
+    lacks = rates(residual_rows(told, truth, physics, period_s=0.01))[late, 0]
     slope = float(made.ay[late] @ lacks / (made.ay[late] @ made.ay[late]))
     assert 0.04 < slope < 0.15
 
@@ -114,8 +103,7 @@ def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
     oracle = Oracle(parts("lag"))
     made = oracle.drive(lambda t: 0.02 * np.sin(3.0 * t), 12.0)
     off = made.signals.steer_rad + 0.002
-    whole = oracle_window(oracle, made, steer_rad=off)
-    rows = residual_rows(whole.signals, whole.truth, VehicleUkf(oracle.as_vehicle()), period_s=0.01)
+    rows = residual_rows(*oracle_window(made, steer_rad=off), VehicleUkf(oracle.as_vehicle()), period_s=0.01)
     use = rows.weight > 0
     arrays = ResidualRows(
         rows.stamps_ns[use],

@@ -11,15 +11,12 @@ import polars as pl
 import pytest
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
-from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.train_command import run_training
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import load_bundle
-from pdhef_logtool.residual_model.features import NOMINAL_FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.storage.documents import seal
-from studies.defaults import train_baselines
 from tests.command_line import called, pdhef
 
 pytestmark = pytest.mark.slow
@@ -73,27 +70,6 @@ def test_train_writes_a_model_that_runs(
     assert tuned.bundle.provenance["fine_tuned_on"] == read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle.name
     with pytest.raises(OutputError, match="--filter phy-ukf"):
         run_training(joined, tmp_path / "paper", paper=True, epochs=1)
-    nominal = extracted(sample_logs_dir, tmp_path / "nominal", "--filter", "phy-ukf")
-    check_baselines(sample_logs_dir, nominal, tmp_path, bundle.sha256)
-
-
-def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_sha256: str) -> None:
-    """Train the baselines into the model; they run, the network stays as it was, the split is the network's."""
-    train_baselines.main([str(dataset), "-o", str(folder / "model"), "--epochs", "2"])
-    bundle = load_bundle(folder / "model")
-    assert bundle.sha256 == network_sha256
-    assert bundle.pure_lstm is not None
-    assert bundle.linear_regression is not None
-    data = read_dataset(dataset).sha256
-    assert {b.provenance["dataset_sha256"] for b in (bundle.pure_lstm, bundle.linear_regression)} == {data}
-    assert bundle.pure_lstm.feature_names == bundle.linear_regression.feature_names == NOMINAL_FEATURES
-    errors = bundle.linear_regression.provenance["sideslip_rmse_deg"]
-    assert 0.0 < errors["train"] < 1.0
-    assert errors["test"] is not None
-    car, network = sample_logs_dir / "vehicle.toml", folder / "model"
-    config = RunConfig(car=car, network=network, estimators=("all",), annotate="none", end="5")
-    result = run_logs([str(sample_logs_dir / "dlc.mcap")], folder / "with_baselines", config)
-    assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression"}
 
 
 def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:

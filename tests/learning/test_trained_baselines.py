@@ -1,4 +1,4 @@
-"""The baselines' training: known coefficients come back, a trivial map is learnt, damaged files are one clear error."""
+"""The baselines: known coefficients come back, and damaged files are one clear error."""
 
 from __future__ import annotations
 
@@ -10,14 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_models import full_network
 
-from pdhef_logtool.learning.network.fit import FeatureSequence, Recipe, train
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import (
-    LATERAL_VELOCITY,
     LINEAR_REGRESSION_FILE,
     PURE_LSTM_FOLDER,
-    ModelBundle,
     load_bundle,
 )
 from pdhef_logtool.residual_model.features import FEATURES
@@ -26,7 +24,6 @@ from studies.defaults.train_baselines import SideslipSequence, fit_linear
 
 pytestmark = pytest.mark.slow
 
-SMALL = Recipe(hidden=8, layers=1, head=(8,), epochs=8, batch=4, learning_rate=2e-2)
 NAMES = ("vx_m_s", "ay_m_s2", "steer_rad", "friction")
 
 
@@ -65,29 +62,13 @@ def test_regression_recovers_known_coefficients():
     assert noisy.coefficients[3] == 0.0  # a constant feature gets no weight
 
 
-def velocity_sequences(seed: int, count: int) -> list[FeatureSequence]:
-    """The target is one of the features: the trivial map."""
-    out = []
-    for i in range(count):
-        features = make_features(seed + i)
-        out.append(FeatureSequence(f"drive{i}", features, 2.0 * features[:, 6:7], np.ones(len(features))))
-    return out
-
-
 @pytest.fixture(scope="module")
-def velocity_network(tmp_path_factory: pytest.TempPathFactory) -> ModelBundle:
-    recipe = replace(SMALL, target=LATERAL_VELOCITY, epochs=1)
-    return train(velocity_sequences(0, 2), velocity_sequences(100, 1), recipe, tmp_path_factory.mktemp("lstm"))[0]
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, velocity_network: ModelBundle) -> Path:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network with its baselines."""
-    folder = tmp_path_factory.mktemp("model")
-    sequences = [replace(s, target=np.repeat(s.target, 2, axis=1)) for s in velocity_sequences(0, 2)]
-    residual, _ = train(sequences, sequences, replace(SMALL, epochs=1), folder / "work")
-    residual.save(folder)
-    velocity_network.save(folder / PURE_LSTM_FOLDER)
+    folder, network = tmp_path_factory.mktemp("model"), full_network()
+    assert network.pure_lstm is not None
+    network.save(folder)
+    network.pure_lstm.save(folder / PURE_LSTM_FOLDER)
     model = LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
     (folder / LINEAR_REGRESSION_FILE).write_text(model.to_json())
     return folder
@@ -99,10 +80,9 @@ def saved(tmp_path: Path, whole: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "model"))
 
 
-def test_baselines_come_with_the_model(whole, velocity_network):
+def test_baselines_come_with_the_model(whole):
     bundle = load_bundle(whole)
-    assert bundle.pure_lstm is not None
-    assert bundle.pure_lstm.sha256 == velocity_network.sha256
+    assert bundle.pure_lstm.sha256 == full_network().pure_lstm.sha256
     assert bundle.linear_regression == LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0)
     assert bundle.linear_regression.provenance == {"dataset_sha256": "a"}
     alone = replace(bundle, pure_lstm=None, linear_regression=None)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
+from reference_car import FRICTION, Drive, drive, keep, with_noise
 
 from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.posterior import Posterior
@@ -206,14 +206,6 @@ def test_steering_that_does_not_explain_the_yaw_rate_is_refused() -> None:
     assert "of the yaw rate" in found(replace(signals, steer_rad=-2.0 * signals.steer_rad), RIGHT).refused
 
 
-def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
-    signals = wide().signals
-    calibration = found(replace(signals, steer_rad=signals.steer_rad + 0.005), RIGHT)
-    assert calibration.vehicle.steer_offset_rad == pytest.approx(0.005, abs=1e-3)
-    assert calibration.vehicle.physics.names == ("lag", "roll", "bank")
-    assert calibration.vehicle.mass_kg == RIGHT.mass_kg
-
-
 def test_a_pause_of_a_day_costs_no_memory() -> None:
     signals = wide().signals
     day = np.where(np.arange(len(signals)) < 3000, 0, 86_400 * 10**9)
@@ -244,14 +236,3 @@ def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:
     at = math.log(middle.cornering_stiffness_n_per_rad(False, middle.assumed_friction))
     away = [math.log(v.cornering_stiffness_n_per_rad(False, v.assumed_friction)) - at for v in calibration.varied]
     assert 0.7 * by[REAR_STIFFNESS].sd < math.sqrt(sum(x**2 for x in away)) < 1.05 * by[REAR_STIFFNESS].sd
-
-
-@pytest.mark.slow
-def test_less_driving_spreads_them_wider() -> None:
-    def spread(signals: Signals) -> float:
-        of = found(signals, RIGHT)
-        at = of.vehicle.cornering_stiffness_n_per_rad(False, of.vehicle.assumed_friction)
-        return sum(math.log(v.cornering_stiffness_n_per_rad(False, v.assumed_friction) / at) ** 2 for v in of.varied)
-
-    signals = with_noise(wide().signals, 3)
-    assert spread(cut(signals, 0, 2000)) > 1.2 * spread(signals)

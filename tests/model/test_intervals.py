@@ -14,7 +14,6 @@ from pdhef_logtool.car.parts import PHYSICS, FilterNoise, FittedPhysics, FittedV
 from pdhef_logtool.car.posterior import FittedParameter, Posterior
 from pdhef_logtool.car.toml_files import vehicle_of_entries
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, corrected_anew, default_vehicle
-from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.presets import OPEN_LOOP
@@ -144,18 +143,6 @@ def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prio
     assert len({vehicle.model_dump_json() for vehicle in (OWN, *prior_variations(OWN))}) == 7
 
 
-def test_the_notes_state_the_source() -> None:
-    car = calibrated()
-    estimators = [make_estimator(name, car) for name in ("physics", "zero")]
-    intervals = drive_intervals(car, estimators)
-    none = make_track("zero", np.arange(3), sideslip_rad=np.zeros(3))
-    own = replace(none, name="physics", sideslip_std_rad=np.ones(3))
-    for track in (none, own):
-        intervals.apply(track, signals_at(np.empty(0, np.int64)))
-    assert intervals.notes("zero") == ()
-    assert intervals.notes("physics") == ("intervals: own, parameters and sensors",)
-
-
 def test_the_interval_contains_where_the_centre_of_gravity_is_only_assumed(signals: Signals) -> None:
     """At a yaw rate r the rear axle determines v_y up to the error of its distance times r."""
     car = calibrated(VARIED)
@@ -212,27 +199,6 @@ def test_a_sensor_that_the_estimator_reports_as_faulty_widens_nothing() -> None:
 
 
 # ---- estimators on a car that its log has calibrated ----
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["physics", "pd-hef"])
-def test_an_estimator_on_a_car_calibrated_by_the_whole_log_is_not_causal(name: str) -> None:
-    if name.startswith("pd-hef"):
-        pytest.importorskip("torch")
-        if Car.load().network is None:
-            pytest.skip("no network is shipped")
-    car = replace(calibrated(), network=Car.load().network)
-    estimator = make_estimator(name, car)
-    assert not estimator.causal
-    assert estimator.name == name
-    assert resolve(estimator).physics_sha256 == car.calibrated_car.physics_sha256
-
-
-@pytest.mark.parametrize("name", ["zero", "kinematic", "open-loop", "phy-ukf"])
-def test_what_does_not_take_it_is_as_without(name: str) -> None:
-    estimator = make_estimator(name, calibrated())
-    assert estimator.causal
-    assert resolve(estimator) == resolve(make_estimator(name, Car.of(OWN)))
 
 
 def test_the_open_loop_model_runs_once_more_only_on_a_calibrated_car() -> None:

@@ -69,38 +69,6 @@ def road(sample_logs_dir: Path) -> Path:
     return sample_logs_dir / "road.mcap"
 
 
-def before_the_change(both: Signals) -> list[np.ndarray[Any, Any]]:
-    rows = both.stamps_ns < both.stamps_ns[0] + (CHANGE_S - 3.0) * 1e9
-    return [
-        both.steer_rad[rows],
-        both.ay_m_s2[rows],
-        both.yaw_rate_rad_s[rows],
-        both.speed_m_s[rows],
-        both.ready_ns[rows],
-    ]
-
-
-@pytest.mark.parametrize("is_file", [False, True])
-def test_with_a_model_file_the_future_changes_nothing_that_came_before(
-    is_file: bool, road: Path, file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = ReadOptions(model=file) if is_file else ReadOptions()
-    as_recorded, _ = signals(road, options)
-    really_open = reading.open_log
-
-    def opened(*args: Any, **more: Any) -> Any:
-        log = really_open(*args, **more)
-        return ChangedLater(log, log.start_ns + round(CHANGE_S * 1e9))
-
-    monkeypatch.setattr(reading, "open_log", opened)
-    changed, _ = signals(road, options)
-    both = zip(before_the_change(as_recorded), before_the_change(changed), strict=True)
-    same = [np.array_equal(a, b, equal_nan=True) for a, b in both]
-    assert all(same) == is_file  # mounting and delays of a whole log look at all of it
-    later = np.array_equal(changed.ay_m_s2[-500:], -as_recorded.ay_m_s2[-500:], equal_nan=True)
-    assert later == is_file
-
-
 @pytest.mark.slow
 def test_no_causal_estimate_depends_on_the_future(road: Path, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of every estimator, with a model file."""

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
-import tarfile
 import tomllib
-import zipfile
 from pathlib import Path
 
-import check_dist
 import check_sbom
-import pytest
 
 from pdhef_logtool.records.version import __version__
 
@@ -51,58 +46,3 @@ def test_every_dependency_is_locked_and_a_run_needs_no_torch() -> None:
     assert not [name for name in pinned if name.startswith(("nvidia-", "cuda-")) or name == "triton"]
     assert not any("torch" in requirement for requirement in PROJECT["dependencies"])
     assert any("train" in requirement for requirement in extras["dev"])
-
-
-def _bill(file: Path, **versions: str | None) -> list[str]:
-    """Return the problems of a bill of materials of the installed packages, with changed versions."""
-    needed = {re.split(r"[<>=~\[]", r)[0]: "" for r in PROJECT["dependencies"]} | versions
-    pinned = check_sbom.locked()
-    parts = [
-        {"name": name, "version": version or min(pinned[check_sbom.normalized(name)])}
-        for name, version in needed.items()
-        if version is not None
-    ]
-    root = {"name": PROJECT["name"], "version": __version__}
-    file.write_text(json.dumps({"bomFormat": "CycloneDX", "metadata": {"component": root}, "components": parts}))
-    return check_sbom.problems(file)
-
-
-def test_a_bill_of_materials_is_checked(tmp_path: Path) -> None:
-    file = tmp_path / "sbom.cdx.json"
-    assert _bill(file, pip="1.0") == []
-    assert _bill(file, mcap=None) == ["mcap is missing"]
-    assert _bill(file, scipy="0.1") == ["scipy 0.1 is not in constraints.txt"]
-    assert _bill(file, torch="") == ["torch is no dependency of a run"]
-
-
-def _archives(folder: Path, without: str = "", besides: str = "") -> Path:
-    """Write stubs of a wheel and a source archive, correct except for one file."""
-    name = f"pdhef_logtool-{__version__}"
-    files = [*(ROOT / "pdhef_logtool").rglob("*"), *(ROOT / "truthsim").rglob("*")]
-    inside = {f.relative_to(ROOT).as_posix(): f for f in files if f.is_file() and "__pycache__" not in f.parts}
-    inside |= {f"pdhef_logtool/{f.relative_to(ROOT).as_posix()}": f for f in (ROOT / "schemas").rglob("*.*")}
-    folder.mkdir()
-    with zipfile.ZipFile(folder / f"{name}-py3-none-any.whl", "w", zipfile.ZIP_DEFLATED) as wheel:
-        for path, file in inside.items():
-            if path != without:
-                wheel.write(file, path)
-        wheel.writestr(f"{name}.dist-info/METADATA", f"Name: pdhef-logtool\nVersion: {__version__}\n")
-        wheel.writestr(f"{name}.dist-info/entry_points.txt", "[console_scripts]\npdhef = pdhef_logtool.__main__:main\n")
-        if besides:
-            wheel.writestr(besides, "")
-    with tarfile.open(folder / f"{name}.tar.gz", "w:gz") as source:
-        for needed in ("LICENSE", "setup.py"):
-            source.add(ROOT / needed, f"{name}/{needed}")
-    return folder
-
-
-@pytest.mark.slow
-def test_what_is_built_is_looked_at(tmp_path: Path) -> None:
-    assert check_dist.problems(_archives(tmp_path / "a")) == []
-    lacking = check_dist.problems(_archives(tmp_path / "b", without="pdhef_logtool/schemas/run.schema.json"))
-    assert lacking == ["the wheel lacks pdhef_logtool/schemas/run.schema.json"]
-    assert check_dist.problems(_archives(tmp_path / "c", besides="tests/x.py")) == ["the wheel holds tests"]
-    compiled = "pdhef_logtool/records/__pycache__/x.nbi"
-    assert check_dist.problems(_archives(tmp_path / "d", besides=compiled)) == [f"the wheel holds {compiled}"]
-    (tmp_path / "a" / "other.whl").write_text("")
-    assert "alone" in check_dist.problems(tmp_path / "a")[0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,11 @@ from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.results.parquet_sink import write_estimates
 from pdhef_logtool.results.run_report import write_json
+from pdhef_logtool.results.sink import Event
 from pdhef_logtool.storage.documents import seal
+from tests import run_report
 from tests.results.made_run import write_tables
+from tests.run_report import figures, ran, report
 
 START_NS = 1_700_000_000_000_000_000
 #: Those of `pdhef run --estimators all` with a network that has its baselines.
@@ -67,55 +69,30 @@ def drive_tracks(
 
 
 def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) -> dict[str, Any]:
-    """Return a report.json with the entries that a page reads."""
-    names = [t.name for t in tracks if t.name != "truth"]
-    stamps = tracks[0].stamps_ns
-    truth = any(t.name == "truth" for t in tracks)
-    end = int(stamps[-1]) + 1
-
-    def figure(name: str, signal: str, metric: str, value: float, unit: str) -> dict[str, Any]:
-        return {"estimator": name, "signal": signal, "segment": "all", "metric": metric, "value": value,
-                "unit": unit, "n": len(stamps)}  # fmt: skip
-
-    metrics = [figure(n, "sideslip_rad", "rmse", 0.001 * (i + 1), "rad") for i, n in enumerate(names) if truth]
-    metrics += [
-        figure(n, "state", m, v, "1") for n in names if n != "zero" for m, v in (("nis", 3.1), ("nis_dof", 3.0))
-    ]
-    return {
-        "format": "pdhef.report",
-        "version": 2,
-        "log": {"name": label, "file": f"{label}.mcap", "kind": "mcap", "sha256": "0" * 64, "start_ns": int(stamps[0]),
-                "end_ns": end, "duration_s": (end - int(stamps[0])) * 1e-9},
-        "mapping": {"missing": []},
-        "vehicle": {"name": "sedan", "sha256": "1" * 64, "file": None, "proven": False, "low_speed_blend_m_s": 3.0},
-        "estimators": [
-            {"name": n, "causal": n != "pd-hef-smoothed", "outcome": "ran", "reason": None, "notes": [],
-             "intervals": [],
-             "algorithm": {"sha256": "2" * 64, "physics_sha256": None if n == "zero" else "3" * 64,
-                           "network_sha256": "4" * 64 if "hef" in n else None}}
-            for n in names
-        ],
-        "truth": {"available": truth, "quantities": {}, "latency_s": None, "notes": [], "not_independent": []},
-        "friction": None,
-        "self_calibration": None,
-        "metrics": metrics,
-        "segments": [
-            {"name": "straight", "start_ns": int(stamps[0]), "end_ns": int(stamps[len(stamps) // 3]), "text": ""}
-        ],
-        "losses": [],
-        "ledger": {"samples": []},
-        "warnings": [],
-        "remarks": [],
-        "checks": [],
-        "versions": {"python": "3.11"},
-        "largest_errors": [asdict(e) for e in largest_errors(
-            next(t for t in tracks if t.name == names[0]), next((t for t in tracks if t.name == "truth"), None),
-            [t for t in tracks if t.name not in ("truth", names[0])], 3.0,
-        )],
-        "selected_estimate": names[0],
-        "answer": {"why": "for a test", "texts": {"result": "a result", "assumed": ""}},
-        **changes,
-    }  # fmt: skip
+    """Return a report.json of tracks, with changed entries."""
+    truth = next((t for t in tracks if t.name == "truth"), None)
+    others = [t for t in tracks if t.name != "truth"]
+    start_ns, end_ns = int(tracks[0].stamps_ns[0]), int(tracks[0].stamps_ns[-1]) + 1
+    log = {"name": label, "file": f"{label}.mcap", "kind": "mcap", "sha256": "0" * 64, "start_ns": start_ns,
+           "end_ns": end_ns, "duration_s": (end_ns - start_ns) * 1e-9}  # fmt: skip
+    metrics = figures(*((t.name, "sideslip_rad", "rmse", 0.001 * (i + 1)) for i, t in enumerate(others) if truth))
+    metrics += figures(
+        *((t.name, "state", m, v) for t in others if t.name != "zero" for m, v in (("nis", 3.1), ("nis_dof", 3.0)))
+    )
+    hashes = {"sha256": "2" * 64, "physics_sha256": "3" * 64, "network_sha256": None}
+    document = report(
+        None,
+        log=log,
+        vehicle={"name": "sedan", "file": None, "proven": False, "low_speed_blend_m_s": 3.0},
+        estimators=[ran(t.name, causal=t.name != "pd-hef-smoothed", algorithm=hashes) for t in others],
+        truth=run_report.truth() | {"available": truth is not None},
+        friction=None,
+        metrics=metrics,
+        segments=[Event("straight", start_ns, int(tracks[0].stamps_ns[len(tracks[0]) // 3]), "")],
+        largest_errors=largest_errors(others[0], truth, others[1:], 3.0),
+    )
+    answer = {"why": "for a test", "texts": {"result": "a result", "assumed": ""}}
+    return document | {"selected_estimate": others[0].name, "answer": answer} | changes
 
 
 def write_run(

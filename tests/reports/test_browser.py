@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -114,31 +113,6 @@ def test_a_script_that_came_into_the_page_would_not_run(browser, tmp_path):
     assert browser.value("document.title") != "ran"
     assert len([m for m in browser.messages if "Content Security Policy" in m]) >= 2
     assert browser.value("document.images[0].naturalWidth") == 0
-
-
-def test_an_error_of_one_sample_is_seen_unzoomed_and_named(browser, tmp_path):
-    tracks = drive_tracks(3600.0, ("pd-hef", "physics"))
-    tracks[1].sideslip_rad[100_000] += np.radians(5.0)
-    opened(browser, page_of(write_run(tmp_path, tracks)))
-    # The column of the figure at 1000 s has a line in the estimator's colour nearly up to the top.
-    reach = browser.value(
-        """(() => {
-          const canvas = document.querySelector('[data-figure="error"] canvas:not(.legend canvas)');
-          const box = document.querySelector('[data-figure="error"] .u-over');
-          const k = canvas.width / canvas.clientWidth;
-          const x = Math.round((box.offsetLeft + box.offsetWidth * 1000 / 3600.1) * k);
-          const tall = Math.round(box.offsetHeight * k), top = Math.round(box.offsetTop * k);
-          const seen = canvas.getContext('2d').getImageData(x - 3, top, 7, tall).data;
-          let rows = 0;
-          for (let y = 0; y < tall; y++) for (let i = 0; i < 7; i++) {
-            const at = 4 * (7 * y + i);
-            if (seen[at] > 180 && seen[at + 1] > 60 && seen[at + 1] < 150 && seen[at + 2] < 90) { rows++; break; }
-          }
-          return rows / tall;
-        })()"""
-    )
-    assert reach > 0.7
-    assert "1000.000 s" in browser.value("document.querySelector('button.jump').textContent")
 
 
 def test_the_keyboard_zooms(browser, tmp_path):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import re
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -27,31 +27,10 @@ _NUMBER = re.compile(r"(?<![\w.,:#])[-−+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w:]|
 _NO_FIGURE = re.compile(r"\d{4}-\d\d-\d\d[T ]?[\d:.]*Z?|\d{19}|[\w-]*[A-Za-z_]\w*[-.]\d[\w.-]*")
 
 
-class _Text(HTMLParser):
-    """The text that a page shows, elements apart; sentences of templates are in ``p``."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.parts: list[str] = []
-        self._hidden = 0
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self._hidden += tag in ("script", "style")
-        self.parts.append(" ")
-
-    def handle_endtag(self, tag: str) -> None:
-        self._hidden -= tag in ("script", "style")
-        self.parts.append(" ")
-
-    def handle_data(self, data: str) -> None:
-        if not self._hidden:
-            self.parts.append(data)
-
-
 def shown(page: str) -> str:
-    text = _Text()
-    text.feed(page)
-    return _NO_FIGURE.sub(" ", " ".join("".join(text.parts).split()))
+    """Return the text that a page shows, without what is no figure; elements are apart."""
+    text = re.sub(r"<[^>]*>", " ", re.sub(r"<(script|style)\b.*?</\1>", " ", page, flags=re.DOTALL))
+    return _NO_FIGURE.sub(" ", " ".join(html.unescape(text).split()))
 
 
 def known(document: Any, start_ns: int) -> tuple[list[float], str]:

@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-import html
 import re
 import shutil
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from pypdf import PdfReader
 
 sys.path.insert(0, str(Path(__file__).parent))
 from browser import CHROMIUM, WHY_NOT
-from made_runs import drive_tracks, report_of, write_run
+from made_runs import drive_tracks, write_run
 from test_drive import plan_of
 
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.reports import pdf
 from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.pdf import pdf_page, write_pdf
 from pdhef_logtool.results.opened_run import open_run
-
-
-def text_of(page: bytes) -> str:
-    body = page.decode().partition("<main>")[2]
-    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
+from tests.run_report import text_of
 
 
 def test_the_document_has_a_cover_contents_verdicts_figures_and_hashes_but_no_positions(tmp_path):
@@ -69,20 +61,6 @@ def test_the_document_has_the_key_figures_of_manoeuvres(tmp_path):
     run = open_run(write_run(tmp_path, drive_tracks(3.0), metrics=metrics))
     for page in (pdf_page(run), drive_page(run.logs[0]).html):
         assert "Key figures of manoeuvres truth pd-hef yaw rate: response time ms 101 123" in text_of(page)
-
-
-def test_of_more_drives_than_sections_those_with_the_largest_errors_have_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(pdf, "_MOST_DRIVES", 1)
-    run = open_run(write_run(tmp_path, drive_tracks(3.0)))
-    small, large = (
-        SimpleNamespace(label=label, outcome="ok", file=run.logs[0].file, report=partial(report_of, tracks, label))
-        for label, tracks in (("small", drive_tracks(3.0)), ("large", drive_tracks(3.0, ("zero", "physics", "pd-hef"))))
-    )
-    worse = large.report()
-    worse["metrics"][0]["value"] = 0.1
-    large.report = lambda: worse
-    page = text_of(pdf_page(replace(run, logs=(small, large))))
-    assert "Drives large" in page and "1 more drives are in the pages" in page
 
 
 def test_without_chromium_there_is_one_clear_line(tmp_path, monkeypatch):

@@ -16,8 +16,6 @@ from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.residual_model.ladder_fit import (
     LadderFit,
     TaughtDrive,
-    _Problem,
-    _solve,
     fit_ladder,
 )
 
@@ -146,23 +144,6 @@ def test_unknown_features_have_gain_zero_and_the_next_ones_go_on() -> None:
     found = linear_model().evaluate(features(signals))
     assert np.all(found.gain[50:60] == 0.0) and np.all(found.rate_m_s2[50:60] == 0.0)
     assert np.all(np.isfinite(found.rate_m_s2)) and np.mean(found.gain[60:] > 0.0) > 0.5
-
-
-def test_the_sums_of_blocks_give_the_weighted_ridge_regression_of_the_samples() -> None:
-    rng = np.random.default_rng(4)
-    phi, error, ridge = rng.normal(size=(300, 5)) + 0.4, rng.normal(size=300) + 2.0, 3.0
-    root = np.sqrt(0.04 * rng.uniform(0.1, 1.0, 300))
-    table = root[:, None] * np.column_stack([np.ones(300), phi, error])
-    blocks = np.array([table[rows].T @ table[rows] for rows in np.array_split(np.arange(300), 6)])
-    problem = _Problem(blocks, np.zeros(6, dtype=np.int64), blocks.sum(axis=0)[None])
-    # Least squares without the last block, with λ as five more samples.
-    seen = 250
-    columns = np.concatenate([table[:seen, :6], np.eye(6)[1:] * np.sqrt(ridge)])
-    expected = np.linalg.lstsq(columns, np.concatenate([table[:seen, 6], np.zeros(5)]), rcond=None)[0]
-    assert np.allclose(_solve(blocks[:5].sum(axis=0)[None], ridge), expected[1:])
-    squares = np.sum((table[seen:, 6] - table[seen:, :6] @ expected) ** 2)
-    assert problem.block_error(5, (5,), ridge) == pytest.approx(squares)
-    assert problem.only(5).block_error(5, (5,), ridge) == pytest.approx(squares)
 
 
 def test_a_model_survives_its_document_and_damage_is_refused() -> None:

@@ -177,7 +177,7 @@ def test_a_history_has_a_row_per_run_and_reads_only_tables(tmp_path: Path) -> No
     assert compare(*runs[:2]).history == ()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     changed=st.sets(st.sampled_from(["asked", "other signal", "other estimator", "stamps"])),
     gated=st.booleans(),

@@ -60,7 +60,7 @@ def test_checks_that_did_not_pass_are_properties() -> None:
     assert [p.attrib["name"] for p in root.iter("property")] == ["a: check speed"]
 
 
-@settings(derandomize=True, max_examples=50)
+@settings(derandomize=True, max_examples=15)
 @given(name=st.text(min_size=1))
 def test_any_name_gives_xml_that_parsers_read(name: str) -> None:
     root = ET.fromstring(junit_bytes(verdicts(0.03, title=name)))

@@ -19,14 +19,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.layouts import write_layouts
 from pdhef_logtool.results.mcap_sink import AnnotatedMcap
 from pdhef_logtool.results.sink import Event
-
-REPORT = {
-    "format": "pdhef.report",
-    "log": {"name": "drive", "end_ns": 1_700_000_006_000_000_123},
-    "truth": {"available": True},
-    "estimators": [],
-    "metrics": [],
-}
+from tests.run_report import report
 
 
 def write(folder: Path, tracks: Sequence[StateTrack]) -> Path:
@@ -34,7 +27,7 @@ def write(folder: Path, tracks: Sequence[StateTrack]) -> Path:
     event = Event("slalom", 1_700_000_000_000_000_123, 1_700_000_001_000_000_123, "")
     with AnnotatedMcap(folder / "annotated.mcap", None) as annotated:
         annotated.write(tracks)
-        annotated.finish(REPORT, tracks, [event])
+        annotated.finish(report(None), tracks, [event])
     layouts = folder / "foxglove.json", folder / "plotjuggler.xml"
     write_layouts(*layouts, tracks, {"pd-hef": 0x123456}, shown={"truth", "pd-hef"}, fixes=["/gnss/fix"])
     return folder

@@ -27,17 +27,6 @@ def test_what_was_there_stays_until_the_new_file_is_complete(tmp_path: Path) -> 
     assert folder(tmp_path) == DONE
 
 
-@pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
-def test_a_failure_while_writing_goes_through_and_leaves_the_folder_as_it_was(
-    tmp_path: Path, failure: type[BaseException]
-) -> None:
-    (tmp_path / "out.bin").write_bytes(b"old")
-    with pytest.raises(failure), PendingFile(tmp_path / "out.bin") as pending:
-        pending.path.write_bytes(b"half")
-        raise failure
-    assert folder(tmp_path) == {"out.bin": b"old"}
-
-
 def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path: Path) -> None:
     script = "import sys, pathlib; from pdhef_logtool.storage.files import PendingFile as P\n"
     script += "P(pathlib.Path(sys.argv[1])).path.write_bytes(b'half of an old one')"

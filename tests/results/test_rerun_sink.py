@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import io
 import math
 import os
 import subprocess
@@ -15,9 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
-from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.results import rerun_sink as rerun
 from pdhef_logtool.results.rerun_sink import LONGEST_BRIDGE_NS, MOST_OTHERS, write_recording
 from pdhef_logtool.results.sink import Event
 from tests import run_report
@@ -28,17 +25,7 @@ COLOURS = {"phy-ukf": 0x123456}
 #: The third track that is written, zero, is neither.
 SHOWN = ["phy-ukf"]
 START_NS = 1_700_000_000_000_000_123
-REPORT = {
-    "log": {"name": "drive", "file": "drive.mcap", "kind": "mcap", "duration_s": 6.0, "sha256": HASH},
-    "vehicle": {"name": "sedan"},
-    "warnings": ["a warning"],
-    "losses": [],
-    "truth": {"available": False, "quantities": {}, "latency_s": None, "not_independent": [], "notes": []},
-    "metrics": [],
-    "estimators": [],
-    "mapping": {"missing": []},
-    "versions": {"python": "3"},
-}
+REPORT = run_report.report(None)
 EVENTS = (
     Event("nonlinear", START_NS + 10**9, START_NS + 3 * 10**9, "|ay| above 0.5 g"),
     Event("start", START_NS, START_NS + 1, ""),
@@ -277,23 +264,6 @@ def run_script(tmp_path: Path, **env: str) -> str:
 @pytest.mark.slow
 def test_writing_starts_no_analytics_and_a_switched_off_rerun_is_said(tmp_path):
     assert "unset RERUN" in run_script(tmp_path, RERUN="off")
-
-
-@pytest.mark.parametrize("call", ["write", "close"])
-def test_a_disk_that_is_full_is_told(tmp_path, circle, circle_signals, monkeypatch, call):
-    class Full(io.BytesIO):
-        def write(self, data):
-            if call == "write":
-                raise OSError(28, "No space left on device")
-            return len(data)
-
-        def close(self):
-            if call == "close":
-                raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(rerun, "open_new", lambda _path: Full())
-    with pytest.raises(OutputError, match=r"recording\.rrd: .*No space left on device; free some space"):
-        write(tmp_path / "recording.rrd", circle, circle_signals)
 
 
 @settings(max_examples=6, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

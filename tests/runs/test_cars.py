@@ -96,14 +96,6 @@ def test_one_car_and_a_table_exclude_each_other_and_a_flag_wins_over_the_file(fl
     assert (config.car, config.cars) == (None, fleet / "cars.toml")
 
 
-def test_a_car_is_read_once_and_a_shipped_one_goes_by_its_name(fleet: Path) -> None:
-    (fleet / "cars.toml").write_text('default = "saloon"\n')
-    cars = RunCars.of(RunConfig(cars=fleet / "cars.toml"), lambda _text: None)
-    golf, mini = (cars.of_log(log) for log in find_logs([str(fleet / "fleet")]))
-    assert golf is mini
-    assert golf.file_name == "saloon"
-
-
 @pytest.mark.slow
 def test_a_run_says_which_car_each_log_had_and_one_without_stops_no_other(fleet: Path) -> None:
     (fleet / "cars.toml").write_text('[folders]\n"fleet/golf" = "golf.toml"\n"fleet/mini" = "mini.toml"\n')

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import polars as pl
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from pdhef_logtool.records.errors import OutputError
@@ -84,19 +82,6 @@ def test_every_file_of_a_drive_is_regenerated_and_a_page_alone(
         assert ended.code == 0
         assert ("1 of 2 drives are run again: their outputs are damaged" in ended.err) is (name != "report.html")
         assert name.endswith(".rrd") or (out / "logs/dlc" / name).read_bytes() == files[name]
-
-
-def test_a_column_that_was_changed_without_a_trace_is_noticed(tmp_path: Path) -> None:
-    logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
-    run(logs, out)
-    before, part = contents(out), of_drive(out, "part", "a")
-    table = pq.read_table(part, partitioning=None)
-    at, figures = table.schema.get_field_index("metrics"), table["metrics"].to_pylist()
-    figures[0][0]["value"] = 0.5
-    pq.write_table(table.set_column(at, table.schema.field(at), pa.array(figures, table.schema.field(at).type)), part)
-    run(logs, out, resume=True, work=work)
-    assert work.asked == ["a"]
-    assert contents(out) == before
 
 
 def test_a_damaged_line_of_the_journal_costs_its_drive_alone_and_is_said_once(tmp_path: Path) -> None:

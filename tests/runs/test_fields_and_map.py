@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
+from pdhef_logtool.mapping import SignalSource, load_mapping
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.runs.inspection import (
     ask_mapping,
@@ -19,10 +18,6 @@ from pdhef_logtool.runs.inspection import (
     write_mapping,
 )
 from tests.command_line import rendered
-
-
-def sources(*names: str) -> dict[str, SignalSource]:
-    return {n: SignalSource(n, "/t", n) for n in names}
 
 
 def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
@@ -45,20 +40,6 @@ def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path)
     assert len(found.topics) > 5
     with pytest.raises(UsageError, match="topics: "):
         fields_of_log(sample_logs_dir / "dlc.mcap", "/imu")
-
-
-def test_estimators_that_can_run(sample_logs_dir: Path) -> None:
-    found = inspect_log(sample_logs_dir / "dlc.mcap")
-    assert "can run" in rendered(render_inspection, found, 200)
-    for signals, able in (
-        ((), ()),
-        (("ax_m_s2", "speed_m_s"), ()),
-        (("ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("physics",)),
-        (("steering_wheel_rad", "ay_m_s2", "yaw_rate_rad_s", "wheel_speed_rl_rad_s"), ("physics",)),
-    ):
-        names = replace(found, mapping=Mapping(sources(*signals), {})).estimators
-        assert set(able) <= set(names)
-        assert bool(names) is bool(able), signals
 
 
 @pytest.mark.slow

@@ -248,28 +248,6 @@ def test_memory_is_flat_to_3000_logs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(fleet, "_PRELOAD", ("tests.runs.stub_drives",))  # all that a stub needs
-    logs, one, two = named_logs(tmp_path / "logs", *"abcdefgh"), tmp_path / "one", tmp_path / "two"
-    run(logs, one)
-
-    def killed(_line: str, share: float) -> None:
-        if share >= 0.25:
-            raise KeyboardInterrupt
-
-    schedule = Schedule(jobs=2)
-    with pytest.raises(KeyboardInterrupt):
-        run_logs(
-            [str(logs)], two, RunConfig(), schedule=schedule, reporter=Reporter(killed), report=False, work=stub_drive
-        )
-    assert 0 < len(labels(two)) < 8
-    run(logs, two, jobs=2, resume=True)
-    assert contents(one) == contents(two)
-
-
-@pytest.mark.slow
 def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path, tmp_path: Path) -> None:
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
     config = RunConfig(car=Path("saloon"), keep="metrics", end="4")

@@ -18,27 +18,27 @@ from pdhef_logtool.runs.inspection.page import inspection_page, sparkline
 from tests.command_line import called
 from tests.mcap_files import mcap_writer
 from tests.reports.browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
+from tests.run_report import text_of
 
 HOSTILE = "/<script>document.title='ran'</script>\x1b[31m\u202e&quot;\"'"
 _MOST_BYTES = 500_000
 _VALUES = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
 
 
-def _text(page: str) -> str:
-    body = page[page.index("<main>") : page.index("<footer>")]
-    return html.unescape(" ".join(re.sub(r"<[^>]*>", " ", body).split()))
-
-
-def write_log(path: Path, topics: dict[str, dict[str, np.ndarray]]) -> Path:
-    """Write JSON messages at 20 Hz."""
+def write_log(
+    path: Path, topics: dict[str, dict[str, np.ndarray]], stamps_ns: dict[str, np.ndarray] | None = None
+) -> Path:
+    """Write JSON messages, at 20 Hz if no stamps are given."""
     with mcap_writer(path) as writer:
         for topic, columns in topics.items():
             kinds = {name: {"type": "number"} for name in columns}
             schema = writer.register_schema(f"t{topic}", "jsonschema", json.dumps({"properties": kinds}).encode())
             channel = writer.register_channel(topic, "json", schema)
-            for i in range(len(next(iter(columns.values())))):
+            count = len(next(iter(columns.values())))
+            stamps = (stamps_ns or {}).get(topic, 10**18 + np.arange(count) * 50_000_000)
+            for i, stamp in enumerate(stamps.tolist()):
                 data = json.dumps({name: float(column[i]) for name, column in columns.items()}).encode()
-                writer.add_message(channel, 10**18 + i * 50_000_000, data, 10**18 + i * 50_000_000)
+                writer.add_message(channel, stamp, data, stamp)
     return path
 
 
@@ -83,7 +83,7 @@ def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> N
     file = tmp_path / "page.html"
     assert called("inspect", str(log), "--report", str(file)).returncode == 0
     page, inspection = file.read_text(), inspect_log(log)
-    text = _text(page)
+    text = text_of(page)
     assert inspection.signals
     for report in inspection.signals.values():
         assert f"{report.topic}.{report.field}" in text
@@ -102,7 +102,7 @@ def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> N
     assert load_mapping(pasted).signals == inspection.mapping.signals
     assert len(page) < _MOST_BYTES
     called("inspect", str(log), "--mapping", str(pasted), "--report", str(file))
-    assert "named by the mapping file" in _text(file.read_text())
+    assert "named by the mapping file" in text_of(file.read_text())
 
 
 def test_a_log_of_many_fields_stays_below_the_limit(tmp_path: Path) -> None:

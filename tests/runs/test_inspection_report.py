@@ -163,12 +163,3 @@ def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
     # The ground truth of the same name has lost no sample.
     assert found.truth["yaw_rate_rad_s"].dropped == {}
     assert found.is_partial
-
-
-@pytest.mark.slow
-def test_signal_and_truth_of_one_name_keep_their_own_comments(shared_dir: Path, tmp_path: Path) -> None:
-    write_mapping(inspect_log(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag"), tmp_path / "m.toml")
-    lines = (tmp_path / "m.toml").read_text().splitlines()
-    above = {line.split("]")[0]: lines[i - 1] for i, line in enumerate(lines) if line.startswith("[")}
-    assert "Imu" in above["[signals.yaw_rate_rad_s"]
-    assert "TwistStamped" in above["[truth.yaw_rate_rad_s"]

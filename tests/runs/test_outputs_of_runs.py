@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -136,45 +134,6 @@ def test_whichever_write_fails_a_log_is_whole_and_the_error_one_line(
         assert found == states["new"] or ended == "old", number
         assert leftovers(out) == [], number
     assert number > 80
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
-    """A separate file system of the size that the test requests."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = shutil.which("mount") and subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={request.param}", "none", str(disk)], capture_output=True, check=False
-    )
-    if not mounted or mounted.returncode != 0:
-        pytest.skip("a file system that can be filled needs root: mount -t tmpfs")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("small_disk", ["40k", "1m"], indirect=True)
-def test_a_full_disk_is_one_line_and_leaves_nothing(sample_logs_dir: Path, small_disk: Path, log: str) -> None:
-    done = called("run", log, "-o", small_disk / "out", "-e", "zero")
-    assert done.returncode == 1
-    errors = [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
-    assert len(errors) == 1
-    assert errors[0].startswith(f"pdhef: {small_disk}/out/")
-    assert "No space left on device; free some space" in errors[0]
-    assert [p for p in small_disk.rglob("*") if not p.is_dir()] == []
-
-
-@pytest.mark.parametrize("small_disk", ["2m"], indirect=True)
-def test_a_disk_that_was_full_keeps_the_run_before(sample_logs_dir: Path, small_disk: Path, log: str) -> None:
-    out = small_disk / "out"
-    run_logs([log], out, config(sample_logs_dir))
-    before = contents(out)
-    room = os.statvfs(small_disk)
-    (small_disk / "filler").write_bytes(b"x" * (room.f_bavail * room.f_frsize - 20_000))
-    with pytest.raises(OutputError, match="No space left on device; free some space"):
-        run_logs([log], out, config(sample_logs_dir, estimators=("kinematic",)))
-    assert contents(out) == before
-    assert leftovers(out) == []
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

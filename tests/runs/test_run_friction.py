@@ -10,7 +10,6 @@ import polars as pl
 import pytest
 
 from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
-from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 
@@ -67,10 +66,3 @@ def test_what_is_asked_for_is_told_to_the_estimators(
     friction = track.filter(pl.col("estimator") != "truth")["friction"].drop_nulls().drop_nans().to_numpy()
     assert friction.size
     np.testing.assert_allclose(friction, value, atol=1e-6)
-
-
-def test_a_vehicle_file_without_friction_cannot_be_asked_for_it(
-    files: Path, sample_logs_dir: Path, tmp_path: Path
-) -> None:
-    with pytest.raises(UsageError, match="--friction"):
-        run(sample_logs_dir / "sweep.mcap", tmp_path, car=files / "car.toml", friction="file")

@@ -10,11 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
 from reference_car import signals_at
 
-from pdhef_logtool.cli import console
-from pdhef_logtool.cli.running import _finish
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps
 from pdhef_logtool.records.signals import Signals
@@ -24,6 +21,7 @@ from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
 from pdhef_logtool.runs.scoring import why_silent
 from studies.torture.hours import Drive, read_samples, write_samples
+from tests.command_line import called
 
 SAID = "has no valid row although the car moves: its signals are there, but the estimator marks none as valid"
 
@@ -86,19 +84,17 @@ def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sa
 
 @pytest.mark.usefixtures("silenced")
 def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
-    tmp_path: Path, sample_logs_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(preparing, "default_names", lambda _car, _available: ())  # physics has valid rows
-    result = _run(dict, tmp_path, sample_logs_dir, "phy-ukf")
-    assert result.exit_code == 1
+    write_samples(tmp_path / "odd.mcap", [read_samples(sample_logs_dir / "step.mcap")])
+    words = ("run", tmp_path / "odd.mcap", "-o", tmp_path / "out", "-e", "phy-ukf", "--car", "saloon")
+    done = called(*words, "--network", "none", "--keep", "estimates", "--no-report", "--json")
+    assert done.returncode == 1
     report = json.loads((tmp_path / "out" / "logs" / "odd" / "report.json").read_text())
     assert [x["kind"] for x in report["losses"]] == ["no-valid-row"]
-    monkeypatch.setattr(console, "as_json", True)
-    with pytest.raises(typer.Exit) as left:
-        _finish(result)
-    assert left.value.exit_code == 1
     said = f"no estimator {SAID.replace('no', 'a', 1)}"
-    assert capsys.readouterr().err == f"pdhef: odd: {said}\n"
+    assert done.stderr.splitlines()[-1] == f"pdhef: odd: {said}"
 
 
 def test_a_signal_that_ends_before_the_car_moves_is_named_as_the_cause() -> None:

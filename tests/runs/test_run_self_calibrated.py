@@ -176,15 +176,3 @@ def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_
     selected, named, other = (read_track(file, name) for name in ("selected", "physics", "pd-hef"))
     np.testing.assert_array_equal(selected.sideslip_rad, named.sideslip_rad)
     assert (selected.sideslip_rad != other.sideslip_rad).any()
-
-
-def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if Car.load().network is None:
-        pytest.skip("no network is shipped, without which there is no pd-hef")
-    monkeypatch.setattr(selection, "FACTOR", 0.0)
-    car = sample_logs_dir / "vehicle.toml"
-    report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "pd-hef"), end=None)
-    assert all(e["causal"] for e in report["estimators"])
-    assert any("WARNING" in w for w in report["warnings"])

@@ -8,6 +8,7 @@ import pytest
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.recorded_estimates import score_log
+from tests.runs.test_run import NO_TRUTH_MAPPING
 
 ESTIMATE = ("/rtk/odometry",)
 
@@ -33,19 +34,7 @@ def test_beside_ground_truth_both_figures_exist(sample_logs_dir):
 
 def test_without_ground_truth_no_figure_is_an_error(sample_logs_dir, tmp_path):
     mapping = tmp_path / "mapping.toml"
-    mapping.write_text(
-        "".join(
-            f'[signals.{name}]\ntopic = "{topic}"\nfield = "{field}"\n'
-            for name, topic, field in (
-                ("ay_m_s2", "/imu/data", "linear_acceleration.y"),
-                ("ax_m_s2", "/imu/data", "linear_acceleration.x"),
-                ("yaw_rate_rad_s", "/imu/data", "angular_velocity.z"),
-                ("wheel_speed_rl_m_s", "/vehicle/wheel_speeds", "rl_m_s"),
-                ("wheel_speed_rr_m_s", "/vehicle/wheel_speeds", "rr_m_s"),
-            )
-        ),
-        encoding="utf-8",
-    )
+    mapping.write_text(NO_TRUTH_MAPPING)
     report, found = _metrics(sample_logs_dir / "dlc.mcap", mapping=mapping)
     assert not report["truth"]["available"]
     assert "rmse" not in found

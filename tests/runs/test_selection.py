@@ -9,11 +9,10 @@ import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 from pdhef_logtool.results.selected_estimate import MainFacts
-from pdhef_logtool.runs import frames, selection
+from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.selection import choose_main, default_names
@@ -62,11 +61,6 @@ def test_a_log_that_lacks_what_physics_needs_runs_what_does_with_less(
     assert set(default_names(Car.load(car), EVERY - lacks)) == {"zero", "physics", "pd-hef", *instead}
 
 
-@pytest.mark.parametrize("lacks", [{"ay_m_s2"}, {"yaw_rate_rad_s"}, {"ay_m_s2", "yaw_rate_rad_s"}])
-def test_physics_runs_without_a_measurement(lacks: set[str]) -> None:
-    assert {"physics", "pd-hef"} <= set(default_names(Car.load("saloon"), EVERY - lacks))
-
-
 def test_the_main_one_is_the_best_of_its_kind_whatever_the_order() -> None:
     assert main("zero kinematic physics pd-hef", proven=True).name == "pd-hef"
     assert main("zero phy-ukf open-loop").name == "phy-ukf"
@@ -103,12 +97,6 @@ def test_three_are_shown_the_answer_first_unless_they_were_named() -> None:
     assert list(main(names).shown) == ["pd-hef", "physics", "zero"]
     assert list(main(names, named=True).shown) == names.split()
     assert list(main(names, d2(pd_hef=1.0, phy_ukf=0.1)).shown) == ["phy-ukf", "physics", "zero"]
-
-
-def test_the_interface_for_scripts_runs_the_same_ones(sample_logs_dir: Path) -> None:
-    with read_drive(sample_logs_dir / "step.mcap", Car.load("saloon")) as drive:
-        assert [e.name for e in frames.choose(drive)[0]] == ["zero", "physics", "pd-hef"]
-        assert len(frames.choose(drive, ["all"])[0]) > 8
 
 
 @pytest.mark.slow

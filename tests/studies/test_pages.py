@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from importlib.util import find_spec
 
-from studies.pages import DOCS, ROOT, fill, number, table
+from studies.pages import DOCS, ROOT
 
 DOCUMENTS = [*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile", *ROOT.glob("sample_logs/*.toml")]
 TEXTS = {p.name: p.read_text(encoding="utf-8") for p in DOCUMENTS}
@@ -18,14 +18,3 @@ def test_every_command_and_file_that_a_document_names_is_there() -> None:
     files = {(p, f) for p, t in TEXTS.items() for f in re.findall(r"(?:benchmarks|studies)/[\w/]+\.py", t)}
     assert files
     assert not {(p, f) for p, f in files if not (ROOT / f).is_file()}
-
-
-def test_a_filled_block_replaces_the_former_one() -> None:
-    page = "a\n<!-- begin measured -->\n| old |\n<!-- end measured -->\nb\n"
-    filled = fill(page, {"measured": "| new |"}, "page.md")
-    assert filled == page.replace("old", "new") == fill(filled, {"measured": "| new |"}, "page.md")
-
-
-def test_tables_and_numbers() -> None:
-    assert table(["a", "b"], [["1", "2"]], right_from=1) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
-    assert [number(1.23456), number(float("nan")), number(2.0, 1)] == ["1.235", "–", "2.0"]

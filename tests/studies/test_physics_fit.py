@@ -9,14 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 from physics_oracle import parts
-from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, Drive, drive, keep, with_noise
+from reference_car import FRONT_TYRE, REAR_TYRE, Drive, drive, keep, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD
 from pdhef_logtool.records.tracks import make_track
-from studies.defaults import physics_fit
 from studies.defaults.axle_forces import FitDrive, axle_samples, part_of
-from studies.defaults.physics_fit import STARTS, build_car, choose_parts, drive_errors, fit_physics, make_priors
+from studies.defaults.physics_fit import STARTS, build_car, drive_errors, fit_physics, make_priors
 
 STATIC = PhysicsParts()
 #: Slope of the true tyres at no slip, N/rad at friction 0.85.
@@ -101,48 +99,4 @@ def test_only_parameters_that_the_parts_use_are_fitted(names: tuple[str, ...]) -
     assert fitted == {*CORE, *constant}.union(*(OF_PARTS.get(name, ()) for name in names))
 
 
-def test_the_car_at_theta_has_its_values_and_keeps_the_rest() -> None:
-    start = guess(1.1, 0.9, roll_gradient_rad_per_m_s2=0.008)
-    has = parts("lag", "roll", "load_transfer")
-    none = axle_samples([part_of(static_drive(1, 2.0), 0, 100)], start)
-    priors = make_priors(start, has, none, 0.0)
-    theta = np.linspace(-1.0, 1.0, len(priors))
-    vehicle, noise = build_car(start, has, priors, theta)
-    v = {p.name: max(p.value(t), -math.inf if p.low is None else p.low) for p, t in zip(priors, theta, strict=True)}
-    assert vehicle.physics == has
-    for front, axle in ((True, "front"), (False, "rear")):
-        assert vehicle.cornering_stiffness_n_per_rad(front, 0.85) == pytest.approx(v[f"{axle} cornering stiffness"])
-        assert vehicle.magic_formula(front, 0.85)[2] == pytest.approx(v[f"{axle} peak force"])
-        assert getattr(vehicle.tyres, axle).keeps_stiffness  # at another friction, too
-        slope = vehicle.cornering_stiffness_n_per_rad(front, 0.3)
-        assert slope == pytest.approx(v[f"{axle} cornering stiffness"])
-    for name, entry in (
-        ("yaw inertia", "yaw_inertia_kg_m2"), ("steering offset", "steer_offset_rad"),
-        ("roll gradient", "roll_gradient_rad_per_m_s2"),
-        ("relaxation length", "relaxation_length_m"), ("load sensitivity", "load_sensitivity"),
-        ("roll frequency", "roll_frequency_rad_s"), ("roll damping", "roll_damping"),
-        ("CG over roll axis", "cg_over_roll_axis_m"),
-    ):  # fmt: skip
-        assert getattr(vehicle, entry) == pytest.approx(v[name]), name
-    assert (vehicle.mass_kg, vehicle.track_m) == (MASS_KG, start.track_m)
-    q_force = v["q axle force"]
-    assert noise.q_std == (PHYSICS_Q_STD[0], v["q v_y"], v["q yaw rate"], v["q a_x bias"], q_force, q_force)
-    rounded, _ = build_car(start, has, priors, theta, digits=3)
-    assert rounded.yaw_inertia_kg_m2 == float(f"{v['yaw inertia']:.3g}")
-
-
 # ---- parts ----
-
-
-@pytest.mark.slow
-def test_a_car_without_parts_is_given_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = {"ORDER": ("biases", "lag", "roll"), "MAX_ITERATIONS": 4, "TRIAL_ITERATIONS": 3, "STARTS": STARTS[:1]}
-    for name, value in {**few, "LEAST_FOLD_S": 5.0}.items():
-        monkeypatch.setattr(physics_fit, name, value)
-    one, other = [static_drive(1, 8.0)], [static_drive(2, 8.0)]
-    told: list[str] = []
-    found, tried = choose_parts([(one, other), (other, one)], guess(), progress=lambda text, _share: told.append(text))
-    assert set(found.names) == set()
-    assert [set(t.parts) for t in tried[:2]] == [set(), {"lag", "roll", "biases"}]
-    assert all(len(t.held_out_deg) == 2 for t in tried)
-    assert told[0] == "is biases worth having"

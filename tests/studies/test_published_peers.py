@@ -11,9 +11,8 @@ import pytest
 
 from pdhef_logtool.records.tracks import make_track
 from studies.pages import DOCS, RESULTS
-from studies.peers import __main__ as peers
 from studies.peers import benchmark
-from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, PeerDrive, beside_mapping, beside_vehicle
+from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, PeerDrive
 from studies.peers.page import page
 from studies.peers.parameters import pairs_table
 from studies.peers.scoring import DriveErrors, score
@@ -41,30 +40,6 @@ def test_slow_stamps_are_not_scored_and_an_offset_is_removed_where_it_is_declare
     offset = score(PeerDrive("log", "car", OFFSET), {"zero": np.zeros(4)}, truth)
     assert offset.offset_deg == pytest.approx(2.0)
     assert offset.rmse_deg["zero"] == pytest.approx(1.5)
-
-
-def test_files_beside_a_drive_become_mapping_and_vehicle():
-    entries = [
-        {"signal": "lateral_acceleration", "role": "sensor", "scale": -1.0},
-        {"signal": "lateral_velocity", "role": "truth", "scale": 1.0},
-        {"signal": "yaw_rate", "role": "aux", "scale": 1.0},
-    ]
-    place = {"topic": "/t", "field": "f", "stamp": "header.stamp", "offset": 0.5}
-    mapping = beside_mapping({"signal": [entry | place for entry in entries]})
-    assert (mapping["signals"].keys(), mapping["truth"].keys()) == ({"ay_m_s2"}, {"vy_m_s"})
-    assert mapping["signals"]["ay_m_s2"] == place | {"scale": -1.0}
-    given = {"name": "car", "mass_kg": 1500.0, "yaw_inertia_kg_m2": 2500.0, "lf_m": 1.2, "lr_m": 1.4}
-    given |= {"cf_axle_n_per_rad": 9e4, "cr_axle_n_per_rad": 1.1e5, "friction_front": 0.9, "friction_rear": 0.94}
-    vehicle = beside_vehicle({"vehicle": given})
-    assert (vehicle["cg_to_rear_axle_m"], vehicle["friction"]) == (1.4, pytest.approx(0.92))
-    assert vehicle["tyres"]["rear"] == {"cornering_stiffness_n_per_rad": 1.1e5}
-
-
-def test_without_the_drives_it_writes_nothing_and_ends_with_0(monkeypatch, tmp_path: Path, capsys):
-    monkeypatch.setattr(peers, "DRIVES", tmp_path / "absent")
-    assert peers.main(["--out", str(tmp_path), "--results", str(tmp_path)]) == 0
-    assert "needs ../shared" in capsys.readouterr().out
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_page_shows_the_stored_errors_of_every_drive():

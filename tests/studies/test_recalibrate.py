@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.pages import ROOT
-from studies.recalibrate import Recalibration, Stage, load_stages
+from studies.recalibrate import Recalibration, Stage
 
 #: Joins its inputs into its output and logs the call; fails while a file ``broken`` exists.
 JOIN = """
@@ -77,12 +76,3 @@ def test_a_changed_input_runs_the_dependents_again_and_deletes_their_work(projec
     (project.root / "c").unlink()
     project.run()
     assert calls(project) == "c"
-
-
-def test_no_stage_of_the_project_needs_the_output_of_a_later_one() -> None:
-    stages = load_stages()
-    for i, stage in enumerate(stages):
-        assert not {o for s in stages[i + 1 :] for o in s.outputs} & set(stage.inputs)
-        assert not any(i.startswith("@") for i in stage.inputs)
-        files = [p for p in stage.inputs if p.startswith(("studies", "benchmarks", "pdhef_logtool/", "truthsim"))]
-        assert all(list(ROOT.glob(p)) for p in files)

@@ -6,19 +6,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from pdhef_logtool import inspect_log
 from studies import reference as study
 from studies.pages import DOCS, RESULTS
-
-N = 6000
-T = np.arange(N) * 0.01
-
-
-def motion() -> study.Motion:
-    stamps = np.rint(T * 1e9).astype(np.int64)
-    return study.Motion(stamps, np.full(N, 20.0), np.full(N, 0.4), 0.1 * T, np.zeros(N))
 
 
 def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
@@ -28,26 +19,6 @@ def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
     assert set(names) <= set(stored)
     figures = {n: study.Figures(**{k: v for k, v in stored[n].items() if k != "key"}) for n in names}
     assert study.page(figures) == (DOCS / "reference.md").read_text(encoding="utf-8")
-
-
-def test_a_made_receiver_has_its_rate_and_error_and_the_velocity_of_the_antenna():
-    stamps, made = study.made_gnss(motion(), study.Receiver(10.0, 0.05, 0.02, 5.0))
-    assert len(stamps) == pytest.approx(N / 10, abs=1)
-    rate = 0.1
-    forward = 20.0 - study.ANTENNA_M[1] * rate
-    left = 0.4 + study.ANTENNA_M[0] * rate
-    error = np.hypot(*made.T) - np.hypot(forward, left)
-    assert abs(error.mean()) < 0.02
-    assert 0.03 < error.std() < 0.08
-
-
-def test_faults_change_gnss_where_they_say():
-    stamps, sound = study.made_gnss(motion(), study.RECEIVERS[study.MADE])
-    with_outage, _ = study.made_gnss(motion(), study.RECEIVERS[study.MADE], study.OUTAGE)
-    absent = np.setdiff1d(stamps, with_outage) * 1e-9
-    assert (absent.min(), absent.max()) == (pytest.approx(20.0, abs=0.11), pytest.approx(39.9, abs=0.11))
-    _, jumped = study.made_gnss(motion(), study.RECEIVERS[study.MADE], study.MULTIPATH)
-    assert np.hypot(*(jumped - sound).T).max() == pytest.approx(0.5)
 
 
 def test_added_gnss_is_read_as_a_topic_of_the_log(sample_logs_dir: Path, tmp_path: Path) -> None:

@@ -4,18 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
-
-import pytest
 
 from studies import teaching
 from studies.teaching import CARS, PairResult, Score
-
-
-def test_without_the_drives_it_says_so_and_ends_with_0(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
-    monkeypatch.setattr(teaching, "DRIVES", tmp_path / "absent")
-    assert teaching.main(["--out", str(tmp_path)]) == 0
-    assert "needs ../shared" in capsys.readouterr().out
 
 
 def pair(untaught: float, hybrid: float) -> PairResult:
