@@ -501,8 +501,9 @@ class ColumnarLog(DriveLog):
         topics: Collection[str], container: Container, start_ns: int | None, end_ns: int | None
     ) -> Iterator[Span]:
         """Yield the spans of a window that contain any of the requested topics."""
+        ids = {id_ for id_, channel in container.channels.items() if channel.topic in topics}
         for span in container.spans:
-            if span.overlaps(start_ns, end_ns) and any(container.channels[id_].topic in topics for id_ in span.counts):
+            if not ids.isdisjoint(span.counts) and span.overlaps(start_ns, end_ns):
                 yield span
 
     def _collect_span(self, request: _Request, c: int, span: Span, parts: Mapping[str, list[Columns]]) -> None:
