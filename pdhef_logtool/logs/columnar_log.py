@@ -241,9 +241,9 @@ class ColumnarLog(DriveLog):
             for span in container.spans:
                 stamps = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
                 for id_, times in (stamps or {}).items():
-                    keep = in_window(times, start_ns, end_ns)
-                    parts[container.channels[id_].topic].append(times if keep is None else times[keep])
-        return {topic: np.sort(np.concatenate(part), kind="stable") for topic, part in parts.items() if part}
+                    parts[container.channels[id_].topic].append(times)
+        ordered = {topic: np.sort(np.concatenate(part), kind="stable") for topic, part in parts.items() if part}
+        return {topic: times[slice(*np.searchsorted(times, (start_ns, end_ns)))] for topic, times in ordered.items()}
 
     def covered_topics(self, topics: Collection[str]) -> frozenset[str]:
         """Return the topics with all messages in spans with one of these topics: they need no further read."""
