@@ -218,7 +218,7 @@ def posterior(
     energy += priors[first] + priors[second]
     least = float(energy.min())
     likely = np.flatnonzero(energy < least + 25.0)  # all others are less than 1e-10 times as likely
-    weights = {tuple(k for k in (int(first[i]), int(second[i])) if k != none): math.exp(least - energy[i]) for i in likely}
+    weights = {tuple(sorted({int(first[i]), int(second[i])} - {none})): math.exp(least - energy[i]) for i in likely}
     total = sum(weights.values())
     ordered = sorted(weights.items(), key=lambda x: (-x[1], x[0]))
     return Posterior(tuple((w / total, tuple(useful[i] for i in k)) for k, w in ordered))
