@@ -22,7 +22,6 @@ from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
     concatenate_columns,
-    empty_column,
     missing_column,
 )
 from pdhef_logtool.logs.definitions import SHIPPED
@@ -620,12 +619,12 @@ def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -
 
 
 def _join(topic: str, plan: _Plan, parts: Sequence[Columns]) -> Columns:
-    if not parts:
-        none = np.empty(0, dtype=np.int64)
-        return Columns(topic, none, none.copy(), {s.path: empty_column(s) for s in plan.selections})
-    log_time = np.concatenate([p.log_time_ns for p in parts])
-    publish_time = np.concatenate([p.publish_time_ns for p in parts])
-    fields = {s.path: concatenate_columns([p.fields[s.path] for p in parts]) for s in plan.selections}
+    none = np.empty(0, dtype=np.int64)
+    log_time = np.concatenate([none, *(p.log_time_ns for p in parts)])
+    publish_time = np.concatenate([none, *(p.publish_time_ns for p in parts)])
+    fields = {
+        s.path: concatenate_columns([*(p.fields[s.path] for p in parts), missing_column(s, 0)]) for s in plan.selections
+    }
     if np.all(log_time[1:] >= log_time[:-1]):
         return Columns(topic, log_time, publish_time, fields)
     order = np.argsort(log_time, kind="stable")
