@@ -106,7 +106,6 @@ class ColumnarLog(DriveLog):
         self._expected: dict[str, _Plan] = {}  # by topic
         self._columns: dict[tuple[int, int], dict[int, Columns]] = {}  # of expected topics, by span and channel
         self._column_bytes = 0
-        self._is_last_read = False
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
     @property
@@ -338,7 +337,7 @@ class ColumnarLog(DriveLog):
         """See :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
         self._kept.clear()
         self._kept_bytes = _KEPT_BYTES
-        self._expected, self._is_last_read = {}, True
+        self._expected = {}
 
     def close(self) -> None:
         """Release the files."""
@@ -510,7 +509,7 @@ class ColumnarLog(DriveLog):
         """Add the columns of the requested topics in a span; if it is opened, keep those of expected topics."""
         channels, plans, expected = self.containers[c].channels, request.plans, request.expected
         requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
-        stored = (self._columns.pop if self._is_last_read else self._columns.get)((c, span.index), {})
+        stored = self._columns.get((c, span.index), {})
         if not all(id_ in stored and plans[channels[id_].topic].is_in(stored[id_]) for id_ in requested):
             later = frozenset(id_ for id_ in span.counts if channels[id_].topic in expected and id_ not in stored)
             payloads = frozenset(id_ for id_ in requested | later if request.used[channels[id_].topic].selections)

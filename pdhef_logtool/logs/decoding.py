@@ -295,12 +295,12 @@ def _record_column(layout: LayoutReader, records: NDArray[Any], selection: Selec
     values, n = [layout.values(records, steps) for steps in selection.components], len(records)
     if selection.shape == "vector":
         return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in values])
-    known = [f for f in values if f is not None]
-    if len(known) < len(values):
+    columns = [f for f in values if f is not None]
+    if len(columns) < len(values):
         return missing_column(selection, n)
     if selection.shape == "time":
-        return known[0].astype(np.int64) * 1_000_000_000 + known[1].astype(np.int64)
-    return known[0].astype(np.float64)
+        return columns[0].astype(np.int64) * 1_000_000_000 + columns[1].astype(np.int64)
+    return columns[0].astype(np.float64)
 
 
 def _single_value(message: object, selection: Selection) -> object:
