@@ -179,9 +179,10 @@ class Posterior:
 
     def of(self, name: str) -> list[tuple[float, Hypothesis]]:
         """Return the mistakes of a signal with their probabilities, the likeliest first."""
-        mistakes = {id(h): h for _, chosen in self.sets for h in chosen if name in h.factors}
-        shares = [(sum(p for p, chosen in self.sets if any(h is m for h in chosen)), m) for m in mistakes.values()]
-        return sorted(shares, key=lambda x: -x[0])
+        shares: dict[int, tuple[float, Hypothesis]] = {}
+        for p, mistake in ((p, h) for p, chosen in self.sets for h in chosen if name in h.factors):
+            shares[id(mistake)] = shares.get(id(mistake), (0.0, mistake))[0] + p, mistake
+        return sorted(shares.values(), key=lambda x: -x[0])
 
     def turned(self, name: str) -> float:
         """Return the probability that an open sign is inverted."""
@@ -200,24 +201,24 @@ def posterior(
     # Mistakes of signals without a relation change no likelihood.
     useful = [h for h in hypotheses if h.is_about(touched)]
     priors = np.array([*(h.energy + _of_scales(h, scales or {}) for h in useful), 0.0])
-    # Factor of each mistake on each relation's gain; the last row is for no mistake.
-    acts = np.ones((len(useful) + 1, len(telling)))
-    for name in touched:
-        factors = np.array([*(h.factors.get(name, 1.0) for h in useful), 1.0])
-        acts *= factors[:, None] ** [r.powers.get(name, 0) for r in telling]
-    looked_up = []
-    for relation, column in zip(telling, acts.T, strict=True):
-        single, index = np.unique(column, return_inverse=True)
-        table = relation.energies(np.outer(single, single).ravel()).reshape(len(single), len(single))
-        looked_up.append((table, index))
-
     none = len(useful)
-    sets = np.concatenate([[(k, none) for k in range(none + 1)], np.argwhere(np.triu(_compatible(useful)))])
-    first, second = sets.T
-    energy = priors[first] + priors[second] + sum(table[index[first], index[second]] for table, index in looked_up)
+    # Factors of the mistakes by signal; the last one is of no mistake.
+    factors = {name: np.ones(none + 1) for name in touched}
+    for k, mistake in enumerate(useful):
+        for name in mistake.factors.keys() & touched:
+            factors[name][k] = mistake.factors[name]
+    first, second = np.nonzero(np.triu(_compatible(useful)))
+    first, second = np.append(np.arange(none + 1), first), np.append(np.full(none + 1, none), second)
+    energy = np.zeros(len(first))
+    for relation in telling:
+        on_gain = np.prod([factors[name] ** power for name, power in relation.powers.items()], axis=0)
+        single, index = np.unique(on_gain, return_inverse=True)
+        table = relation.energies(np.outer(single, single).ravel()).reshape(len(single), len(single))
+        energy += table[index[first], index[second]]
+    energy += priors[first] + priors[second]
     least = float(energy.min())
     likely = np.flatnonzero(energy < least + 25.0)  # all others are less than 1e-10 times as likely
-    weights = {tuple(k for k in sets[i].tolist() if k != none): math.exp(least - energy[i]) for i in likely}
+    weights = {tuple(sorted({int(first[i]), int(second[i])} - {none})): math.exp(least - energy[i]) for i in likely}
     total = sum(weights.values())
     ordered = sorted(weights.items(), key=lambda x: (-x[1], x[0]))
     return Posterior(tuple((w / total, tuple(useful[i] for i in k)) for k, w in ordered))
@@ -226,9 +227,10 @@ def posterior(
 def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
     """Return bool [N, N], the pairs that can be true together: of different signals, neither of kind ``foreign``."""
     names = sorted({n for h in mistakes for n in h.factors})
-    about = np.array([[n in h.factors for n in names] for h in mistakes], dtype=bool).reshape(len(mistakes), len(names))
+    about = np.array([[n in h.factors for n in names] for h in mistakes], dtype=np.float32)
+    about = about.reshape(len(mistakes), len(names))
     common = np.array([h.kind != "foreign" for h in mistakes], dtype=bool)
-    return np.asarray(np.outer(common, common) & ~(about @ about.T))
+    return np.asarray(np.outer(common, common) & (about @ about.T == 0.0))
 
 
 @lru_cache

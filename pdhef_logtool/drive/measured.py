@@ -53,6 +53,7 @@ class Measured:
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     open_signs: tuple[tuple[str, ...], ...] = ()
     has_truth: bool = False
+    _posteriors: dict[bool, Posterior] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def positions(self) -> tuple[str, str]:
@@ -75,8 +76,11 @@ class Measured:
 
     def posterior(self, *, mounting_is_known: bool) -> Posterior:
         """Return the probabilities of the mistakes that mappings make with these signals."""
-        groups = tuple(self.groups(mounting_is_known=mounting_is_known))
-        return posterior(self.relations, known_hypotheses((*self.columns,), groups, self.open_signs), self.scales)
+        if mounting_is_known not in self._posteriors:
+            groups = tuple(self.groups(mounting_is_known=mounting_is_known))
+            mistakes = known_hypotheses((*self.columns,), groups, self.open_signs)
+            self._posteriors[mounting_is_known] = posterior(self.relations, mistakes, self.scales)
+        return self._posteriors[mounting_is_known]
 
     def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
         """Return groups of signals with a common error of sign or unit: per topic, and of ground truth."""

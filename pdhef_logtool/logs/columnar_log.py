@@ -22,7 +22,6 @@ from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
     concatenate_columns,
-    empty_column,
     missing_column,
 )
 from pdhef_logtool.logs.definitions import SHIPPED
@@ -241,9 +240,9 @@ class ColumnarLog(DriveLog):
             for span in container.spans:
                 stamps = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
                 for id_, times in (stamps or {}).items():
-                    keep = in_window(times, start_ns, end_ns)
-                    parts[container.channels[id_].topic].append(times if keep is None else times[keep])
-        return {topic: np.sort(np.concatenate(part), kind="stable") for topic, part in parts.items() if part}
+                    parts[container.channels[id_].topic].append(times)
+        ordered = {topic: np.sort(np.concatenate(part), kind="stable") for topic, part in parts.items() if part}
+        return {topic: times[slice(*np.searchsorted(times, (start_ns, end_ns)))] for topic, times in ordered.items()}
 
     def covered_topics(self, topics: Collection[str]) -> frozenset[str]:
         """Return the topics with all messages in spans with one of these topics: they need no further read."""
@@ -501,8 +500,9 @@ class ColumnarLog(DriveLog):
         topics: Collection[str], container: Container, start_ns: int | None, end_ns: int | None
     ) -> Iterator[Span]:
         """Yield the spans of a window that contain any of the requested topics."""
+        ids = {id_ for id_, channel in container.channels.items() if channel.topic in topics}
         for span in container.spans:
-            if span.overlaps(start_ns, end_ns) and any(container.channels[id_].topic in topics for id_ in span.counts):
+            if not ids.isdisjoint(span.counts) and span.overlaps(start_ns, end_ns):
                 yield span
 
     def _collect_span(self, request: _Request, c: int, span: Span, parts: Mapping[str, list[Columns]]) -> None:
@@ -618,12 +618,12 @@ def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -
 
 
 def _join(topic: str, plan: _Plan, parts: Sequence[Columns]) -> Columns:
-    if not parts:
-        none = np.empty(0, dtype=np.int64)
-        return Columns(topic, none, none.copy(), {s.path: empty_column(s) for s in plan.selections})
-    log_time = np.concatenate([p.log_time_ns for p in parts])
-    publish_time = np.concatenate([p.publish_time_ns for p in parts])
-    fields = {s.path: concatenate_columns([p.fields[s.path] for p in parts]) for s in plan.selections}
+    none = np.empty(0, dtype=np.int64)
+    log_time = np.concatenate([none, *(p.log_time_ns for p in parts)])
+    publish_time = np.concatenate([none, *(p.publish_time_ns for p in parts)])
+    fields = {
+        s.path: concatenate_columns([*(p.fields[s.path] for p in parts), missing_column(s, 0)]) for s in plan.selections
+    }
     if np.all(log_time[1:] >= log_time[:-1]):
         return Columns(topic, log_time, publish_time, fields)
     order = np.argsort(log_time, kind="stable")

@@ -260,9 +260,9 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     ------
     LimitError : the arrays are too wide and too many for the memory.
     """
-    if len(parts) == 1:
-        return parts[0]
     filled = [p for p in parts if p.shape[0]] or list(parts[:1])
+    if len(filled) == 1:
+        return filled[0]
     width = max((p.shape[1] for p in filled if p.ndim == 2), default=None)
     if width is None:
         return np.concatenate(filled)
@@ -283,36 +283,24 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return np.concatenate(wide)
 
 
-def empty_column(selection: Selection) -> NDArray[Any]:
-    """Return the column of a path over no messages."""
-    if selection.shape == "time":
-        return np.empty(0, dtype=np.int64)
-    if selection.shape == "vector":
-        return np.empty((0, len(selection.components)))
-    if selection.shape == "array":
-        return np.empty((0, selection.length or 0))
-    return np.empty(0)
-
-
 def missing_column(selection: Selection, n: int) -> NDArray[Any]:
-    """Return the column of a path that none of the N messages has."""
-    empty = empty_column(selection)
-    fill: float | int = NO_TIME_NS if selection.shape == "time" else np.nan
-    return np.full((n, *empty.shape[1:]), fill, dtype=empty.dtype)
+    """Return the column of a path that none of N messages has."""
+    if selection.shape == "time":
+        return np.full(n, NO_TIME_NS, dtype=np.int64)
+    width = {"vector": len(selection.components), "array": selection.length or 0}.get(selection.shape)
+    return np.full(n if width is None else (n, width), np.nan)
 
 
 def _record_column(layout: LayoutReader, records: NDArray[Any], selection: Selection) -> NDArray[Any]:
     values, n = [layout.values(records, steps) for steps in selection.components], len(records)
-    if selection.shape == "time":
-        seconds, nanoseconds = values
-        if seconds is None or nanoseconds is None:
-            return np.full(n, NO_TIME_NS, dtype=np.int64)
-        return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
     if selection.shape == "vector":
         return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in values])
-    if values[0] is None:
+    columns = [f for f in values if f is not None]
+    if len(columns) < len(values):
         return missing_column(selection, n)
-    return values[0].astype(np.float64)
+    if selection.shape == "time":
+        return columns[0].astype(np.int64) * 1_000_000_000 + columns[1].astype(np.int64)
+    return columns[0].astype(np.float64)
 
 
 def _single_value(message: object, selection: Selection) -> object:

@@ -510,12 +510,11 @@ class McapContainer(FileContainer):
 
     def times(self, span: Span) -> dict[int, IntArray]:
         """Return a span's log times by channel; of a chunk, by its message indexes if they agree with the span."""
-        indexes = self._indexes(self.chunks[span.index]) or ()
-        times = {id_: _held_times(its) for id_, its, _ in indexes if len(its)}
-        if times and {id_: len(its) for id_, its in times.items()} == span.counts:
-            bounds = min(int(its.min()) for its in times.values()), max(int(its.max()) + 1 for its in times.values())
-            if bounds == (span.start_ns, span.end_ns):
-                return times
+        indexes = [(id_, times) for id_, times, _ in self._indexes(self.chunks[span.index]) or () if len(times)]
+        named = span_of_indexes(indexes)
+        is_complete = len(indexes) == len(span.counts) and named.counts == span.counts
+        if is_complete and (named.start_ns, named.end_ns) == (span.start_ns, span.end_ns):
+            return {id_: _held_times(times) for id_, times in indexes}
         return super().times(span)
 
     def attachments(self) -> Iterator[Attachment]:
@@ -635,9 +634,7 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
 
 def _held_times(times: UintArray) -> IntArray:
     """Return times [N] as int64, those above ``MAX_TIME_NS`` as that."""
-    held = times.astype(np.int64)
-    fit = held.min() >= 0 and held.max() <= MAX_TIME_NS
-    return held if fit else np.minimum(times, np.uint64(MAX_TIME_NS)).astype(np.int64)
+    return np.minimum(times, np.uint64(MAX_TIME_NS)).astype(np.int64)
 
 
 def _other_records(block: Block) -> list[tuple[int, int, int]] | None:

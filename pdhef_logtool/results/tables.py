@@ -177,7 +177,9 @@ def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str]
         while some := [*islice(left, _PARTS_AT_ONCE)]:
             whole = pa.concat_tables(some)
             for name, writer in writers.items():
-                rows = pa.concat_arrays([chunk.flatten() for chunk in whole[name].chunks])
+                # To flatten the lists would import all functions of pyarrow.
+                bounds = [(x.values, x.offsets[0].as_py(), x.offsets[-1].as_py()) for x in whole[name].chunks]
+                rows = pa.concat_arrays([values[first:end] for values, first, end in bounds])
                 columns = dict(zip(schemas[name].names, rows.flatten(), strict=True))
                 if name == "drives" and folders is not None:
                     columns["folder"] = arrow_array(folders[done : done + len(some)], pa.string())

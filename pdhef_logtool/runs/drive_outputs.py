@@ -34,12 +34,9 @@ from pdhef_logtool.results.opened_run import (
 from pdhef_logtool.results.palette import REFERENCE_COLOUR
 from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
 from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
-from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_tables
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.estimating import Estimated
-from pdhef_logtool.runs.preparing import PreparedDrive
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import file_sha256
 from pdhef_logtool.storage.files import PendingFile, write_bytes, writing
@@ -48,6 +45,9 @@ from pdhef_logtool.storage.outputs import FolderTransaction, check_no_input
 if TYPE_CHECKING:
     from pdhef_logtool.results.mcap_sink import AnnotatedMcap
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+    from pdhef_logtool.results.selected_estimate import MainFacts
+    from pdhef_logtool.runs.estimating import Estimated
+    from pdhef_logtool.runs.preparing import PreparedDrive
 
 _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER = "annotated.mcap", "foxglove.json", "plotjuggler.xml"
 #: Files of an earlier run, deleted unless the new run writes them.

@@ -33,7 +33,6 @@ from pdhef_logtool.runs.journal import Entry, Journal
 from pdhef_logtool.runs.judging import judge, read_validation_plan, write_verdicts
 from pdhef_logtool.runs.planning import Plan, PlannedLog, plan_logs, settings_of, sweep_parts
 from pdhef_logtool.runs.reporting import FleetProgress, collect, write_run_pages
-from pdhef_logtool.runs.run_drive import run_log
 from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult, RunResult
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
 from pdhef_logtool.storage.object_store import is_url
@@ -50,8 +49,9 @@ FULL_WORST = 5
 FAILED = "failed"
 #: Time without progress after which a log is aborted, if several logs are processed at once or there are many.
 SILENCE_S = 600.0
-#: Modules that workers have loaded; polars starts threads at its first query, and none of these makes one.
-_PRELOAD = ("pdhef_logtool.runs.fleet", "pdhef_logtool.logs.mcap_log", "pdhef_logtool.results.parquet_sink", *FILTERS)
+#: Modules that workers have loaded, and with them the compiler, which the process of the run has no need for. polars
+#: starts threads at its first query, and none of these makes one.
+_PRELOAD = ("pdhef_logtool.runs.run_drive", "pdhef_logtool.runs.working", "pdhef_logtool.logs.mcap_log", *FILTERS)
 #: Numbers the runs of this process.
 _RUNS = itertools.count()
 
@@ -178,6 +178,8 @@ def _given_limits(config: RunConfig) -> Limits | None:
 
 def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> RunResult:
     """Run one log in this process; its error ends the run."""
+    from pdhef_logtool.runs.run_drive import run_log
+
     config, car = job.config, job.cars.of_log(log)
     log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
     _check_names([log], output, job, reporter)

@@ -27,7 +27,6 @@ from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import LOG_FILES, log_place
 from pdhef_logtool.runs.journal import digest_of, states_of
-from pdhef_logtool.runs.run_drive import run_log
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Tell
 
@@ -145,6 +144,8 @@ def _identity_of_slice(log: LogInput, identity: str) -> str:
 
 
 def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
+    from pdhef_logtool.runs.run_drive import run_log  # loads the compiler
+
     cars, mapping = _cars_and_mapping(task.run, task.config)
     cars = replace(cars, warn=warned.append)
     car = cars.of_log(task.log)
