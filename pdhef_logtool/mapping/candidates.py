@@ -21,7 +21,8 @@ from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import STATES, UNIT_TEXTS, UNITS, Meaning, is_command, meaning_among, words_of
+from pdhef_logtool.mapping.naming import COUNTING, STATES, UNIT_TEXTS, UNITS, Meaning, is_command, meaning_among, words_of
+from pdhef_logtool.mapping.proposals import MOST_PROPOSED, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
@@ -52,14 +53,16 @@ ANGLES = (("rad", 1.0), ("deg", math.radians(1.0)))
 HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
     "acceleration": (("m/s²", 1.0), ("g", UNITS["acceleration"]["g"]), ("mg", UNITS["acceleration"]["mg"])),
     "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
-    **dict.fromkeys(("steering", "sideslip"), ANGLES),
+    **dict.fromkeys(("steering", "sideslip", "heading"), ANGLES),
     **dict.fromkeys(("speed", "velocity", "wheel speed"), SPEEDS),
     "wheel rate": (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0)),
     **dict.fromkeys(("latitude", "longitude"), (("deg", 1.0),)),
 }
+#: Strength of the meaning of a field that only the drive gives, and least strength of a name.
+PROPOSED, LEAST_NAMED = 0.55, 0.6
 #: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
 MOST = {
-    "acceleration": 80.0, "rate": 9.0, "steering": 16.0, "sideslip": math.pi, "speed": 110.0, "velocity": 60.0,
+    "acceleration": 80.0, "rate": 9.0, "steering": 16.0, "sideslip": math.pi, "heading": 6.6, "speed": 110.0, "velocity": 60.0,
     "wheel speed": 130.0, "wheel rate": 400.0, "latitude": 90.0, "longitude": 180.0,
 }  # fmt: skip
 #: The same where no other unit is possible: five turns of a truck's steering wheel, in degrees.
@@ -155,7 +158,7 @@ class Field:
     def is_axis(self) -> bool:
         """Return whether its name is an axis letter; the direction of the axis then depends on the mounting."""
         leaf_words = words_of(self.path.rpartition(".")[2])
-        return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words)
+        return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words) and self.meaning.strength != PROPOSED
 
     @property
     def is_downward(self) -> bool:
@@ -214,6 +217,31 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             elif not documented.fields or info.path.count(".") or documented.has:
                 meaning = meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
+    return results
+
+
+def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> list[Named]:
+    """Return the fields without a usable name that only one assignment of the drive's motion explains."""
+    if {"speed", "rate", "acceleration", "steering"} & {n[3].quantity for n in named}:
+        return []
+    nameless = [
+        (topic, role, info)
+        for topic, role in topics
+        if role == "sensor"
+        for info in log.fields(topic.name, quiet=True)
+        if info.kind == "number" and all(len(w) == 1 or w.isdigit() or w in COUNTING for w in words_of(info.path))
+    ]
+    pieces, requests = Pieces(log), dict[str, list[str]]()
+    for topic, _, info in nameless[:MOST_PROPOSED]:
+        requests.setdefault(topic.name, []).append(info.path.removesuffix("[]"))
+    seen = {key: s for key, s in pieces.read(requests).items() if s.changes}
+    of_topic = {t.name: (t, role) for t, role, _ in nameless}
+    keys, results = [*seen], []
+    for place, quantity, part, unit in propose(pieces, [*seen.values()]):
+        topic_name, path = keys[place]
+        why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
+        meaning = Meaning(quantity, part, PROPOSED, unit, dict(HYPOTHESES[quantity]).get(unit), why)
+        results.append((*of_topic[topic_name], FieldInfo(path, "number"), meaning, False))
     return results
 
 
@@ -290,6 +318,8 @@ def _weighable(
         elif its.scale is not None:
             item.unit_known = True
             item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
+        if its.strength < LEAST_NAMED:
+            item.doubts.append("its values alone identify it")
         if _may_be_share(item):
             item.is_weak = _has_pedals_beside(item, fields)
             item.doubts.append("it may be a share of the largest angle, which needs a scale")
@@ -374,8 +404,9 @@ def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
 
 
 def triad_of(item: Field) -> str:
-    """Return the key shared by the three axes of a vector: topic and struct, or the name without the axis."""
-    return f"{item.topic.name}.{item.path.rpartition('.')[0] or item.path.rstrip('xyzXYZ0123[]_')}"
+    """Return the key shared by the three axes of a vector: topic and struct, or the words without the axis."""
+    struct, _, leaf = re.sub(r"\[\d+\]$", "", item.path).rpartition(".")
+    return f"{item.topic.name}.{struct or '_'.join(w.rstrip('xyz') for w in words_of(leaf))}"
 
 
 def leaf_group(item: Field) -> tuple[str, str]:

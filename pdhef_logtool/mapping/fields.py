@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,15 @@ _HALF = 5
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
 SAME, BY_DRIVING = 0.03, 0.15
+#: Usual mountings by the axis that gravity shows as upward: parts of the car's axes with their signs, by axis.
+MOUNTED: dict[str, dict[str, tuple[str, float]]] = {
+    "+z": {}, "+x": {}, "-x": {}, "-z": {"y": ("y", -1.0), "z": ("z", -1.0)},
+    "+y": {"x": ("y", -1.0), "y": ("z", 1.0), "z": ("x", -1.0)},
+    "-y": {"x": ("y", -1.0), "y": ("z", -1.0), "z": ("x", 1.0)},
+}  # fmt: skip
+USUAL = {"-z": "forward, right, down", "+y": "a phone in a holder", "-y": "a camera, or in g a phone that gives gravity"}
+#: Share of the mean acceleration that is along one axis.
+UPRIGHT = 0.9
 #: Probability at which a unit counts as known.
 CERTAIN = 0.9
 #: Energies of rare units.
@@ -215,9 +224,32 @@ def _by_gravity(fields: Fields) -> None:
             groups[f"{triad_of(item)}.{item.path}"] = {"z": item}
     for axes in groups.values():
         if set(axes) in ({"z"}, set("xyz")):
-            size = float(np.linalg.norm([np.nanmean(f.seen.values) for f in axes.values()]))
+            means = {axis: float(np.nanmean(f.seen.values)) for axis, f in axes.items()}
+            size = math.hypot(*means.values())
             for item in axes.values() if size > 0.0 else ():
                 settle((item,), [Gain((1,), size / G_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
+            up = max(means, key=lambda axis: abs(means[axis]))
+            if len(means) > 1 and abs(means[up]) > UPRIGHT * size > 0.0:
+                _turn(fields, axes, f"{'-' if means[up] < 0.0 else '+'}{up}")
+
+
+def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
+    """Turn an inertial sensor's axes to the car's by the usual mounting for this axis upward; the drive checks it."""
+    device, is_negated = axes["x"], up == "-y" and axes["x"].factors[0][0] == "g"
+    rates = [f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and _are_near(f, device)]
+    for item in (*axes.values(), *rates):
+        part, sign = MOUNTED["+y" if is_negated else up].get(item.meaning.part, (item.meaning.part, 1.0))
+        if item.fixed or item.is_downward or (part, sign) == (item.meaning.part, 1.0):
+            continue
+        item.meaning = replace(item.meaning, part=part)
+        item.sign = -sign if is_negated and item.meaning.quantity == "acceleration" else sign
+        item.reasons.append(f"gravity is along {up} of its device: {USUAL[up]}")
+
+
+def _are_near(first: Field, second: Field) -> bool:
+    """Return whether two fields belong to one device: a struct, or neighbouring topics."""
+    places = [f.topic.name.rpartition("/")[0] or leaf_group(f) for f in (first, second)]
+    return places[0] == places[1]
 
 
 def _speeds(fields: Fields) -> None:

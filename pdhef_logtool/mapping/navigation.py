@@ -57,6 +57,9 @@ Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.
 NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative: in reverse it has the wrong sign"
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
+#: Words of receivers, whose heading without positions is a course.
+_RECEIVERS = frozenset({"gps", "gnss", "vbox"})
+NO_SIGNALS: Mapping[str, SignalSource] = {}
 #: Ground truth with one of these contains a heading, or motion that needs one.
 HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
 #: Course of a single antenna in addition to a heading from two antennas: a sensor, even of a ground-truth instrument.
@@ -97,8 +100,7 @@ def axes_of(
             return order
     length = np.hypot(x, y)
     moving = length > SLOW_M_S
-    with np.errstate(invalid="ignore", divide="ignore"):
-        turning = np.where(moving, (x * pieces.rate_of(y) - y * pieces.rate_of(x)) / length**2, np.nan)
+    turning = pieces.turning(np.where(moving, x + 1j * y, np.nan))
     relation = None if rate is None else fit(pieces.smooth(rate), turning)
     sense = _sense(relation)
     if sense > 0.0:
@@ -217,11 +219,12 @@ def receiver_signals(
 class _Instrument:
     """A topic with the fields of a navigation system or receiver by their names.
 
-    ``mapped``: a source that is mapped already, with a unit that the drive shows.
+    ``signals``: mapped already, among them a speed with a unit that the drive shows.
     """
 
-    def __init__(self, log: DriveLog, topic: TopicInfo, mapped: SignalSource | None = None) -> None:
+    def __init__(self, log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource] = NO_SIGNALS) -> None:
         self.log, self.topic, self.fields = log, topic.name, log.fields(topic.name, quiet=True)
+        self.yaw_rate, mapped = signals.get("yaw_rate_rad_s"), signals.get("speed_m_s")
         self.stamp = stamp_path_of(self.fields)
         numbers = (f for f in self.fields if f.kind == "number")
         named = ((f.path, meaning_of(topic.name, topic.type_name, f.path, f.unit)) for f in numbers)
@@ -243,6 +246,7 @@ class _Instrument:
     def seen(self) -> dict[str, Seen]:
         """Values of velocities, angles and positions in a few pieces of the log, by path."""
         paths = [*(p for v in self.velocities for p in v.values()), *self.angles]
+        paths += [p for p, m in self.meanings.items() if m.quantity == "speed"]
         wanted = [*dict.fromkeys([*paths, *(s.paths[0] for s in self.places.values())])]
         return {path: seen for (_, path), seen in self.pieces.read({self.topic: wanted} if wanted else {}).items()}
 
@@ -264,6 +268,21 @@ class _Instrument:
         velocity = path_velocity(_on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read)))
         nothing = np.full(len(self.pieces.starts) * self.pieces.cells_a_piece, np.nan)
         return nothing if velocity is None else _direction(*velocity)
+
+    def follows(self, path: str, speed: str, scale: float, angle: float) -> bool:
+        """Return whether an angle is the direction of the path; without positions, whether a course turns as the car.
+
+        ``speed``: path of the speed.
+        """
+        if self.has_place:
+            return _off(self.seen[path], self.course, scale, angle) < NEAR_RAD
+        is_course = self.meanings[path].quantity == "course"
+        is_course |= bool(_RECEIVERS & {*words_of(path), *words_of(self.topic)})
+        if self.yaw_rate is None or speed not in self.seen or not is_course:
+            return False
+        pieces, _, (rate, *_) = _read(self.log, [self.yaw_rate])
+        moving = self.seen[speed].cells * (self.meanings[speed].scale or 1.0) > MOVING_M_S
+        return turns(pieces, np.where(moving, scale * self.seen[path].cells, np.nan), rate.si) != 0.0
 
     @property
     def over_ground(self) -> list[SignalSource]:
@@ -288,15 +307,17 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
-def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = None) -> dict[str, SignalSource]:
+def named_gnss(
+    log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource] = NO_SIGNALS
+) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    ``speed`` is mapped already, with a unit that the drive shows. A velocity must agree with the path, if there is one.
-    A heading that is the direction of the path is a course.
+    ``signals`` are mapped already. A velocity must agree with the path, if there is one. A heading that is the direction
+    of the path is a course.
     """
-    its = _Instrument(log, topic, speed)
+    its = _Instrument(log, topic, signals)
     if len(its.places) < len(_PLACES):
-        return {s.name: s for s in its.over_ground}
+        return {s.name: s for s in its.over_ground or _speed_and_course(its)}
     if not its.has_place:
         return {}
     sources = [replace(its.places[n], name=name) for n, name in zip(_PLACES, GNSS_POSITION, strict=True)]
@@ -313,9 +334,9 @@ def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
     speed = next((p for p, m in its.meanings.items() if m.quantity == "speed" and m.scale is not None), None)
     for path, meaning in its.angles.items() if speed is not None else ():
-        # A course over ground is clockwise from north by definition; the path confirms this and determines the unit.
+        # A course over ground is clockwise from north by definition; the drive confirms this and determines the unit.
         fitting = [c[1:] for c in _CONVENTIONS[:2] if meaning.scale is None or math.isclose(-c[1], meaning.scale)]
-        fitting = [c for c in fitting if path in its.seen and _off(its.seen[path], its.course, *c) < NEAR_RAD]
+        fitting = [c for c in fitting if path in its.seen and its.follows(path, speed, *c)]
         if fitting and speed is not None:
             yield its.source("gnss_course_rad", path, *fitting[0])
             yield its.source("gnss_speed_m_s", speed, its.meanings[speed].scale or 1.0)
@@ -390,6 +411,14 @@ def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
         name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
         if f"{base}[2]" in paths and f"{base}[3]" not in paths and words & {"velocity", "vel", "position", "pos"}:
             yield SignalSource(name, its.topic, tuple(f"{base}[{i}]" for i in range(3)), its.stamp)
+
+
+def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
+    """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
+    relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
+    if relation is None or abs(relation.correlation) <= CLEAR or not SAME_STEPS[0] < abs(relation.slope) < SAME_STEPS[1]:
+        return 0.0
+    return math.copysign(1.0, relation.slope)
 
 
 def _is_place(seen: Seen | None, most: float) -> bool:

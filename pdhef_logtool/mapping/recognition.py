@@ -377,7 +377,7 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
         if fields and (topic in others or has_path(fields, RAW_COURSE)):
             signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
-            signals = named_gnss(draft.log, topic, draft.signals.get("speed_m_s")) if by_name else signals
+            signals = named_gnss(draft.log, topic, draft.signals) if by_name else signals
             if signals:
                 yield signals
 
@@ -447,13 +447,12 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"] | _TOPICS["estimate"])]
     if "yaw_rate_rad_s" not in draft.signals:
-        odometries = [t for t in twists if _type(t) in BODY_TWIST_TYPES and not _is_truth(t)]
-        odometries = [t for t in odometries if _words(t.name) & _TOPICS["vehicle"]]
+        odometries = [t for t in twists if not _is_truth(t) and _words(t.name) & _TOPICS["vehicle"]]
         odometries = [t for t in odometries if _span(draft.values(t.name, _twist(t, "angular", "z"))) > 0.0]
         chosen = draft.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
         if chosen is not None:
             draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
-            draft.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
+            draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
     if not draft.signals or has_speed(draft.signals):
         return
     _speed_of_navigation(draft, topics)
