@@ -21,7 +21,16 @@ from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import COUNTING, STATES, UNIT_TEXTS, UNITS, Meaning, is_command, meaning_among, words_of
+from pdhef_logtool.mapping.naming import (
+    COUNTING,
+    STATES,
+    UNIT_TEXTS,
+    VOCABULARY,
+    Meaning,
+    is_command,
+    meaning_among,
+    words_of,
+)
 from pdhef_logtool.mapping.proposals import MOST_PROPOSED, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
@@ -47,26 +56,16 @@ MOST_READ = 160
 #: Candidates with a lower score are listed as comments only.
 LEAST_SCORE = 0.45
 
-#: Possible factors of a field without a unit, by kind of unit; the conventional one is first.
-SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
-ANGLES = (("rad", 1.0), ("deg", math.radians(1.0)))
+#: Possible units of a field without one, with their factors, by quantity; the conventional one is first.
 HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
-    "acceleration": (("m/s²", 1.0), ("g", UNITS["acceleration"]["g"]), ("mg", UNITS["acceleration"]["mg"])),
-    "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
-    **dict.fromkeys(("steering", "sideslip", "heading"), ANGLES),
-    **dict.fromkeys(("speed", "velocity", "wheel speed"), SPEEDS),
-    "wheel rate": (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0)),
-    **dict.fromkeys(("latitude", "longitude"), (("deg", 1.0),)),
+    quantity: tuple(units.items()) for quantity, units in VOCABULARY["possible_units"].items()
 }
-#: Strength of the meaning of a field that only the drive gives, and least strength of a name.
-PROPOSED, LEAST_NAMED = 0.55, 0.6
 #: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
-MOST = {
-    "acceleration": 80.0, "rate": 9.0, "steering": 16.0, "sideslip": math.pi, "heading": 6.6, "speed": 110.0, "velocity": 60.0,
-    "wheel speed": 130.0, "wheel rate": 400.0, "latitude": 90.0, "longitude": 180.0,
-}  # fmt: skip
+MOST: dict[str, float] = VOCABULARY["largest"]
 #: The same where no other unit is possible: five turns of a truck's steering wheel, in degrees.
 MOST_OTHERWISE = {**MOST, "steering": 32.0}
+#: Strength of the meaning of a field that only the drive gives, and least strength of a name.
+PROPOSED, LEAST_NAMED = 0.55, 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,29 +219,26 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     return results
 
 
-def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> list[Named]:
-    """Return the fields without a usable name that only one assignment of the drive's motion explains."""
+def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> Iterator[Named]:
+    """Yield the fields without a usable name that the drive's motion explains, if no name gives a quantity of motion."""
     if {"speed", "rate", "acceleration", "steering"} & {n[3].quantity for n in named}:
-        return []
-    nameless = [
-        (topic, role, info)
-        for topic, role in topics
-        if role == "sensor"
-        for info in log.fields(topic.name, quiet=True)
-        if info.kind == "number" and all(len(w) == 1 or w.isdigit() or w in COUNTING for w in words_of(info.path))
-    ]
-    pieces, requests = Pieces(log), dict[str, list[str]]()
-    for topic, _, info in nameless[:MOST_PROPOSED]:
-        requests.setdefault(topic.name, []).append(info.path.removesuffix("[]"))
-    seen = {key: s for key, s in pieces.read(requests).items() if s.changes}
-    of_topic = {t.name: (t, role) for t, role, _ in nameless}
-    keys, results = [*seen], []
-    for place, quantity, part, unit in propose(pieces, [*seen.values()]):
-        topic_name, path = keys[place]
-        why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
+        return
+    sensors = {t.name: t for t, role in topics if role == "sensor"}
+    requests = {
+        name: [
+            f.path.removesuffix("[]")
+            for f in log.fields(name, quiet=True)
+            if f.kind == "number" and all(len(w) == 1 or w.isdigit() or w in COUNTING for w in words_of(f.path))
+        ][:MOST_PROPOSED]
+        for name in sensors
+    }
+    pieces = Pieces(log)
+    seen = pieces.read({name: paths for name, paths in requests.items() if paths})
+    keys, why = [*seen], "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
+    for place, (quantity, part, unit) in propose(pieces, [*seen.values()]).items():
+        topic, path = keys[place]
         meaning = Meaning(quantity, part, PROPOSED, unit, dict(HYPOTHESES[quantity]).get(unit), why)
-        results.append((*of_topic[topic_name], FieldInfo(path, "number"), meaning, False))
-    return results
+        yield sensors[topic], "sensor", FieldInfo(path, "number"), meaning, False
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 
 from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
 from pdhef_logtool.mapping.evidence import CELL_NS, Fit, Pieces, fit, ratio, spread
-from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
 
@@ -31,13 +31,6 @@ _HALF = 5
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
 SAME, BY_DRIVING = 0.03, 0.15
-#: Usual mountings by the axis that gravity shows as upward: parts of the car's axes with their signs, by axis.
-MOUNTED: dict[str, dict[str, tuple[str, float]]] = {
-    "+z": {}, "+x": {}, "-x": {}, "-z": {"y": ("y", -1.0), "z": ("z", -1.0)},
-    "+y": {"x": ("y", -1.0), "y": ("z", 1.0), "z": ("x", -1.0)},
-    "-y": {"x": ("y", -1.0), "y": ("z", -1.0), "z": ("x", 1.0)},
-}  # fmt: skip
-USUAL = {"-z": "forward, right, down", "+y": "a phone in a holder", "-y": "a camera, or in g a phone that gives gravity"}
 #: Share of the mean acceleration that is along one axis.
 UPRIGHT = 0.9
 #: Probability at which a unit counts as known.
@@ -234,16 +227,18 @@ def _by_gravity(fields: Fields) -> None:
 
 
 def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
-    """Turn an inertial sensor's axes to the car's by the usual mounting for this axis upward; the drive checks it."""
+    """Turn an inertial sensor's axes to the car's by the usual mounting for this axis upward; the drive checks it.
+
+    Phones that give accelerations in g give gravity, not the force against it.
+    """
     device, is_negated = axes["x"], up == "-y" and axes["x"].factors[0][0] == "g"
+    usual = VOCABULARY["mountings"].get("+y" if is_negated else up, {})
     rates = [f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and _are_near(f, device)]
-    for item in (*axes.values(), *rates):
-        part, sign = MOUNTED["+y" if is_negated else up].get(item.meaning.part, (item.meaning.part, 1.0))
-        if item.fixed or item.is_downward or (part, sign) == (item.meaning.part, 1.0):
-            continue
+    for item in (f for f in (*axes.values(), *rates) if f.meaning.part in usual and not (f.fixed or f.is_downward)):
+        part, sign = usual[item.meaning.part]
         item.meaning = replace(item.meaning, part=part)
         item.sign = -sign if is_negated and item.meaning.quantity == "acceleration" else sign
-        item.reasons.append(f"gravity is along {up} of its device: {USUAL[up]}")
+        item.reasons.append(f"gravity is along {up} of its device, {usual['text']}")
 
 
 def _are_near(first: Field, second: Field) -> bool:
