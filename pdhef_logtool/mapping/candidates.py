@@ -107,6 +107,7 @@ class Field:
     unit_known : its unit is certain. anchor : the mapping already contains it. sign : sign of the scale.
     sign_path : path of the field that contains its sign.
     is_weak : its values cannot identify the quantity, so that it is never taken.
+    is_turned : its axis and sign are those of a usual mounting.
     """
 
     topic: TopicInfo
@@ -126,6 +127,7 @@ class Field:
     doubts: list[str] = field(default_factory=list)
     offset: float = 0.0
     is_weak: bool = False
+    is_turned: bool = False
     sign_path: str = ""
 
     @property
@@ -157,7 +159,8 @@ class Field:
     def is_axis(self) -> bool:
         """Return whether its name is an axis letter; the direction of the axis then depends on the mounting."""
         leaf_words = words_of(self.path.rpartition(".")[2])
-        return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words) and self.meaning.strength != PROPOSED
+        is_guess = self.is_turned or self.meaning.strength == PROPOSED
+        return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words) and not is_guess
 
     @property
     def is_downward(self) -> bool:

@@ -31,8 +31,8 @@ _HALF = 5
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
 SAME, BY_DRIVING = 0.03, 0.15
-#: Share of the mean acceleration that is along one axis.
-UPRIGHT = 0.9
+#: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
+UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
 CERTAIN = 0.9
 #: Energies of rare units.
@@ -222,7 +222,8 @@ def _by_gravity(fields: Fields) -> None:
             for item in axes.values() if size > 0.0 else ():
                 settle((item,), [Gain((1,), size / G_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
             up = max(means, key=lambda axis: abs(means[axis]))
-            if len(means) > 1 and abs(means[up]) > UPRIGHT * size > 0.0:
+            is_gravity = abs(size * axes["z"].scale / G_M_S2 - 1.0) < NEAR_1_G and abs(means[up]) > UPRIGHT * size
+            if len(means) > 1 and is_gravity:
                 _turn(fields, axes, f"{'-' if means[up] < 0.0 else '+'}{up}")
 
 
@@ -236,9 +237,9 @@ def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
     rates = [f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and _are_near(f, device)]
     for item in (f for f in (*axes.values(), *rates) if f.meaning.part in usual and not (f.fixed or f.is_downward)):
         part, sign = usual[item.meaning.part]
-        item.meaning = replace(item.meaning, part=part)
+        item.meaning, item.is_turned = replace(item.meaning, part=part), True
         item.sign = -sign if is_negated and item.meaning.quantity == "acceleration" else sign
-        item.reasons.append(f"gravity is along {up} of its device, {usual['text']}")
+        item.doubts.append(f"gravity is along {up} of its device, read as that of {usual['text']}")
 
 
 def _are_near(first: Field, second: Field) -> bool:

@@ -181,7 +181,11 @@ def _with_wheel(leaf: str, beside: Collection[str]) -> str:
         code = place[0].lower()
         for wheels in _WHEEL_CODES:
             partner = wheels[wheels.index(code) ^ 1] if code in wheels else ""
-            if partner and place[0] != leaf and f"{leaf[: place.start()]}{partner}{leaf[place.end() :]}".lower() in beside:
+            if (
+                partner
+                and place[0] != leaf
+                and f"{leaf[: place.start()]}{partner}{leaf[place.end() :]}".lower() in beside
+            ):
                 wheel = WHEELS[wheels.index(code)]
                 return f"{leaf[: place.start()]}_wheel_{wheel}_{leaf[place.end() :]}".strip("_")
     return leaf

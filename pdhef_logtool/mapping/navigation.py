@@ -276,13 +276,14 @@ class _Instrument:
         """
         if self.has_place:
             return _off(self.seen[path], self.course, scale, angle) < NEAR_RAD
-        is_course = self.meanings[path].quantity == "course"
-        is_course |= bool(_RECEIVERS & {*words_of(path), *words_of(self.topic)})
+        is_receiver = bool(_RECEIVERS & {*words_of(path), *words_of(self.topic)})
+        is_course = is_receiver or self.meanings[path].quantity == "course"
         if self.yaw_rate is None or speed not in self.seen or not is_course:
             return False
         pieces, _, (rate, *_) = _read(self.log, [self.yaw_rate])
         moving = self.seen[speed].cells * (self.meanings[speed].scale or 1.0) > MOVING_M_S
-        return turns(pieces, np.where(moving, scale * self.seen[path].cells, np.nan), rate.si) != 0.0
+        sense = turns(pieces, np.where(moving, scale * self.seen[path].cells, np.nan), rate.si)
+        return sense != 0.0 if is_receiver else sense > 0.0
 
     @property
     def over_ground(self) -> list[SignalSource]:
@@ -416,7 +417,11 @@ def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
 def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
     """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
     relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
-    if relation is None or abs(relation.correlation) <= CLEAR or not SAME_STEPS[0] < abs(relation.slope) < SAME_STEPS[1]:
+    if (
+        relation is None
+        or abs(relation.correlation) <= CLEAR
+        or not SAME_STEPS[0] < abs(relation.slope) < SAME_STEPS[1]
+    ):
         return 0.0
     return math.copysign(1.0, relation.slope)
 
