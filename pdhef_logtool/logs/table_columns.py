@@ -52,21 +52,7 @@ _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS_NS}
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 #: Letters in ASCII.
-LATIN = str.maketrans(
-    {
-        "ä": "ae",
-        "ö": "oe",
-        "ü": "ue",
-        "Ä": "Ae",
-        "Ö": "Oe",
-        "Ü": "Ue",
-        "ß": "ss",
-        "ł": "l",
-        "æ": "ae",
-        "ø": "oe",
-        "ı": "i",
-    }
-)
+LATIN = str.maketrans(CONSTANTS["latin"])
 
 #: Words of titles in other alphabets, and their English.
 _TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]

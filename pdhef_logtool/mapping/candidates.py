@@ -223,7 +223,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 
 
 def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> Iterator[Named]:
-    """Yield the fields without a usable name that the drive's motion explains, if no name gives a quantity of motion."""
+    """Yield the fields without a usable name that the drive's motion explains, if no name gives a quantity."""
     if {"speed", "rate", "acceleration", "steering"} & {n[3].quantity for n in named}:
         return
     sensors = {t.name: t for t, role in topics if role == "sensor"}

@@ -313,8 +313,8 @@ def named_gnss(
 ) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    ``signals`` are mapped already. A velocity must agree with the path, if there is one. A heading that is the direction
-    of the path is a course.
+    ``signals`` are mapped already. A velocity must agree with the path, if there is one. A heading that is the
+    direction of the path is a course.
     """
     its = _Instrument(log, topic, signals)
     if len(its.places) < len(_PLACES):

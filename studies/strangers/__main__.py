@@ -33,9 +33,10 @@ FIRST_RUNS = {
     "unseen": "layouts of documented tables and ROS messages were built last, and scored once",
     "trackside": "layouts of track modes, cameras, simulators and receivers were built last, and scored once",
     "vendors": "layouts of race loggers, INS, phones, data frames and ROS tables were built last, and scored once",
-    "later": "layouts of loggers, buses and exports in five languages were built after the causes were corrected, and "
-    "scored once",
+    "later": "layouts of loggers, buses and exports in five languages were built later, and scored once",
     "fresh": "layouts of 16 tables and buses and 10 ROS logs were built after that, and scored once",
+    "workshops": "layouts of 36 tables and buses and 9 ROS logs were built after that, and scored once",
+    "strange": "layouts of 16 tables and buses and 4 ROS logs were built after corrections, and scored once",
     "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",
