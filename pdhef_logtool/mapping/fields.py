@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
+from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, place_of, triad_of
 from pdhef_logtool.mapping.evidence import CELL_NS, Fit, Pieces, fit, ratio, spread
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
 from pdhef_logtool.records.geometry import DEGREE_M
@@ -233,18 +233,14 @@ def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
     """
     device, is_negated = axes["x"], up == "-y" and axes["x"].factors[0][0] == "g"
     usual = VOCABULARY["mountings"].get("+y" if is_negated else up, {})
-    rates = [f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and _are_near(f, device)]
+    rates = [
+        f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and place_of(f) == place_of(device)
+    ]
     for item in (f for f in (*axes.values(), *rates) if f.meaning.part in usual and not (f.fixed or f.is_downward)):
         part, sign = usual[item.meaning.part]
         item.meaning, item.is_turned = replace(item.meaning, part=part), True
         item.sign = -sign if is_negated and item.meaning.quantity == "acceleration" else sign
         item.doubts.append(f"gravity is along {up} of its device, read as that of {usual['text']}")
-
-
-def _are_near(first: Field, second: Field) -> bool:
-    """Return whether two fields belong to one device: a struct, or neighbouring topics."""
-    places = [f.topic.name.rpartition("/")[0] or leaf_group(f) for f in (first, second)]
-    return places[0] == places[1]
 
 
 def _speeds(fields: Fields) -> None:

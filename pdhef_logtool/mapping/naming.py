@@ -253,7 +253,7 @@ def _with_unit(
 ) -> Meaning | None:
     """Return the meaning with the unit from the leaf or its struct (``names``); None for a rotational speed."""
     name, part, kind = quantity
-    corner = _corner(inner, ())
+    corner = corner_of(inner)
     if name == "speed" and corner:
         name, part = "wheel speed", corner
     if name == "speed" and unit_of(names[0], "wheel rate")[0]:
@@ -294,12 +294,12 @@ def _quantity(
     axis = next((_AXES[w] for w in (*reversed(leaf_words), *reversed(words)) if w in _AXES), "")
     if not axis and index is not None and index < 3:
         axis = "xyz"[index]
-    corner = _corner(words, leaf_words)
+    corner = corner_of(words, leaf_words)
     leaf = set(leaf_words)
     tokens = {*words, *(f".{w}" for w in leaf), f".{'_'.join(leaf_words[-2:])}", f"={'_'.join(leaf_words)}", f"@{axis}"}
     flags = {
         "@corner": bool(corner),
-        "@any_corner": bool(_corner(tuple(set(words)), ())),
+        "@any_corner": bool(corner_of(tuple(set(words)))),
         "@index": index is not None,
         "@around": strength < 1.0,
         "@delta": "delta" in leaf <= _WORDS["of_delta"],
@@ -320,7 +320,8 @@ def _quantity(
     return name, {"@axis": axis, "@corner": corner}.get(part, part), kind
 
 
-def _corner(words: tuple[str, ...], leaf_words: tuple[str, ...]) -> str:
+def corner_of(words: tuple[str, ...], leaf_words: tuple[str, ...] = ()) -> str:
+    """Return the wheel (fl, fr, rl, rr) in the words of a name, of the leaf first; empty without one."""
     for group in (leaf_words, words):
         for word in group:
             if word in _CORNERS:
@@ -334,8 +335,3 @@ def _corner(words: tuple[str, ...], leaf_words: tuple[str, ...]) -> str:
         if all(len(end) == 1 for end in letters):
             return "".join(letters)
     return ""
-
-
-def corner_of(words: tuple[str, ...]) -> str:
-    """Return the wheel (fl, fr, rl, rr) in a list of words; empty without one."""
-    return _corner(words, words)

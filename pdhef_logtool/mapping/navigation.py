@@ -23,7 +23,7 @@ from pdhef_logtool.mapping.candidates import Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
-from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.naming import VOCABULARY, meaning_of, unit_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
@@ -36,16 +36,12 @@ NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 _PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
 #: Largest plausible extent of a log.
 WIDEST_DEG = 10.0
-_SIDES = {
-    "north": "n", "n": "n", "vn": "n", "veln": "n", "east": "e", "e": "e", "ve": "e", "vele": "e",
-    "up": "u", "u": "u", "vu": "u", "velu": "u", "down": "d", "d": "d", "vd": "d", "veld": "d",
-}  # fmt: skip
+_SIDES = {word: side for side, words in VOCABULARY["sides"].items() for word in words.split()}
 #: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
-_CONVENTIONS = (
-    ("degrees clockwise from north", -math.radians(1.0), math.pi / 2.0),
-    ("radians clockwise from north", -1.0, math.pi / 2.0),
-    ("degrees counter-clockwise from east", math.radians(1.0), 0.0),
-    ("radians counter-clockwise from east", 1.0, 0.0),
+_CONVENTIONS = tuple(
+    (f"{unit} {sense}", sign * factor, angle)
+    for sense, sign, angle in (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
+    for unit, factor in (("degrees", math.radians(1.0)), ("radians", 1.0))
 )
 #: Tolerance of the ratio of a velocity to the speed from positions; speed over ground over that along the path if the
 #: axes are the earth's; share of the time that a body moves ahead.
@@ -334,11 +330,13 @@ def named_gnss(
 def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
     speed = next((p for p, m in its.meanings.items() if m.quantity == "speed" and m.scale is not None), None)
-    for path, meaning in its.angles.items() if speed is not None else ():
+    if speed is None:
+        return
+    for path, meaning in its.angles.items():
         # A course over ground is clockwise from north by definition; the drive confirms this and determines the unit.
         fitting = [c[1:] for c in _CONVENTIONS[:2] if meaning.scale is None or math.isclose(-c[1], meaning.scale)]
         fitting = [c for c in fitting if path in its.seen and its.follows(path, speed, *c)]
-        if fitting and speed is not None:
+        if fitting:
             yield its.source("gnss_course_rad", path, *fitting[0])
             yield its.source("gnss_speed_m_s", speed, its.meanings[speed].scale or 1.0)
             return

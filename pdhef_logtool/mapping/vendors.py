@@ -106,7 +106,8 @@ class VendorField:
 
 def meaning_of_signal(name: str) -> Meaning:
     """Return the meaning of a signal or ground-truth quantity."""
-    return Meaning(*_QUANTITIES.get(name, ("", "")), 1.0, "", 1.0, "its type is documented")
+    quantity, part = _QUANTITIES.get(name, ("", ""))
+    return Meaning(quantity, part, 1.0, "", 1.0, "its type is documented")
 
 
 def names_of(quantity: str, part: str, among: Iterable[str] = SIGNAL_UNITS) -> tuple[str, ...]:

@@ -57,6 +57,8 @@ _SENSORS = (
     ("speed_m_s", "speed", ("", "x")), ("ax_m_s2", "acceleration", ("x",)), ("ay_m_s2", "acceleration", ("y",)),
     ("yaw_rate_rad_s", "rate", ("z",)),
 )  # fmt: skip
+#: Least correlation of a yaw rate about the right axis.
+FOLLOWS = 0.5
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -158,6 +160,7 @@ class Weighing:
         for name, quantity, part in _SENSORS:
             if name not in have and not (wheels and quantity == "speed"):
                 self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
+        self._turn_about()
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
@@ -210,6 +213,19 @@ class Weighing:
         self.taken[name] = best
         if rivals:
             self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
+
+    def _turn_about(self) -> None:
+        """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's."""
+        rate, ay, speed = self.taken.get("yaw_rate_rad_s"), self._chosen("ay_m_s2"), self._speed()
+        if rate is None or ay is None or speed is None or rate.fixed or not rate.is_axis or ay.is_axis:
+            return
+        rates = [f for f in self.fields.candidates if f.meaning.quantity == "rate" and triad_of(f) == triad_of(rate)]
+        fits = [(abs(r.correlation), r.slope, f) for f in rates if (r := self.fields.turning(ay.si, f.si, speed.si))]
+        surest, slope, best = max(fits, key=lambda f: f[0], default=(0.0, 1.0, rate))
+        if best is not rate and surest > 0.9 and all(c < FOLLOWS for c, _, f in fits if f is rate):
+            best.sign = math.copysign(1.0, slope)
+            self.taken["yaw_rate_rad_s"] = best
+            self.notes.append(f"yaw_rate_rad_s is {best.path} of {best.topic.name}, with its sign: it follows a_y / v")
 
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
