@@ -9,7 +9,6 @@ A source that also has a heading (two antennas, INS) or sideslip is ground truth
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -18,12 +17,11 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.candidates import Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
-from pdhef_logtool.mapping.naming import VOCABULARY, meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.naming import Meaning, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
@@ -36,7 +34,6 @@ NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 _PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
 #: Largest plausible extent of a log.
 WIDEST_DEG = 10.0
-_SIDES = {word: side for side, words in VOCABULARY["sides"].items() for word in words.split()}
 #: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
 _CONVENTIONS = tuple(
     (f"{unit} {sense}", sign * factor, angle)
@@ -230,7 +227,7 @@ class _Instrument:
             self.meanings |= units
         first = {m.quantity: path for path, m in reversed(self.meanings.items())}
         self.places = {name: self.source(name, first[q]) for name, q in _PLACES.items() if q in first}
-        self.velocities = [*_horizontal(self.fields)]
+        self.velocities = [*_horizontal(self.meanings)]
         angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
         self.angles = {path: meaning for meaning, path in angles}
 
@@ -287,7 +284,7 @@ class _Instrument:
         if not self.velocities:
             return []
         paths = [self.velocities[0][side] for side in "en"]
-        unit = unit_of(paths[1].rpartition(".")[2], "speed")[1] or 1.0
+        unit = self.meanings[paths[1]].scale or 1.0
         return [self.source(name, path, unit) for name, path in zip((_EAST, _NORTH), paths, strict=True)]
 
 
@@ -368,38 +365,19 @@ def _enu_velocities(its: _Instrument) -> Iterator[SignalSource]:
     for paths_of in its.velocities:
         if vertical := next((s for s in "ud" if s in paths_of), ""):
             paths = (paths_of["e"], paths_of["n"], paths_of[vertical])
-            factor = unit_of(paths[0].rpartition(".")[2], "speed")[1] or 1.0
+            factor = its.meanings[paths[0]].scale or 1.0
             scale = (factor, factor, factor if vertical == "u" else -factor)
             yield SignalSource("enu_velocity_m_s", its.topic, paths, its.stamp, scale)
             return
 
 
-def _horizontal(fields: tuple[FieldInfo, ...]) -> Iterator[dict[str, str]]:
-    """Yield by struct the paths of a velocity with at least north and east, by direction."""
+def _horizontal(meanings: Mapping[str, Meaning]) -> Iterator[dict[str, str]]:
+    """Yield by struct the paths of a velocity over ground with at least north and east, by direction."""
     structs: dict[str, dict[str, str]] = {}
-    for info in fields:
-        prefix, _, leaf = info.path.rpartition(".")
-        if info.kind == "number" and "ecef" not in info.path.lower() and (side := side_of(prefix, leaf)):
-            structs.setdefault(prefix, {}).setdefault(side, info.path)
+    for path, meaning in meanings.items():
+        if meaning.quantity == "over ground":
+            structs.setdefault(path.rpartition(".")[0], {}).setdefault(meaning.part, path)
     yield from (paths_of for paths_of in structs.values() if {"n", "e"} <= set(paths_of))
-
-
-def side_of(struct: str, leaf: str) -> str:
-    """Return the direction (n, e, u, d) of a velocity component by its name; empty for other fields."""
-    words = words_of(leaf)
-    short = "".join(words)
-    side = next((_SIDES[w] for w in (*words, short) if w in _SIDES and len(w) > 1), "")
-    side = side or (_SIDES[words[-1]] if len(words) > 1 and words[-1] in "neud" else "")
-    if {"std", "stddev", "stdev", "var", "cov", "accuracy", "sigma", "acc"} & set(words):
-        return ""
-    frame = next((f for f in ("ned", "enu") if f in words and words[-1] in {*"xyz"}), "")
-    side = {"x": frame[:1], "y": frame[1:2], "z": frame[2:]}[words[-1]] if frame else side
-    is_speed = (
-        {"velocity", "vel", "speed"} & {*words, *words_of(struct)}
-        or re.fullmatch("(v|vel)[neud]", short)
-        or words[:1] == ("v",)
-    )
-    return side if is_speed else ""
 
 
 def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
