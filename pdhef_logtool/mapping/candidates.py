@@ -408,7 +408,12 @@ def triad_of(item: Field) -> str:
     return f"{item.topic.name}.{struct or '_'.join(w.rstrip('xyz') for w in words_of(leaf))}"
 
 
-def place_of(item: Field) -> str | tuple[str, str]:
-    """Return where a device is: the topic without its last element, otherwise topic and innermost-but-one struct."""
+def leaf_group(item: Field) -> tuple[str, str]:
+    """Return topic and innermost-but-one struct, which accelerations and rates of one IMU share."""
     parts = item.path.split(".")
-    return item.topic.name.rpartition("/")[0] or (item.topic.name, ".".join(parts[: max(0, len(parts) - 2)]))
+    return item.topic.name, ".".join(parts[: max(0, len(parts) - 2)])
+
+
+def place_of(item: Field) -> str | tuple[str, str]:
+    """Return where a device is: the topic without its last element, or :func:`leaf_group`."""
+    return item.topic.name.rpartition("/")[0] or leaf_group(item)

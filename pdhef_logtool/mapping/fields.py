@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, place_of, triad_of
+from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, place_of, triad_of
 from pdhef_logtool.mapping.evidence import CELL_NS, Fit, Pieces, fit, ratio, spread
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
 from pdhef_logtool.records.geometry import DEGREE_M
@@ -205,6 +205,7 @@ def decide_units(fields: Fields) -> None:
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
+    _by_siblings(fields)
 
 
 def _by_gravity(fields: Fields) -> None:
@@ -274,3 +275,16 @@ def _by_turning(fields: Fields) -> None:
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
         if relation is not None and abs(relation.correlation) > CLEAR:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
+
+
+def _by_siblings(fields: Fields) -> None:
+    """Use the unit of other accelerations, or velocities, of the same message."""
+    for kinds in ({"acceleration"}, {"speed", "velocity"}):
+        settled = {leaf_group(f): f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known}
+        mine = (f for f in fields.candidates if f.meaning.quantity in kinds and f.meaning.strength > 0.6)
+        for item in [f for f in mine if not f.unit_known and leaf_group(f) in settled]:
+            other = settled[leaf_group(item)]
+            same = [u for u, s in item.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
+            if same:
+                item.use(same[0])
+                item.reasons.append(f"unit {same[0]} as of {other.path}")

@@ -28,9 +28,11 @@ _WHEELS = {f"wheel_speed_{w}_{u}": [q, w] for w in WHEELS for u, q in (("m_s", "
 _QUANTITIES: dict[str, list[str]] = {**VOCABULARY["signals"], **_WHEELS}
 
 
-class _FieldTable(BaseModel):
+class _Entry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
+
+class _FieldTable(_Entry):
     field: Annotated[str, Field(min_length=1)] | list[str]
     signal: str = ""
     truth: str = ""
@@ -55,9 +57,7 @@ class _FieldTable(BaseModel):
         return self
 
 
-class _TypeTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
-
+class _TypeTable(_Entry):
     type: list[str]
     vendor: str
     page: str
@@ -68,9 +68,7 @@ class _TypeTable(BaseModel):
     fields: list[_FieldTable]
 
 
-class _ReceiverTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
-
+class _ReceiverTable(_Entry):
     message: str
     page: str
     has: list[str]

@@ -94,7 +94,7 @@ def weigh(
     signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
     """
     named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
-    if not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
+    if log.end_ns > log.start_ns and not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
         named += proposed_fields(log, topics, named)
     wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
     if not wanted:
