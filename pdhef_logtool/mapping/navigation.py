@@ -52,7 +52,6 @@ NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative:
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
 #: Words of receivers, whose heading without positions is a course.
 _RECEIVERS = frozenset({"gps", "gnss", "vbox"})
-NO_SIGNALS: Mapping[str, SignalSource] = {}
 #: Ground truth with one of these contains a heading, or motion that needs one.
 HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
 #: Course of a single antenna in addition to a heading from two antennas: a sensor, even of a ground-truth instrument.
@@ -215,7 +214,7 @@ class _Instrument:
     ``signals``: mapped already, among them a speed with a unit that the drive shows.
     """
 
-    def __init__(self, log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource] = NO_SIGNALS) -> None:
+    def __init__(self, log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource]) -> None:
         self.log, self.topic, self.fields = log, topic.name, log.fields(topic.name, quiet=True)
         self.yaw_rate, mapped = signals.get("yaw_rate_rad_s"), signals.get("speed_m_s")
         self.stamp = stamp_path_of(self.fields)
@@ -296,14 +295,12 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
     topics : of navigation systems and references with undocumented types.
     whole : whether only a velocity with a heading counts.
     """
-    truths = [truth for t in topics if (truth := _truth_of(_Instrument(log, t))) is not None]
+    truths = [truth for t in topics if (truth := _truth_of(_Instrument(log, t, {}))) is not None]
     truths = [t for t in truths if not whole or {"enu_velocity_m_s", "yaw_rad"} <= set(t[0])]
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
-def named_gnss(
-    log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource] = NO_SIGNALS
-) -> dict[str, SignalSource]:
+def named_gnss(log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
     ``signals`` are mapped already. A velocity must agree with the path, if there is one. A heading that is the

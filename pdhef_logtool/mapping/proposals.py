@@ -12,13 +12,12 @@ from pdhef_logtool.mapping.evidence import Pieces, Seen, fit
 from pdhef_logtool.mapping.naming import VOCABULARY
 from pdhef_logtool.records.signals import FloatArray
 
-#: Most columns that are compared.
-MOST_PROPOSED = 24
 #: Quantities and parts that a proposal consists of, and the range of the largest value of each in a drive, SI.
 _QUANTITIES = (("speed", "x"), ("acceleration", "x"), ("acceleration", "y"), ("rate", "z"))
 _LARGEST = {"speed": (4.0, 90.0), "acceleration": (0.7, 16.0), "rate": (0.04, 2.5)}
-#: Least correlation of a relation; 1-sigma of the logarithm of its gain; how much surer the best proposal must be.
-LEAST, SIGMA, MARGIN = 0.8, 0.15, 1.0
+#: Most columns that are compared; least correlation of a relation; 1-sigma of the logarithm of its gain; how much surer
+#: the best proposal must be.
+MOST_PROPOSED, LEAST, SIGMA, MARGIN = 24, 0.8, 0.15, 1.0
 
 
 def propose(pieces: Pieces, columns: Sequence[Seen]) -> dict[int, tuple[str, str, str]]:
