@@ -52,7 +52,7 @@ _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS_NS}
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 #: Letters in ASCII.
-LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ł": "l"})
+LATIN = str.maketrans(CONSTANTS["latin"])
 
 #: Words of titles in other alphabets, and their English.
 _TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
@@ -67,7 +67,7 @@ _WEEK_TIME = re.compile(
 _SECOND_NS = TIME_UNITS_NS["seconds"]
 #: Columns of a table in long form, with a row for each value.
 _SIGNAL = re.compile(
-    r"(?:signal|channel|variable|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
+    r"(?:signal|channel|variable|field|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
 )
 _VALUE = re.compile(r"(?:physical_|signal_|phys_|telemetry_|metric_)?(?:value|val|wert)")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")

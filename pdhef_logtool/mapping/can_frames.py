@@ -32,6 +32,7 @@ from pdhef_logtool.logs.can_decoding import (
 )
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.mapping.naming import VOCABULARY
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.errors import MappingError
@@ -40,13 +41,8 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
 
-# Names of the fields of a frame, best first; names are compared in lower case without underscores.
-ID_NAMES = ("id", "canid", "arbitrationid", "address", "identifier", "frameid", "msgid", "messageid")
-DATA_NAMES = ("data", "payload", "dat", "bytes")
-LENGTH_NAMES = ("dlc", "len", "length", "datalength", "size")
-EXTENDED_NAMES = ("isextended", "isextendedid", "extended", "ide", "iseff")
-ERROR_NAMES = ("iserror", "iserrorframe", "errorframe", "error")
-REMOTE_NAMES = ("isrtr", "isremote", "isremoteframe", "remoteframe", "rtr", "remote")
+#: Names of the fields of a frame, best first, by part; names are compared in lower case without underscores.
+NAMES = {part: tuple(names.split()) for part, names in VOCABULARY["can_fields"].items()}
 
 #: Flags that SocketCAN and DBC files keep above the 29 bits of an identifier.
 EXTENDED_FLAG = 1 << 31
@@ -383,8 +379,8 @@ def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSetting
         return matches[0] if matches else None
 
     numbers = ("number", "bool")
-    identifier = find(ID_NAMES, settings.id_field, "id_field", ("number",))
-    data = find(DATA_NAMES, settings.data_field, "data_field", ("array", "string"))
+    identifier = find(NAMES["id"], settings.id_field, "id_field", ("number",))
+    data = find(NAMES["data"], settings.data_field, "data_field", ("array", "string"))
     for path, what, entry in ((identifier, "identifier", "id_field"), (data, "data", "data_field")):
         if path is None:
             problems.append(f"{topic} has no field that is known as a frame's {what}: name it in [can] {entry}")
@@ -392,9 +388,9 @@ def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSetting
         data += f"|{settings.data_encoding}"
     elif data is not None and kinds.get(data) == "string":
         problems.append(f'{topic}.{data} is a text: set [can] data_encoding = "hex" or "base64"')
-    length = find(LENGTH_NAMES, settings.length_field, "length_field", ("number",))
-    extended = find(EXTENDED_NAMES, settings.extended_field, "extended_field", numbers)
-    flags = [_best([p for p, k in kinds.items() if k in numbers], n) for n in (ERROR_NAMES, REMOTE_NAMES)]
+    length = find(NAMES["length"], settings.length_field, "length_field", ("number",))
+    extended = find(NAMES["extended"], settings.extended_field, "extended_field", numbers)
+    flags = [_best([p for p, k in kinds.items() if k in numbers], n) for n in (NAMES["error"], NAMES["remote"])]
     if problems or identifier is None or data is None:
         return "; ".join(problems)
     no_data = tuple(p for matches in flags for p in matches)

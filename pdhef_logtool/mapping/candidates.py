@@ -21,7 +21,17 @@ from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import STATES, UNIT_TEXTS, UNITS, Meaning, is_command, meaning_among, words_of
+from pdhef_logtool.mapping.naming import (
+    COUNTING,
+    STATES,
+    UNIT_TEXTS,
+    VOCABULARY,
+    Meaning,
+    is_command,
+    meaning_among,
+    words_of,
+)
+from pdhef_logtool.mapping.proposals import MOST_PROPOSED, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
@@ -46,24 +56,16 @@ MOST_READ = 160
 #: Candidates with a lower score are listed as comments only.
 LEAST_SCORE = 0.45
 
-#: Possible factors of a field without a unit, by kind of unit; the conventional one is first.
-SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
-ANGLES = (("rad", 1.0), ("deg", math.radians(1.0)))
+#: Possible units of a field without one, with their factors, by quantity; the conventional one is first.
 HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
-    "acceleration": (("m/s²", 1.0), ("g", UNITS["acceleration"]["g"]), ("mg", UNITS["acceleration"]["mg"])),
-    "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
-    **dict.fromkeys(("steering", "sideslip"), ANGLES),
-    **dict.fromkeys(("speed", "velocity", "wheel speed"), SPEEDS),
-    "wheel rate": (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0)),
-    **dict.fromkeys(("latitude", "longitude"), (("deg", 1.0),)),
+    quantity: tuple(units.items()) for quantity, units in VOCABULARY["possible_units"].items()
 }
 #: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
-MOST = {
-    "acceleration": 80.0, "rate": 9.0, "steering": 16.0, "sideslip": math.pi, "speed": 110.0, "velocity": 60.0,
-    "wheel speed": 130.0, "wheel rate": 400.0, "latitude": 90.0, "longitude": 180.0,
-}  # fmt: skip
+MOST: dict[str, float] = VOCABULARY["largest"]
 #: The same where no other unit is possible: five turns of a truck's steering wheel, in degrees.
 MOST_OTHERWISE = {**MOST, "steering": 32.0}
+#: Strength of the meaning of a field that only the drive gives, and least strength of a name.
+PROPOSED, LEAST_NAMED = 0.55, 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +107,7 @@ class Field:
     unit_known : its unit is certain. anchor : the mapping already contains it. sign : sign of the scale.
     sign_path : path of the field that contains its sign.
     is_weak : its values cannot identify the quantity, so that it is never taken.
+    is_turned : its axis and sign are those of a usual mounting.
     """
 
     topic: TopicInfo
@@ -124,6 +127,7 @@ class Field:
     doubts: list[str] = field(default_factory=list)
     offset: float = 0.0
     is_weak: bool = False
+    is_turned: bool = False
     sign_path: str = ""
 
     @property
@@ -155,7 +159,8 @@ class Field:
     def is_axis(self) -> bool:
         """Return whether its name is an axis letter; the direction of the axis then depends on the mounting."""
         leaf_words = words_of(self.path.rpartition(".")[2])
-        return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words)
+        is_guess = self.is_turned or self.meaning.strength == PROPOSED
+        return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words) and not is_guess
 
     @property
     def is_downward(self) -> bool:
@@ -215,6 +220,28 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
                 meaning = meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
+
+
+def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> Iterator[Named]:
+    """Yield the fields without a usable name that the drive's motion explains, if no name gives a quantity."""
+    if {"speed", "rate", "acceleration", "steering"} & {n[3].quantity for n in named}:
+        return
+    sensors = {t.name: t for t, role in topics if role == "sensor"}
+    requests = {
+        name: [
+            f.path.removesuffix("[]")
+            for f in log.fields(name, quiet=True)
+            if f.kind == "number" and all(len(w) == 1 or w.isdigit() or w in COUNTING for w in words_of(f.path))
+        ][:MOST_PROPOSED]
+        for name in sensors
+    }
+    pieces = Pieces(log)
+    seen = pieces.read({name: paths for name, paths in requests.items() if paths})
+    keys, why = [*seen], "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
+    for place, (quantity, part, unit) in propose(pieces, [*seen.values()]).items():
+        topic, path = keys[place]
+        meaning = Meaning(quantity, part, PROPOSED, unit, dict(HYPOTHESES[quantity]).get(unit), why)
+        yield sensors[topic], "sensor", FieldInfo(path, "number"), meaning, False
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
@@ -290,6 +317,8 @@ def _weighable(
         elif its.scale is not None:
             item.unit_known = True
             item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
+        if its.strength < LEAST_NAMED:
+            item.doubts.append("its values alone identify it")
         if _may_be_share(item):
             item.is_weak = _has_pedals_beside(item, fields)
             item.doubts.append("it may be a share of the largest angle, which needs a scale")
@@ -374,11 +403,17 @@ def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
 
 
 def triad_of(item: Field) -> str:
-    """Return the key shared by the three axes of a vector: topic and struct, or the name without the axis."""
-    return f"{item.topic.name}.{item.path.rpartition('.')[0] or item.path.rstrip('xyzXYZ0123[]_')}"
+    """Return the key shared by the three axes of a vector: topic and struct, or the words without the axis."""
+    struct, _, leaf = re.sub(r"\[\d+\]$", "", item.path).rpartition(".")
+    return f"{item.topic.name}.{struct or '_'.join(w.rstrip('xyz') for w in words_of(leaf))}"
 
 
 def leaf_group(item: Field) -> tuple[str, str]:
     """Return topic and innermost-but-one struct, which accelerations and rates of one IMU share."""
     parts = item.path.split(".")
     return item.topic.name, ".".join(parts[: max(0, len(parts) - 2)])
+
+
+def place_of(item: Field) -> str | tuple[str, str]:
+    """Return where a device is: the topic without its last element, or :func:`leaf_group`."""
+    return item.topic.name.rpartition("/")[0] or leaf_group(item)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.records.errors import PdhefError
@@ -136,12 +138,17 @@ class Pieces:
         busy = max(1, int(np.count_nonzero(count)))
         return cells, float(values.shape[0]) / (busy * CELL_NS * 1e-9)
 
-    def rate_of(self, cells: FloatArray) -> FloatArray:
-        """Return the time derivative of values on the grid [M], within each piece."""
+    def rate_of(self, cells: NDArray[Any]) -> NDArray[Any]:
+        """Return the time derivative of values on the grid [M], real or complex, within each piece."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
         out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_NS * 1e-9)
         return out.ravel()
+
+    def turning(self, direction: NDArray[np.complex128]) -> FloatArray:
+        """Return the rate at which a complex direction [M] turns, rad/s [M]."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray((self.rate_of(direction) / direction).imag)
 
     def smooth(self, cells: FloatArray) -> FloatArray:
         """Return the mean of five neighbouring cells [M], to match the bandwidth of :meth:`rate_of`."""

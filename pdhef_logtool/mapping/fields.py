@@ -8,14 +8,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
+from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, place_of, triad_of
 from pdhef_logtool.mapping.evidence import CELL_NS, Fit, Pieces, fit, ratio, spread
-from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
 
@@ -31,6 +31,8 @@ _HALF = 5
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
 SAME, BY_DRIVING = 0.03, 0.15
+#: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
+UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
 CERTAIN = 0.9
 #: Energies of rare units.
@@ -215,9 +217,31 @@ def _by_gravity(fields: Fields) -> None:
             groups[f"{triad_of(item)}.{item.path}"] = {"z": item}
     for axes in groups.values():
         if set(axes) in ({"z"}, set("xyz")):
-            size = float(np.linalg.norm([np.nanmean(f.seen.values) for f in axes.values()]))
+            means = {axis: float(np.nanmean(f.seen.values)) for axis, f in axes.items()}
+            size = math.hypot(*means.values())
             for item in axes.values() if size > 0.0 else ():
                 settle((item,), [Gain((1,), size / G_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
+            up = max(means, key=lambda axis: abs(means[axis]))
+            is_gravity = abs(size * axes["z"].scale / G_M_S2 - 1.0) < NEAR_1_G and abs(means[up]) > UPRIGHT * size
+            if len(means) > 1 and is_gravity:
+                _turn(fields, axes, f"{'-' if means[up] < 0.0 else '+'}{up}")
+
+
+def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
+    """Turn an inertial sensor's axes to the car's by the usual mounting for this axis upward; the drive checks it.
+
+    Phones that give accelerations in g give gravity, not the force against it.
+    """
+    device, is_negated = axes["x"], up == "-y" and axes["x"].factors[0][0] == "g"
+    usual = VOCABULARY["mountings"].get("+y" if is_negated else up, {})
+    rates = [
+        f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and place_of(f) == place_of(device)
+    ]
+    for item in (f for f in (*axes.values(), *rates) if f.meaning.part in usual and not (f.fixed or f.is_downward)):
+        part, sign = usual[item.meaning.part]
+        item.meaning, item.is_turned = replace(item.meaning, part=part), True
+        item.sign = -sign if is_negated and item.meaning.quantity == "acceleration" else sign
+        item.doubts.append(f"gravity is along {up} of its device, read as that of {usual['text']}")
 
 
 def _speeds(fields: Fields) -> None:

@@ -16,6 +16,7 @@ from typing import TypeAlias
 
 from pdhef_logtool.logs.table_columns import LATIN
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
+from pdhef_logtool.records.signals import WHEELS
 
 #: Size of the cache of meanings: the drives of a fleet have the same names.
 CACHED_NAMES = 8192
@@ -26,6 +27,7 @@ G_M_S2 = GRAVITY_M_S2
 VOCABULARY = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 #: Factors to SI by kind of quantity and word of a unit.
 UNITS: dict[str, dict[str, float]] = VOCABULARY["units"]
+_UNIT_WORDS = frozenset(word for words in UNITS.values() for word in words)
 #: Spelling of units in reports.
 UNIT_TEXTS: dict[str, str] = VOCABULARY["unit_texts"]
 #: Names of a struct, and the longer names that short ones have beside them.
@@ -34,8 +36,14 @@ _UNIT_PHRASES: tuple[tuple[str, str], ...] = tuple(VOCABULARY["unit_phrases"].it
 _SPELLED_UNITS = tuple((re.compile(pattern), sign) for pattern, sign in VOCABULARY["unit_parts"].items())
 _SYNONYMS: dict[str, str] = VOCABULARY["synonyms"]
 _WORDS = {name: frozenset(words.split()) for name, words in VOCABULARY["words"].items()}
+COUNTING = _WORDS["counting"]
+#: Words by which names that are written as one word are cut.
+_KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
 _CORNERS: dict[str, str] = VOCABULARY["corners"]
 _GERMAN: dict[str, str] = VOCABULARY["german_corners"]
+#: Names of the wheels in the order of WHEELS, and a name of a wheel in the name of a field.
+_WHEEL_CODES = tuple(tuple(codes.split()) for codes in VOCABULARY["wheel_codes"]["codes"])
+_CODE = re.compile(r"(?<![A-Za-z])(?:[a-z]{2,3}|[A-Z]{2,3}|[LR]\d)(?![A-Za-z0-9])")
 _AXES: dict[str, str] = {word: axis for axis, words in VOCABULARY["axes"].items() for word in words.split()}
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
@@ -47,14 +55,8 @@ def words_of(name: str) -> tuple[str, ...]:
     name = _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name.translate(LATIN))
     name = _CORNER_AT_END.sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
-        if part.lower() in _SYNONYMS:
-            words += _SYNONYMS[part.lower()].split()
-            continue
-        if part.lower() in _WORDS["lexicon"] or part.lower() in _WORDS["whole"]:
-            words.append(part.lower())
-            continue
-        for piece in _CAMEL.findall(part):
-            words += _SYNONYMS[piece.lower()].split() if piece.lower() in _SYNONYMS else _unglued(piece.lower())
+        for piece in [part] if part.lower() in _KNOWN | _WORDS["whole"] else _CAMEL.findall(part):
+            words += [english for word in _unglued(piece.lower()) for english in _SYNONYMS.get(word, word).split()]
     return tuple(words)
 
 
@@ -75,16 +77,15 @@ _CORNER_SPEED = re.compile(
 
 def _unglued(piece: str) -> list[str]:
     """Split a piece into known words; return the piece itself if it contains other letters."""
-    if piece not in _WORDS["lexicon"] and (letters := _CORNER_SPEED.match(piece)):
-        first = letters[0]
-        return [*_SYNONYMS.get(first, first).split(), piece[letters.end() :]]
-    if piece in _WORDS["lexicon"] or len(piece) < 5:
+    if piece not in _KNOWN and (letters := _CORNER_SPEED.match(piece)):
+        return [letters[0], piece[letters.end() :]]
+    if piece in _KNOWN or len(piece) < 5:
         return [piece]
     best: list[list[str] | None] = [[]] + [None] * len(piece)
     for end in range(1, len(piece) + 1):
         for start in range(max(0, end - 16), end):
             before = best[start]
-            if before is not None and piece[start:end] in _WORDS["lexicon"]:
+            if before is not None and piece[start:end] in _KNOWN:
                 best[end] = [*before, piece[start:end]]
                 break
     return best[-1] or [piece]
@@ -169,8 +170,25 @@ def _spelled_out(path: str, there: Collection[str]) -> str:
         return f"{gyro[1]}gyro_{gyro[2]}"
     leaf = path.rpartition(".")[2]
     struct = path.removesuffix(leaf)
-    beside = {p.removeprefix(struct) for p in there if p.startswith(struct)}
-    return struct + next((names[leaf] for needed, names in _SHORT_NAMES if leaf in names and needed <= beside), leaf)
+    beside = {p.removeprefix(struct).lower() for p in there if p.startswith(struct)}
+    short = (names[leaf.lower()] for needed, names in _SHORT_NAMES if leaf.lower() in names and needed <= beside)
+    return struct + next(short, _with_wheel(leaf, beside))
+
+
+def _with_wheel(leaf: str, beside: Collection[str]) -> str:
+    """Return a name with the wheel in words if it differs by the side of the wheel only from another one beside it."""
+    for place in _CODE.finditer(leaf):
+        code = place[0].lower()
+        for wheels in _WHEEL_CODES:
+            partner = wheels[wheels.index(code) ^ 1] if code in wheels else ""
+            if (
+                partner
+                and place[0] != leaf
+                and f"{leaf[: place.start()]}{partner}{leaf[place.end() :]}".lower() in beside
+            ):
+                wheel = WHEELS[wheels.index(code)]
+                return f"{leaf[: place.start()]}_wheel_{wheel}_{leaf[place.end() :]}".strip("_")
+    return leaf
 
 
 def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> Meaning | None:
@@ -194,7 +212,7 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
     scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
     scopes.append((0.9, (*inner, *leaf_words), path))
     # The topic's name describes its fields only if the leaf identifies no quantity.
-    if all(w in _WORDS["bare"] or not w.isalpha() for w in leaf_words):
+    if all(w in _WORDS["bare"] | _UNIT_WORDS or not w.isalpha() for w in leaf_words):
         scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
         quantity = _quantity(words, leaf_words, column, strength, named)
@@ -235,7 +253,7 @@ def _with_unit(
 ) -> Meaning | None:
     """Return the meaning with the unit from the leaf or its struct (``names``); None for a rotational speed."""
     name, part, kind = quantity
-    corner = _corner(inner, ())
+    corner = corner_of(inner)
     if name == "speed" and corner:
         name, part = "wheel speed", corner
     if name == "speed" and unit_of(names[0], "wheel rate")[0]:
@@ -276,12 +294,12 @@ def _quantity(
     axis = next((_AXES[w] for w in (*reversed(leaf_words), *reversed(words)) if w in _AXES), "")
     if not axis and index is not None and index < 3:
         axis = "xyz"[index]
-    corner = _corner(words, leaf_words)
+    corner = corner_of(words, leaf_words)
     leaf = set(leaf_words)
     tokens = {*words, *(f".{w}" for w in leaf), f".{'_'.join(leaf_words[-2:])}", f"={'_'.join(leaf_words)}", f"@{axis}"}
     flags = {
         "@corner": bool(corner),
-        "@any_corner": bool(_corner(tuple(set(words)), ())),
+        "@any_corner": bool(corner_of(tuple(set(words)))),
         "@index": index is not None,
         "@around": strength < 1.0,
         "@delta": "delta" in leaf <= _WORDS["of_delta"],
@@ -289,7 +307,7 @@ def _quantity(
         "@v_axis": leaf_words[0] == "v" and leaf_words[1:2] != () and leaf_words[1] in _AXES,
         "@bare_v": "v" in leaf <= _WORDS["of_v"],
         **{f"@unit_{kind.replace(' ', '_')}": bool(unit_of(named, kind)[0]) for kind in UNITS},
-        **{f"@place_{w}": leaf - {w} <= _PLACE_WORDS for w in leaf - _PLACE_WORDS},
+        **{f"@place_{w}": leaf - {w} <= _PLACE_WORDS | _UNIT_WORDS for w in leaf - _PLACE_WORDS},
     }
     tokens |= {flag for flag, is_set in flags.items() if is_set}
     for trait, rule in _TRAITS:
@@ -302,7 +320,8 @@ def _quantity(
     return name, {"@axis": axis, "@corner": corner}.get(part, part), kind
 
 
-def _corner(words: tuple[str, ...], leaf_words: tuple[str, ...]) -> str:
+def corner_of(words: tuple[str, ...], leaf_words: tuple[str, ...] = ()) -> str:
+    """Return the wheel (fl, fr, rl, rr) in the words of a name, of the leaf first; empty without one."""
     for group in (leaf_words, words):
         for word in group:
             if word in _CORNERS:
@@ -316,8 +335,3 @@ def _corner(words: tuple[str, ...], leaf_words: tuple[str, ...]) -> str:
         if all(len(end) == 1 for end in letters):
             return "".join(letters)
     return ""
-
-
-def corner_of(words: tuple[str, ...]) -> str:
-    """Return the wheel (fl, fr, rl, rr) in a list of words; empty without one."""
-    return _corner(words, words)

@@ -9,7 +9,6 @@ A source that also has a heading (two antennas, INS) or sideslip is ground truth
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -18,12 +17,11 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.candidates import Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
-from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.naming import Meaning, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
@@ -36,16 +34,11 @@ NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 _PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
 #: Largest plausible extent of a log.
 WIDEST_DEG = 10.0
-_SIDES = {
-    "north": "n", "n": "n", "vn": "n", "veln": "n", "east": "e", "e": "e", "ve": "e", "vele": "e",
-    "up": "u", "u": "u", "vu": "u", "velu": "u", "down": "d", "d": "d", "vd": "d", "veld": "d",
-}  # fmt: skip
 #: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
-_CONVENTIONS = (
-    ("degrees clockwise from north", -math.radians(1.0), math.pi / 2.0),
-    ("radians clockwise from north", -1.0, math.pi / 2.0),
-    ("degrees counter-clockwise from east", math.radians(1.0), 0.0),
-    ("radians counter-clockwise from east", 1.0, 0.0),
+_CONVENTIONS = tuple(
+    (f"{unit} {sense}", sign * factor, angle)
+    for sense, sign, angle in (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
+    for unit, factor in (("degrees", math.radians(1.0)), ("radians", 1.0))
 )
 #: Tolerance of the ratio of a velocity to the speed from positions; speed over ground over that along the path if the
 #: axes are the earth's; share of the time that a body moves ahead.
@@ -57,6 +50,8 @@ Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.
 NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative: in reverse it has the wrong sign"
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
+#: Words of receivers, whose heading without positions is a course.
+_RECEIVERS = frozenset({"gps", "gnss", "vbox"})
 #: Ground truth with one of these contains a heading, or motion that needs one.
 HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
 #: Course of a single antenna in addition to a heading from two antennas: a sensor, even of a ground-truth instrument.
@@ -97,8 +92,7 @@ def axes_of(
             return order
     length = np.hypot(x, y)
     moving = length > SLOW_M_S
-    with np.errstate(invalid="ignore", divide="ignore"):
-        turning = np.where(moving, (x * pieces.rate_of(y) - y * pieces.rate_of(x)) / length**2, np.nan)
+    turning = pieces.turning(np.where(moving, x + 1j * y, np.nan))
     relation = None if rate is None else fit(pieces.smooth(rate), turning)
     sense = _sense(relation)
     if sense > 0.0:
@@ -217,11 +211,12 @@ def receiver_signals(
 class _Instrument:
     """A topic with the fields of a navigation system or receiver by their names.
 
-    ``mapped``: a source that is mapped already, with a unit that the drive shows.
+    ``signals``: mapped already, among them a speed with a unit that the drive shows.
     """
 
-    def __init__(self, log: DriveLog, topic: TopicInfo, mapped: SignalSource | None = None) -> None:
+    def __init__(self, log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource]) -> None:
         self.log, self.topic, self.fields = log, topic.name, log.fields(topic.name, quiet=True)
+        self.yaw_rate, mapped = signals.get("yaw_rate_rad_s"), signals.get("speed_m_s")
         self.stamp = stamp_path_of(self.fields)
         numbers = (f for f in self.fields if f.kind == "number")
         named = ((f.path, meaning_of(topic.name, topic.type_name, f.path, f.unit)) for f in numbers)
@@ -231,7 +226,7 @@ class _Instrument:
             self.meanings |= units
         first = {m.quantity: path for path, m in reversed(self.meanings.items())}
         self.places = {name: self.source(name, first[q]) for name, q in _PLACES.items() if q in first}
-        self.velocities = [*_horizontal(self.fields)]
+        self.velocities = [*_horizontal(self.meanings)]
         angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
         self.angles = {path: meaning for meaning, path in angles}
 
@@ -243,6 +238,7 @@ class _Instrument:
     def seen(self) -> dict[str, Seen]:
         """Values of velocities, angles and positions in a few pieces of the log, by path."""
         paths = [*(p for v in self.velocities for p in v.values()), *self.angles]
+        paths += [p for p, m in self.meanings.items() if m.quantity == "speed"]
         wanted = [*dict.fromkeys([*paths, *(s.paths[0] for s in self.places.values())])]
         return {path: seen for (_, path), seen in self.pieces.read({self.topic: wanted} if wanted else {}).items()}
 
@@ -265,13 +261,29 @@ class _Instrument:
         nothing = np.full(len(self.pieces.starts) * self.pieces.cells_a_piece, np.nan)
         return nothing if velocity is None else _direction(*velocity)
 
+    def follows(self, path: str, speed: str, scale: float, angle: float) -> bool:
+        """Return whether an angle is the direction of the path; without positions, whether a course turns as the car.
+
+        ``speed``: path of the speed.
+        """
+        if self.has_place:
+            return _off(self.seen[path], self.course, scale, angle) < NEAR_RAD
+        is_receiver = bool(_RECEIVERS & {*words_of(path), *words_of(self.topic)})
+        is_course = is_receiver or self.meanings[path].quantity == "course"
+        if self.yaw_rate is None or speed not in self.seen or not is_course:
+            return False
+        pieces, _, (rate, *_) = _read(self.log, [self.yaw_rate])
+        moving = self.seen[speed].cells * (self.meanings[speed].scale or 1.0) > MOVING_M_S
+        sense = turns(pieces, np.where(moving, scale * self.seen[path].cells, np.nan), rate.si)
+        return sense != 0.0 if is_receiver else sense > 0.0
+
     @property
     def over_ground(self) -> list[SignalSource]:
         """Velocity east and north over ground; empty without one."""
         if not self.velocities:
             return []
         paths = [self.velocities[0][side] for side in "en"]
-        unit = unit_of(paths[1].rpartition(".")[2], "speed")[1] or 1.0
+        unit = self.meanings[paths[1]].scale or 1.0
         return [self.source(name, path, unit) for name, path in zip((_EAST, _NORTH), paths, strict=True)]
 
 
@@ -283,20 +295,20 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
     topics : of navigation systems and references with undocumented types.
     whole : whether only a velocity with a heading counts.
     """
-    truths = [truth for t in topics if (truth := _truth_of(_Instrument(log, t))) is not None]
+    truths = [truth for t in topics if (truth := _truth_of(_Instrument(log, t, {}))) is not None]
     truths = [t for t in truths if not whole or {"enu_velocity_m_s", "yaw_rad"} <= set(t[0])]
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
-def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = None) -> dict[str, SignalSource]:
+def named_gnss(log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    ``speed`` is mapped already, with a unit that the drive shows. A velocity must agree with the path, if there is one.
-    A heading that is the direction of the path is a course.
+    ``signals`` are mapped already. A velocity must agree with the path, if there is one. A heading that is the
+    direction of the path is a course.
     """
-    its = _Instrument(log, topic, speed)
+    its = _Instrument(log, topic, signals)
     if len(its.places) < len(_PLACES):
-        return {s.name: s for s in its.over_ground}
+        return {s.name: s for s in its.over_ground or _speed_and_course(its)}
     if not its.has_place:
         return {}
     sources = [replace(its.places[n], name=name) for n, name in zip(_PLACES, GNSS_POSITION, strict=True)]
@@ -312,11 +324,13 @@ def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = Non
 def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
     speed = next((p for p, m in its.meanings.items() if m.quantity == "speed" and m.scale is not None), None)
-    for path, meaning in its.angles.items() if speed is not None else ():
-        # A course over ground is clockwise from north by definition; the path confirms this and determines the unit.
+    if speed is None:
+        return
+    for path, meaning in its.angles.items():
+        # A course over ground is clockwise from north by definition; the drive confirms this and determines the unit.
         fitting = [c[1:] for c in _CONVENTIONS[:2] if meaning.scale is None or math.isclose(-c[1], meaning.scale)]
-        fitting = [c for c in fitting if path in its.seen and _off(its.seen[path], its.course, *c) < NEAR_RAD]
-        if fitting and speed is not None:
+        fitting = [c for c in fitting if path in its.seen and its.follows(path, speed, *c)]
+        if fitting:
             yield its.source("gnss_course_rad", path, *fitting[0])
             yield its.source("gnss_speed_m_s", speed, its.meanings[speed].scale or 1.0)
             return
@@ -348,38 +362,19 @@ def _enu_velocities(its: _Instrument) -> Iterator[SignalSource]:
     for paths_of in its.velocities:
         if vertical := next((s for s in "ud" if s in paths_of), ""):
             paths = (paths_of["e"], paths_of["n"], paths_of[vertical])
-            factor = unit_of(paths[0].rpartition(".")[2], "speed")[1] or 1.0
+            factor = its.meanings[paths[0]].scale or 1.0
             scale = (factor, factor, factor if vertical == "u" else -factor)
             yield SignalSource("enu_velocity_m_s", its.topic, paths, its.stamp, scale)
             return
 
 
-def _horizontal(fields: tuple[FieldInfo, ...]) -> Iterator[dict[str, str]]:
-    """Yield by struct the paths of a velocity with at least north and east, by direction."""
+def _horizontal(meanings: Mapping[str, Meaning]) -> Iterator[dict[str, str]]:
+    """Yield by struct the paths of a velocity over ground with at least north and east, by direction."""
     structs: dict[str, dict[str, str]] = {}
-    for info in fields:
-        prefix, _, leaf = info.path.rpartition(".")
-        if info.kind == "number" and "ecef" not in info.path.lower() and (side := side_of(prefix, leaf)):
-            structs.setdefault(prefix, {}).setdefault(side, info.path)
+    for path, meaning in meanings.items():
+        if meaning.quantity == "over ground":
+            structs.setdefault(path.rpartition(".")[0], {}).setdefault(meaning.part, path)
     yield from (paths_of for paths_of in structs.values() if {"n", "e"} <= set(paths_of))
-
-
-def side_of(struct: str, leaf: str) -> str:
-    """Return the direction (n, e, u, d) of a velocity component by its name; empty for other fields."""
-    words = words_of(leaf)
-    short = "".join(words)
-    side = next((_SIDES[w] for w in (*words, short) if w in _SIDES and len(w) > 1), "")
-    side = side or (_SIDES[words[-1]] if len(words) > 1 and words[-1] in "neud" else "")
-    if {"std", "stddev", "stdev", "var", "cov", "accuracy", "sigma", "acc"} & set(words):
-        return ""
-    frame = next((f for f in ("ned", "enu") if f in words and words[-1] in {*"xyz"}), "")
-    side = {"x": frame[:1], "y": frame[1:2], "z": frame[2:]}[words[-1]] if frame else side
-    is_speed = (
-        {"velocity", "vel", "speed"} & {*words, *words_of(struct)}
-        or re.fullmatch("(v|vel)[neud]", short)
-        or words[:1] == ("v",)
-    )
-    return side if is_speed else ""
 
 
 def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
@@ -390,6 +385,18 @@ def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
         name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
         if f"{base}[2]" in paths and f"{base}[3]" not in paths and words & {"velocity", "vel", "position", "pos"}:
             yield SignalSource(name, its.topic, tuple(f"{base}[{i}]" for i in range(3)), its.stamp)
+
+
+def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
+    """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
+    relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
+    if (
+        relation is None
+        or abs(relation.correlation) <= CLEAR
+        or not SAME_STEPS[0] < abs(relation.slope) < SAME_STEPS[1]
+    ):
+        return 0.0
+    return math.copysign(1.0, relation.slope)
 
 
 def _is_place(seen: Seen | None, most: float) -> bool:

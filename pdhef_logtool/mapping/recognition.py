@@ -33,7 +33,7 @@ from pdhef_logtool.mapping.navigation import (
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighing, weigh
-from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
+from pdhef_logtool.records.signals import FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
 TRUTH_WORDS, NAVIGATION_WORDS = _TOPICS["truth"], _TOPICS["navigation"]
@@ -53,7 +53,6 @@ NEAR_1_G = 0.08
 
 #: Types with velocities in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
-WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
 #: Required fields of known types; an IMU needs any of them, the others need all.
@@ -191,7 +190,6 @@ def auto_map(
     _map_imu(draft, topics)
     _map_steering(draft, topics)
     _map_speed(draft, topics)
-    _map_wheel_speeds(draft, topics)
     _map_truth(draft, topics, prefer_truth)
     _map_truth_friction(draft, topics, prefer_truth)
     _map_documented_truth(draft, topics, vendors)
@@ -377,7 +375,7 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
         if fields and (topic in others or has_path(fields, RAW_COURSE)):
             signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
-            signals = named_gnss(draft.log, topic, draft.signals.get("speed_m_s")) if by_name else signals
+            signals = named_gnss(draft.log, topic, draft.signals) if by_name else signals
             if signals:
                 yield signals
 
@@ -425,7 +423,7 @@ def _is_well_known(topic: TopicInfo) -> bool:
     """Return whether a topic was mapped by its type already."""
     tables = (TWIST_FIELDS, _FIELDS["pose"], _FIELDS["steering"], _FIELDS["speed"], _FIELDS["several_positions"])
     kind = _type(topic)
-    return kind in IMU_TYPES | FIX_TYPES | WHEEL_SPEED_TYPES or any(kind in table for table in tables)
+    return kind in IMU_TYPES | FIX_TYPES or any(kind in table for table in tables)
 
 
 def _role(topic: TopicInfo) -> Role:
@@ -447,13 +445,12 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"] | _TOPICS["estimate"])]
     if "yaw_rate_rad_s" not in draft.signals:
-        odometries = [t for t in twists if _type(t) in BODY_TWIST_TYPES and not _is_truth(t)]
-        odometries = [t for t in odometries if _words(t.name) & _TOPICS["vehicle"]]
+        odometries = [t for t in twists if not _is_truth(t) and _words(t.name) & _TOPICS["vehicle"]]
         odometries = [t for t in odometries if _span(draft.values(t.name, _twist(t, "angular", "z"))) > 0.0]
         chosen = draft.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
         if chosen is not None:
             draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
-            draft.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
+            draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
     if not draft.signals or has_speed(draft.signals):
         return
     _speed_of_navigation(draft, topics)
@@ -654,15 +651,6 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
         why = "its name does not suggest ground truth"
         draft.notes.append(f"{chosen.name} contains a lateral velocity, which is not used: {why}")
-
-
-def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
-    candidates = [t for t in topics if _type(t) in WHEEL_SPEED_TYPES and not _words(t.name) & TRUTH_WORDS]
-    chosen = draft.choose("wheel speeds", candidates, lambda _: (), "the first of its kind")
-    if chosen is None:
-        return
-    for wheel in WHEELS:
-        draft.take(draft.signals, f"wheel_speed_{wheel}_m_s", chosen.name, f"{wheel}_m_s")
 
 
 # ------------------------------------------------------------------------------------------------ ground truth

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdhef_logtool.logs.drive_log import TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.mapping.naming import Meaning
+from pdhef_logtool.mapping.naming import VOCABULARY, Meaning
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS, SignalSource
 from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, WHEELS
@@ -23,21 +23,16 @@ from pdhef_logtool.storage.documents import checked, read_toml
 #: Environment variable with the path of a user file, which has priority over the shipped types.
 USERS_FILE = "PDHEF_VENDORS"
 
-_QUANTITIES = {
-    "steer_rad": ("steering", "road"), "steering_wheel_rad": ("steering", "wheel"), "ax_m_s2": ("acceleration", "x"),
-    "ay_m_s2": ("acceleration", "y"), "az_m_s2": ("acceleration", "z"),
-    "yaw_rate_rad_s": ("rate", "z"), "speed_m_s": ("speed", "x"),
-    "vx_m_s": ("speed", "x"), "vy_m_s": ("velocity", "y"), "sideslip_rad": ("sideslip", ""),
-    "lat_deg": ("latitude", ""), "lon_deg": ("longitude", ""), "course_rad": ("course", ""), "yaw_rad": ("heading", ""),
-    "x_m": ("position", "x"), "y_m": ("position", "y"),
-    **{f"wheel_speed_{w}_m_s": ("wheel speed", w) for w in WHEELS},
-    **{f"wheel_speed_{w}_rad_s": ("wheel rate", w) for w in WHEELS},
-}  # fmt: skip
+_WHEELS = {f"wheel_speed_{w}_{u}": [q, w] for w in WHEELS for u, q in (("m_s", "wheel speed"), ("rad_s", "wheel rate"))}
+#: Quantity and part by signal and ground truth.
+_QUANTITIES: dict[str, list[str]] = {**VOCABULARY["signals"], **_WHEELS}
 
 
-class _FieldTable(BaseModel):
+class _Entry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
+
+class _FieldTable(_Entry):
     field: Annotated[str, Field(min_length=1)] | list[str]
     signal: str = ""
     truth: str = ""
@@ -62,9 +57,7 @@ class _FieldTable(BaseModel):
         return self
 
 
-class _TypeTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
-
+class _TypeTable(_Entry):
     type: list[str]
     vendor: str
     page: str
@@ -75,9 +68,7 @@ class _TypeTable(BaseModel):
     fields: list[_FieldTable]
 
 
-class _ReceiverTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
-
+class _ReceiverTable(_Entry):
     message: str
     page: str
     has: list[str]
@@ -113,13 +104,14 @@ class VendorField:
 
 def meaning_of_signal(name: str) -> Meaning:
     """Return the meaning of a signal or ground-truth quantity."""
-    return Meaning(*_QUANTITIES.get(name, ("", "")), 1.0, "", 1.0, "its type is documented")
+    quantity, part = _QUANTITIES.get(name, ("", ""))
+    return Meaning(quantity, part, 1.0, "", 1.0, "its type is documented")
 
 
 def names_of(quantity: str, part: str, among: Iterable[str] = SIGNAL_UNITS) -> tuple[str, ...]:
     """Return the signals among ``among`` that match a quantity and part."""
     parts = (part,) if part else {"speed": ("x",), "steering": ("road", "wheel")}.get(quantity, ("",))
-    return tuple(n for n in among if any(_QUANTITIES.get(n) == (quantity, p) for p in parts))
+    return tuple(n for n in among if any(_QUANTITIES.get(n) == [quantity, p] for p in parts))
 
 
 @dataclass(frozen=True, slots=True)

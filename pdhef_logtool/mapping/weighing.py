@@ -22,6 +22,7 @@ from pdhef_logtool.mapping.candidates import (
     anchor_of,
     look,
     named_fields,
+    proposed_fields,
     triad_of,
 )
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, ratio
@@ -39,7 +40,7 @@ from pdhef_logtool.mapping.fields import (
     posterior,
 )
 from pdhef_logtool.mapping.naming import words_of
-from pdhef_logtool.mapping.navigation import axes_of, has_heading
+from pdhef_logtool.mapping.navigation import axes_of, has_heading, turns
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
@@ -93,6 +94,8 @@ def weigh(
     signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
     """
     named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
+    if log.end_ns > log.start_ns and not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
+        named += proposed_fields(log, topics, named)
     wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
     if not wanted:
         return Weighing(Fields(Pieces(log), {}, [], []), "")
@@ -124,7 +127,7 @@ def _is_wanted(
     open_ = any(n not in signals and not (n.startswith("steer") and steered) for n in names)
     if open_ and quantity == "speed" and "speed_m_s" not in signals and any(n.startswith("wheel") for n in signals):
         open_ = role in ("sensor", "truth", "estimate", "command")
-    for_truth = not truth and (role in ("truth", "navigation") or quantity in ("sideslip", "velocity"))
+    for_truth = not truth and (role in ("truth", "navigation") or quantity in ("sideslip", "velocity", "heading"))
     for_truth |= role == "truth" and not has_heading(truth)
     return open_ or for_truth
 
@@ -203,8 +206,6 @@ class Weighing:
         if not good:
             return
         best = good[0]
-        if best.meaning.strength < 0.6:
-            best.doubts.append("its element of the array is identified by values alone")
         self._choose(name, best, [f for f in good[1:] if f.score > best.score - 0.1 and not agree(best.si, f.si)])
 
     def _choose(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
@@ -218,7 +219,7 @@ class Weighing:
         rate, ay, speed = self.taken.get("yaw_rate_rad_s"), self._chosen("ay_m_s2"), self._speed()
         if rate is None or ay is None or speed is None or rate.fixed or not rate.is_axis or ay.is_axis:
             return
-        rates = [f for f in self.fields.candidates if f.meaning.quantity == "rate" and _same_but_axis(f, rate)]
+        rates = [f for f in self.fields.candidates if f.meaning.quantity == "rate" and triad_of(f) == triad_of(rate)]
         fits = [(abs(r.correlation), r.slope, f) for f in rates if (r := self.fields.turning(ay.si, f.si, speed.si))]
         surest, slope, best = max(fits, key=lambda f: f[0], default=(0.0, 1.0, rate))
         if best is not rate and surest > 0.9 and all(c < FOLLOWS for c, _, f in fits if f is rate):
@@ -343,6 +344,7 @@ class Weighing:
         self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
         if not self.true:
             return
+        self._head()
         first = its[0]
         if first.role == "sensor" and self.true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
             self.true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
@@ -359,6 +361,23 @@ class Weighing:
         self.notes.append(f"ground truth comes from {first.topic.name}, by the names of its fields")
         for name, item in self.true.items():
             self._tell(f"truth.{name}", item)
+
+    def _head(self) -> None:
+        """Add the heading that turns as fast as the car.
+
+        Values of a full turn count clockwise from north, as a compass does; others have the sense of the yaw rate, and
+        count from east if it is to the left.
+        """
+        rate = self._chosen("yaw_rate_rad_s")
+        headings = [f for f in self.fields.candidates if f.meaning.quantity == "heading" and not f.fixed]
+        for item in sorted(headings, key=lambda f: f.topic.name != self.truth_from):
+            sense = 0.0 if rate is None else turns(self.fields.pieces, item.si, rate.si)
+            is_compass = bool(np.nanmin(item.seen.values) >= 0.0) and item.seen.largest * item.scale > math.pi
+            if sense and rate is not None and (is_compass or not _has_open_sign(rate)):
+                item.sign = -1.0 if is_compass and not rate.fixed else sense
+                item.offset = 0.0 if item.sign > 0.0 else math.pi / 2.0
+                self.true["yaw_rad"] = item
+                return
 
     def _truth_turns(self) -> bool:
         """Return whether the yaw rates of ground truth and sensor are equal up to the sign."""
@@ -411,12 +430,6 @@ class Weighing:
 def _has_open_sign(item: Field) -> bool:
     """Return whether the sign of a field is unknown from documentation, name and mounting."""
     return not (item.fixed or item.is_downward) and (item.meaning.quantity == "steering" or not item.is_axis)
-
-
-def _same_but_axis(first: Field, second: Field) -> bool:
-    """Return whether two names of one topic differ only in the letter of their axis."""
-    words = ([w for w in words_of(f.path) if w not in {*"xyz"}] for f in (first, second))
-    return first.topic.name == second.topic.name and next(words) == next(words)
 
 
 def _share_axis(first: Field, second: Field) -> bool:

@@ -123,10 +123,8 @@ def others_without_answers() -> str:
         if taken:
             most = max(taken.values())
             mapped_files.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
-    text = f"{count} further recordings of `reader_corpus` contain no vehicle signals. "
-    return text + (
-        f"Channels are mapped in {'; '.join(mapped_files)}.\n" if mapped_files else "No channel is mapped in them.\n"
-    )
+    said = f"Channels are mapped in {'; '.join(mapped_files)}." if mapped_files else "No channel is mapped in them."
+    return f"{count} further recordings of `reader_corpus` contain no vehicle signals. {said}\n"
 
 
 def _wanted(name: str, only: Sequence[str]) -> bool:

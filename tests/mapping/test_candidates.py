@@ -691,3 +691,33 @@ def test_the_axis_of_a_lateral_velocity_is_that_of_the_acceleration_beside_it() 
     auto = surveyed(ins=topic(**fields), steering=steering, wheel__speed=topic(speed_mps=V))
     assert auto.mapping.signals["ay_m_s2"].scale == -1.0
     assert auto.mapping.truth["vy_m_s"].scale == -1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("Speed_2D", ("speed", "")),
+        ("VelN", ("over ground", "n")),
+        ("Gierwinkelgeschwindigkeit", ("rate", "z")),
+        ("Sideakselerasjon", ("acceleration", "y")),
+        ("kmph", ("speed", "")),
+    ],
+)
+def test_words_of_languages_and_directions(name: str, meant: tuple[str, str]) -> None:
+    meaning = meaning_among("log", "", name, "")
+    assert meaning is not None
+    assert (meaning.quantity, meaning.part) == meant
+
+
+def test_columns_without_names_by_the_drive() -> None:
+    auto = found(box=topic(ch1=3.6 * V, ch2=AX, ch3=AY, ch4=RATE, ch5=12.0 + 0.0 * S))
+    assert {n: s[0] for n, s in taken(auto).items()} == {
+        "speed_m_s": "/box.ch1", "ax_m_s2": "/box.ch2", "ay_m_s2": "/box.ch3", "yaw_rate_rad_s": "/box.ch4",
+    }  # fmt: skip
+    assert {c.subject for c in auto.mapping.checks} >= {"speed_m_s", "yaw_rate_rad_s"}
+
+
+def test_axes_by_gravity() -> None:
+    down = {"acc_x": AX, "acc_y": -AY, "acc_z": -G + 0.0 * S, "gyro_z": -RATE}
+    assert taken(found(box=topic(**down)))["ay_m_s2"] == ("/box.acc_y", -1.0)
+    assert taken(found(box=topic(**down)))["yaw_rate_rad_s"] == ("/box.gyro_z", -1.0)

@@ -7,10 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from pdhef_logtool.mapping.candidates import ANGLES, SPEEDS
+from pdhef_logtool.mapping.candidates import HYPOTHESES
 from pdhef_logtool.mapping.fields import BY_DRIVING, CERTAIN, RARE, SAME, Gain, Unit, posterior
 
-SPEED, RATE = ([Unit(*u, energy=RARE.get(u[0], 0.0)) for u in units] for units in (SPEEDS, ANGLES))
+SPEED, RATE = (
+    [Unit(*u, energy=RARE.get(u[0], 0.0)) for u in units] for units in (HYPOTHESES["speed"], HYPOTHESES["steering"])
+)
 
 
 @pytest.mark.parametrize("true", SPEED, ids=[u.name for u in SPEED])
