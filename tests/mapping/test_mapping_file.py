@@ -46,16 +46,13 @@ def load_text(tmp_path: Path, text: str) -> Mapping:
 def test_the_documented_example_loads(tmp_path: Path) -> None:
     mapping = load_text(tmp_path, DESIGN_EXAMPLE)
     assert mapping.signals["steer_rad"] == SignalSource(
-        name="steer_rad",
-        topic="/vehicle/status/steering_status",
-        field="steering_tire_angle",
-        stamp="stamp",
-        valid_min=-1.0,
-        valid_max=1.0,
+        "steer_rad", "/vehicle/status/steering_status", "steering_tire_angle", "stamp", valid_min=-1.0, valid_max=1.0
     )
     assert mapping.truth["vy_m_s"].field == "twist.twist.linear.y"
     assert mapping.quality == QualityGate(topic="/ins/status", field="mode", values=(4.0,))
     assert mapping.origin == "file"
+    with pytest.raises(MappingError, match="no such file"):
+        load_mapping(tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize(
@@ -147,11 +144,6 @@ def test_contradictions_are_named(tmp_path: Path, text: str, said: str) -> None:
     assert said in str(caught.value)
 
 
-def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(MappingError, match="no such file"):
-        load_mapping(tmp_path / "none.toml")
-
-
 texts = st.text(
     st.characters(exclude_categories=["Cs"]) | st.sampled_from(string.printable + '"\\\x7f'), min_size=1, max_size=12
 )
@@ -226,7 +218,7 @@ def _device_without_stamp(source: SignalSource) -> bool:
 
 
 def test_missing_signals_stand_ready_as_comments(tmp_path: Path) -> None:
-    text = mapping_to_toml(Mapping(), comments={"speed_m_s": "perhaps /can.v"})
+    text = mapping_to_toml(Mapping(notes=("first\nsecond = 3\r[signals]",)), comments={"speed_m_s": "perhaps /can.v"})
     assert load_text(tmp_path, text) == Mapping()
     for name in ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"):
         assert f"# [signals.{name}]" in text
@@ -236,8 +228,3 @@ def test_missing_signals_stand_ready_as_comments(tmp_path: Path) -> None:
     at = next(i for i, line in enumerate(lines) if line.startswith("# [signals.yaw_rate_rad_s]"))
     edited = "\n".join(line[2:] for line in lines[at : at + 4])
     assert set(load_text(tmp_path, edited).signals) == {"yaw_rate_rad_s"}
-
-
-def test_notes_become_comments_even_over_several_lines(tmp_path: Path) -> None:
-    mapping = Mapping(notes=("first\nsecond = 3\r[signals]",))
-    assert load_text(tmp_path, mapping_to_toml(mapping)) == Mapping()

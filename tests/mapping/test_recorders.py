@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from contextlib import closing
 from pathlib import Path
 
@@ -25,8 +24,6 @@ WIDE = A + '[signals.speed_m_s]\ntopic = "/speed"\nfield = "v"\n'
 
 
 def log_of(**fields: tuple[str, str]) -> FakeLog:
-    import numpy as np
-
     stamps = np.array(STAMPS, dtype=np.int64)
     return FakeLog({f"/{t}": FakeTopic(kind, stamps, {name: stamps * 1e-9}) for t, (name, kind) in fields.items()})
 
@@ -92,20 +89,14 @@ def test_wrong_rules_and_empty_folders_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_fleet_of_two_recorders_is_run_with_one_folder(tmp_path: Path) -> None:
-    first = write_log(tmp_path / "first.mcap", {"/car": car()})
-    second = write_log(tmp_path / "second.mcap", {"/vehicle": car()})
-    folder = tmp_path / "mappings"
+    folder, logs = tmp_path / "mappings", tmp_path / "logs"
     folder.mkdir()
-    for log in (first, second):
-        assert called("inspect", log, "--write-mapping", folder / f"{log.stem}.toml").returncode == 0
-    logs = tmp_path / "logs"
     logs.mkdir()
-    for log in (first, second):
-        shutil.move(log, logs / log.name)
-    result = called(
-        "run", logs, "-o", tmp_path / "out", "--mapping", folder, "-e", "kinematic", "--model", "off",
-        "--annotate", "none",
-    )  # fmt: skip
+    for name, topic in (("first", "/car"), ("second", "/vehicle")):
+        log = write_log(logs / f"{name}.mcap", {topic: car()})
+        assert called("inspect", log, "--write-mapping", folder / f"{name}.toml").returncode == 0
+    options = ("-e", "kinematic", "--model", "off", "--annotate", "none")
+    result = called("run", logs, "-o", tmp_path / "out", "--mapping", folder, *options)
     assert result.returncode == 0, result.stderr
     for name in ("first", "second"):
         report = (tmp_path / "out" / "logs" / name / "report.json").read_text()
@@ -128,25 +119,16 @@ def write(path: Path, *runs: str) -> Path:
 
 
 def test_a_choice_between_runs_is_asked_for(tmp_path: Path) -> None:
-    with closing(open_log(write(tmp_path / "runs.mat", "run_1", "run_2"))) as log:
+    path = write(tmp_path / "runs.mat", "run_1", "run_2")
+    with closing(open_log(path)) as log:
         with pytest.raises(MappingError, match=r"2 runs: run_1, run_2.*--set group=run_1"):
             choose_mapping(log, None, prefer_truth="perfect")
         auto = auto_map(log)
     assert {s.topic for s in auto.mapping.sources()} == {"run_1_imu", "run_1_car"}
     assert [(a.subject, a.candidates) for a in auto.ambiguities] == [("run", ("run_1", "run_2"))]
-
-
-def test_a_single_run_is_read(tmp_path: Path) -> None:
-    with closing(open_log(write(tmp_path / "run.mat", "run_1"))) as log:
-        assert "ay_m_s2" in choose_mapping(log, None, prefer_truth="perfect").mapping.signals
-
-
-def test_the_answer_to_the_question_is_a_group(tmp_path: Path) -> None:
-    path = write(tmp_path / "runs.mat", "run_1", "run_2")
     with closing(open_log(path, settings=TableSettings(group="run_2"))) as log:
-        assert {s.topic for s in choose_mapping(log, None, prefer_truth="perfect").mapping.sources()} == {
-            "run_2_imu", "run_2_car",
-        }  # fmt: skip
+        chosen = choose_mapping(log, None, prefer_truth="perfect")
+        assert {s.topic for s in chosen.mapping.sources()} == {"run_2_imu", "run_2_car"}
 
 
 @pytest.mark.parametrize("start_s", [0.0, 100.0])

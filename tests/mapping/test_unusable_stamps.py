@@ -111,9 +111,6 @@ def test_zero_stamps_lose_no_topic() -> None:
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     assert clocks["/imu.header.stamp"].unusable == "100% of its stamps are zero or no time"
     assert clocks["/imu.header.stamp"].median_period_s == pytest.approx(0.01, abs=0.001)
-    found = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
-    np.testing.assert_array_equal(found.signals["ay_m_s2"].stamps_ns, LOG)
-    assert [(x.kind, x.severity) for x in found.losses] == [("log-time-serves", "note")]
 
 
 @pytest.mark.parametrize(
