@@ -25,7 +25,6 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks, load_mapping, read_signals
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel
-from truthsim.drive import simulate_drive, write_drive
 
 T0 = 1_700_000_000_000_000_000
 MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
@@ -61,27 +60,23 @@ def drive(
     def state(t: np.ndarray) -> tuple[np.ndarray, ...]:
         speed = 15.0 + lively * 6.0 * slow(t, speed_phase)
         steer = lively * 0.05 * slow(t, steer_phase)
-        yaw_rate = speed * steer / (2.7 + 0.002 * speed**2)
-        return steer, yaw_rate, speed
+        return steer, speed * steer / (2.7 + 0.002 * speed**2), speed
 
     imu_s = np.arange(0.0, duration_s, 0.01)
     can_s = np.arange(0.003, duration_s, 0.02)
     _, yaw_rate, speed = state(imu_s)
     can_steer, _, can_speed = state(can_s)
-
-    def noisy(values: np.ndarray, std: float) -> np.ndarray:
-        return values + std * rng.standard_normal(values.shape[0])
-
+    #: Times, values and noise.
     channels = {
-        "steer_rad": (can_s, noisy(can_steer, 0.0008)),
-        "yaw_rate_rad_s": (imu_s, noisy(yaw_rate, 0.004)),
-        "ay_m_s2": (imu_s, noisy(yaw_rate * speed, 0.5)),
-        "ax_m_s2": (imu_s, noisy(np.gradient(speed, imu_s), 0.5)),
-        "speed_m_s": (can_s, noisy(can_speed, 0.05)),
-        "wheel_speed_rl_m_s": (can_s, noisy(can_speed, 0.1)),
-        "wheel_speed_fr_rad_s": (can_s, noisy(can_speed / wheel_radius_m, 0.1)),
+        "steer_rad": (can_s, can_steer, 0.0008),
+        "yaw_rate_rad_s": (imu_s, yaw_rate, 0.004),
+        "ay_m_s2": (imu_s, yaw_rate * speed, 0.5),
+        "ax_m_s2": (imu_s, np.gradient(speed, imu_s), 0.5),
+        "speed_m_s": (can_s, can_speed, 0.05),
+        "wheel_speed_rl_m_s": (can_s, can_speed, 0.1),
+        "wheel_speed_fr_rad_s": (can_s, can_speed / wheel_radius_m, 0.1),
     }
-    return {name: channel(name, t, v) for name, (t, v) in channels.items()}
+    return {n: channel(n, t, v + std * rng.standard_normal(v.shape[0])) for n, (t, v, std) in channels.items()}
 
 
 MISTAKES = {
@@ -167,13 +162,6 @@ def test_exchanged_steering_angles() -> None:
     assert "road-wheel angle" in check.remedy
 
 
-@pytest.mark.parametrize("factor", [-1.0, 180 / np.pi])
-def test_ten_seconds_are_enough_for_steering(factor: float) -> None:
-    channels = drive(4, duration_s=10.0)
-    wrong = replace(channels["steer_rad"], values=channels["steer_rad"].values * factor)
-    assert {n.split(".")[0] for n in failed({**channels, "steer_rad": wrong})} == {"steer_rad"}
-
-
 def test_standing_or_missing_data_decide_nothing() -> None:
     channels = drive(6)
     standing = {n: replace(c, values=0.0 * c.values) for n, c in channels.items()}
@@ -183,19 +171,6 @@ def test_standing_or_missing_data_decide_nothing() -> None:
     empty = {n: replace(c, stamps_ns=c.stamps_ns[:0], values=c.values[:0]) for n, c in channels.items()}
     assert failed(empty) == set()
     assert verdicts(checks_of({"speed_m_s": channels["speed_m_s"]}), "undecided") == {"speed_m_s.unit"}
-
-
-@pytest.mark.slow
-def test_a_gap_and_an_absurd_stamp_do_no_harm() -> None:
-    channels = drive(7, duration_s=120.0)
-    for name, c in list(channels.items()):
-        keep = (c.stamps_ns < T0 + 40_000_000_000) | (c.stamps_ns > T0 + 70_000_000_000)
-        stamps = c.stamps_ns[keep]
-        stamps[0] = 1_000_000_000  # 1970
-        channels[name] = replace(c, stamps_ns=stamps, arrival_ns=stamps, values=c.values[keep])
-    assert failed(channels) == set()
-    wrong = replace(channels["yaw_rate_rad_s"], values=-channels["yaw_rate_rad_s"].values)
-    assert failed({**channels, "yaw_rate_rad_s": wrong}) == {"yaw_rate_rad_s.sign"}
 
 
 # ------------------------------------------------------------------------------------- a simulated drive
@@ -263,17 +238,6 @@ def test_what_is_wrong_with_truth_and_sensors_together(
 
 
 @pytest.mark.slow
-def test_a_truth_that_is_turned_by_half_a_degree(road: MappedChannels) -> None:
-    truth = dict(road.truth)
-    turn = np.radians(0.4)
-    vx, vy = truth["vx_m_s"].values, truth["vy_m_s"].values
-    truth["vx_m_s"] = replace(truth["vx_m_s"], values=np.cos(turn) * vx - np.sin(turn) * vy)
-    truth["vy_m_s"] = replace(truth["vy_m_s"], values=np.sin(turn) * vx + np.cos(turn) * vy)
-    checks = checks_of(road.signals, truth, derive_truth(truth))
-    assert verdicts(checks, "failed") == {"truth.sideslip_rad.offset"}
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
@@ -316,20 +280,6 @@ def test_recorded_drives_fail_nothing(shared_dir: Path, file: str, mapping_name:
     assert verdicts(checks, "failed") == known
 
 
-@pytest.mark.slow
-def test_every_mistake_is_found_on_a_recorded_drive(shared_dir: Path) -> None:
-    found = survey(shared_dir / "data" / "drives" / "revs_250lm_a.mcap", "revs_250lm")
-    for name, factor in CASES:
-        if name in found.signals:
-            checks = checked(found, **{name: factor})
-            assert {c.subject for c in checks if c.verdict == "failed"} == {name}, (name, factor)
-
-
-def test_the_instrument_with_its_yaw_rate_to_the_right(shared_dir: Path) -> None:
-    found = survey(shared_dir / "data" / "drives" / "lunda_v40", "lunda_v40")
-    assert verdicts(checked(found, yaw_rate_rad_s=-1.0), "failed") == {"yaw_rate_rad_s.sign"}
-
-
 # ------------------------------------------------------------------------------------ lever, gain, delay
 
 
@@ -368,22 +318,6 @@ def test_place_gain_and_delay_are_told_apart(
     checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), **errors), saloon)
     assert verdicts(checks, "failed") == ({name} if name else set())
     assert {"ay_m_s2.place", "yaw_rate_rad_s.gain", "yaw_rate_rad_s.delay"} <= {c.name for c in checks}
-
-
-def test_a_place_that_no_car_has_is_undecided(sample_logs_dir: Path) -> None:
-    checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), lever_m=-7.0))
-    (place,) = (c for c in checks if c.name == "ay_m_s2.place")
-    assert place.verdict == "undecided" and "no car has its sensor there" in place.remedy
-
-
-def test_sideslip_that_hardly_moves_beside_a_y_tells_no_sign(tmp_path: Path) -> None:
-    """In a ramp steer at constant speed, the curvature that a_y does not explain is noise and decides no sign."""
-    ramp = simulate_drive(
-        "ramp-steer", speed_km_h=81.81, friction=0.426, seed=1068668474, duration_s=12.5, amplitude=0.2748
-    )
-    write_drive(ramp, tmp_path / "ramp.mcap")
-    found = survey(tmp_path / "ramp.mcap")
-    assert verdicts(checked(found), "failed") == set()
 
 
 def test_what_the_car_knows_of_its_sensors_fails_nothing(sample_logs_dir: Path, saloon: VehicleParameters) -> None:

@@ -101,14 +101,3 @@ def test_the_error_of_a_shift_is_that_of_its_scatter(coloured: bool) -> None:
         shift = find_shift(grid, 0.5).shift_s
         ratios.append((shift - 0.07) / shift_error(grid, shift))
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.3
-
-
-def test_a_ramp_shows_no_shift() -> None:
-    """A gain that bends with the size looks like a delay in a ramp, and only there."""
-    rng, time = np.random.default_rng(4), np.arange(4000) * 0.01
-    for motion, shows in ((0.1 * time, False), (np.sin(1.5 * time), True)):
-        a = motion + 1e-3 * rng.standard_normal(4000)
-        b = 1.5 * motion * (1.0 - 0.05 * np.abs(motion)) + 1e-3 * rng.standard_normal(4000)
-        grid = CommonGrid(0.01, a - np.mean(a), b - np.mean(b))
-        assert (shift_error(grid, find_shift(grid, 0.5).shift_s) < 0.015) == shows
-    assert shift_error(CommonGrid(0.01, np.zeros(4000), np.zeros(4000)), 0.0) == np.inf

@@ -76,22 +76,6 @@ def test_scales_of_right_mappings_are_those_of_units() -> None:
     assert counts == posterior([between], known_hypotheses(("speed_m_s",)))
 
 
-def test_signals_without_a_relation_take_no_probability_from_a_mistake() -> None:
-    """That the roll rate beside a wrong a_y is wrong too is as likely: it must not keep a correction from certainty."""
-    backwards, sound = (
-        relation(-1.0, -1.05, -0.95, -1.0),
-        relation(1.0, 1.0, 1.0, powers={"speed_m_s": 1}, text="speed"),
-    )
-    steered = relation(-1.0, -1.0, -1.0, powers={"ay_m_s2": 1, "speed_m_s": -2}, text="steering")
-    together = ("ay_m_s2", "roll_rate_rad_s", "pitch_rate_rad_s")
-    alone, beside = (
-        posterior([backwards, steered, sound], known_hypotheses((*NAMES, *more), (together,)))
-        for more in ((), together[1:])
-    )
-    assert alone.sets[0][0] == pytest.approx(beside.sets[0][0])
-    assert beside.sets[0][0] > 0.99 and beside.sets[0][1][0].factors == {"ay_m_s2": -1.0}
-
-
 def test_gains_of_blocks_are_free_of_a_bank_and_of_blocks_that_rest() -> None:
     time = np.arange(0.0, 80.0, 0.05)
     bend = np.where(time < 60.0, np.sin(0.9 * time), 0.0)

@@ -61,21 +61,6 @@ def test_only_the_late_topic_is_read_by_stamp_and_it_is_named(late: Path, sample
     assert "0.3 s" in note
 
 
-def test_a_topic_so_late_that_its_delay_is_unknown_is_not_called_causal_either(
-    sample_logs_dir: Path, tmp_path: Path
-) -> None:
-    path = tmp_path / "later.mcap"
-    rewrite(
-        sample_logs_dir / "dlc.mcap", path, lambda _n, _s, topic: round(1.5 * S) if topic == STEERING else 0,
-        lambda _n, _s, _topic: 0,
-    )  # fmt: skip
-    with read_drive(path, Car.load("saloon"), options=ReadOptions(friction=1.0)) as drive:
-        found = drive.whole().signals
-        assert np.isfinite(found.steer_rad).mean() > 0.95
-        assert drive.not_causal == "not causal: steer_rad read by stamp, not by arrival"
-        assert STEERING in {loss.where for loss in drive.losses}, drive.losses
-
-
 @pytest.mark.slow
 def test_a_run_of_it_scores_and_calls_nothing_causal(
     late: Path, sample_logs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -96,10 +96,3 @@ def test_a_waived_check_stops_nothing(sample_logs_dir: Path, tmp_path: Path, map
     for waived in ((), ("steer_rad.unit",)):
         with read_drive(path, car, wrong, ReadOptions(waived=waived)) as drive:
             assert ("steer_rad" in drive.available) == bool(waived)
-
-
-def test_ground_truth_with_a_wrong_sign_scores_nothing(sample_logs_dir: Path, tmp_path: Path, mapping_of: Any) -> None:
-    path = sample_logs_dir / "dlc.mcap"
-    wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), "truth.vy_m_s", "sign"))
-    with read_drive(path, sample_logs_dir / "vehicle.toml", wrong) as drive:
-        assert "vy_m_s" not in drive.mapping.truth

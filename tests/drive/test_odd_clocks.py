@@ -130,15 +130,6 @@ def test_header_stamps_that_are_no_time(name: str, sample_logs_dir: Path, tmp_pa
     assert whole.truth.valid.sum() > 850
 
 
-def test_a_pause_of_twenty_minutes_is_no_epoch(sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
-    log = tmp_path / "pause.mcap"
-    rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: 1200 * S if at_s > 4.0 else 0)
-    drive, whole = read(log, car)
-    assert kinds(drive) == {}
-    assert all(s.used == s.total for s in drive.sample_ledger)
-    assert len(whole.signals) == 951
-
-
 def test_the_share_that_is_damage() -> None:
     def count(**reasons: int) -> SampleCount:
         named = {reason.replace("_", "-"): n for reason, n in reasons.items()}

@@ -75,14 +75,6 @@ def test_a_change_is_named_and_corrected(road: Signals, name: str, jump: float) 
     assert np.sqrt(np.nanmean(error**2)) < (0.004 if stuck else 0.25 * abs(jump))
 
 
-def test_two_sensors_name_the_third_although_the_fourth_shows_nothing(road: Signals) -> None:
-    """The steering confirms a jump of the gyro beside a noisy accelerometer; samples show a jump of a_y without it."""
-    noise = 3.0 * np.random.default_rng(0).standard_normal(len(road))
-    noisy = changed(replace(road, ay_m_s2=road.ay_m_s2 + noise), "yaw_rate_rad_s", 0.05)
-    without_steering = changed(replace(road, steer_rad=np.full(len(road), np.nan)), "ay_m_s2", 2.0)
-    assert [only(s)[1].sensor for s in (noisy, without_steering)] == ["yaw_rate_rad_s", "ay_m_s2"]
-
-
 #: Sensor, gain and bias.
 STEPS = [("yaw_rate_rad_s", 1.0, np.radians(2.0)), ("speed_m_s", 0.95, 0.0), ("speed_m_s", 1.05, 0.0),
          ("steer_rad", 1.0, np.radians(1.0)), ("steer_rad", 1.0, np.radians(10.0 / 16.0))]  # fmt: skip

@@ -17,6 +17,8 @@ DRIVES = {
         "road --speed 46.71 --mu 0.689 --seed 8192170 --duration 25 --vehicle sedan~176164575",
     "noise across the path shows no scale":
         "road --speed 59.04 --mu 0.935 --seed 528562405 --duration 12.5 --vehicle sedan~1192796631",
+    "a curvature that is noise decides no sign of a sideslip":
+        "ramp-steer --speed 81.81 --mu 0.426 --seed 1068668474 --duration 12.5 --amplitude 0.2748",
 }  # fmt: skip
 
 

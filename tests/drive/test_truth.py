@@ -191,31 +191,6 @@ def test_lever_arm_is_taken_back_to_the_cg(kind):
         np.testing.assert_allclose(truth.track.y_m, d.y, atol=1e-9)
 
 
-def test_measured_lateral_acceleration_is_moved_too():
-    stamps, _ = drive(rate=100)
-    t = (stamps - T0) * 1e-9
-    r = 0.4 * np.sin(t)
-    x, y = 1.5, -0.5
-    channels = {
-        "vx_m_s": channel("vx_m_s", stamps, 10 + 0 * t),
-        "vy_m_s": channel("vy_m_s", stamps, 0 * t),
-        "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, r),
-        "ay_m_s2": channel("ay_m_s2", stamps, 10 * r + 0.4 * np.cos(t) * x - r**2 * y),
-    }
-    track = derive_truth(channels, truth_position_m=(x, y, 0.0)).track
-    good = np.isfinite(track.ay_m_s2)
-    np.testing.assert_allclose(track.ay_m_s2[good], 10 * r[good], atol=1e-5)
-
-
-def test_without_a_yaw_rate_velocities_stay_and_the_report_says_so():
-    stamps, d = drive(2.0)
-    channels = {n: channel(n, stamps, v) for n, v in {"vx_m_s": d.vx, "vy_m_s": d.vy}.items()}
-    truth = derive_truth(channels, truth_position_m=(1.0, 0.0, 0.0))
-    np.testing.assert_array_equal(truth.track.vy_m_s, d.vy)
-    assert "no yaw rate" in truth.derivation["cg"]
-    assert np.isnan(truth.track.ay_m_s2).all()
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.floats(-0.2, 0.2), st.floats(0.002, 0.02), st.sampled_from(("quat", "ned frd")))
 def test_specific_force_on_a_bank(bank, gradient, axes):

@@ -106,14 +106,6 @@ def test_a_damaged_column_costs_its_rows_of_one_group() -> None:
         np.testing.assert_array_equal(_column(tables, f"c{i}"), np.where(is_lost, np.nan, AY + i))
 
 
-def test_a_text_that_is_no_utf_8_costs_its_column() -> None:
-    out = io.BytesIO()
-    pq.write_table(pa.table({"t": TIME_S, "ay": AY, "x": ["text"] * N}), out, compression="none", use_dictionary=False)
-    tables = open_parquet(_file(out.getvalue().replace(b"\4\0\0\0text", b"\4\0\0\0te\xd1t")))
-    assert _names(tables) == {"ay"}
-    assert tables.losses[0].what.startswith("x cannot be read: ")
-
-
 def test_rows_and_texts_above_the_limits_are_refused_before_they_are_read() -> None:
     constant = {"t": np.zeros(1_000_000), "ay": np.zeros(1_000_000)}
     with pytest.raises(LogError, match="table bytes"):
@@ -220,13 +212,6 @@ def test_clocks_of_one_mat_file_share_a_unit_and_unlike_lengths_are_a_loss(tmp_p
     path.write_bytes(_mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": fast}))
     with closing(open_log(path)) as two:
         assert [loss.kind for loss in two.lost] == ["clock-lengths"]
-
-
-def test_a_vector_beside_several_clocks_of_its_length_is_named() -> None:
-    structs = {"a": {"time": TIME_S, "x": AY}, "b": {"time": 2.0 * TIME_S, "y": AY}, "c": {"z": AY}}
-    tables = open_mat(_file(_mat({"r": structs})))
-    assert _names(tables) == {"x", "y"}
-    assert [loss.kind for loss in tables.losses] == ["no-clock"]
 
 
 # ------------------------------------------------------------------------------------------------ MAT 7.3

@@ -20,18 +20,12 @@ from pdhef_logtool.records.errors import MappingError
 T0 = 1_700_000_000_000_000_000
 
 
-def _write_raw(
-    path: Path, payloads: Sequence[bytes], encoding: str, name: str, schema_encoding: str, text: str
-) -> None:
+def _write_raw(path: Path, payloads: Sequence[bytes], encoding: str, name: str, schema: str, text: str) -> None:
     with McapLogWriter(path, profile="") as writer:
         channel = writer.add_raw_channel(
-            "/t",
-            schema_name=name,
-            schema_encoding=schema_encoding,
-            schema_data=text.encode(),
-            message_encoding=encoding,
+            "/t", schema_name=name, schema_encoding=schema, schema_data=text.encode(), message_encoding=encoding,
             metadata={},
-        )
+        )  # fmt: skip
         writer.write([], [RawMessage(channel, T0 + i, T0 + i, i, p) for i, p in enumerate(payloads)])
 
 
@@ -122,27 +116,21 @@ def test_listed_fields_follow_the_schema(tmp_path: Path) -> None:
     ("path", "problem"),
     [
         ("angular_velocity.zz", "angular_velocity.z"),
-        ("yaw.z", "angular_velocity.z"),
         ("header.frame_id", "text"),
         ("header", "struct"),
         ("orientation_covariance[9]", "nearest"),
         ("angular_velocity..z", "dotted path"),
-        ("angular_velocity[", "dotted path"),
         ("", "dotted path"),
     ],
 )
 def test_a_wrong_path_names_the_nearest(tmp_path: Path, path: str, problem: str) -> None:
     with McapLogWriter(tmp_path / "x.mcap") as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu")
-    with closing(open_log(tmp_path / "x.mcap")) as log, pytest.raises(MappingError, match=problem):
-        log.read({"/imu": [path]})
-
-
-def test_a_wrong_topic_names_the_nearest(tmp_path: Path) -> None:
-    with McapLogWriter(tmp_path / "x.mcap") as writer:
-        writer.add_topic("/vehicle/imu", "sensor_msgs/msg/Imu")
-    with closing(open_log(tmp_path / "x.mcap")) as log, pytest.raises(MappingError, match="nearest: /vehicle/imu"):
-        log.read({"/vehicle/imv": ["x"]})
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        with pytest.raises(MappingError, match=problem):
+            log.read({"/imu": [path]})
+        with pytest.raises(MappingError, match="nearest: /imu"):
+            log.read({"/imv": ["x"]})
 
 
 def test_an_empty_window_has_columns_of_the_right_shape(tmp_path: Path) -> None:

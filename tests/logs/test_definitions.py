@@ -11,9 +11,8 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pdhef_logtool.logs.definitions import read_definitions
-from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.schema_files import message_definition, schema_file
+from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import MappingError, UsageError
@@ -85,14 +84,6 @@ def test_definitions_of_a_folder_of_a_package_or_a_workspace(tmp_path: Path, lay
     np.testing.assert_allclose(log.read({"/car": ["inner.angle_rad"]})["/car"].fields["inner.angle_rad"], [0, 0.1, 0.2])
 
 
-def test_own_definition_keeps_its_units_and_carries_its_contained_types() -> None:
-    name = "pdhef_msgs/msg/VehicleStateEstimate"
-    text = message_definition(name)
-    assert text.startswith(schema_file(f"{name}.msg").read_text(encoding="utf-8").rstrip())
-    assert "MSG: std_msgs/Header" in text
-    assert "MSG: builtin_interfaces/Time" in text
-
-
 def test_common_packages_are_shipped(tmp_path: Path) -> None:
     name = "ackermann_msgs/msg/AckermannDriveStamped"
     drive = message_definition("ackermann_msgs/msg/AckermannDrive")
@@ -100,15 +91,6 @@ def test_common_packages_are_shipped(tmp_path: Path) -> None:
     log = open_log(bag(tmp_path / "b", {"/drive": (name, texts)}))
     assert auto_map(log).mapping.signals["steer_rad"].field == "drive.steering_angle"
     assert "MSG: ackermann_msgs/AckermannDrive" in message_definition(name)
-
-
-def test_a_part_that_is_missing_is_named(tmp_path: Path) -> None:
-    path = bag(
-        tmp_path / "b", {"/car": ("car_msgs/msg/Outer", {"car_msgs/msg/Inner": INNER, "car_msgs/msg/Outer": OUTER})}
-    )
-    (tmp_path / "defs").mkdir()
-    (tmp_path / "defs" / "Outer.msg").write_text(OUTER)
-    assert "no definition of car_msgs/Inner" in open_log(path, msgs=tmp_path / "defs").unreadable("/car")
 
 
 def test_an_empty_topic_is_said_to_be_empty(tmp_path: Path) -> None:
@@ -157,24 +139,3 @@ def test_an_installed_ros_is_looked_in_and_named(
     (note,) = log.lost
     assert (note.severity, note.where) == ("note", "/steer")
     assert f"read by {folder / 'Steer.msg'} of this machine, as the log does not define its type" in note.what
-
-
-def test_first_messages_come_whole(tmp_path: Path) -> None:
-    path = bag(tmp_path / "b", {"/imu": ("sensor_msgs/msg/Temperature", {})})
-    log = open_log(path)
-    found = log.first_messages("/imu", 2)
-    assert len(found) == 2
-    assert value_at(found[0], ("header", "frame_id")) == ""
-    assert log.first_messages("/none", 1) == []
-
-
-def test_looking_makes_no_losses(tmp_path: Path) -> None:
-    path = bag(tmp_path / "b", {"/steer": ("dbw_msgs/msg/Steer", {"dbw_msgs/msg/Steer": STEER})})
-    (tmp_path / "defs").mkdir()
-    (tmp_path / "defs" / "Steer.msg").write_text("float32 steering_wheel_angle\nstring more\nfloat64[4] and_more\n")
-    log = open_log(path, msgs=tmp_path / "defs")
-    paths = {"/steer": ["steering_wheel_angle"]}
-    log.read(paths, quiet=True)
-    assert log.lost == ()
-    log.read(paths)
-    assert [x.kind for x in log.lost] == ["undecodable"]

@@ -155,14 +155,6 @@ def test_decompression_stops_where_the_claim_ends(compression: str, monkeypatch:
         decompress_message(zstandard.ZstdCompressor().compress(bytes(8 << 20)), ResourceLimits(chunk_bytes=1 << 20))
 
 
-def test_a_file_that_unpacks_to_too_much_gives_its_beginning(tmp_path: Path) -> None:
-    plain = _write(tmp_path / "a.mcap").read_bytes()
-    path = tmp_path / "a.mcap.zst"
-    path.write_bytes(zstandard.ZstdCompressor().compress(plain + bytes(64 << 20)))
-    with closing(open_log(path, ResourceLimits(chunk_ratio=100))) as log:
-        assert [loss.what for loss in log.lost if "above the limit" in loss.what]
-
-
 def test_a_sparse_length_near_the_largest_integer_is_a_loss(tmp_path: Path) -> None:
     message = struct.pack("<BQHIQQ", 5, 2**63 - 8, 1, 0, T0, T0) + bytes(100)
     read, lost, _ = _outcome(_mcap_of_chunk(tmp_path / "a.mcap", len(message), b"", message, zlib.crc32(message)))

@@ -15,7 +15,6 @@ from recorded import write_vectors
 
 from pdhef_logtool import inspect_log
 from pdhef_logtool.logs import mcap_log
-from pdhef_logtool.logs.container import Block
 from pdhef_logtool.logs.open_log import is_log_folder, open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError
@@ -152,24 +151,6 @@ def test_rows_in_a_write_ahead_log_are_read_and_nothing_is_written_beside(tmp_pa
     before = {p.name: p.read_bytes() for p in path.parent.iterdir()}
     assert len(_values(path, "/v", "x")) == len(VALUES) + 1
     assert {p.name: p.read_bytes() for p in path.parent.iterdir()} == before
-
-
-def test_a_chunk_costs_the_same_however_many_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with mcap_writer(tmp_path / "many.mcap", chunk_size=1) as writer:
-        channel = writer.register_channel("/a", "json", 0)
-        for i in range(300):
-            writer.add_message(channel, i, b'{"x": 1.0}', i)
-    asked = 0
-
-    def nbytes(block: Block) -> int:
-        nonlocal asked
-        asked += 1
-        return len(block.buffer)
-
-    monkeypatch.setattr(Block, "nbytes", property(nbytes))
-    with closing(open_log(tmp_path / "many.mcap")) as log:
-        assert len(log.read({"/a": ["x"]})["/a"].fields["x"]) == 300
-    assert 300 <= asked <= 2 * 300
 
 
 # ---- a command decompresses each chunk of a log once, whatever else the chunks contain ----

@@ -44,22 +44,6 @@ def test_a_number_in_any_spelling(texts: list[str], numbers: list[float]) -> Non
     assert (cells.empty, cells.unreadable, cells.ambiguous) == (0, 0, "")
 
 
-@pytest.mark.parametrize(
-    ("texts", "decimal", "numbers"),
-    [
-        (["1,234", "5"], "", [1.234, 5.0]),
-        (["1,234", "5"], ".", [1234.0, 5.0]),
-        (["1.234", "5"], ",", [1234.0, 5.0]),
-        (["5,678", "1.234"], "", [5678.0, 1.234]),
-    ],
-)
-def test_a_group_of_three_digits_alone_is_ambiguous(texts: list[str], decimal: str, numbers: list[float]) -> None:
-    cells = read_cells(pl.Series(texts), decimal)
-    assert (cells.values.tolist(), cells.decimal) == (numbers, "")
-    assert [(x.kind, x.severity) for x in cells.losses("a", "a.csv")] == [("ambiguous-number", "note")]
-    assert cells.ambiguous == f"{texts[0]} is read as {numbers[0]:g}"
-
-
 def test_cells_without_a_number_leave_the_others_in_place() -> None:
     cells = read_cells(pl.Series(["1.5", *EMPTY, *UNREADABLE, "2,5", None, *["0.25"] * 20]))
     where = np.flatnonzero(np.isfinite(cells.values))
@@ -70,12 +54,6 @@ def test_cells_without_a_number_leave_the_others_in_place() -> None:
     assert (loss.kind, loss.count, loss.severity) == ("bad-cell", len(UNREADABLE), "lost")
     assert "'ERR'" in loss.what
     assert f"row {2 + len(EMPTY)}" in loss.where
-
-
-def test_a_column_of_texts_is_no_column_of_numbers() -> None:
-    assert read_cells(pl.Series(["12:00:00", "12:00:01", "", "7"])).is_text
-    assert not read_cells(pl.Series(["", "", "7"])).is_text
-    assert not read_cells(pl.Series(["", ""], dtype=pl.String)).is_text
 
 
 _SPELLINGS: dict[str, Callable[[float], str]] = {

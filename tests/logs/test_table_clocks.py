@@ -121,13 +121,6 @@ def test_a_clock_without_a_unit_is_one_of_a_usual_recording(values: FloatArray, 
     assert [note in text for text in clock.notes] == [True] * bool(note)
 
 
-def test_another_clock_of_the_table_decides_the_unit() -> None:
-    utc = pl.Series([f"2024-05-01 12:{i // 60 % 60:02d}:{i % 60:02d}" for i in range(40)])
-    seconds = np.arange(40) * 10.0  # 400 s, or 0.4 s; the dates last 39 s
-    assert np.ptp(_clock(time=np.arange(40) * 1000.0, utc=utc).stamps_ns) == 39 * 10**9
-    assert np.ptp(_clock(time=seconds).stamps_ns) == 390 * 10**9
-
-
 @pytest.mark.parametrize(
     ("name", "beside", "year"),
     [("gps_time", {}, 2024), ("time", {}, 2014), ("time", {"utc_time": MAY_1_NS * 1e-9}, 2024)],
@@ -268,14 +261,6 @@ def test_a_column_has_its_own_table_if_its_clock_is_slower(missing: str, own_row
     np.testing.assert_allclose(gnss[np.isfinite(gnss)], stamps[np.isfinite(gnss)], atol=1e-6)
     assert np.isfinite(gnss).sum() == there.sum()
     assert [loss.what for loss in losses] == ["columns without numbers are left out: driver"]
-
-
-def test_a_column_of_another_length_is_a_loss() -> None:
-    losses: list[Loss] = []
-    columns = {"t": np.arange(50) * 0.02, "ay": np.zeros(50), "short": np.zeros(49)}
-    (table,) = tables_of(Sheet("csv", columns, {}), "a.csv", losses)
-    assert [field.path for field in table.fields] == ["ay"]
-    assert [loss.what for loss in losses] == ["short: 49 values for 50 times"]
 
 
 # ---- shared cases of clocks, Parquet and MAT files: duration, start and samples of each ----

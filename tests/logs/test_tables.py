@@ -279,30 +279,6 @@ def test_other_columns_decide_what_a_mark_between_digits_is(
     assert lost == ([("ambiguous-number", None)] if note else [])
 
 
-def test_bytes_that_are_no_utf_8_cost_no_other_character(tmp_path: Path) -> None:
-    data = _csv(SECONDS, "time,ay [m/s²],speed [km/h]").encode() + "2.00,1.0,caf\xe9\n".encode("latin-1")
-    columns, lost = _read(tmp_path / "a.csv", data)
-    assert len(columns["ay"]) == N + 1
-    assert ("bad-cell", 1) in lost
-    with closing(open_log(tmp_path / "a.csv")) as log:
-        assert {f.path: f.unit for f in log.fields("csv")}["ay"] == "m/s²"
-
-
-def test_a_title_may_have_two_lines(tmp_path: Path) -> None:
-    columns, lost = _read(
-        tmp_path / "a.csv", _csv(SECONDS, '"time","ay\n[m/s²]","speed, measured"') + '"2.0","1","2"\n'
-    )
-    assert {*columns} == {"ay", "speed_measured"}
-    assert lost == []
-
-
-def test_more_columns_than_the_limit_are_refused_before_they_are_read(tmp_path: Path) -> None:
-    width = 70_000
-    text = "\n".join([",".join(["time", *(f"c{i}" for i in range(width))]), *(f"{i}" + "," * width for i in range(30))])
-    with pytest.raises(PdhefError, match="array width"):
-        _log(tmp_path / "a.csv", text.encode())
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -376,15 +352,6 @@ def test_of_too_many_or_too_few_units_those_that_belong_to_one_quantity_are_used
         assert (loss.kind, loss.severity, loss.count) == ("units", "note", list(units.values()).count(""))
 
 
-def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:
-    data = vbo(["100000.00", "100000.01"], units="\n\n\n")
-    data = data.replace(b"YawRate\r", b"YawRate [deg/s]\r").replace(b"Y_Accel\r", b"Y_Accel (g)\r")
-    with closing(_log(tmp_path / "a.vbo", data)) as log:
-        units = {f.path: f.unit for f in log.fields("vbox")}
-        assert (units["YawRate"], units["Y_Accel"], units["latitude"]) == ("deg/s", "g", "min")
-        assert log.lost == ()
-
-
 @pytest.mark.parametrize(("east", "turn"), [(1, 90), (-1, 90), (1, 1), (-1, 1)])
 def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp_path: Path) -> None:
     head = "File created on 01/05/2024\n\n[header]\ntime\nlatitude\nlongitude\nheading\n\n[data]\n"
@@ -437,30 +404,7 @@ def test_a_parquet_file_with_units_nulls_and_structs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["parquet_2"].fields["gnss_speed"], SPEED[::10])
 
 
-@pytest.mark.parametrize("kind", [pa.duration("us"), pa.time64("us")])
-def test_durations_and_times_of_day_are_times(kind: pa.DataType, tmp_path: Path) -> None:
-    clock = pa.array(np.round(TIME_S * 1e6).astype(np.int64)).cast(kind)
-    pq.write_table(pa.table({"t": clock, "ay": AY}), tmp_path / "a.parquet")
-    with closing(open_log(tmp_path / "a.parquet")) as log:
-        read = log.read({"parquet": ["ay"]})["parquet"]
-    np.testing.assert_allclose((read.log_time_ns - RELATIVE_NS) * 1e-9, TIME_S, atol=1e-9)
-
-
 # ------------------------------------------------------------------------------------------------ MAT
-
-
-def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
-    savemat(tmp_path / "a.mat", {"t": TIME_S, "ay": AY, "speed": SPEED}, do_compression=True)
-    data = bytearray((tmp_path / "a.mat").read_bytes())
-    second = 128 + 8 + int.from_bytes(data[132:136], "little")
-    data[second + 40 : second + 80] = b"\x00" * 40
-    with closing(_log(tmp_path / "b.mat", bytes(data))) as log:
-        assert [(x.kind, x.severity) for x in log.lost] == [("bad-variable", "lost")]
-        assert [f.path for f in log.fields("mat")] == ["speed"]
-    cut = (tmp_path / "a.mat").read_bytes()[:-30]
-    with closing(_log(tmp_path / "c.mat", cut)) as log:
-        assert [f.path for f in log.fields("mat")] == ["ay"]
-    assert called("inspect", tmp_path / "c.mat").returncode == 3
 
 
 @pytest.mark.parametrize(("turned_deg", "recognised"), [(0.0, True), (3.0, True), (90.0, False), (180.0, False)])
@@ -500,15 +444,6 @@ def test_a_search_ignores_general_files_beside_logs(tmp_path: Path) -> None:
     assert [log.path.name for log in find_logs([str(tmp_path / "one" / "notes.csv")])] == ["notes.csv"]
 
 
-def test_a_text_table_is_a_log_where_it_is_named_and_not_in_a_search(tmp_path: Path) -> None:
-    data = DIALECTS["tabs"][0]
-    for name in ("drive.csv", "drive.txt", "notes.txt"):
-        (tmp_path / name).write_bytes(data)
-    assert [log.path for log in find_logs([str(tmp_path)])] == [tmp_path / "drive.csv"]
-    with closing(open_log(tmp_path / "drive.txt")) as text, closing(open_log(tmp_path / "drive.csv")) as table:
-        assert [(t.name, t.messages) for t in text.topics] == [(t.name, t.messages) for t in table.topics]
-
-
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path: Path) -> None:
     rows = [(t, "Lat Acc [m/s²]", a) for t, a in zip(TIME_S, AY, strict=True)]
@@ -531,15 +466,6 @@ def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path
     np.testing.assert_allclose(read[kind].fields["Lat_Acc"], AY)
     np.testing.assert_allclose(read[kind].fields["speed"], SPEED)
     np.testing.assert_allclose(read[f"{kind}_2"].fields["gnss"], 2.0 * TIME_S[::10])
-
-
-def test_a_magnitude_and_its_sign_are_one_signal(tmp_path: Path) -> None:
-    signed = np.sin(TIME_S)
-    rows = [f"{t:.2f},{abs(v):.6f},{int(v < 0)},{int(v < 0)}" for t, v in zip(TIME_S, signed, strict=True)]
-    path = tmp_path / "a.csv"
-    path.write_text("\n".join(["time,ESP_Gierrate [rad/s],ESP_VZ_Gierrate,Other_sign", *rows, ""]))
-    source = inspect_log(path).mapping.signals["yaw_rate_rad_s"]
-    assert (source.field, source.combine) == (("ESP_Gierrate", "ESP_VZ_Gierrate"), "signed")
 
 
 @pytest.mark.parametrize("clock", ["millis", "sensorTimestamp_since1970(s)"])
@@ -577,15 +503,6 @@ def test_texts_that_name_no_signals_make_no_columns(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("\n".join(["time,name,value", *rows, ""]))
     with closing(open_log(tmp_path / "a.csv")) as log:
         assert [f.path for t in log.topics for f in log.fields(t.name)] == ["value"]
-
-
-def test_titles_in_other_alphabets_and_short_names_of_a_clock(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("ts,车速 [km/h],横摆角速度(deg/s),左前轮速\n0.00,36,1,10\n0.01,36,2,10\n0.02,37,3,10\n")
-    with closing(open_log(path)) as log:
-        assert {f.path for t in log.topics for f in log.fields(t.name)} == {
-            "vehicle_speed", "yaw_rate", "front_left_wheel_speed"
-        }  # fmt: skip
 
 
 def _stamps_of(path: Path, text: str) -> list[int]:

@@ -59,15 +59,6 @@ def test_a_suite_s_manifest_tells_what_is_there(suite: tuple[Path, dict], tmp_pa
     assert hashlib.sha256((tmp_path / "x.mcap").read_bytes()).hexdigest() == manifest["drives"][1]["sha256"]
 
 
-def test_a_larger_suite_begins_with_the_smaller_one() -> None:
-    small, large = plan_suite(5, 7), plan_suite(50, 7)
-    assert large[:5] == small
-    assert plan_suite(5, 8) != small
-    assert [j.candidates[0].vehicle for j in plan_suite(3, 7)] == ["sedan"] * 3
-    others = [j.candidates[0].vehicle for j in plan_suite(20, 7, vehicles="randomised")]
-    assert len(set(others)) == 20 and all(v.startswith("sedan~") for v in others)
-
-
 def test_draws_fill_the_range_and_the_splits() -> None:
     jobs = plan_suite(750, 1)
     specs = [job.candidates[0] for job in jobs]

@@ -105,35 +105,6 @@ def test_values_survive(read_back, drive: Drive) -> None:
     assert messages["/rtk/quality"][-1][2].quality == 4
 
 
-def test_perfect_truth_is_exact(read_back, drive: Drive) -> None:
-    messages, _, _ = read_back
-    q = np.array(
-        [[getattr(m.pose.pose.orientation, k) for k in "wxyz"] for _, _, m in messages["/truth/perfect/odometry"]]
-    )
-    w, x, y, z = q.T
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    truth = drive.truth
-    assert np.abs(np.unwrap(yaw) - truth["yaw_rad"]).max() < 1e-6
-    assert np.abs(roll - truth["roll_rad"]).max() < 1e-6
-    states = [m for _, _, m in messages["/truth/perfect/state"]]
-    for name in ("vx_m_s", "vy_m_s", "sideslip_rad", "ay_m_s2", "roll_rad", "steer_rad"):
-        assert np.abs(np.array([getattr(m, name) for m in states]) - truth[name]).max() < 1e-7, name
-    twist = np.array([m.twist.twist.linear.y for _, _, m in messages["/truth/perfect/odometry"]])
-    assert np.abs(twist - truth["vy_m_s"]).max() < 1e-7
-    assert states[-1].friction == pytest.approx(0.85, abs=1e-7)
-    assert states[-1].vertical_force_n.sum() == pytest.approx(1440.0 * 9.80665, rel=2e-3)
-
-
-def test_metadata_says_how_it_was_made(read_back) -> None:
-    _, _, metadata = read_back
-    assert metadata["command"] == "pdhef simulate step-steer --speed 100 --mu 0.85 --seed 2"
-    assert (metadata["friction"], metadata["seed"], metadata["spun"]) == ("0.85", "2", "false")
-    assert json.loads(metadata["vehicle"])["mass_kg"] == 1440.0
-    assert json.loads(metadata["noise"])["acceleration_m_s2"] == 0.12
-    assert set(json.loads(metadata["versions"])) >= {"pdhef-logtool", "numpy"}
-
-
 @pytest.fixture(scope="module")
 def manifest() -> list[dict]:
     return tomllib.loads((ROOT / "sample_logs" / "manifest.toml").read_text(encoding="utf-8"))["log"]
