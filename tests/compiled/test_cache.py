@@ -50,8 +50,8 @@ def _load(file: Path) -> ModuleType:
 def _close(monkeypatch: pytest.MonkeyPatch, *folders: Path) -> None:
     """Make these folders read-only: permissions do not restrict root."""
 
-    def file_in(dir: Path) -> object:  # noqa: A002
-        if any(map(dir.is_relative_to, folders)):
+    def file_in(dir: Path | str) -> object:  # noqa: A002
+        if any(map(Path(dir).is_relative_to, folders)):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(dir))
         return TEMPORARY_FILE(dir=dir)
 

@@ -82,13 +82,6 @@ def test_columns_on_an_even_grid_are_those_of_numpy(share: float) -> None:
             np.testing.assert_allclose(column, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_what_never_moves_has_no_shift() -> None:
-    moving = np.sin(np.arange(300) * 0.1)
-    holed = np.where(np.arange(300) % 7 == 0, np.nan, 0.0)
-    for still in (np.zeros(300), holed):
-        assert repr(find_shift(CommonGrid(0.01, moving, still), 0.3)) == repr(_UNKNOWN)
-
-
 @pytest.mark.parametrize("coloured", [False, True])
 def test_the_error_of_a_shift_is_that_of_its_scatter(coloured: bool) -> None:
     """Noise is white or as slow as a bend: the spread of shifts over many drives is the error that is stated."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from odd_clocks import S, Shift, rewrite
+from odd_clocks import S, rewrite
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
@@ -105,29 +105,6 @@ def test_a_clock_that_steps_back(chunk: int, sample_logs_dir: Path, tmp_path: Pa
         _, i, j = np.intersect1d(stamps[part] + by, sound.stamps_ns, return_indices=True)
         assert len(i) == part.sum() > 100
         np.testing.assert_array_equal(whole.signals.yaw_rate_rad_s[part][i], sound.yaw_rate_rad_s[j])
-
-
-def shifts() -> dict[str, Shift]:
-    return {
-        "an hour back, half-way": lambda _n, at_s, _t: -3600 * S if at_s > 4.0 else 0,
-        "an hour back, one topic": lambda _n, _s, topic: -3600 * S if topic == "/imu/data" else 0,
-        "three seconds back, one topic": lambda _n, at_s, t: -3 * S if at_s > 4.0 and t == "/imu/data" else 0,
-        "in fives": lambda number, _s, _t: -(number % 5) * S // 100,
-    }
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", shifts())
-def test_header_stamps_that_are_no_time(name: str, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
-    log = tmp_path / "headers.mcap"
-    rewrite(sample_logs_dir / "dlc.mcap", log, lambda *_: 0, shifts()[name])
-    drive, whole = read(log, car)
-    assert kinds(drive) == {"log-time-serves": "note"}
-    assert all(s.used == s.total for s in drive.sample_ledger)
-    assert {s.stamp for s in drive.sample_ledger if s.source.startswith("/imu/data")} == {"log_time"}
-    assert len(whole.signals) == 951
-    assert whole.truth is not None
-    assert whole.truth.valid.sum() > 850
 
 
 def test_the_share_that_is_damage() -> None:

@@ -275,17 +275,6 @@ def test_a_damaged_object_costs_itself(offset: int, value: bytes, tmp_path: Path
     assert [loss.kind for loss in tables.losses] == ["bad-chunk"]
 
 
-def test_an_object_that_covers_others_costs_itself(tmp_path: Path) -> None:
-    marker = bytearray(blf_object(96, bytes(48), 0))
-    marker[8:12] = struct.pack("<I", 1001)
-    parts = [bytearray(container(numbered(5, first=i))) for i in range(40, 60, 5)]
-    parts[1][8:12] = struct.pack("<I", len(parts[1]) + 50)
-    objects = numbered(5) + bytes(marker) + numbered(35, first=5)
-    tables = read(blf(tmp_path / "a.blf", container(objects), *map(bytes, parts)))
-    assert set(range(60)) - set(numbers_of(tables)) <= set(range(45, 50))
-    assert {loss.kind for loss in tables.losses} == {"bad-chunk"}
-
-
 def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     path = write(
         tmp_path / "a.blf", [sent(i / 100, 256, struct.pack("<I", i)) for i in range(600)], max_container_size=2000
@@ -665,15 +654,3 @@ def test_a_dbc_that_matches_nothing_is_named(tmp_path: Path) -> None:
     notes = " ".join(map(str, inspect_log(path, options=ReadOptions(msgs=tmp_path / "car.dbc")).to_dict()["notes"]))
     assert "car.dbc contains none of their identifiers" in notes
     assert "--set msgs" not in notes
-
-
-def test_losses_of_a_column_are_those_of_a_log_that_reads_it(drive: Path, tmp_path: Path) -> None:
-    (tmp_path / "car.dbc").write_text(HEAD + MOTION.replace("(0.01,0) [0|0]", "(0.01,0) [0|72.9]"))
-    with closing(open_log(drive, msgs=tmp_path / "car.dbc")) as log:
-        log.read({"Motion": ["Speed"]}, quiet=True)
-        log.read({"Motion": ["AccelY"]})
-        assert kinds_of(log) == ["unknown-frame"]
-        for _ in range(2):
-            read = log.read({"Motion": ["Speed"]}, log.end_ns - 10**9, log.end_ns)["Motion"]
-        assert kinds_of(log) == ["unknown-frame", "out-of-range"]
-    assert np.isnan(read.fields["Speed"]).sum() == 9

@@ -337,15 +337,6 @@ def test_invalid_samples_are_missing_at_their_own_times(low: float | None, high:
     np.testing.assert_array_equal(read.fields["v"], SPEED[rows])
 
 
-def test_rows_with_an_invalid_time_are_a_loss(tmp_path: Path) -> None:
-    samples = np.zeros(N, [("t", "<f8"), ("a", "<f8"), ("i", "u1")])
-    samples["t"], samples["a"], samples["i"] = TIME_S, AY, np.arange(N) % 5 == 0
-    channels = [Ch("time", kind=2, sync=1, flags=2), Ch("AccY", 8)]
-    read = of_bytes(tmp_path, mdf4(channels, samples.tobytes(), N, 16, invalid_bytes=1))
-    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY[np.arange(N) % 5 != 0])
-    assert [loss.count for loss in read.read.losses] == [N // 5]
-
-
 # ---- times ----
 
 
@@ -496,17 +487,6 @@ HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
 def test_a_file_that_is_made_to_harm_is_one_line(make: Callable[[], bytes], match: str, tmp_path: Path) -> None:
     with pytest.raises(LogError, match=match):
         of_bytes(tmp_path, make())
-
-
-def test_an_unfinished_file_with_several_lists_of_data_is_one_line(tmp_path: Path) -> None:
-    data = bytearray(written(tmp_path / "a.mf4", [signal("ay", AY)]).read_bytes())
-    group = block(bytes(data), b"DG")
-    lists = [len(data), len(data) + 48]
-    for following in (lists[1], 0):
-        data += struct.pack("<4s4xQQQIIQ", b"##DL", 48, 1, following, 0, 0, 0)[:48]
-    data[:8], data[60:62] = b"UnFinMF ", struct.pack("<H", 0b10000)
-    with pytest.raises(LogError, match="several lists of data"):
-        of_bytes(tmp_path, patched(bytes(data), group + 24 + 16, lists[0]))
 
 
 def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(

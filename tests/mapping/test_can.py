@@ -23,6 +23,7 @@ from pdhef_logtool.mapping import Mapping, check_mapping, fit_clocks, load_mappi
 from pdhef_logtool.mapping.evidence import LARGEST
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.runs.inspection.report import inspect_log
+from studies.strangers.containers import Topic, write
 from tests.mcap_files import mcap_writer
 
 S = 1_000_000_000
@@ -85,14 +86,6 @@ def test_any_layout_decodes_as_cantools_decodes_it(layout: tuple[Signal, int], f
 
 # ---------------------------------------------------------------------------------------------- whole logs
 
-_ROS_FRAME = (
-    "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n"
-    + "=" * 80
-    + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-    + "=" * 80
-    + "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-)
-
 
 def _write(path: Path, encoding: str, schema: tuple[str, str, bytes], payloads: Sequence[bytes]) -> None:
     with mcap_writer(path) as writer:
@@ -103,25 +96,12 @@ def _write(path: Path, encoding: str, schema: tuple[str, str, bytes], payloads: 
 
 
 def _write_ros(path: Path, frames: Sequence[Frame]) -> None:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(_ROS_FRAME, "can_msgs/msg/Frame"))
-    kinds = store.types
-    payloads = []
-    for i, f in enumerate(frames):
-        stamp = kinds["builtin_interfaces/msg/Time"](sec=1 + i // 1000, nanosec=i % 1000 * 1_000_000)
-        message = kinds["can_msgs/msg/Frame"](
-            header=kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="can0"),
-            id=f.id,
-            is_rtr=f.remote,
-            is_extended=f.extended,
-            is_error=f.error,
-            dlc=len(f.data),
-            data=np.frombuffer(f.data.ljust(8, b"\xaa"), np.uint8),
-        )
-        payloads.append(bytes(store.serialize_cdr(message, "can_msgs/msg/Frame")))
-    _write(path, "cdr", ("can_msgs/msg/Frame", "ros2msg", _ROS_FRAME.encode()), payloads)
+    stamps_ns = S + np.arange(len(frames), dtype=np.int64) * 1_000_000
+    parts = {"id": "id", "is_rtr": "remote", "is_extended": "extended", "is_error": "error"}
+    fields = {field: np.array([getattr(f, name) for f in frames]) for field, name in parts.items()}
+    fields |= {"header.stamp": stamps_ns, "dlc": np.array([len(f.data) for f in frames])}
+    fields["data"] = np.array([list(f.data.ljust(8, b"\xaa")) for f in frames])
+    write([Topic("/can/raw", "can_msgs/msg/Frame", stamps_ns, stamps_ns, fields)], path, "mcap")
 
 
 def _write_json(path: Path, frames: Sequence[Frame], data: Callable[[bytes], object]) -> None:

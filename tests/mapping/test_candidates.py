@@ -243,13 +243,6 @@ def test_the_path_shows_how_a_heading_counts(
         assert source.scale == (1.0, 1.0, -1.0 if names[2] == "vel_d" else 1.0)
 
 
-def test_a_magnitude_whose_sign_is_a_text_is_no_signal_and_the_others_are() -> None:
-    bus = topic(steering_angle_deg=np.abs(STEER) / DEG, yaw_rate_dps=RATE / DEG)
-    bus.fields["steering_angle_deg_sign"] = np.where(STEER < 0.0, "right", "left").astype(object)
-    signals = found(bus=bus, **SPEED).mapping.signals
-    assert "yaw_rate_rad_s" in signals and not {"steer_rad", "steering_wheel_rad"} & set(signals)
-
-
 def test_a_magnitude_takes_its_sign_from_another_field() -> None:
     bus = topic(steering_angle_deg=np.abs(STEER) / DEG, steering_angle_deg_sign=1.0 * (STEER < 0.0))
     source = found(bus=bus, imu__data=topic(**imu_fields()), **SPEED).mapping.signals["steer_rad"]

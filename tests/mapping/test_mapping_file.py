@@ -79,24 +79,12 @@ def test_a_unit_states_the_scale(tmp_path: Path, signal: str, unit: str, scale: 
 
 def test_all_problems_come_in_one_line(tmp_path: Path) -> None:
     text = """
-    [signals.yaw_rate_rads]
-    topic = "/imu"
-    field = "z"
-    [signals.vy_m_s]
-    topic = "/imu"
-    field = "y"
-    [signals.ax_m_s2]
-    topic = "/imu"
-    fields = "x"
-    scale = "9.81"
-    [signals.ay_m_s2]
-    topic = "/imu"
-    field = "y"
-    scale = 0.0
-    stamp_unit = "hours"
-    [signal.speed_m_s]
-    topic = "/s"
-    field = "v"
+    signal.speed_m_s = {topic = "/s", field = "v"}
+    [signals]
+    yaw_rate_rads = {topic = "/imu", field = "z"}
+    vy_m_s = {topic = "/imu", field = "y"}
+    ax_m_s2 = {topic = "/imu", fields = "x", scale = "9.81"}
+    ay_m_s2 = {topic = "/imu", field = "y", scale = 0.0, stamp_unit = "hours"}
     """
     with pytest.raises(MappingError) as caught:
         load_text(tmp_path, text)

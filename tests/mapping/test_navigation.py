@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +16,8 @@ from pdhef_logtool.mapping.joints import joint_names
 from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_from_dict, mapping_to_toml
 from pdhef_logtool.mapping.navigation import receiver_signals
 from pdhef_logtool.records.errors import MappingFileError
+from studies.strangers import containers
+from studies.strangers.containers import Topic
 from tests.fake_drive_log import FakeLog, FakeTopic
 
 N = 3000
@@ -207,13 +209,6 @@ def test_a_message_with_a_heading_is_no_sensor(fields):
     assert receiver_signals("/ins", "log_time", fields) == {}
 
 
-def test_the_accuracy_of_a_fix_is_the_root_of_its_variances():
-    paths = ["latitude", "longitude", "position_covariance_type", "status.status", "position_covariance"]
-    accuracy = receiver_signals("/fix", "log_time", paths)["gnss_position_accuracy_m"]
-    assert (accuracy.combine, accuracy.scale) == ("root", (0.5, 0.5))
-    assert accuracy.paths == ("position_covariance[0]", "position_covariance[4]")
-
-
 def _log(**topics):
     rng = np.random.default_rng(0)
     imu = {
@@ -245,28 +240,18 @@ def test_an_instrument_that_is_ground_truth_is_no_sensor():
     assert not [name for name in auto_map(log).mapping.signals if name.startswith("gnss_")]
 
 
-def write(path: Path, *, ros1: bool) -> Path:
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-    types: Any = store.types
-    name, values = "sensor_msgs/msg/JointState", np.array([0.1, 0.2])
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="", **({"seq": 0} if ros1 else {}))
-    joints = types[name](header, ["left_steer", "right_steer"], values, values, values)
-    with Writer1(path) if ros1 else Writer2(path, version=8) as writer:
-        connection = writer.add_connection("/joint_states", name, typestore=store)
-        data = store.serialize_ros1(joints, name) if ros1 else store.serialize_cdr(joints, name)
-        for i in range(3):
-            writer.write(connection, START + i * 10_000_000, data)
-    return path
+def write(path: Path, container: str) -> Path:
+    """Write a log of two steered joints."""
+    values = np.tile([0.1, 0.2], (3, 1))
+    fields = dict.fromkeys(("position", "velocity", "effort"), values)
+    joints = Topic(
+        "/joint_states", "sensor_msgs/msg/JointState", T[:3], T[:3], fields, {"name": "left_steer right_steer"}
+    )
+    return containers.write([joints], path, container)
 
 
-@pytest.mark.parametrize("name", ["log.bag", "log"])
-def test_joints_of_real_messages(tmp_path: Path, name: str) -> None:
-    log = open_log(write(tmp_path / name, ros1=name.endswith(".bag")))
-    (topic,) = (t for t in log.topics if t.name == "/joint_states")
-    assert joint_names(log, topic) == ("left_steer", "right_steer")
-    log.close()
+@pytest.mark.parametrize("container", ["rosbag1", "rosbag2"])
+def test_joints_of_real_messages(tmp_path: Path, container: str) -> None:
+    with closing(open_log(write(tmp_path / "log", container))) as log:
+        (topic,) = (t for t in log.topics if t.name == "/joint_states")
+        assert joint_names(log, topic) == ("left_steer", "right_steer")

@@ -183,18 +183,6 @@ def test_a_yaw_rate_of_nothing_but_zeros_is_a_filler() -> None:
     assert set(found({"/ins/odom": out}).mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
 
 
-@pytest.mark.parametrize(
-    ("x_m", "y_m", "filler"), [(0.9, 0.9, False), (1.1, 0.0, True), (0.0, 1.1, True), (1.9, 0.5, True)]
-)
-def test_a_car_that_stands_still_has_a_twist_of_zero(x_m: float, y_m: float, filler: bool) -> None:
-    out = odometry(forward=0 * S, left=0 * S)
-    out.fields |= {f"pose.pose.position.{a}": m * np.sin(S) for a, m in (("x", x_m / 2), ("y", y_m / 2))}
-    out.fields["pose.pose.position.x"][5] = np.nan
-    assert ("vx_m_s" not in found({"/ins/odom": out}).mapping.truth) == filler
-    out.fields["twist.twist.linear.y"] = np.where(np.arange(N) == N - 1, 0.01, 0.0)
-    assert "vx_m_s" in found({"/ins/odom": out}).mapping.truth
-
-
 def test_what_was_ambiguous_names_its_readings_and_the_one_that_was_taken() -> None:
     heading = 0.5 * S
     vel = twist("geometry_msgs/msg/TwistStamped", "twist", 10 * np.cos(heading), 10 * np.sin(heading))
@@ -221,14 +209,6 @@ def test_a_fix_is_gated_by_the_best_that_its_receiver_can_say(name: str, status:
     gate = auto.mapping.quality
     assert gate is not None and (gate.topic, gate.min, gate.stamp) == (name, lowest, "header.stamp")
     assert auto.mapping.notes == (f"ground truth is used where {name}.status.status is at least {lowest:g}",)
-
-
-def test_an_orientation_that_is_none_and_a_pose_that_stays_at_the_origin_are_fillers() -> None:
-    out = odometry()
-    out.fields["pose.pose.orientation.w"] = np.zeros(N)
-    assert set(found({"/ins/odom": out}).mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m"}
-    out.fields |= {f"pose.pose.position.{a}": np.zeros(N) for a in "xy"}
-    assert set(found({"/ins/odom": out}).mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
 
 
 @pytest.mark.parametrize(
