@@ -162,17 +162,6 @@ def test_what_is_no_array_of_numbers_is_named() -> None:
     )
 
 
-def test_dimensions_without_their_values_cost_one_variable() -> None:
-    data = bytearray(_mat({"t": TIME_S, "ay": AY, "huge": np.arange(77.0)}))
-    place = data.index(b"\x05\x00\x00\x00\x08\x00\x00\x00\x01\x00\x00\x00\x4d")
-    data[place + 8 : place + 16] = (50_000).to_bytes(4, "little") * 2
-    tables = open_mat(_file(bytes(data)))
-    assert _names(tables) == {"ay"}
-    assert _losses(tables) == [
-        ("lost", "a variable cannot be read: ValueError: huge has 77 values for the dimensions [50000, 50000]")
-    ]
-
-
 def test_a_compressed_variable_above_the_limits_costs_itself() -> None:
     data = _mat({"t": TIME_S, "ay": AY}) + _mat({"zeros": np.zeros(4_000_000)}, compressed=True)[128:]
     tables = open_mat(_file(data, DEFAULT_LIMITS.times(0.01)))

@@ -275,19 +275,6 @@ def test_a_damaged_object_costs_itself(offset: int, value: bytes, tmp_path: Path
     assert [loss.kind for loss in tables.losses] == ["bad-chunk"]
 
 
-def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
-    path = write(
-        tmp_path / "a.blf", [sent(i / 100, 256, struct.pack("<I", i)) for i in range(600)], max_container_size=2000
-    )
-    data = path.read_bytes()
-    (tmp_path / "b.blf").write_bytes(data[: len(data) // 2])
-    tables = read(tmp_path / "b.blf")
-    found = numbers_of(tables)
-    assert found == list(range(len(found)))
-    assert 200 < len(found) < 400
-    assert [loss.kind for loss in tables.losses] == ["truncated"]
-
-
 @pytest.mark.parametrize(
     ("bad", "limits", "kind", "text"),
     [

@@ -218,24 +218,6 @@ def test_a_file_that_is_cut_while_it_is_open_is_a_loss(tmp_path: Path, chunked: 
         assert log.lost
 
 
-def test_whatever_escapes_a_container_is_the_loss_of_its_span(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with closing(open_log(_write(tmp_path / "a.mcap"))) as log:
-        container = log.containers[0]  # type: ignore[attr-defined]
-        load, bad = container.load, container.spans[1]
-
-        def broken(span: object, want: object = None) -> object:
-            if span is bad:
-                raise ZeroDivisionError("a fault of ours")
-            return load(span, want)
-
-        monkeypatch.setattr(container, "load", broken)
-        count = sum(bad.counts.values())
-        assert sum(counts_of(log).values()) == 2 * N - count
-        (loss,) = log.lost
-        assert (loss.start_ns, loss.end_ns, loss.count) == (bad.start_ns, bad.end_ns, count)
-        assert "ZeroDivisionError: a fault of ours" in loss.what
-
-
 def _within(action: Callable[[], object]) -> BaseException | None:
     """Return the exception that an action raises; fail if the action does not end."""
     caught: list[BaseException | None] = []

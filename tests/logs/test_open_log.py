@@ -187,18 +187,6 @@ def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: py
     assert sorted(opened.values())[-2:] in ([1, 1], [1, 2])
 
 
-def test_large_payloads_are_read_again_when_they_are_requested(mixed: Path) -> None:
-    with closing(open_log(mixed)) as log:
-        small = next(t.name for t in log.topics if t.name != "/camera" and log.fields(t.name))
-        path = next(f.path for f in log.fields(small) if f.kind == "number")
-        before = log.read({small: [path]}, stamps=["/camera"])
-        images = log.read({"/camera": ["size"]})["/camera"]
-        after = log.read({small: [path]})[small]
-    np.testing.assert_array_equal(images.fields["size"], np.arange(len(images)) * 50)
-    np.testing.assert_array_equal(before["/camera"].log_time_ns, images.log_time_ns)
-    np.testing.assert_array_equal(before[small].fields[path], after.fields[path])
-
-
 def test_expected_fields_are_those_of_a_plain_read(mixed: Path) -> None:
     with closing(open_log(mixed)) as log, closing(open_log(mixed)) as plain:
         requests = {t.name: [f.path for f in log.fields(t.name) if f.kind == "number"][:3] for t in log.topics}

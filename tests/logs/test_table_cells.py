@@ -44,18 +44,6 @@ def test_a_number_in_any_spelling(texts: list[str], numbers: list[float]) -> Non
     assert (cells.empty, cells.unreadable, cells.ambiguous) == (0, 0, "")
 
 
-def test_cells_without_a_number_leave_the_others_in_place() -> None:
-    cells = read_cells(pl.Series(["1.5", *EMPTY, *UNREADABLE, "2,5", None, *["0.25"] * 20]))
-    where = np.flatnonzero(np.isfinite(cells.values))
-    assert where.tolist() == [0, len(EMPTY) + len(UNREADABLE) + 1, *range(len(cells.values) - 20, len(cells.values))]
-    assert (cells.empty, cells.unreadable) == (len(EMPTY) + 1, len(UNREADABLE))
-    assert (cells.example, cells.row, cells.decimal) == ("ERR", 1 + len(EMPTY), ".")
-    (loss,) = cells.losses("yaw", "a.csv")
-    assert (loss.kind, loss.count, loss.severity) == ("bad-cell", len(UNREADABLE), "lost")
-    assert "'ERR'" in loss.what
-    assert f"row {2 + len(EMPTY)}" in loss.where
-
-
 _SPELLINGS: dict[str, Callable[[float], str]] = {
     "point": str,
     "comma": lambda v: str(v).replace(".", ","),
