@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool
 
 import aiohttp
 
-from pdhef_logtool import Car, ReadOptions, RunConfig, Schedule, read_drive, run
+from pdhef_logtool import Car, ReadOptions, read_drive
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.discovery import LogInput, identity_of
@@ -23,7 +23,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, RedirectGuard, is_public
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, LogError, PdhefError
-from tests.counting_server import CountingServer, serving
+from tests.counting_server import CountingServer, Fault, serving, status
 
 
 @pytest.fixture(autouse=True)
@@ -39,15 +39,8 @@ def server(sample_logs_dir: Path) -> Iterator[CountingServer]:
         yield of
 
 
-def _redirecting(to: str, code: int = 302) -> Callable[[Any, int], bool]:
-    def fault(handler: Any, _: int) -> bool:
-        if handler.path.partition("?")[0] != "/away.mcap":
-            return False
-        handler.note("away.mcap", 0, 0)
-        handler.plain(code, {"Location": to})
-        return True
-
-    return fault
+def _redirecting(to: str, code: int = 302) -> Fault:
+    return status(code, {"Location": to}, of="away.mcap")
 
 
 def _named(monkeypatch: pytest.MonkeyPatch, **addresses: list[str]) -> None:
@@ -119,19 +112,6 @@ def test_an_option_allows_it(server: CountingServer, tmp_path: Path, monkeypatch
     (tmp_path / "pdhef.toml").write_text("allow_private_redirects = true\n")
     monkeypatch.chdir(tmp_path)
     assert _exit_code("inspect", url, "--fields") == EXIT_OK
-
-
-@pytest.mark.slow
-def test_the_option_reaches_the_processes_of_a_fleet(
-    server: CountingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("pdhef_logtool.runs.fleet._PRELOAD", ("pdhef_logtool.runs.*",))  # no compiled code
-    server.fault = _redirecting(server.place("dlc.mcap").replace("127.0.0.1", "localhost"))
-    urls = [server.place("away.mcap"), server.place("dlc.mcap")]
-    config = RunConfig(estimators=("zero",), annotate="none", keep="metrics", allow_private_redirects=True)
-    result = run(urls, tmp_path / "out", config, schedule=Schedule(jobs=2), report=False)
-    assert result.exit_code == EXIT_OK
-    assert "allow_private_redirects" not in (tmp_path / "out" / "run.json").read_text()
 
 
 def test_a_public_host_may_redirect_to_public_ones_alone(
