@@ -88,17 +88,6 @@ def test_stamps_in_a_wrong_unit_are_refused_in_one_line():
         plan_of(channels)
 
 
-def test_an_imu_channel_of_another_device_is_brought_to_the_grid():
-    channels = imu()
-    other = regular(0, 10, 100) + 3 * MS
-    channels["ay_m_s2"] = channel("ay_m_s2", other, 2.0 * seconds(other), topic="/other")
-    plan = plan_of(channels)
-    assert "ay_m_s2" not in plan.grid_channels
-    signals = whole(channels, plan)
-    np.testing.assert_allclose(signals.ay_m_s2[1:], 2.0 * seconds(signals.stamps_ns[1:]), atol=1e-6)
-    assert np.isnan(signals.ay_m_s2[0])  # no extrapolation
-
-
 @pytest.mark.parametrize("channels", [{}, {"speed_m_s": channel("speed_m_s", regular(0, 1, 10), np.zeros(10))}])
 def test_without_an_imu_the_error_says_what_to_map(channels):
     with pytest.raises(MappingError, match="map an IMU topic"):

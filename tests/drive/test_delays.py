@@ -12,7 +12,6 @@ import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.checks import delay_checks
-from pdhef_logtool.drive.correlation import has_peak_within, on_common_grid
 from pdhef_logtool.drive.delays import LatencyEstimate, late_sensors
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.recorded import read_recorded
@@ -61,17 +60,6 @@ def test_what_the_car_stands_between_is_late_by_at_least_so_much(
     assert not late.exact
     assert 0.0 < late.delay_s < delay_s
     assert delay_checks([late])[0].remedy.endswith("at least")
-
-
-def test_a_sine_that_goes_with_itself_a_period_later_tells_nothing() -> None:
-    time_ns = np.arange(0, 30_000_000_000, 10_000_000, dtype=np.int64)
-
-    def sine(late_s: float) -> np.ndarray:
-        return np.sin(2 * np.pi * 2.2 * (time_ns * 1e-9 - late_s))
-
-    grid = on_common_grid(time_ns, sine(0.0), time_ns, sine(0.4))
-    assert has_peak_within(grid, -0.1, 0.0, 0.8)
-    assert not has_peak_within(grid, 0.0, 0.3, 0.8)
 
 
 def test_a_late_gyro_is_put_right_once_without_truth(sample_logs_dir: Path) -> None:

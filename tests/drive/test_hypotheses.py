@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.hypotheses import Relation, block_gains, known_hypotheses, posterior
+from pdhef_logtool.drive.hypotheses import Relation, known_hypotheses, posterior
 from pdhef_logtool.drive.plan import plan_drive
 from pdhef_logtool.drive.survey import scaled_source
 from pdhef_logtool.logs.open_log import open_log
@@ -74,14 +74,6 @@ def test_scales_of_right_mappings_are_those_of_units() -> None:
     assert all(p > 0.75 for p, _ in likeliest.values())
     counts = posterior([between], known_hypotheses(("speed_m_s",)), {"speed_m_s": 0.0123})
     assert counts == posterior([between], known_hypotheses(("speed_m_s",)))
-
-
-def test_gains_of_blocks_are_free_of_a_bank_and_of_blocks_that_rest() -> None:
-    time = np.arange(0.0, 80.0, 0.05)
-    bend = np.where(time < 60.0, np.sin(0.9 * time), 0.0)
-    bank = 3.0 * np.floor(time / 10.0)
-    np.testing.assert_allclose(block_gains(bend, 1.2 * bend + bank, 8), [1.2] * 6)
-    assert block_gains(bend[:400], bend[:400], 2) == ()
 
 
 def test_inspect_and_run_refuse_the_same_channels(sample_logs_dir: Path) -> None:

@@ -76,15 +76,6 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
 
 
-def test_a_pose_whose_heading_is_not_that_of_the_car_states_nothing() -> None:
-    signals, truth = with_truth(VEHICLE, 1.0)
-    flat = np.zeros_like(truth["vx_m_s"].values)
-    pose = {"x_m": np.cumsum(truth["vx_m_s"].values) * 0.01, "y_m": flat, "yaw_rad": flat + 0.5 * np.pi}
-    truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
-    relations = measure(signals, truth, derive_truth(truth), VEHICLE).relations
-    assert not [r for r in relations if "positions and heading" in r.text]
-
-
 def test_exchanged_velocities_of_ground_truth_are_named() -> None:
     signals, truth = with_truth(VEHICLE, 1.0)
     ahead, across = truth["vx_m_s"], truth["vy_m_s"]

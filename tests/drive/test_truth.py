@@ -6,6 +6,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -475,11 +476,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     t = np.arange(20 * RATE_HZ) / RATE_HZ
     speed = np.where((t > 10.0) & (t < 12.0), 0.0, 20.0)
     rate = np.where(speed > 0.0, 0.2 * np.sin(2.0 * t), 0.0)
-    lines = ["time [s],Speed [m/s],YawRate [rad/s],AccY [m/s2],AccX [m/s2],Sideslip [rad]"]
-    for i in range(len(t)):
-        sensors = f"{speed[i]},{rate[i]},{speed[i] * rate[i]},0" if not 14.0 <= t[i] < 16.0 else ",,,"
-        lines.append(f"{t[i]:.2f},{sensors},{-0.1 * rate[i]:.5f}")
-    path.write_text("\n".join(lines))
+    sensors = np.where((t < 14.0) | (t >= 16.0), [speed, rate, speed * rate, 0.0 * t], np.nan)
+    titles = ["time [s]", "Speed [m/s]", "YawRate [rad/s]", "AccY [m/s2]", "AccX [m/s2]", "Sideslip [rad]"]
+    pl.DataFrame([t, *sensors, -0.1 * rate], schema=titles).fill_nan(None).write_csv(path)
     return path
 
 
