@@ -167,25 +167,6 @@ def test_a_temporary_folder_of_somebody_else_is_not_taken(
     assert not is_taken()
 
 
-def test_kept_code_is_loaded_before_it_is_called(
-    module_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    first = _load(module_file)
-    assert first.more(1) == 2
-    assert first.more(1.5) == 2.5
-    capsys.readouterr()
-    monkeypatch.setattr(cache, "announced", False)
-    again = _load(module_file)
-    assert cache.load_kept()
-    assert set(again.more.signatures) == set(first.more.signatures)
-    assert capsys.readouterr().err == ""
-    for file in _code_files(module_file.parent):
-        file.write_bytes(b"cut")
-    cut = _load(module_file)
-    cache.load_kept()
-    assert cut.more.signatures == []
-
-
 def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(
     module_file: Path, tmp_path: Path
 ) -> None:

@@ -106,13 +106,6 @@ def test_every_message_is_found_through_the_copied_indexes(tmp_path: Path) -> No
                 assert [m.data for _, _, m in make_reader(b).iter_messages(topics=topic, **options)] == expected
     with closing(open_log(target)) as log:
         assert sum(t.messages for t in log.topics) == 7600
-        container = log.containers[0]
-        assert isinstance(container, McapContainer)
-        for span in container.spans:
-            # These counts are read from the chunk's index only; the load visits every message.
-            block = container.load(span)
-            ids, counts = np.unique(block.channel, return_counts=True)
-            assert dict(zip(ids.tolist(), counts.tolist(), strict=True)) == span.counts
 
 
 def _damage_chunk(path: Path, number: int) -> tuple[int, int]:

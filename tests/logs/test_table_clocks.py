@@ -19,7 +19,6 @@ from pdhef_logtool.logs.table_clocks import (
     ascending_rows,
     number_clock,
     text_clock,
-    unlike_lengths,
     week_clock,
 )
 from pdhef_logtool.logs.table_columns import Sheet, find_clock, tables_of
@@ -218,14 +217,6 @@ def test_rows_without_a_time_or_of_another_day_are_counted() -> None:
     rows, losses = ascending_rows(stamps, "a")
     assert len(rows) == 1988
     assert {kind: count for kind, count, _ in _losses(losses)} == {"bad-stamp": 1, "other-epoch": 11}
-
-
-def test_clocks_of_one_file_that_differ_a_thousandfold_are_a_loss() -> None:
-    long, short, event = _times(50.0, 1000), _times(50_000.0, 1000), _times(1e4, 3)
-    assert unlike_lengths({"imu": long, "event": event}, "a") == []
-    (loss,) = unlike_lengths({"imu": long, "gnss": short, "event": event}, "a")
-    assert (loss.kind, loss.severity) == ("clock-lengths", "lost")
-    assert "gnss lasts 0.01998 s" in loss.what
 
 
 ROW, RANDOM = np.arange(1000), np.random.default_rng(1).random(1000)

@@ -152,6 +152,44 @@ def test_any_numbers_come_back(
     assert len(read) == len(values)
 
 
+@pytest.mark.parametrize(
+    ("texts", "numbers"),
+    [
+        (["1.5", "-2", "+.5", "3.", "1e-3", "2E+02"], [1.5, -2.0, 0.5, 3.0, 1e-3, 200.0]),
+        (["0", "0", "-0,123", "1,5E-05"], [0.0, 0.0, -0.123, 1.5e-05]),
+        (["8.734,5", "987,25", "1.234", "12.000.000"], [8734.5, 987.25, 1234.0, 12e6]),
+        (["8 734,5", "8\u00a0734,5", "12\u202f345\u202f678,0", "7"], [8734.5, 8734.5, 12345678.0, 7.0]),
+        (["8'734.5", "8’734.5", "0.5"], [8734.5, 8734.5, 0.5]),
+        (["\u22121.5", "\u2212.5", "2"], [-1.5, -0.5, 2.0]),
+        (["0x4f", "0X10", "7"], [79.0, 16.0, 7.0]),
+        (["true", "False", "TRUE"], [1.0, 0.0, 1.0]),
+        (["1.234", "0,5", "0,25"], [1234.0, 0.5, 0.25]),  # the column has decimal commas
+        (["1.234", "10.5", "11.5", "0,25"], [1.234, 10.5, 11.5, 0.25]),
+        (["1,234", "0.5"], [1234.0, 0.5]),
+    ],
+)
+def test_a_number_in_any_spelling(texts: list[str], numbers: list[float], tmp_path: Path) -> None:
+    rows = [f"{i};{text}" for i, text in enumerate(texts * 9)]
+    columns, lost = _read(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
+    np.testing.assert_array_equal(columns["a"], numbers * 9)
+    assert lost == []
+
+
+EMPTY = [
+    "", " ", "nan", "NaN", "-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND00", "#N/A", "n/a", "NULL", "None", "-", "--",
+]  # fmt: skip
+UNREADABLE = [
+    "ERR", "****", "inf", "-Infinity", "1.#INF", "12.5 km/h", "1e999", "12:00", "0x", "1,2,3", "e5", "+", "x y",
+]  # fmt: skip
+
+
+def test_cells_without_a_number_are_empty_or_a_loss(tmp_path: Path) -> None:
+    rows = [f"{i};{text}" for i, text in enumerate(["1.5", *EMPTY, *UNREADABLE, *["0.25"] * 200])]
+    columns, lost = _read(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
+    assert columns["a"][np.isfinite(columns["a"])].tolist() == [1.5, *[0.25] * 200]
+    assert lost == [("bad-cell", len(UNREADABLE))]
+
+
 def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_number(tmp_path: Path) -> None:
     rows = [f"{t:.2f},{AY[i]},{SPEED[i] if i % 10 == 0 else ''},{2 * AY[i]}" for i, t in enumerate(TIME_S)]
     with closing(_log(tmp_path / "a.csv", "\n".join(["t,ay,speed,ay", *rows]).encode())) as log:

@@ -308,23 +308,6 @@ def test_frames_that_are_not_recognised_ask_for_the_field(tmp_path: Path, row: d
         _read(tmp_path / "a.mcap", _mapping(tmp_path, {"speed_m_s": "can:Motion.Speed"}))
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ('[signals.speed_m_s]\ntopic = "/c"\nfield = "can:A.b"', r"needs \[can\]"),
-        ('[can]\ndbc = "a.dbc"\n[signals.speed_m_s]\ntopic = "/c"\nfield = "can:A"', "can:<message>.<signal>"),
-        ('[can]\ndbc = []', "can.dbc"),
-        ('[can]\ndbcs = "a.dbc"', "did you mean can.dbc?"),
-        ('[can]\ndbc = "a.dbc"\nbus = 1', "belong together"),
-        ('[can]\ndbc = "a.dbc"\n[truth.quat_wxyz]\ntopic = "/c"\nfield = "can:A.b"', "is a vector"),
-    ],
-)  # fmt: skip
-def test_wrong_entries_are_named(tmp_path: Path, text: str, says: str) -> None:
-    (tmp_path / "m.toml").write_text(text)
-    with pytest.raises(MappingError, match=says):
-        load_mapping(tmp_path / "m.toml")
-
-
 def test_frames_without_their_description_are_said_to_need_one(tmp_path: Path) -> None:
     frames = [Frame(0x10, bytes([i, 2, 3])) for i in range(5)]
     _write_ros(tmp_path / "ros.mcap", frames)

@@ -458,11 +458,14 @@ def test_a_users_file_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("trans_accel", "acceleration"),
         ("steering_angle_sign", ""), ("cross_acceleration", "acceleration"), ("speed_vessel_frame.y", "velocity"),
         ("accelerometer.acceleration.v[1]", "acceleration"), ("gyroscope.gyroUncalibrated.v[2]", "rate"),
-        ("vEgo", "speed"), ("LFspeed", "wheel speed"), ("AFRspeed", ""),
+        ("vEgo", "speed"), ("LFspeed", "wheel speed"), ("AFRspeed", ""), ("gx", ""), ("V [V]", ""), ("YR", ""),
+        ("LWS_Speed [°/s]", ""), ("FL_Susp_Vel [mm/s]", ""), ("VW_FL [bar]", ""), ("str", ""),
+        ("StePinRelInit_An_Sns [Degrees]", ""), ("Lateral [deg]", ""),
     ],
 )  # fmt: skip
 def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
-    meaning = meaning_of("/topic", "a/B", path)
+    name, _, unit = path.partition(" [")
+    meaning = meaning_of("/topic", "a/B", name, unit.rstrip("]"))
     assert (meaning.quantity if meaning else "") == quantity
 
 
@@ -547,17 +550,6 @@ def test_a_short_name_is_what_the_names_beside_it_show(
 ) -> None:
     meaning = meaning_among("log", "", path, "", {path, *beside})
     assert (meaning and (meaning.quantity, meaning.part)) == meant
-
-
-@pytest.mark.parametrize(
-    ("name", "unit"),
-    [
-        ("gx", ""), ("V", "V"), ("YR", ""), ("LWS_Speed", "°/s"), ("FL_Susp_Vel", "mm/s"), ("VW_FL", "bar"),
-        ("str", ""), ("StePinRelInit_An_Sns", "Degrees"), ("Lateral", "deg"),
-    ],
-)  # fmt: skip
-def test_abbreviations_of_other_quantities_are_none(name: str, unit: str) -> None:
-    assert meaning_of("log", "", name, unit) is None
 
 
 def test_a_v_without_a_unit_is_a_speed_if_the_acceleration_follows_it() -> None:
