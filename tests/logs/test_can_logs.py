@@ -515,6 +515,13 @@ def test_raw_values_without_a_meaning_are_not_available() -> None:
     assert column(standard["Motion"], "Speed") == [655.35]
 
 
+def test_named_raw_values_of_a_dbc_are_not_available() -> None:
+    dbc = MOTION + 'VAL_ 291 Speed 65535 "SNA" 65534 "Signal_Error" 0 "No_Error" ;\n'
+    tables, _, columns = decoded([(291, struct.pack("<hH4x", 0, s)) for s in (65535, 65534, 0, 500)], dbc)
+    np.testing.assert_allclose(column(tables["Motion"], "Speed"), [np.nan, np.nan, 0, 5])
+    assert [x.count for x in columns["Motion", "Speed"]] == [2]
+
+
 def test_values_outside_of_the_range_of_the_dbc_are_lost() -> None:
     dbc = MOTION.replace("(0.01,0) [0|0]", "(0.01,0) [0|250]")
     raw = [100, 0xFFFF, 25_000, 25_001, 200, 0xFFFF]

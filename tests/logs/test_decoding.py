@@ -54,16 +54,6 @@ def test_missing_json_fields_and_short_arrays_are_nan(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["d"], [1, np.nan, 0])
 
 
-def test_json_without_a_schema_takes_its_fields_from_the_first_message(tmp_path: Path) -> None:
-    messages = [{"speed": 1.0, "pos": {"x": 1, "y": 2, "z": 3}, "name": "a"}, {"speed": 2.0, "pos": None}]
-    read = _read_json(tmp_path / "x.mcap", messages, None, ["speed", "pos"])
-    np.testing.assert_array_equal(read["speed"], [1, 2])
-    np.testing.assert_array_equal(read["pos"], [[1, 2, 3], [np.nan] * 3])
-    with closing(open_log(tmp_path / "x.mcap")) as log:
-        kinds = {f.path: f.kind for f in log.fields("/t")}
-        assert kinds == {"speed": "number", "pos.x": "number", "pos.y": "number", "pos.z": "number", "name": "string"}
-
-
 def test_json_times_are_nanoseconds_and_missing_ones_are_marked(tmp_path: Path) -> None:
     messages = [{"stamp": {"sec": 5, "nsec": 7}}, {}]
     read = _read_json(tmp_path / "x.mcap", messages, None, ["stamp"])

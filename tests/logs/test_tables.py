@@ -19,7 +19,6 @@ from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
-from pdhef_logtool.logs.table_columns import field_name, split_unit
 from pdhef_logtool.records.errors import PdhefError
 from tests.command_line import called
 
@@ -210,6 +209,9 @@ def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_numbe
         ("latin-1", "Größe [°]", "Groesse"),
         ("cp1252", "Größe – Weg", "Groesse_Weg"),
         ("utf-8", "Wzdłużne", "Wzdluzne"),
+        ("utf-8", "Längsbeschl.\\CCP:1 (m/s²)", "Laengsbeschl"),
+        ("utf-8", "wheel speed [FL]", "wheel_speed_FL"),
+        ("utf-8", "2nd gear", "n_2nd_gear"),
     ],
 )
 def test_the_bytes_of_the_titles_show_their_encoding(encoding: str, title: str, name: str, tmp_path: Path) -> None:
@@ -330,15 +332,6 @@ def test_a_csv_without_header_or_times_is_refused_in_one_line(text: str, words: 
     with pytest.raises(PdhefError, match=words) as refused:
         _log(tmp_path / "a.csv", text.encode())
     assert "\n" not in str(refused.value)
-
-
-def test_names_and_units_of_titles() -> None:
-    assert split_unit("Speed (km/h)") == ("Speed", "km/h")
-    assert split_unit("wheel speed [FL]") == ("wheel speed [FL]", "")
-    assert split_unit("yaw rate_[°/s]") == ("yaw rate", "°/s")
-    assert field_name("Lat._Vel.") == "Lat_Vel"
-    assert field_name("Längsbeschl.\\CCP:1") == "Laengsbeschl"
-    assert field_name("2nd gear") == "n_2nd_gear"
 
 
 # ------------------------------------------------------------------------------------------------ VBO

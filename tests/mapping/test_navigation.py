@@ -39,8 +39,12 @@ def topic(type_name: str, fields: dict[str, np.ndarray], *examples: object) -> F
 
 
 def found(**contents: FakeTopic) -> AutoMapping:
-    imu = topic("sensor_msgs/msg/Imu", IMU)
-    return auto_map(FakeLog({"/imu": imu} | {f"/{k}": v for k, v in contents.items()}))
+    return auto_map(FakeLog({"/imu": topic("sensor_msgs/msg/Imu", IMU)} | {f"/{k}": v for k, v in contents.items()}))
+
+
+def of_table(**columns: np.ndarray) -> AutoMapping:
+    """The mapping of a table without types."""
+    return auto_map(FakeLog({"csv": FakeTopic("table", T, columns)}))
 
 
 def speed_of(auto: AutoMapping, east: np.ndarray = EAST, north: np.ndarray = NORTH) -> np.ndarray:
@@ -66,8 +70,7 @@ def test_a_velocity_east_and_north_gives_the_speed(witness: dict[str, FakeTopic]
 @pytest.mark.parametrize("names", [("VelN", "VelE"), ("v_n", "v_e"), ("north_speed", "east_speed")])
 def test_north_and_east_in_a_table_of_everything_are_speed_and_receiver(names: tuple[str, str]) -> None:
     table = {"AccX": IMU["linear_acceleration.x"], "AccY": IMU["linear_acceleration.y"], "GyroZ": RATE}
-    table |= dict(zip(names, (NORTH, EAST), strict=True))
-    signals = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping.signals
+    signals = of_table(**table, **dict(zip(names, (NORTH, EAST), strict=True))).mapping.signals
     assert signals["speed_m_s"].paths == names[::-1]
     assert signals["gnss_velocity_north_m_s"].paths + signals["gnss_velocity_east_m_s"].paths == names
 
@@ -127,30 +130,24 @@ def test_a_twist_that_turns_with_the_car_is_a_receivers_velocity(name: str, swap
 
 
 def test_position_speed_and_heading_of_one_table_are_a_receivers() -> None:
-    heading = 90.0 - np.degrees(YAW)
-    table = {"LATITUDE": FIX["latitude"], "LONGITUDE": FIX["longitude"], "SPEED_KPH": 3.6 * V, "HEADING_DEG": heading}
-    signals = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping.signals
+    place = {"LATITUDE": FIX["latitude"], "LONGITUDE": FIX["longitude"]}
+    signals = of_table(**place, SPEED_KPH=3.6 * V, HEADING_DEG=90.0 - np.degrees(YAW)).mapping.signals
     assert {"gnss_latitude_deg", "gnss_longitude_deg", "gnss_speed_m_s", "gnss_course_rad"} <= set(signals)
     assert signals["gnss_speed_m_s"].scale == pytest.approx(1.0 / 3.6)
 
 
 def test_letters_are_signals_where_physics_shows_them() -> None:
-    delta = 2.9 * RATE / V
-    table = {"u": V, "v": 0.3 * RATE, "r": RATE, "delta": delta, "a_x": IMU["linear_acceleration.x"]}
-    table["a_y"] = np.roll(V * RATE, -8)
-    mapping = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping
+    forces = {"a_x": IMU["linear_acceleration.x"], "a_y": np.roll(V * RATE, -8)}
+    mapping = of_table(u=V, v=0.3 * RATE, r=RATE, delta=2.9 * RATE / V, **forces).mapping
     paths = {n: s.paths[0] for n, s in mapping.signals.items()}
-    assert paths["speed_m_s"] == "u"
-    assert paths["yaw_rate_rad_s"] == "r"
+    assert (paths["speed_m_s"], paths["yaw_rate_rad_s"]) == ("u", "r")
     assert {c.name for c in mapping.checks} >= {"truth.source"}
 
 
 @pytest.mark.parametrize("name", ["steer_angle_status", "steer_angle_state"])
 def test_a_status_that_is_an_angle_is_read_and_an_enumeration_is_not(name: str) -> None:
-    angles, modes = 2.9 * RATE / V, np.rint(S) % 3.0
-    table = {"yaw_rate": RATE, "speed": V, "accel_y": V * RATE}
-    for values, is_read in ((angles, True), (modes, False)):
-        signals = auto_map(FakeLog({"csv": FakeTopic("table", T, {**table, name: values})})).mapping.signals
+    for values, is_read in ((2.9 * RATE / V, True), (np.rint(S) % 3.0, False)):
+        signals = of_table(yaw_rate=RATE, speed=V, accel_y=V * RATE, **{name: values}).mapping.signals
         assert ("steer_rad" in signals or "steering_wheel_rad" in signals) == is_read
 
 
@@ -162,7 +159,6 @@ def test_an_imu_with_z_down_is_undecided_without_a_drive_that_shows_it() -> None
     assert ("imu.mounting", "undecided") in {(c.name, c.verdict) for c in checks}
 
 
-STAMP = np.arange(200, dtype=np.int64) * 100_000_000 + 1_700_000_000_000_000_000
 NAV_PVT = ("vel_n", "vel_e", "g_speed", "h_acc", "s_acc", "fix_type", "lat", "lon")
 
 
@@ -209,23 +205,15 @@ def test_a_message_with_a_heading_is_no_sensor(fields):
     assert receiver_signals("/ins", "log_time", fields) == {}
 
 
-def _log(**topics):
+def _noise(type_name: str, *fields: str) -> FakeTopic:
     rng = np.random.default_rng(0)
-    imu = {
-        f"{part}.{axis}": rng.standard_normal(200)
-        for part in ("linear_acceleration", "angular_velocity")
-        for axis in "xyz"
-    }
-    contents = {"/imu": FakeTopic("sensor_msgs/msg/Imu", STAMP, imu)}
-    for name, (type_name, fields) in topics.items():
-        contents[f"/{name.replace('__', '/')}"] = FakeTopic(
-            type_name, STAMP, {f: rng.standard_normal(200) for f in fields}
-        )
-    return FakeLog(contents)
+    return FakeTopic(type_name, T[:200], {f: rng.standard_normal(200) for f in fields})
 
 
 def test_a_receiver_is_mapped_with_its_quality_and_rates_of_the_imu():
-    signals = auto_map(_log(gps__pvt=("ublox_msgs/msg/NavPVT", NAV_PVT))).mapping.signals
+    parts = (f"{part}.{axis}" for part in ("linear_acceleration", "angular_velocity") for axis in "xyz")
+    imu, pvt = _noise("sensor_msgs/msg/Imu", *parts), _noise("ublox_msgs/msg/NavPVT", *NAV_PVT)
+    signals = auto_map(FakeLog({"/imu": imu, "/gps/pvt": pvt})).mapping.signals
     assert signals["gnss_velocity_east_m_s"].label == "/gps/pvt.vel_e"
     assert {"gnss_fix_type", "gnss_velocity_accuracy_m_s", "gnss_position_accuracy_m"} <= set(signals)
     assert signals["roll_rate_rad_s"].field == "angular_velocity.x"
@@ -233,10 +221,8 @@ def test_a_receiver_is_mapped_with_its_quality_and_rates_of_the_imu():
 
 
 def test_an_instrument_that_is_ground_truth_is_no_sensor():
-    log = _log(
-        truth__twist=("geometry_msgs/msg/TwistStamped", ("twist.linear.x", "twist.linear.y", "twist.angular.z")),
-        truth__pvt=("ublox_msgs/msg/NavPVT", NAV_PVT),
-    )
+    velocity = _noise("geometry_msgs/msg/TwistStamped", "twist.linear.x", "twist.linear.y", "twist.angular.z")
+    log = FakeLog({"/truth/twist": velocity, "/truth/pvt": _noise("ublox_msgs/msg/NavPVT", *NAV_PVT)})
     assert not [name for name in auto_map(log).mapping.signals if name.startswith("gnss_")]
 
 

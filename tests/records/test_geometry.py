@@ -35,13 +35,6 @@ def test_wrapped_angle_is_the_same_direction_in_one_turn(angle):
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-12)
 
 
-def test_wrap_keeps_the_shape_and_takes_half_a_turn_as_minus_pi():
-    assert wrap_angle(np.array([[math.pi, -math.pi], [0.0, 3 * math.pi]])).tolist() == [
-        [-math.pi, -math.pi],
-        [0.0, -math.pi],
-    ]
-
-
 @exact
 @given(st.lists(st.tuples(*[st.floats(-10, 10)] * 4), min_size=1, max_size=8))
 def test_rotation_of_a_quaternion_agrees_with_scipy(quats):
