@@ -249,28 +249,6 @@ def test_a_fifo_is_refused_at_once(tmp_path: Path, name: str) -> None:
     assert isinstance(_within(lambda: open_log(tmp_path)), LogError)
 
 
-_ENDS = {
-    "noindex_flip.mcap": "at byte",
-    "index_claims_2e8.mcap": "message indexes",
-    "zstd_claims_100g.mcap": "chunk at byte",
-    "bz2_6g.bag": "chunk at byte",
-    "gather_overflow1.mcap": "chunk at byte",
-    "fuzz_02d558aee3_b_bag_LZ4.bag": "at byte",
-}
-
-
-@pytest.mark.parametrize("name", sorted(_ENDS))
-def test_every_case_that_did_harm_once_ends_as_it_must(shared_dir: Path, name: str) -> None:
-    path = shared_dir / "torture" / name
-    if not path.exists():
-        pytest.skip("the shared folder has no torture cases")
-    inspection = inspect_log(path)
-    assert inspection.is_partial
-    assert any(_ENDS[name] in loss.what for loss in inspection.lost)
-    read, _, claimed = _outcome(path)
-    assert read == claimed
-
-
 def test_more_messages_than_their_bytes_can_hold_are_refused(tmp_path: Path) -> None:
     record = struct.pack("<BQHIQQ", 5, 22, 1, 0, T0, T0)
     for count, kinds in ((60_000, {"unknown-channel"}), (70_000, {"over-budget"})):

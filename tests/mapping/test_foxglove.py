@@ -30,7 +30,6 @@ _TYPES: dict[str, list[tuple[str, int, Any, str]]] = {
         ("timestamp", 6, ".google.protobuf.Timestamp", ""), ("frame_id", 7, _STRING, ""),
         ("heading", 10, _DOUBLE, "optional"), ("course", 13, _DOUBLE, "optional"),
     ],
-    "PoseInFrame": [("timestamp", 1, ".google.protobuf.Timestamp", ""), ("pose", 3, ".foxglove.Pose", "")],
     "PosesInFrame": [("timestamp", 1, ".google.protobuf.Timestamp", ""), ("poses", 3, ".foxglove.Pose", "repeated")],
     "Odometry": [
         ("timestamp", 1, ".google.protobuf.Timestamp", ""), ("pose", 4, ".foxglove.Pose", ""),
@@ -164,14 +163,6 @@ def test_odometry_is_truth_or_speed_by_its_name(tmp_path: Path, encoding: str) -
     np.testing.assert_allclose(got["yaw_rate_rad_s"].values, 0.3 + 0.01 * np.arange(40))
     np.testing.assert_allclose(got["quat_wxyz"].values[0], [0.8, 0.0, 0.0, 0.6])
     assert got["vx_m_s"].stamps_ns[1] == 100 * S + S // 10
-
-
-@pytest.mark.parametrize("encoding", ["protobuf", "json"])
-def test_a_pose_in_frame_is_a_pose(tmp_path: Path, encoding: str) -> None:
-    rows = [{"pose": _pose(2.0 * i)} for i in range(40)]
-    found, got = _map(_write(tmp_path / "a.mcap", {"/vicon/car": _build(encoding, "PoseInFrame", rows)}))
-    assert set(found.mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
-    np.testing.assert_allclose(got["x_m"].values, 2.0 * np.arange(40))
 
 
 def test_a_list_of_poses_is_said_and_not_guessed(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Recorders and runs: a folder of mappings serves several recorders; a file of several runs needs a choice."""
+"""Recorders and runs: a folder of mappings serves several; a file of several runs needs a choice; recorded drives."""
 
 from __future__ import annotations
 
@@ -10,8 +10,17 @@ import pytest
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_file import TableSettings
-from pdhef_logtool.mapping import auto_map, load_mapping, mapping_to_toml
+from pdhef_logtool.mapping import (
+    Mapping,
+    SignalSource,
+    auto_map,
+    clock_key,
+    fit_clocks,
+    load_mapping,
+    mapping_to_toml,
+)
 from pdhef_logtool.mapping.choosing import choose_mapping
+from pdhef_logtool.mapping.clocks import apply_clock
 from pdhef_logtool.records.errors import MappingError, MappingFileError
 from tests.command_line import called
 from tests.fake_drive_log import FakeLog, FakeTopic
@@ -150,3 +159,36 @@ def test_repeated_channel_groups_of_an_mdf_are_runs_if_one_follows_the_other(sta
     for group, name in (("1", "Fast"), ("2", "Fast_2")):
         with closing(open_log(path, settings=TableSettings(group=group))) as log:
             assert [t.name for t in log.topics] == [name]
+
+
+def test_phone_clock_is_found_from_log_times(shared_dir: Path) -> None:
+    path = shared_dir / "data" / "drives" / "comma2k19_segment.mcap"
+    log = open_log(path)
+    source = SignalSource(
+        "yaw_rate_rad_s", "/imu", "gyro[2]", stamp="t", stamp_unit="s", clock="device", latency_s=0.002
+    )
+    clock = fit_clocks(log, Mapping(signals={source.name: source}), log.start_ns, log.end_ns)[clock_key(source)]
+    columns = log.read({"/imu": ["t"]})["/imu"]
+    found = apply_clock(np.rint(columns.fields["t"] * 1e9).astype(np.int64), clock) - 2_000_000
+    # The publish time is the sample's time in UTC, which the fit has not seen.
+    assert np.abs(found - columns.publish_time_ns).max() < 200_000
+    log.close()
+
+
+def test_a_file_may_name_one_signal_and_leave_the_rest_to_recognised_types(tmp_path: Path) -> None:
+    text = '[signals.friction]\ntopic = "/truth/perfect/state"\nfield = "friction"\n'
+    log_path = next(Path("sample_logs").glob("dlc*.mcap"))
+    log = open_log(log_path)
+    recognised = auto_map(log).mapping
+    for filled in (False, True):
+        (tmp_path / "mapping.toml").write_text(("fill_recognised = true\n" if filled else "") + text)
+        chosen = choose_mapping(log, load_mapping(tmp_path / "mapping.toml"), prefer_truth="perfect")
+        mapping, missing = chosen.mapping, chosen.missing
+        assert len(chosen.mapping.notes) == filled  # which truth it is
+        assert chosen.ambiguities == ()
+        assert mapping.signals["friction"].topic == "/truth/perfect/state"
+        others = {n: s for n, s in mapping.signals.items() if n != "friction"}
+        assert others == ({n: s for n, s in recognised.signals.items() if n != "friction"} if filled else {})
+        assert mapping.truth == (recognised.truth if filled else {})
+        assert ("yaw_rate_rad_s" in missing) is not filled
+    log.close()
