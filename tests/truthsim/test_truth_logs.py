@@ -78,28 +78,29 @@ def test_stamps_are_measurement_times_and_log_times_arrivals(read_back) -> None:
     assert steering[0] - START_NS == 3_000_000 and set(np.diff(steering)) == {10_000_000}
 
 
+#: Topic and field of a message, channel and field of the sensor.
+FIELDS = [
+    ("/imu/data", "linear_acceleration.x", "imu", "ax_m_s2"),
+    ("/imu/data", "linear_acceleration.y", "imu", "ay_m_s2"),
+    ("/imu/data", "angular_velocity.z", "imu", "yaw_rate_rad_s"),
+    ("/vehicle/status/steering_status", "steering_tire_angle", "steering", "steer_rad"),
+    *(("/vehicle/wheel_speeds", f"{w}_m_s", "wheels", f"{w}_m_s") for w in ("fl", "fr", "rl", "rr")),
+    ("/rtk/odometry", "twist.twist.linear.y", "rtk", "vy_m_s"),
+    ("/rtk/odometry", "pose.pose.position.x", "rtk", "x_m"),
+    ("/rtk/fix", "latitude", "fix", "lat_deg"),
+]
+
+
 def test_values_survive(read_back, drive: Drive) -> None:
     messages, _, _ = read_back
-    imu = drive.channels["imu"].fields
-    last = messages["/imu/data"][-1][2]
-    assert (last.linear_acceleration.x, last.linear_acceleration.y) == (imu["ax_m_s2"][-1], imu["ay_m_s2"][-1])
-    assert last.angular_velocity.z == imu["yaw_rate_rad_s"][-1]
-    assert last.orientation_covariance[0] == -1.0
-    assert last.linear_acceleration_covariance[4] == pytest.approx(0.12**2)
-    steering = messages["/vehicle/status/steering_status"][-1][2].steering_tire_angle
-    assert steering == np.float32(drive.channels["steering"].fields["steer_rad"][-1])
-    wheels = messages["/vehicle/wheel_speeds"][-1][2]
-    assert [getattr(wheels, f"{w}_m_s") for w in ("fl", "fr", "rl", "rr")] == [
-        drive.channels["wheels"].fields[f"{w}_m_s"][-1] for w in ("fl", "fr", "rl", "rr")
-    ]
-    odometry = messages["/rtk/odometry"][-1][2]
-    rtk = drive.channels["rtk"].fields
-    assert odometry.twist.twist.linear.y == pytest.approx(rtk["vy_m_s"][-1], abs=1e-5)
-    assert odometry.pose.pose.position.x == pytest.approx(rtk["x_m"][-1], abs=1e-5)
+    for topic, path, channel, name in FIELDS:
+        found = [operator.attrgetter(path)(m) for _, _, m in messages[topic]]
+        assert found == pytest.approx(drive.channels[channel].fields[name], abs=1e-5, rel=1e-7), path
+    imu, odometry, fix = (messages[topic][-1][2] for topic in ("/imu/data", "/rtk/odometry", "/rtk/fix"))
+    assert imu.orientation_covariance[0] == -1.0
+    assert imu.linear_acceleration_covariance[4] == pytest.approx(0.12**2)
     assert odometry.pose.covariance[0] == pytest.approx(1e-4) and odometry.twist.covariance[7] > 0.0
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "base_link")
-    fix = messages["/rtk/fix"][-1][2]
-    assert fix.latitude == drive.channels["fix"].fields["lat_deg"][-1]
     assert fix.status.status == 2 and fix.position_covariance_type == 2
     assert fix.position_covariance[[0, 4, 8]] == pytest.approx([1e-4, 1e-4, 4e-4])
     assert messages["/rtk/quality"][-1][2].quality == 4
