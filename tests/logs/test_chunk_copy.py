@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
@@ -81,30 +80,8 @@ def test_chunks_are_taken_over_bit_for_bit(tmp_path: Path, compression: Compress
     copied = [c for c in _chunks(target) if c in _chunks(source)]  # data, size, CRC, compression and both times
     assert copied == _chunks(source)
     assert _messages(target) == _messages(source)
-    ours = [m[0] for m in messages_of(target) if m[1] == "/ours"]
-    assert ours == (T0 - 50_000_000 + np.arange(7000) * 100_000).tolist()
-    summary = summary_of(target)
-    statistics = summary.statistics
-    assert (statistics.message_count, statistics.channel_count) == (7600, 4)
-    assert statistics.channel_message_counts == {1: 200, 2: 200, 3: 200, 4: 7000}
-    assert (statistics.message_start_time, statistics.message_end_time) == (T0 - 50_000_000, T0 + 649_900_000)
-    starts = [c.message_start_time for c in summary.chunk_indexes]
+    starts = [c.message_start_time for c in summary_of(target).chunk_indexes]
     assert starts == sorted(starts)
-    assert statistics.chunk_count == len(starts)
-
-
-def test_every_message_is_found_through_the_copied_indexes(tmp_path: Path) -> None:
-    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    _write(source)
-    _annotate(source, target)
-    window = {"starting_at": T0 + 123_000_000, "ending_before": T0 + 124_000_000}
-    for topic in ("/a", "/b", "/c"):
-        for options in ({}, window):
-            with source.open("rb") as a, target.open("rb") as b:
-                expected = [m.data for _, _, m in make_reader(a).iter_messages(topics=topic, **options)]
-                assert [m.data for _, _, m in make_reader(b).iter_messages(topics=topic, **options)] == expected
-    with closing(open_log(target)) as log:
-        assert sum(t.messages for t in log.topics) == 7600
 
 
 def _damage_chunk(path: Path, number: int) -> tuple[int, int]:
