@@ -37,7 +37,7 @@ def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path, t
     """A wrong unit, sign and axis of each signal; the speed and the tyres of the default car may leave one open."""
     path = sample_logs_dir / "dlc.mcap"
     mapping = mapping_of(path)
-    kinds = [(subject, kind) for subject in subjects(mapping) for kind in ("x57.3", "sign", "axis")]
+    kinds = [(subject, kind) for subject in subjects(mapping) for kind in ("x57.3", "/9.81", "sign", "axis")]
     found = list(outcomes(look_at, path, mapping, tmp_path, kinds))
     assert len(found) == len(kinds)
     assert not {f"{o.signal} {o.kind}": o.verdict for o in found if o.verdict not in ("named", "refused")}

@@ -85,9 +85,12 @@ def test_dates_of_each_unit_and_those_outside_of_int64(unit: str, zone: str | No
     per_s = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
     values = [(1_714_521_600 + i) * per_s for i in range(N)]
     values[3] = 10**12 * per_s if unit != "ns" else values[3]
-    tables = _parquet({"recorded": pa.array(values, pa.timestamp(unit, zone)), "ay": AY})
+    of_g = pa.field("ay", pa.float64(), metadata={"unit": "g"})
+    schema = pa.schema([pa.field("recorded", pa.timestamp(unit, zone)), of_g])
+    tables = _parquet(pa.table({"recorded": values, "ay": AY}, schema=schema))
     lost = 0 if unit == "ns" else 1
     (table,) = tables.tables
+    assert [(field.path, field.unit) for field in table.fields] == [("ay", "g")]
     np.testing.assert_array_equal(np.delete(np.arange(N), [3] * lost), table.stamps_ns // 10**9 - 1_714_521_600)
     assert [loss.kind for loss in tables.losses] == ["bad-stamp"] * lost
 

@@ -418,31 +418,6 @@ def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------ Parquet
 
 
-def test_a_parquet_file_with_units_nulls_and_structs(tmp_path: Path) -> None:
-    gnss = [float(v) if i % 10 == 0 else None for i, v in enumerate(SPEED)]
-    imu = pa.StructArray.from_arrays([pa.array(AY), pa.array(-AY)], ["ay [m/s²]", "ax"])
-    fields = [
-        pa.field("time", pa.timestamp("us")),
-        pa.field("speed", pa.float32(), metadata={"unit": "km/h"}),
-        pa.field("imu", imu.type),
-        pa.field("gnss_speed", pa.float64()),
-        pa.field("driver", pa.string()),
-    ]
-    stamps = NOON_NS + np.round(TIME_S * 1e9).astype(np.int64)
-    times = pa.array(stamps.astype("datetime64[ns]")).cast(pa.timestamp("us"))
-    columns = [times, pa.array(SPEED.astype(np.float32)), imu, pa.array(gnss), pa.array(["me"] * N)]
-    pq.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)), tmp_path / "a.parquet")
-    with closing(open_log(tmp_path / "a.parquet")) as log:
-        assert {(t.name, f.path): f.unit for t in log.topics for f in log.fields(t.name)} == {
-            ("parquet", "speed"): "km/h", ("parquet", "imu_ay"): "m/s²", ("parquet", "imu_ax"): "",
-            ("parquet_2", "gnss_speed"): "",
-        }  # fmt: skip
-        read = log.read({"parquet": ["imu_ay"], "parquet_2": ["gnss_speed"]})
-    np.testing.assert_array_equal(read["parquet"].fields["imu_ay"], AY)
-    np.testing.assert_array_equal(read["parquet"].log_time_ns, NOON_NS + np.round(TIME_S * 1e9).astype(np.int64))
-    np.testing.assert_array_equal(read["parquet_2"].fields["gnss_speed"], SPEED[::10])
-
-
 # ------------------------------------------------------------------------------------------------ MAT
 
 

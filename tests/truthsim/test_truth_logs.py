@@ -60,16 +60,8 @@ def test_other_libraries_find_every_topic_with_its_type(read_back, drive: Drive)
 
 def test_stamps_are_measurement_times_and_log_times_arrivals(read_back) -> None:
     messages, _, _ = read_back
-    for topic, delay_ns in (
-        ("/imu/data", 10_000_000),
-        ("/vehicle/status/steering_status", 10_000_000),
-        ("/vehicle/wheel_speeds", 10_000_000),
-        ("/rtk/odometry", 20_000_000),
-        ("/rtk/fix", 20_000_000),
-        ("/rtk/quality", 20_000_000),
-        ("/truth/perfect/odometry", 0),
-        ("/truth/perfect/state", 0),
-    ):
+    for topic in TYPES:
+        delay_ns = 0 if "truth" in topic else 20_000_000 if "rtk" in topic else 10_000_000
         for log_time, publish_time, message in messages[topic]:
             stamp = nanoseconds(message.stamp if topic.endswith("steering_status") else message.header.stamp)
             assert stamp == publish_time and log_time - publish_time == delay_ns
