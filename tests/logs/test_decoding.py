@@ -93,6 +93,7 @@ def test_a_cut_payload_costs_only_its_own_message(tmp_path: Path) -> None:
     ("path", "problem"),
     [
         ("angular_velocity.zz", "angular_velocity.z"),
+        ("yaw.z", "angular_velocity.z"),
         ("header.frame_id", "text"),
         ("header", "struct"),
         ("orientation_covariance[9]", "nearest"),

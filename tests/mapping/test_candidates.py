@@ -368,6 +368,13 @@ def test_an_ins_whose_type_is_documented_is_truth_before_a_bare_fix() -> None:
     assert any("/gps/fix is not used" in n for n in auto.mapping.notes)
 
 
+def test_latitude_and_longitude_of_two_topics_show_the_path() -> None:
+    apart = {f"bus__{n}": topic(value=v) for n, v in WHERE.items()}
+    auto = found(**apart, bus__vehicle_speed=topic(value=3.6 * V))
+    assert taken(auto) == {"speed_m_s": ("/bus/vehicle_speed.value", round(1 / 3.6, 6))}
+    assert undecided(auto) == set()
+
+
 def test_a_documented_trap_is_left_out_with_its_reason() -> None:
     auto = found(novatel__corrimu=topic("novatel_oem7_msgs/msg/CORRIMU", yaw_rate=RATE, lateral_acc=AY))
     assert auto.mapping.signals == {}
