@@ -375,6 +375,12 @@ def test_latitude_and_longitude_of_two_topics_show_the_path() -> None:
     assert undecided(auto) == set()
 
 
+def test_the_unit_of_a_speed_by_positions() -> None:
+    auto = found(gps__fix=topic("sensor_msgs/msg/NavSatFix", **WHERE), bus=topic(vehicle_speed=3.6 * V))
+    assert taken(auto) == {"speed_m_s": ("/bus.vehicle_speed", round(1 / 3.6, 6))}
+    assert undecided(auto) == set()
+
+
 def test_a_documented_trap_is_left_out_with_its_reason() -> None:
     auto = found(novatel__corrimu=topic("novatel_oem7_msgs/msg/CORRIMU", yaw_rate=RATE, lateral_acc=AY))
     assert auto.mapping.signals == {}
