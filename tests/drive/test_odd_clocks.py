@@ -187,18 +187,8 @@ def signals_of(path: Path, **options: Any) -> tuple[Signals, list[str], str]:
         return drive.whole().signals, drive.notes, drive.not_causal
 
 
-def run_command(capsys: pytest.CaptureFixture[str], out: Path, *arguments: object) -> tuple[int, dict[str, Any], str]:
-    given = [
-        "run_command",
-        *map(str, arguments),
-        "-o",
-        str(out),
-        "--car",
-        "saloon",
-        "--no-report",
-        "--annotate",
-        "none",
-    ]
+def run(capsys: pytest.CaptureFixture[str], out: Path, *arguments: object) -> tuple[int, dict[str, Any], str]:
+    given = ["run", *map(str, arguments), "-o", str(out), "--car", "saloon", "--no-report", "--annotate", "none"]
     code = app(given, prog_name="pdhef", standalone_mode=False) or 0
     (report,) = out.glob("logs/*/report.json")
     return code, json.loads(report.read_text(encoding="utf-8")), capsys.readouterr().err
@@ -224,14 +214,14 @@ def test_only_the_late_topic_is_read_by_stamp_and_it_is_named(late: Path, sample
 def test_a_run_of_it_scores_and_calls_nothing_causal(
     late: Path, sample_logs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, report, err = run_command(capsys, tmp_path / "out", late, "--estimators", "zero,phy-ukf")
+    code, report, err = run(capsys, tmp_path / "out", late, "--estimators", "zero,phy-ukf")
     assert code == 0
     assert STEERING in err
     assert [e["causal"] for e in report["estimators"]] == [False] * 2
     assert all("steer_rad read by stamp" in " ".join(e["notes"]) for e in report["estimators"])
     rows = pl.read_parquet(tmp_path / "out/logs/late/estimates.parquet").filter(estimator="phy-ukf")
     assert rows["valid"].mean() > 0.95  # type: ignore[operator]
-    run_command(capsys, tmp_path / "sound", sample_logs_dir / "dlc.mcap", "--estimators", "zero,phy-ukf")
+    run(capsys, tmp_path / "sound", sample_logs_dir / "dlc.mcap", "--estimators", "zero,phy-ukf")
     sound = pl.read_parquet(tmp_path / "sound/logs/dlc/estimates.parquet").filter(estimator="phy-ukf")
     both = rows.join(sound, on="stamp_ns").filter("valid", "valid_right")
     assert (both["vy_m_s"] - both["vy_m_s_right"]).abs().max() < 1e-9  # type: ignore[operator]
