@@ -102,6 +102,20 @@ def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back() -> None
     assert axle.expected[1] > (0.8 + 1.8) / 0.8
 
 
+def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
+    """At a low correlation both regressions reach far: 3.6 times as much would be plausible too."""
+    signals = drive(3)
+    ay = signals["ay_m_s2"]
+    noise = np.random.default_rng(1).standard_normal(ay.values.size // 100 + 1).repeat(100)[: ay.values.size]
+    loud = replace(ay, values=0.4 * ay.values + 0.55 * noise)
+    kept = {n: signals[n] for n in ("yaw_rate_rad_s", "speed_m_s")} | {"ay_m_s2": loud}
+    checks = {c.name: c for c in checks_of(kept)}
+    unit = checks.get("ay_m_s2.unit", checks.get("ay_m_s2.sign"))
+    assert unit is not None
+    assert unit.verdict == "undecided"
+    assert unit.remedy.startswith("needs ")
+
+
 def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed() -> None:
     """Without ground truth, four wheel speeds with reversed sign contradict no other signal."""
     signals = {n: c for n, c in drive(3, calm=True).items() if n in ("wheel_speed_rl_m_s", "yaw_rate_rad_s", "ay_m_s2")}
