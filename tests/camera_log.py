@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from mcap.reader import make_reader
-from mcap.writer import Writer
+
+from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 
 _SLICE_NS = 20_000_000_000
 _IMAGE_BYTES, _IMAGE_NS = 20_000, 200_000_000
@@ -21,20 +22,14 @@ Message = tuple[str, Definition, int, bytes]
 
 def write_apart(path: Path, chunks: Iterable[list[Message]]) -> None:
     """Write an MCAP with just these chunks."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1 << 40)
-        writer.start("ros2")
-        schemas: dict[Definition, int] = {}
-        channels: dict[str, int] = {}
+    with McapLogWriter(path) as writer:
+        ids: dict[str, int] = {}
         for chunk in chunks:
-            for topic, definition, log_time, data in chunk:
-                if topic not in channels:
-                    if definition not in schemas:
-                        schemas[definition] = writer.register_schema(*definition)
-                    channels[topic] = writer.register_channel(topic, "cdr", schemas[definition])
-                writer.add_message(channels[topic], log_time, data, log_time)
-            writer._Writer__finalize_chunk()  # type: ignore[attr-defined]  # the library has no name for it
-        writer.finish()  # type: ignore[no-untyped-call]
+            for topic, (name, encoding, text), *_ in chunk:
+                if topic not in ids:
+                    about = {"schema_name": name, "schema_encoding": encoding, "message_encoding": "cdr"}
+                    ids[topic] = writer.add_raw_channel(topic, schema_data=text, metadata={}, **about)
+            writer.write([], [RawMessage(ids[topic], at, at, 0, data) for topic, _, at, data in chunk])
 
 
 def with_camera(source: Path, slice_ns: int = _SLICE_NS) -> Iterator[list[Message]]:

@@ -79,48 +79,43 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def _answer(self, path: str, n: int) -> None:
-        of = self.of
+        of, data = self.of, self.of.files.get(path)
         if of.fault is not None and of.fault(self, n):
             return
-        data = of.files.get(path)
-        if data is None:
+        if data is None or self.headers.get("If-Match", _etag(data)) != _etag(data):
             self.note(path, 0, 0)
-            self.plain(404)
+            self.plain(404 if data is None else 412)
             return
-        etag = _etag(data)
-        if self.headers.get("If-Match", etag) != etag:
-            self.note(path, 0, 0)
-            self.plain(412)
-            return
-        asked = self.headers.get("Range", "") if of.ranges else ""
-        start, end, status = 0, len(data), 200
-        if asked:
-            low, _, high = asked.removeprefix("bytes=").partition("-")
-            start, end, status = int(low), min(int(high) + 1, len(data)), 206
-            if start >= len(data):
-                self.note(path, 0, 0)
-                self.plain(416, {"Content-Range": f"bytes */{len(data)}"})
-                return
-        self.note(path, start, end)
-        heads = {"ETag": etag, "Last-Modified": formatdate(1e9, usegmt=True), "Content-Length": str(end - start)}
-        if status == 206:
+        start, end, heads = 0, len(data), {"ETag": _etag(data), "Last-Modified": formatdate(1e9, usegmt=True)}
+        if is_part := of.ranges and "Range" in self.headers:
+            start, end = self.asked(len(data))
             heads["Content-Range"] = f"bytes {start}-{end - 1}/{len(data)}"
+        if is_part and start >= len(data):
+            self.note(path, 0, 0)
+            self.plain(416, {"Content-Range": f"bytes */{len(data)}"})
+            return
+        self.note(path, start, end)
+        self.send(206 if is_part else 200, {**heads, "Content-Length": str(end - start)})
+        self.wfile.write(data[start:end])
+
+    def asked(self, size: int) -> tuple[int, int]:
+        """Return the range of bytes [start, end) that the request asks for."""
+        low, _, high = self.headers["Range"].removeprefix("bytes=").partition("-")
+        return int(low), min(int(high) + 1, size)
+
+    def send(self, status: int, headers: dict[str, str]) -> None:
         self.send_response(status)
-        for name, value in heads.items():
-            if name not in of.without:
+        for name, value in headers.items():
+            if name not in self.of.without:
                 self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(data[start:end])
 
     def note(self, path: str, start: int, end: int) -> None:
         with self.of._lock:
             self.of.requests.append(Request(path, start, end, dict(self.headers)))
 
     def plain(self, status: int, headers: dict[str, str] | None = None) -> None:
-        self.send_response(status)
-        for name, value in {"Content-Length": "0", **(headers or {})}.items():
-            self.send_header(name, value)
-        self.end_headers()
+        self.send(status, {"Content-Length": "0", **(headers or {})})
 
 
 @lru_cache(maxsize=64)
@@ -154,15 +149,16 @@ def serving(**files: bytes) -> Iterator[CountingServer]:
         server.server_close()
 
 
-def status(code: int, headers: dict[str, str] | None = None, times: int = 10**9, after: int = 0) -> Fault:
-    """Answer requests ``after`` .. ``after + times`` with a status and no bytes."""
+def status(code: int, headers: dict[str, str] | None = None, times: int = 10**9, after: int = 0, of: str = "") -> Fault:
+    """Answer requests ``after`` .. ``after + times`` of paths that begin with ``of`` with a status and no bytes."""
 
     def fault(handler: _Handler, n: int) -> bool:
-        if after <= n < after + times:
-            handler.note(handler.path.split("?")[0].lstrip("/"), 0, 0)
-            handler.plain(code, headers)
-            return True
-        return False
+        path = handler.path.split("?")[0].lstrip("/")
+        if not (after <= n < after + times and path.startswith(of)):
+            return False
+        handler.note(path, 0, 0)
+        handler.plain(code, headers)
+        return True
 
     return fault
 
@@ -173,14 +169,11 @@ def cutting(after_bytes: int, times: int = 10**9) -> Fault:
     def fault(handler: _Handler, n: int) -> bool:
         path = handler.path.lstrip("/")
         data = handler.of.files[path]
-        low, _, high = handler.headers["Range"].removeprefix("bytes=").partition("-")
-        start, end = int(low), min(int(high) + 1, len(data))
+        start, end = handler.asked(len(data))
         if n >= times or end - start <= after_bytes:
             return False
-        handler.send_response(206)
-        handler.send_header("Content-Range", f"bytes {start}-{end - 1}/{len(data)}")
-        handler.send_header("Content-Length", str(end - start))
-        handler.end_headers()
+        of_file = {"Content-Range": f"bytes {start}-{end - 1}/{len(data)}", "Content-Length": str(end - start)}
+        handler.send(206, of_file)
         handler.wfile.write(data[start : start + after_bytes])
         handler.wfile.flush()
         handler.close_connection = True
@@ -191,7 +184,7 @@ def cutting(after_bytes: int, times: int = 10**9) -> Fault:
 
 
 def stalling(seconds: float) -> Fault:
-    """Suppress log lines."""
+    """Say nothing for some time, and close the connection."""
 
     def fault(handler: _Handler, _: int) -> bool:
         handler.note(handler.path.split("?")[0].lstrip("/"), 0, 0)

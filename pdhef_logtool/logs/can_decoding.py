@@ -294,7 +294,8 @@ def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = F
     number: NDArray[Any] = raw
     if signal.is_float:
         width = signal.length // 8
-        number = raw.astype(f"<u{width}").view(f"<f{width}").astype(np.float64)
+        with np.errstate(invalid="ignore"):  # numpy warns about a signalling NaN
+            number = raw.astype(f"<u{width}").view(f"<f{width}").astype(np.float64)
     elif signal.is_signed:
         sign = np.uint64(1 << (signal.length - 1))
         number = ((raw ^ sign) - sign).view(np.int64)

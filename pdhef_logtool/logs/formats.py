@@ -114,7 +114,8 @@ FORMATS = (
 
 
 @cache
-def _of_other_packages() -> tuple[LogFormat, ...]:
+def formats_of_other_packages() -> tuple[LogFormat, ...]:
+    """Return the formats of installed plug-ins, by the names of their entry points."""
     from importlib.metadata import entry_points
 
     entries = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
@@ -124,7 +125,7 @@ def _of_other_packages() -> tuple[LogFormat, ...]:
 def _every_format() -> Iterator[LogFormat]:
     """Yield all formats. Those of other packages are last, so that they are searched for only if necessary."""
     yield from FORMATS
-    yield from _of_other_packages()
+    yield from formats_of_other_packages()
 
 
 def recognised_format(head: bytes, name: str) -> LogFormat | None:

@@ -18,7 +18,7 @@ LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 2.0, 0.3, 0.6
 #: Excluded start of each stretch, where the initial state is unknown.
 SETTLE_S = 1.0
 #: Longest driving of one log in a fit, and length of the pieces from which it is selected.
-MOST_S, PIECE_S = 120.0, 10.0
+MOST_S, PIECE_S = 200.0, 10.0
 
 _COLUMNS = 5
 _PAUSE_CELLS = 100

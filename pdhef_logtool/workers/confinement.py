@@ -57,8 +57,9 @@ def allow_processor_time(more_s: float) -> None:
     """End this process (SIGXCPU) when it takes this much more processor time (Linux)."""
     import resource
 
-    spent = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-    resource.setrlimit(resource.RLIMIT_CPU, (int(spent + more_s) + 1, resource.RLIM_INFINITY))
+    bound = int(sum(resource.getrusage(resource.RUSAGE_SELF)[:2]) + more_s) + 1
+    _, most = resource.getrlimit(resource.RLIMIT_CPU)
+    resource.setrlimit(resource.RLIMIT_CPU, (bound if most == resource.RLIM_INFINITY else min(bound, most), most))
 
 
 def _refuse_other_files(folder: Path) -> None:

@@ -68,14 +68,6 @@ def test_grid_is_the_imu_stamps_with_irregular_steps_kept():
     np.testing.assert_array_equal(signals.ready_ns, stamps + 2 * MS)
 
 
-def test_a_dropout_of_the_grid_channel_does_not_stop_the_clock():
-    channels = imu(drop=range(300, 700))
-    signals = whole(channels, plan_of(channels))
-    assert np.isnan(signals.yaw_rate_rad_s[300:700]).all()
-    assert np.isfinite(signals.ay_m_s2).all()
-    assert np.diff(signals.stamps_ns).max() == 10 * MS
-
-
 def test_grid_order_and_a_slow_gyro_does_not_set_the_clock():
     channels = imu()
     assert plan_of(channels).grid_channel == "yaw_rate_rad_s"
@@ -96,26 +88,10 @@ def test_stamps_in_a_wrong_unit_are_refused_in_one_line():
         plan_of(channels)
 
 
-def test_an_imu_channel_of_another_device_is_brought_to_the_grid():
-    channels = imu()
-    other = regular(0, 10, 100) + 3 * MS
-    channels["ay_m_s2"] = channel("ay_m_s2", other, 2.0 * seconds(other), topic="/other")
-    plan = plan_of(channels)
-    assert "ay_m_s2" not in plan.grid_channels
-    signals = whole(channels, plan)
-    np.testing.assert_allclose(signals.ay_m_s2[1:], 2.0 * seconds(signals.stamps_ns[1:]), atol=1e-6)
-    assert np.isnan(signals.ay_m_s2[0])  # no extrapolation
-
-
 @pytest.mark.parametrize("channels", [{}, {"speed_m_s": channel("speed_m_s", regular(0, 1, 10), np.zeros(10))}])
 def test_without_an_imu_the_error_says_what_to_map(channels):
     with pytest.raises(MappingError, match="map an IMU topic"):
         plan_of(channels)
-
-
-def test_an_imu_without_samples_is_named():
-    with pytest.raises(MappingError, match="no samples of ay_m_s2"):
-        plan_of({"ay_m_s2": channel("ay_m_s2", [], [])})
 
 
 # ---- inputs ----
@@ -182,18 +158,6 @@ def test_a_slow_measurement_stands_once_at_the_first_stamp_at_or_after():
     np.testing.assert_array_equal(signals.speed_m_s[at], np.arange(stamps.size))
 
 
-def test_a_measurement_at_half_the_rate_is_given_at_half_the_stamps():
-    channels = imu()
-    stamps = regular(0, 10, 50) + 3 * MS
-    channels["speed_m_s"] = channel("speed_m_s", stamps, seconds(stamps), topic="/can")
-    plan = plan_of(channels)
-    assert {c.name: c.method for c in plan.channels}["speed_m_s"] == "interpolate"
-    signals = whole(channels, plan)
-    good = np.isfinite(signals.speed_m_s)
-    assert good.sum() == stamps.size - 1
-    np.testing.assert_allclose(signals.speed_m_s[good], seconds(signals.stamps_ns[good]), atol=1e-6)
-
-
 # ---- wheels ----
 
 
@@ -229,17 +193,6 @@ def test_a_mapped_speed_beats_the_wheels_and_road_wheel_angle_beats_the_steering
     assert plan.to_dict()["unused"] == {"steering_wheel_rad": "steer_rad is mapped too"}
 
 
-def test_a_single_wheel_gives_no_speed():
-    channels = imu()
-    stamps = channels["ay_m_s2"].stamps_ns
-    channels["wheel_speed_rl_m_s"] = channel("wheel_speed_rl_m_s", stamps, np.ones(stamps.size), topic="/can")
-    plan = plan_of(channels)
-    signals = whole(channels, plan)
-    assert plan.speed_from == "none"
-    assert "speed_m_s" not in signals.available
-    assert np.isnan(signals.speed_m_s).all()
-
-
 def test_combined_wheel_speed_withstands_one_wrong_wheel():
     nan = np.nan
     speeds = np.array(
@@ -255,16 +208,6 @@ def test_combined_wheel_speed_withstands_one_wrong_wheel():
 
 
 # ---- arrival ----
-
-
-def test_ready_is_the_latest_arrival_of_what_is_used():
-    channels = imu(end_s=1.0)
-    stamps = regular(0, 1, 100) + 5 * MS
-    channels["steer_rad"] = channel("steer_rad", stamps, np.zeros(stamps.size), delay_ns=6 * MS, topic="/can")
-    signals = whole(channels, plan_of(channels))
-    inner = slice(1, -1)  # both neighbours: the later one lies 5 ms ahead and takes 6 ms
-    np.testing.assert_array_equal(signals.ready_ns[inner], signals.stamps_ns[inner] + 11 * MS)
-    assert signals.ready_ns[0] == signals.stamps_ns[0] + 2 * MS  # no steering yet
 
 
 def test_late_samples_are_not_waited_for_and_are_counted():

@@ -1,8 +1,7 @@
-"""Of sensors that go together the late one is named without truth; a latency of the truth is applied if significant."""
+"""Of sensors that go together the late one is named; the shift is the one that every shift gives."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -12,16 +11,20 @@ import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.checks import delay_checks
-from pdhef_logtool.drive.correlation import has_peak_within, on_common_grid
+from pdhef_logtool.drive.correlation import (
+    CommonGrid,
+    Shift,
+    find_shift,
+    on_common_grid,
+    shift_error,
+)
 from pdhef_logtool.drive.delays import LatencyEstimate, late_sensors
+from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
-from pdhef_logtool.drive.recorded import read_recorded
 from pdhef_logtool.drive.survey import mapping_proposals, survey_log
-from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks
-from pdhef_logtool.records.signals import WHEELS, Channel
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 from tests.drive.test_checks import survey
 
 WHEEL_NAMES = tuple(f"wheel_speed_{w}_m_s" for w in WHEELS)
@@ -63,17 +66,6 @@ def test_what_the_car_stands_between_is_late_by_at_least_so_much(
     assert delay_checks([late])[0].remedy.endswith("at least")
 
 
-def test_a_sine_that_goes_with_itself_a_period_later_tells_nothing() -> None:
-    time_ns = np.arange(0, 30_000_000_000, 10_000_000, dtype=np.int64)
-
-    def sine(late_s: float) -> np.ndarray:
-        return np.sin(2 * np.pi * 2.2 * (time_ns * 1e-9 - late_s))
-
-    grid = on_common_grid(time_ns, sine(0.0), time_ns, sine(0.4))
-    assert has_peak_within(grid, -0.1, 0.0, 0.8)
-    assert not has_peak_within(grid, 0.0, 0.3, 0.8)
-
-
 def test_a_late_gyro_is_put_right_once_without_truth(sample_logs_dir: Path) -> None:
     log = open_log(sample_logs_dir / "dlc.mcap")
     recognised = auto_map(log).mapping
@@ -96,9 +88,9 @@ ERROR_S = 0.002
 
 
 @pytest.fixture(scope="module")
-def planned(sample_logs_dir: Path) -> Iterator[tuple[DriveLog, DrivePlan]]:
+def planned(sample_logs_dir: Path) -> DrivePlan:
     with closing(open_log(sample_logs_dir / "step.mcap")) as log:
-        yield log, plan_drive(log, auto_map(log).mapping, default_vehicle(), log.start_ns, log.end_ns)
+        return plan_drive(log, auto_map(log).mapping, default_vehicle(), log.start_ns, log.end_ns)
 
 
 def with_latency(plan: DrivePlan, latency_s: float, std_error_s: float = ERROR_S) -> DrivePlan:
@@ -106,40 +98,89 @@ def with_latency(plan: DrivePlan, latency_s: float, std_error_s: float = ERROR_S
     return replace(plan, latency=found)
 
 
-@pytest.mark.parametrize("std_errors", [2.001, -2.001, 2.5, -2.9, 30.0])
-def test_a_latency_beyond_two_standard_errors_is_applied_with_its_sign(planned, std_errors):
-    plan = with_latency(planned[1], std_errors * ERROR_S)
-    assert plan.truth_latency_s == std_errors * ERROR_S
+@pytest.mark.parametrize("std_errors", [2.001, -2.001, 30.0, 0.0, -1.1, 1.999, 2.0, -2.0])
+def test_a_latency_is_applied_if_it_is_beyond_two_standard_errors(planned, std_errors):
+    applied = std_errors * ERROR_S if abs(std_errors) > 2.0 else 0.0
+    assert with_latency(planned, std_errors * ERROR_S).truth_latency_s == applied
+    assert replace(planned, latency=None).truth_latency_s == 0.0
 
 
-@pytest.mark.parametrize("std_errors", [0.0, 0.5, -1.1, 1.999, -1.999, 2.0, -2.0])
-def test_a_latency_within_two_standard_errors_is_not(planned, std_errors):
-    assert with_latency(planned[1], std_errors * ERROR_S).truth_latency_s == 0.0
+_UNKNOWN = Shift(float("nan"), float("nan"), False)
 
 
-def test_a_latency_that_nobody_could_measure_is_not_applied(planned):
-    assert replace(planned[1], latency=None).truth_latency_s == 0.0
-    assert with_latency(planned[1], 0.0, float("inf")).truth_latency_s == 0.0
+def by_every_shift(a: FloatArray, b: FloatArray, reach: int) -> FloatArray:
+    """Return the coefficient at each shift as it is defined; NaN where a side varies by less than rounding."""
+    found, n = np.full(2 * reach + 1, np.nan), len(a)
+    for k in range(max(-reach, 2 - n), min(reach, n - 2) + 1):
+        x, y = a[max(0, -k) : n - max(0, k)], b[max(0, k) : n - max(0, -k)]
+        known = np.isfinite(x) & np.isfinite(y)
+        sides = [(v[known], 1e-9 * np.nanvar(of)) for v, of in ((x, a), (y, b))]
+        if np.count_nonzero(known) > 1 and all(v.var() > least for v, least in sides):
+            found[k + reach] = np.corrcoef(x[known], y[known])[0, 1]
+    return found
 
 
-def truth_of(log: DriveLog, plan: DrivePlan) -> StateTrack:
-    truth = read_recorded(log, plan).truth
-    assert truth is not None
-    return truth
+def pair(kind: str, rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:
+    """Make two signals of which one follows the other."""
+    walk = np.cumsum(rng.standard_normal(n))
+    late = np.roll(walk, int(rng.integers(-40, 40))) + rng.uniform() * rng.standard_normal(n)
+    if kind == "holes":
+        walk[rng.random(n) < 0.3] = late[rng.random(n) < 0.3] = np.nan
+    made = {
+        "walk": (walk, late), "holes": (walk, late), "equal": (walk, walk.copy()), "constant": (np.zeros(n), late),
+        "ties": (np.arange(n) % 2.0, np.arange(n) % 2.0), "far from zero": (walk + 1e4, late),
+        "tiny and huge": (walk * 1e-100, late * 1e100),
+    }  # fmt: skip
+    return made[kind]
 
 
-def test_the_rule_decides_what_the_estimates_are_compared_with(planned):
-    """A shift of 50 ms is ten samples of the truth; at 3 standard errors the truth moves by it, at 1 not at all."""
-    log, plan = planned
-    at_zero = truth_of(log, replace(plan, latency=None))
-    applied = truth_of(log, with_latency(plan, 0.05, 0.05 / 3.0))
-    dropped = truth_of(log, with_latency(plan, 0.05, 0.05))
-    np.testing.assert_array_equal(dropped.yaw_rate_rad_s, at_zero.yaw_rate_rad_s)
-    np.testing.assert_array_equal(applied.stamps_ns, at_zero.stamps_ns)
-    # A motion that the sensors show at t appears in the ground truth at t + latency.
-    t = (at_zero.stamps_ns - at_zero.stamps_ns[0]) * 1e-9
-    later = np.interp(t + 0.05, t, at_zero.yaw_rate_rad_s)
-    inside = np.isfinite(applied.yaw_rate_rad_s) & (t < t[-1] - 0.1)
-    assert inside.mean() > 0.9
-    moved = np.abs(later - at_zero.yaw_rate_rad_s)[inside].max()
-    assert np.abs(applied.yaw_rate_rad_s - later)[inside].max() < 0.1 * moved
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["walk", "holes", "equal", "constant", "ties", "far from zero", "tiny and huge"])
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_the_shift_is_that_of_every_shift(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        a, b = pair(kind, rng, int(rng.integers(2, 200)))
+        shift, every = find_shift(CommonGrid(0.01, a, b), 0.3), by_every_shift(a, b, 30)
+        if not np.isfinite(every).any():
+            assert repr(shift) == repr(_UNKNOWN)
+            continue
+        best = np.flatnonzero(every > np.nanmax(every) - 1e-6)  # equal to rounding
+        assert shift.correlation == pytest.approx(np.nanmax(every), abs=1e-6)
+        assert np.abs(shift.shift_s / 0.01 - (best - 30)).min() <= 0.5 + 1e-6
+        assert shift.inside == (0.3 - abs(shift.shift_s) > 1e-9)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_columns_on_an_even_grid_are_those_of_numpy(share: float) -> None:
+    rng = np.random.default_rng(1)
+    stamps = np.cumsum(rng.integers(8_000_000, 12_000_000, 500)).astype(np.int64)
+    stamps = stamps[(rng.random(500) >= share) | (np.arange(500) % 499 == 0)]
+    for _ in range(3):
+        values = np.cumsum(rng.standard_normal(len(stamps)))
+        found = on_common_grid(stamps, values, stamps.copy(), values)
+        on_grid = Bracket(
+            stamps,
+            np.arange(stamps[0], stamps[-1] + 1, round(found.step_s * 1e9)),
+            round(3 * np.median(np.diff(stamps))),
+        ).linear(values)
+        known, n = np.flatnonzero(np.isfinite(on_grid)), len(on_grid)
+        slope, offset = np.polyfit(known / n, on_grid[known], 1)
+        expected = on_grid - offset - slope * (np.arange(n) / n)
+        same = on_common_grid(stamps, values, stamps, values)
+        for column in (same.a, same.b, found.a, found.b):
+            np.testing.assert_allclose(column, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_the_error_of_a_shift_is_that_of_its_scatter(coloured: bool) -> None:
+    """Noise is white or as slow as a bend: the spread of shifts over many drives is the error that is stated."""
+    rng, ratios = np.random.default_rng(3), []
+    for _ in range(40):
+        a, noise = (np.convolve(rng.standard_normal(6200), np.hanning(200), "valid") for _ in range(2))
+        noise = noise[:6000] if coloured else 6.0 * rng.standard_normal(6000)
+        b = np.roll(a[:6000], 7) + 0.1 * noise
+        grid = CommonGrid(0.01, a[:6000], b)
+        shift = find_shift(grid, 0.5).shift_s
+        ratios.append((shift - 0.07) / shift_error(grid, shift))
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.3

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.hypotheses import Relation, block_gains, known_hypotheses, posterior
+from pdhef_logtool.drive.hypotheses import Relation, known_hypotheses, posterior
 from pdhef_logtool.drive.plan import plan_drive
 from pdhef_logtool.drive.survey import scaled_source
 from pdhef_logtool.logs.open_log import open_log
@@ -74,30 +74,6 @@ def test_scales_of_right_mappings_are_those_of_units() -> None:
     assert all(p > 0.75 for p, _ in likeliest.values())
     counts = posterior([between], known_hypotheses(("speed_m_s",)), {"speed_m_s": 0.0123})
     assert counts == posterior([between], known_hypotheses(("speed_m_s",)))
-
-
-def test_signals_without_a_relation_take_no_probability_from_a_mistake() -> None:
-    """That the roll rate beside a wrong a_y is wrong too is as likely: it must not keep a correction from certainty."""
-    backwards, sound = (
-        relation(-1.0, -1.05, -0.95, -1.0),
-        relation(1.0, 1.0, 1.0, powers={"speed_m_s": 1}, text="speed"),
-    )
-    steered = relation(-1.0, -1.0, -1.0, powers={"ay_m_s2": 1, "speed_m_s": -2}, text="steering")
-    together = ("ay_m_s2", "roll_rate_rad_s", "pitch_rate_rad_s")
-    alone, beside = (
-        posterior([backwards, steered, sound], known_hypotheses((*NAMES, *more), (together,)))
-        for more in ((), together[1:])
-    )
-    assert alone.sets[0][0] == pytest.approx(beside.sets[0][0])
-    assert beside.sets[0][0] > 0.99 and beside.sets[0][1][0].factors == {"ay_m_s2": -1.0}
-
-
-def test_gains_of_blocks_are_free_of_a_bank_and_of_blocks_that_rest() -> None:
-    time = np.arange(0.0, 80.0, 0.05)
-    bend = np.where(time < 60.0, np.sin(0.9 * time), 0.0)
-    bank = 3.0 * np.floor(time / 10.0)
-    np.testing.assert_allclose(block_gains(bend, 1.2 * bend + bank, 8), [1.2] * 6)
-    assert block_gains(bend[:400], bend[:400], 2) == ()
 
 
 def test_inspect_and_run_refuse_the_same_channels(sample_logs_dir: Path) -> None:

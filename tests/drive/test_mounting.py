@@ -14,7 +14,6 @@ from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import ACCELERATIONS, RATES, Mounting, angles_deg, find_mounting, find_triads
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.recorded import read_recorded
-from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, fit_clocks, load_mapping, read_signals, resolve_mapping
 from pdhef_logtool.records.signals import Signals
@@ -139,22 +138,6 @@ def test_a_sensor_that_takes_gravity_off_is_turned_by_its_rates(log) -> None:
     for angles in ((90, 0, 0), (180, 0, 90)):
         turned = Compensated(log, rotation(*angles))
         assert difference(signals_of(turned, planned(turned)), signals_of(log, planned(log))) < 1e-9
-
-
-def test_a_drive_that_says_nothing_turns_nothing(sample_logs_dir: Path) -> None:
-    log = open_log(sample_logs_dir / "fishhook.mcap")
-    mapping = auto_map(log).mapping
-    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    found = survey_log(log, mapping, clocks, (log.start_ns, log.start_ns + 2_000_000_000))
-    log.close()
-    assert found.mapping is mapping
-    assert found.mounted == ()
-
-
-def test_angles_are_those_of_the_sensor_in_the_car() -> None:
-    mounting = Mounting(rotation(10, -20, 30), np.eye(3), "", confident=True)
-    assert angles_deg(mounting.rotation) == pytest.approx((10, -20, 30))
-    assert mounting.text == "the IMU is mounted with roll 10, pitch -20, yaw 30 deg"
 
 
 @pytest.mark.parametrize("angles", [(0, 90, 30), (0, -90, -120), (170, 20, -30)])

@@ -1,18 +1,64 @@
-"""Logs with odd clocks are processed and report dropped messages; the rest equals the result of the sound log."""
+"""Logs with odd clocks and late topics are processed and say so; the rest equals the result of the sound log."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
-from odd_clocks import S, Shift, rewrite
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.cli.app import app
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
 from pdhef_logtool.records.ledger import DAMAGE, DAMAGED_SHARE, SampleCount, damage
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.inspection import inspect_log
+
+S = 1_000_000_000
+
+#: Nanoseconds to add: of the number of the message on its topic, the seconds since the log's start, and the topic.
+Shift = Callable[[int, float, str], int]
+
+
+def rewrite(
+    source: Path, target: Path, log_shift: Shift, stamp_shift: Shift | None = None, chunk: int = 1 << 20
+) -> None:
+    """Copy an MCAP in order of log time, with log times moved, and header stamps (None: as the log times are)."""
+    with source.open("rb") as old, target.open("wb") as new:
+        reader, writer = make_reader(old), Writer(new, chunk_size=chunk, compression=CompressionType.LZ4)
+        writer.start(profile="ros2")
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        numbers: dict[str, int] = {}
+        start = None
+        for schema, channel, message in reader.iter_messages(log_time_order=True):
+            assert schema is not None
+            if channel.id not in channels:
+                if schema.id not in schemas:
+                    schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            start = message.log_time if start is None else start
+            number = numbers[channel.topic] = numbers.get(channel.topic, -1) + 1
+            at = (number, (message.log_time - start) * 1e-9, channel.topic)
+            by = log_shift(*at)
+            data = bytearray(message.data)
+            stamp = int.from_bytes(data[4:8], "little") * S + int.from_bytes(data[8:12], "little")
+            if abs(stamp - message.log_time) < 10 * S:  # behind the encapsulation: a stamp, bare or of a header
+                stamp += by if stamp_shift is None else stamp_shift(*at)
+                data[4:12] = (stamp // S).to_bytes(4, "little") + (stamp % S).to_bytes(4, "little")
+            log_time = min(max(message.log_time + by, 0), 2**64 - 1)
+            writer.add_message(channels[channel.id], log_time, bytes(data), log_time, message.sequence)
+        writer.finish()
+
 
 YEARS = 10 * 365 * 86_400 * S
 START = 1_767_225_600 * S
@@ -107,38 +153,6 @@ def test_a_clock_that_steps_back(chunk: int, sample_logs_dir: Path, tmp_path: Pa
         np.testing.assert_array_equal(whole.signals.yaw_rate_rad_s[part][i], sound.yaw_rate_rad_s[j])
 
 
-def shifts() -> dict[str, Shift]:
-    return {
-        "an hour back, half-way": lambda _n, at_s, _t: -3600 * S if at_s > 4.0 else 0,
-        "an hour back, one topic": lambda _n, _s, topic: -3600 * S if topic == "/imu/data" else 0,
-        "three seconds back, one topic": lambda _n, at_s, t: -3 * S if at_s > 4.0 and t == "/imu/data" else 0,
-        "in fives": lambda number, _s, _t: -(number % 5) * S // 100,
-    }
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", shifts())
-def test_header_stamps_that_are_no_time(name: str, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
-    log = tmp_path / "headers.mcap"
-    rewrite(sample_logs_dir / "dlc.mcap", log, lambda *_: 0, shifts()[name])
-    drive, whole = read(log, car)
-    assert kinds(drive) == {"log-time-serves": "note"}
-    assert all(s.used == s.total for s in drive.sample_ledger)
-    assert {s.stamp for s in drive.sample_ledger if s.source.startswith("/imu/data")} == {"log_time"}
-    assert len(whole.signals) == 951
-    assert whole.truth is not None
-    assert whole.truth.valid.sum() > 850
-
-
-def test_a_pause_of_twenty_minutes_is_no_epoch(sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
-    log = tmp_path / "pause.mcap"
-    rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: 1200 * S if at_s > 4.0 else 0)
-    drive, whole = read(log, car)
-    assert kinds(drive) == {}
-    assert all(s.used == s.total for s in drive.sample_ledger)
-    assert len(whole.signals) == 951
-
-
 def test_the_share_that_is_damage() -> None:
     def count(**reasons: int) -> SampleCount:
         named = {reason.replace("_", "-"): n for reason, n in reasons.items()}
@@ -150,3 +164,64 @@ def test_the_share_that_is_damage() -> None:
     assert (loss.severity, loss.count) == ("lost", 2 * (least + 1))
     assert "101 of 10000 samples are not used (100 duplicate-stamp, 1 nan)" in loss.what
     assert {"nan", "bad-stamp", "duplicate-stamp", "time-jump", "outlier", "other-epoch"} <= DAMAGE
+
+
+STEERING = "/vehicle/status/steering_status"
+INPUTS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+
+
+@pytest.fixture(scope="module")
+def late(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the double lane change with steering that arrives 0.8 s later, with its stamps as they were."""
+    path = tmp_path_factory.mktemp("late") / "late.mcap"
+    rewrite(
+        sample_logs_dir / "dlc.mcap", path, lambda _n, _s, topic: round(0.8 * S) if topic == STEERING else 0,
+        lambda _n, _s, _topic: 0,
+    )  # fmt: skip
+    return path
+
+
+def signals_of(path: Path, **options: Any) -> tuple[Signals, list[str], str]:
+    options = {"friction": 1.0, **options}
+    with read_drive(path, Car.load("saloon"), options=ReadOptions(**options)) as drive:
+        return drive.whole().signals, drive.notes, drive.not_causal
+
+
+def run(capsys: pytest.CaptureFixture[str], out: Path, *arguments: object) -> tuple[int, dict[str, Any], str]:
+    given = ["run", *map(str, arguments), "-o", str(out), "--car", "saloon", "--no-report", "--annotate", "none"]
+    code = app(given, prog_name="pdhef", standalone_mode=False) or 0
+    (report,) = out.glob("logs/*/report.json")
+    return code, json.loads(report.read_text(encoding="utf-8")), capsys.readouterr().err
+
+
+def test_only_the_late_topic_is_read_by_stamp_and_it_is_named(late: Path, sample_logs_dir: Path) -> None:
+    found, notes, not_causal = signals_of(late)
+    sound, no_notes, causal = signals_of(sample_logs_dir / "dlc.mcap")
+    assert causal == ""
+    assert not any("stamps" in n for n in no_notes)
+    for name in INPUTS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(sound, name)[: len(found)])
+    lag = (found.ready_ns - found.stamps_ns)[10:-10]
+    assert lag.max() < 0.1 * S, "0.8 s if the late topic were waited for"
+    assert not_causal == "not causal: steer_rad read by stamp, not by arrival"
+    (note,) = [n for n in notes if "stamps" in n]
+    assert STEERING in note
+    assert "0.81 s" in note
+    assert "0.3 s" in note
+
+
+@pytest.mark.slow
+def test_a_run_of_it_scores_and_calls_nothing_causal(
+    late: Path, sample_logs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, report, err = run(capsys, tmp_path / "out", late, "--estimators", "zero,phy-ukf")
+    assert code == 0
+    assert STEERING in err
+    assert [e["causal"] for e in report["estimators"]] == [False] * 2
+    assert all("steer_rad read by stamp" in " ".join(e["notes"]) for e in report["estimators"])
+    rows = pl.read_parquet(tmp_path / "out/logs/late/estimates.parquet").filter(estimator="phy-ukf")
+    assert rows["valid"].mean() > 0.95  # type: ignore[operator]
+    run(capsys, tmp_path / "sound", sample_logs_dir / "dlc.mcap", "--estimators", "zero,phy-ukf")
+    sound = pl.read_parquet(tmp_path / "sound/logs/dlc/estimates.parquet").filter(estimator="phy-ukf")
+    both = rows.join(sound, on="stamp_ns").filter("valid", "valid_right")
+    assert (both["vy_m_s"] - both["vy_m_s_right"]).abs().max() < 1e-9  # type: ignore[operator]

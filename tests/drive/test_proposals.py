@@ -82,26 +82,6 @@ def test_each_error_is_taken_off_once_however_often(log, tmp_path: Path, times: 
     assert mapping_proposals(surveyed(log, mapping, CAR)) == ()
 
 
-@pytest.mark.slow
-def test_a_recognised_mapping_needs_no_command_for_a_sign(log) -> None:
-    vehicle = CAR.model_copy(
-        update={
-            "sensors": CAR.sensors.model_copy(update={"yaw_rate_delay_s": DELAY_S, "yaw_rate_gain": GAIN}),
-            "imu_position_m": (LEVER_M, 0.0, 0.0),
-        }
-    )
-    plan = plan_drive(log, auto_map(log).mapping, vehicle, log.start_ns, log.end_ns)
-    # It changes numbers: the run ends with exit code 3.
-    corrected = {c.name: c.remedy for c in plan.checks if c.verdict == "failed"}
-    assert all(n.endswith(".corrected") for n in corrected)
-    assert "scale = -1.0" in corrected["steer_rad.corrected"]
-    assert "steer_rad" not in plan.refused
-    assert plan.mapping.signals["steer_rad"].scale == -1.0
-    assert "steer_rad: read with -1 times its scale" in " ".join(plan.mapping.notes)
-    assert plan.mapping.signals["yaw_rate_rad_s"].latency_s == vehicle.sensors.yaw_rate_delay_s
-    assert "the car's gyro is" in " ".join(plan.mapping.notes)
-
-
 def test_proposals_say_where_they_belong_and_why(log) -> None:
     found = inspect_drive_log(log)
     assert {p.subject for p in found.proposals} == {"yaw_rate_rad_s", "ay_m_s2"}, (

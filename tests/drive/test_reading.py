@@ -12,16 +12,13 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive import reading, recorded
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell, one_log, read_drive
-from pdhef_logtool.estimators.drive_signals import DriveSignals
-from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.mapping import Mapping, SignalSource, read_signals
-from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
+from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.runs.estimating import estimate_drive
 
 
 @pytest.fixture
@@ -53,18 +50,6 @@ def test_a_drive_is_read_once_and_says_the_same_again(
     assert len(reads) == 1
     _assert_equal(first.signals, second.signals)
     assert first.seconds == pytest.approx(9.5, abs=0.1)
-
-
-def test_estimates_have_poses_and_tell_their_progress(sample_logs_dir: Path, car: Car) -> None:
-    estimators = [make_estimator(name, car) for name in ("zero", "kinematic", "phy-ukf")]
-    shares: list[float] = []
-    with read_drive(sample_logs_dir / "dlc.mcap", car) as drive:
-        whole = drive.whole()
-        corrected = DriveSignals.of(whole.signals, car)
-        full = estimate_drive(whole, corrected, estimators, progress=shares.append)
-    assert shares == [0.0, 1 / 3, 2 / 3]
-    assert list(full.tracks) == ["zero", "kinematic", "phy-ukf"]
-    assert all(np.isfinite(track.x_m).any() for track in full.tracks.values())
 
 
 def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> None:
@@ -112,11 +97,6 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
         return log
 
     log = sample_logs_dir / "dlc.mcap"
-    with read_drive(log, car) as drive:
-        nothing = replace(drive.recorded(), signals=drive.recorded().signals.rows(0, 0))
-        drive._recorded = nothing
-        with pytest.raises(EstimatorError, match="IMU samples in the chosen slice"):
-            drive.whole()
     monkeypatch.setattr(reading, "open_log", watched_log)
     with pytest.raises(UsageError, match="a slice inside"):
         read_drive(log, car, options=ReadOptions(start="99"))

@@ -246,24 +246,6 @@ def test_times_of_a_blf(
     assert tables.losses == []
 
 
-def test_can_fd_frames_with_data_behind_them(tmp_path: Path) -> None:
-    data = bytes(range(1, 13))
-
-    def fd_64(extension: int, tail: bytes) -> bytes:
-        head = struct.pack("<BBBBIIIIIIIHBBI", 3, 9, 12, 0, 0x80000123, 0, 0x1000, 0, 0, 0, 0, 0, 0, extension, 0)
-        return head + tail
-
-    objects = [
-        blf_object(101, fd_64(0, data), 0),
-        blf_object(101, fd_64(32 + 40 + 12, data + b"\xff" * 8), 1),  # data of an extension
-        blf_object(101, fd_64(0, data[:5]), 2),  # fewer bytes than it states: zeros
-    ]
-    tables = read(blf(tmp_path / "a.blf", *objects))  # in no container
-    row = (0x123, True, 2, False, False, 12)
-    assert rows_of(tables) == [(*row, data), (*row, data), (*row, data[:5] + bytes(7))]
-    assert tables.losses == []
-
-
 @pytest.mark.parametrize("compressed", [True, False])
 def test_damage_costs_its_container_only(compressed: bool, tmp_path: Path) -> None:
     stream, size = numbered(300), 1500  # objects that continue in the next container
@@ -293,30 +275,6 @@ def test_a_damaged_object_costs_itself(offset: int, value: bytes, tmp_path: Path
     assert [loss.kind for loss in tables.losses] == ["bad-chunk"]
 
 
-def test_an_object_that_covers_others_costs_itself(tmp_path: Path) -> None:
-    marker = bytearray(blf_object(96, bytes(48), 0))
-    marker[8:12] = struct.pack("<I", 1001)
-    parts = [bytearray(container(numbered(5, first=i))) for i in range(40, 60, 5)]
-    parts[1][8:12] = struct.pack("<I", len(parts[1]) + 50)
-    objects = numbered(5) + bytes(marker) + numbered(35, first=5)
-    tables = read(blf(tmp_path / "a.blf", container(objects), *map(bytes, parts)))
-    assert set(range(60)) - set(numbers_of(tables)) <= set(range(45, 50))
-    assert {loss.kind for loss in tables.losses} == {"bad-chunk"}
-
-
-def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
-    path = write(
-        tmp_path / "a.blf", [sent(i / 100, 256, struct.pack("<I", i)) for i in range(600)], max_container_size=2000
-    )
-    data = path.read_bytes()
-    (tmp_path / "b.blf").write_bytes(data[: len(data) // 2])
-    tables = read(tmp_path / "b.blf")
-    found = numbers_of(tables)
-    assert found == list(range(len(found)))
-    assert 200 < len(found) < 400
-    assert [loss.kind for loss in tables.losses] == ["truncated"]
-
-
 @pytest.mark.parametrize(
     ("bad", "limits", "kind", "text"),
     [
@@ -334,22 +292,6 @@ def test_a_container_that_harms_is_a_loss_of_itself(
         tables = open_blf(TableFile(stream, path.stat().st_size, "a.blf", replace(DEFAULT_LIMITS, **limits)))
     assert numbers_of(tables) == list(range(10))
     assert any(loss.kind == kind and text in loss.what for loss in tables.losses)
-
-
-def test_many_damaged_places_are_counted(tmp_path: Path) -> None:
-    bad = container(numbered(1))[:32] + b"no zlib!"
-    parts = [bad[:8] + struct.pack("<I", len(bad)) + bad[12:]] * 50
-    tables = read(blf(tmp_path / "a.blf", container(numbered(5)), *parts))
-    assert numbers_of(tables) == list(range(5))
-    assert len(tables.losses) < 30
-    assert sum(loss.count or 1 for loss in tables.losses) == 50
-
-
-@pytest.mark.parametrize("data", [b"LOGG", b"LOGG" + bytes(200), b"LOGG" + b"\xff" * 200])
-def test_a_blf_without_frames_is_one_line(data: bytes, tmp_path: Path) -> None:
-    (tmp_path / "a.blf").write_bytes(data)
-    with pytest.raises(LogError):
-        read(tmp_path / "a.blf")
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".asc", ".log"])
@@ -505,15 +447,6 @@ def column(table: Any, path: str) -> list[float]:
     return table.load(path, slice(0, len(table.stamps_ns))).tolist()
 
 
-def test_frames_survive_as_a_table() -> None:
-    frames = made([(0, 256, b"\1\2"), (1, 257, b""), (0, 256, b"\3\4\5")])
-    again = Frames.of_table(frames.table("can"))
-    np.testing.assert_array_equal(again.data, frames.data)
-    assert {name: part.tolist() for name, part in again.parts.items()} == {
-        n: p.tolist() for n, p in frames.parts.items()
-    }
-
-
 def test_the_same_identifiers_on_two_buses_are_two_tables() -> None:
     rows = [(bus, 291, struct.pack("<hH4x", 100 * bus + i, 0)) for i in range(5) for bus in (1, 0)]
     tables, lost, _ = decoded(made(rows), MOTION)
@@ -521,14 +454,6 @@ def test_the_same_identifiers_on_two_buses_are_two_tables() -> None:
     assert column(tables["Motion"], "AccelY") == pytest.approx([0.001 * i for i in range(5)])
     assert column(tables["Motion#bus1"], "AccelY") == pytest.approx([0.1 + 0.001 * i for i in range(5)])
     assert lost == []
-
-
-def test_the_bus_with_most_messages_of_a_dbc_has_the_plain_names() -> None:
-    other = MOTION.replace("291 Motion", "292 More")
-    rows = [(0, 291, bytes(8)), (2, 291, b"\1" + bytes(7)), (2, 292, bytes(8))]
-    tables, _, _ = decoded(made(rows), MOTION + other)
-    assert {name: len(t.stamps_ns) for name, t in tables.items()} == {"Motion": 1, "Motion#bus0": 1, "More": 1}
-    assert column(tables["Motion"], "AccelY") == [0.001]
 
 
 def j1939(identifier: int, signals: str = ' SG_ Speed : 0|16@1+ (0.01,0) [0|0] "km/h" A\n') -> str:
@@ -591,15 +516,10 @@ def test_raw_values_without_a_meaning_are_not_available() -> None:
 
 
 def test_named_raw_values_of_a_dbc_are_not_available() -> None:
-    dbc = (
-        MOTION
-        + 'VAL_ 291 Speed 65535 "SNA" 65534 "Signal_Error" 0 "No_Error" ;\nVAL_ 291 AccelY -1 "not available" ;\n'
-    )
-    frames = [(291, struct.pack("<hH4x", a, s)) for a, s in ((-1, 65535), (2, 65534), (3, 0), (4, 500))]
-    tables, _, columns = decoded(frames, dbc)
+    dbc = MOTION + 'VAL_ 291 Speed 65535 "SNA" 65534 "Signal_Error" 0 "No_Error" ;\n'
+    tables, _, columns = decoded([(291, struct.pack("<hH4x", 0, s)) for s in (65535, 65534, 0, 500)], dbc)
     np.testing.assert_allclose(column(tables["Motion"], "Speed"), [np.nan, np.nan, 0, 5])
-    np.testing.assert_allclose(column(tables["Motion"], "AccelY"), [np.nan, 0.002, 0.003, 0.004])
-    assert {path: [x.count for x in notes] for (_, path), notes in columns.items()} == {"Speed": [2], "AccelY": [1]}
+    assert [x.count for x in columns["Motion", "Speed"]] == [2]
 
 
 def test_values_outside_of_the_range_of_the_dbc_are_lost() -> None:
@@ -728,15 +648,3 @@ def test_a_dbc_that_matches_nothing_is_named(tmp_path: Path) -> None:
     notes = " ".join(map(str, inspect_log(path, options=ReadOptions(msgs=tmp_path / "car.dbc")).to_dict()["notes"]))
     assert "car.dbc contains none of their identifiers" in notes
     assert "--set msgs" not in notes
-
-
-def test_losses_of_a_column_are_those_of_a_log_that_reads_it(drive: Path, tmp_path: Path) -> None:
-    (tmp_path / "car.dbc").write_text(HEAD + MOTION.replace("(0.01,0) [0|0]", "(0.01,0) [0|72.9]"))
-    with closing(open_log(drive, msgs=tmp_path / "car.dbc")) as log:
-        log.read({"Motion": ["Speed"]}, quiet=True)
-        log.read({"Motion": ["AccelY"]})
-        assert kinds_of(log) == ["unknown-frame"]
-        for _ in range(2):
-            read = log.read({"Motion": ["Speed"]}, log.end_ns - 10**9, log.end_ns)["Motion"]
-        assert kinds_of(log) == ["unknown-frame", "out-of-range"]
-    assert np.isnan(read.fields["Speed"]).sum() == 9

@@ -14,7 +14,6 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from recorded import raw_channel
 
-from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 
@@ -165,8 +164,8 @@ def test_columns_equal_the_independent_deserialiser(
         np.testing.assert_array_equal(column, expected, err_msg=path_)
 
 
-def _with_payloads(path: Path, payload_bytes: int, own_chunks: bool) -> None:
-    """Write 200 numbers, and as many payloads of another topic between them or behind them."""
+def _with_payloads(path: Path, payload_bytes: int) -> None:
+    """Write 200 numbers, and as many payloads of another topic between them."""
     from pdhef_logtool.logs.schema_files import message_definition
 
     name = "std_msgs/msg/Float64"
@@ -176,11 +175,7 @@ def _with_payloads(path: Path, payload_bytes: int, own_chunks: bool) -> None:
         image = raw_channel(writer, "/image", message="octets")
         numbers = [RawMessage(channel, T0 + i, T0, i, b"\0\1\0\0" + np.float64(i).tobytes()) for i in range(200)]
         images = [RawMessage(image, T0 + i, T0, i, noise) for i in range(200)] if payload_bytes else []
-        if own_chunks:
-            writer.write([], numbers)
-            writer.write([], images)
-        else:
-            writer.write([], sorted([*numbers, *images], key=lambda m: m.log_time_ns))
+        writer.write([], sorted([*numbers, *images], key=lambda m: m.log_time_ns))
 
 
 def _peak_bytes(path: Path) -> int:
@@ -194,28 +189,8 @@ def _peak_bytes(path: Path) -> int:
 
 
 def test_memory_does_not_grow_with_payloads_that_nobody_reads(tmp_path: Path) -> None:
-    _with_payloads(tmp_path / "none.mcap", 0, own_chunks=False)
-    _with_payloads(tmp_path / "mixed.mcap", 300_000, own_chunks=False)
+    _with_payloads(tmp_path / "none.mcap", 0)
+    _with_payloads(tmp_path / "mixed.mcap", 300_000)
     _peak_bytes(tmp_path / "none.mcap")  # imports
     # 60 MB of payload. Reading keeps a few chunks of 1 MB, and caches small messages for a second read of a short log.
     assert _peak_bytes(tmp_path / "mixed.mcap") < _peak_bytes(tmp_path / "none.mcap") + 12_000_000
-
-
-def test_chunks_without_a_mapped_topic_are_not_even_decompressed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _with_payloads(tmp_path / "x.mcap", 300_000, own_chunks=True)
-    with closing(open_log(tmp_path / "x.mcap")) as log:
-        decompressed: list[int] = []
-        content = McapContainer.chunk_content
-
-        def counting(self: McapContainer, start: int, end: int) -> bytes:
-            found = content(self, start, end)
-            decompressed.append(len(found))
-            return found
-
-        monkeypatch.setattr(McapContainer, "chunk_content", counting)
-        log.read({"/x": ["data"]})
-        assert decompressed == [200 * (31 + 12)]
-        log.read({"/image": []})
-        assert sum(decompressed[1:]) == 200 * (31 + 300_000)

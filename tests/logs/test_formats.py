@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
-import json
 import math
-import os
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -25,7 +21,6 @@ from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.mat_log import open_mat
 from pdhef_logtool.logs.mdf_log import open_mdf
-from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter
 from pdhef_logtool.logs.table_file import TableFile, Tables
@@ -75,9 +70,9 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(package))
     importlib.invalidate_caches()
-    formats._of_other_packages.cache_clear()
+    formats.formats_of_other_packages.cache_clear()
     yield
-    formats._of_other_packages.cache_clear()
+    formats.formats_of_other_packages.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -123,32 +118,12 @@ def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz: Path, tmp_
             np.testing.assert_array_equal(found.fields["yaw_rate"], expected.fields["yaw_rate"])
 
 
-@pytest.mark.usefixtures("_installed")
-def test_a_column_that_cannot_be_read_is_a_loss_and_the_others_are_read(npz: Path) -> None:
-    def load(path: str, rows: slice) -> np.ndarray:  # type: ignore[type-arg]
-        if path == "bad":
-            raise ValueError("a block of it is damaged")
-        return np.arange(5)[rows]
-
-    fields = tuple(FieldInfo(path, kind) for path, kind in (("good", "number"), ("bad", "number"), ("at", "time")))
-    table = Table("t", np.arange(5) * 10, fields, load)
-    log = TableLog(LogFile(npz, npz, Meter()), "toy", [table])
-    found = log.read({"t": ["good", "bad", "at"]}, 10, 40)["t"].fields
-    assert found["good"].tolist() == found["at"].tolist() == [1, 2, 3]
-    assert found["at"].dtype == np.int64
-    assert np.isnan(found["bad"]).all()
-    assert [(loss.kind, loss.severity, loss.where) for loss in log.lost] == [("bad-column", "lost", "t")]
-    with pytest.raises(LogError, match="ascending times"):
-        TableLog(LogFile(npz, npz, Meter()), "toy", [dataclasses.replace(table, stamps_ns=np.arange(5)[::-1])])
-    with pytest.raises(LogError, match="different names"):
-        TableLog(LogFile(npz, npz, Meter()), "toy", [table, dataclasses.replace(table)])
-
-
-@pytest.mark.usefixtures("_installed")
-def test_a_damaged_file_is_told_in_one_line(npz: Path, tmp_path: Path) -> None:
-    (tmp_path / "cut.npz").write_bytes(npz.read_bytes()[:-500])
-    with pytest.raises(LogError, match="a NumPy archive or a rosbag2 folder"):
-        open_log(tmp_path / "cut.npz")
+def test_a_table_has_ascending_times_and_tables_have_different_names(npz: Path) -> None:
+    stamps_ns, file = np.arange(5) * 10, LogFile(npz, npz, Meter())
+    good, descending = (Table.of_arrays("t", stamps, {"x": np.arange(5.0)}, {}) for stamps in (stamps_ns, -stamps_ns))
+    for tables, match in (([descending], "ascending times"), ([good, good], "different names")):
+        with pytest.raises(LogError, match=match):
+            TableLog(file, "toy", tables)
 
 
 def test_the_message_for_an_unknown_file_lists_the_formats(tmp_path: Path) -> None:
@@ -156,47 +131,6 @@ def test_the_message_for_an_unknown_file_lists_the_formats(tmp_path: Path) -> No
     titles = ", ".join(f.title for f in formats.FORMATS)
     with pytest.raises(PdhefError, match=f"expected {titles} or a rosbag2 folder"):
         open_log(tmp_path / "drive.npz")
-
-
-def _pdhef(package: Path, *arguments: object) -> tuple[int, str, str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "pdhef_logtool", *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": str(package)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return done.returncode, done.stdout, done.stderr
-
-
-@pytest.mark.slow
-def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, tmp_path: Path) -> None:
-    logs = tmp_path / "logs"
-    for name in ("one", "two"):
-        (logs / name).mkdir(parents=True)
-        shutil.copy(npz, logs / name / "drive.npz")
-    with np.load(npz) as archive:
-        columns = dict(archive)
-    columns["imu/yaw_rate [°/s]"] = columns["imu/yaw_rate [°/s]"] * 1.01
-    np.savez(logs / "two" / "drive.npz", **columns)
-    out = tmp_path / "out"
-    code, _, said = _pdhef(package, "run", logs, "-o", out, "--car", "saloon", "-e", "zero,phy-ukf", "--jobs", "2")
-    assert code == 0, said
-    run = json.loads((out / "run.json").read_text())
-    assert [(log["log"], log["outcome"]) for log in run["logs"]] == [("one__drive", "ok"), ("two__drive", "ok")]
-    for log in run["logs"]:
-        folder = out / "logs" / log["log"]
-        report = json.loads((folder / "report.json").read_text())
-        assert report["log"]["kind"] == "npz"
-        assert (
-            "annotated.mcap contains the tool's topics only: a log of kind npz has no messages to copy"
-            in report["remarks"]
-        )
-        assert {m["metric"] for m in report["metrics"]} >= {"d2"}
-        assert (folder / "report.html").stat().st_size > 10_000
-        with closing(open_log(folder / "annotated.mcap")) as annotated:
-            assert {t.name for t in annotated.topics} == {"/pdhef/log"} | {
-                f"/pdhef/{name}/{kind}"
-                for name in ("phy_ukf", "zero", "reference")
-                for kind in ("state", "odometry", "plot", "path")
-            }  # fmt: skip
 
 
 @pytest.mark.usefixtures("_installed")

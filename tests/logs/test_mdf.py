@@ -21,7 +21,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.mdf_conversions import conversion_rule, formula_rule
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import open_log
@@ -195,15 +194,6 @@ def test_channel_groups_keep_their_clocks_and_units(version: str, tmp_path: Path
     assert read[imu.name].log_time_ns[0] == read[other.name].log_time_ns[0] == START_NS
 
 
-def test_a_cut_file_gives_what_is_readable_or_one_line(tmp_path: Path) -> None:
-    data = mdf(tmp_path / "a.mf4").read_bytes()
-    for share in (0.05, 0.3, 0.6, 0.9, 0.98):
-        (tmp_path / "cut.mf4").write_bytes(data[: int(share * len(data))])
-        done = called("inspect", tmp_path / "cut.mf4", "--json")
-        assert done.returncode in (1, 3), share
-        assert "internal error" not in done.stderr
-
-
 def test_a_file_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None:
     (tmp_path / "a.mf4").write_bytes(imu())
     (tmp_path / "b.mf4").write_bytes(imu()[: -16 * 100 - 5])
@@ -298,15 +288,6 @@ def test_a_formula_that_is_no_arithmetic_is_refused_unless_it_is_a_number(text: 
         formula_rule(text)
 
 
-def test_a_conversion_of_an_unknown_type_is_refused() -> None:
-    unknown = block_of(4, 1, a=1.0, b=0.0)
-    unknown.conversion_type = 40
-    with pytest.raises(ValueError, match="type 40"):
-        conversion_rule(unknown, 4)
-    with pytest.raises(ValueError, match="type 7, which is not supported"):
-        conversion_rule(block_of(3, 7, **{**P, "P4": 0.0}), 3)  # exponential to some readers, logarithmic to others
-
-
 @pytest.mark.parametrize("version", ["4.10", "3.30"])
 def test_a_formula_of_a_file_runs_nothing(version: str, tmp_path: Path) -> None:
     canary = tmp_path / "canary"
@@ -356,15 +337,6 @@ def test_invalid_samples_are_missing_at_their_own_times(low: float | None, high:
     np.testing.assert_array_equal(read.fields["v"], SPEED[rows])
 
 
-def test_rows_with_an_invalid_time_are_a_loss(tmp_path: Path) -> None:
-    samples = np.zeros(N, [("t", "<f8"), ("a", "<f8"), ("i", "u1")])
-    samples["t"], samples["a"], samples["i"] = TIME_S, AY, np.arange(N) % 5 == 0
-    channels = [Ch("time", kind=2, sync=1, flags=2), Ch("AccY", 8)]
-    read = of_bytes(tmp_path, mdf4(channels, samples.tobytes(), N, 16, invalid_bytes=1))
-    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY[np.arange(N) % 5 != 0])
-    assert [loss.count for loss in read.read.losses] == [N // 5]
-
-
 # ---- times ----
 
 
@@ -385,13 +357,6 @@ def test_a_local_start_does_not_depend_on_the_time_zone_of_the_machine(
     read = contents(written(tmp_path / "a.mf4", [signal("ay", AY)], version, start))
     assert read.stamps_ns["car"][0] == START_NS
     assert "local time without a time zone" in read.losses("note")
-
-
-def test_offsets_of_a_utc_start_are_not_applied_twice(tmp_path: Path) -> None:
-    tokyo = dt.timezone(dt.timedelta(hours=9))
-    read = contents(written(tmp_path / "a.mf4", [signal("ay", AY)], "4.10", START.astimezone(tokyo)))
-    assert read.stamps_ns["car"][0] == START_NS
-    assert read.read.losses == []
 
 
 @pytest.mark.parametrize(("sync", "what"), [(2, "an angle"), (3, "a distance"), (4, "an index")])
@@ -524,27 +489,6 @@ def test_a_file_that_is_made_to_harm_is_one_line(make: Callable[[], bytes], matc
         of_bytes(tmp_path, make())
 
 
-def test_groups_of_version_3_in_a_circle_are_one_line(tmp_path: Path) -> None:
-    path = written(tmp_path / "a.mdf", [signal("ay", AY)], "3.30")
-    data = bytearray(path.read_bytes())
-    (first,) = struct.unpack_from("<I", data, 68)
-    struct.pack_into("<I", data, first + 4, first)
-    path.write_bytes(data)
-    with pytest.raises(LogError, match="circle"):
-        contents(path)
-
-
-def test_an_unfinished_file_with_several_lists_of_data_is_one_line(tmp_path: Path) -> None:
-    data = bytearray(written(tmp_path / "a.mf4", [signal("ay", AY)]).read_bytes())
-    group = block(bytes(data), b"DG")
-    lists = [len(data), len(data) + 48]
-    for following in (lists[1], 0):
-        data += struct.pack("<4s4xQQQIIQ", b"##DL", 48, 1, following, 0, 0, 0)[:48]
-    data[:8], data[60:62] = b"UnFinMF ", struct.pack("<H", 0b10000)
-    with pytest.raises(LogError, match="several lists of data"):
-        of_bytes(tmp_path, patched(bytes(data), group + 24 + 16, lists[0]))
-
-
 def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -563,11 +507,3 @@ def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(
     gc.collect()
     assert list((tmp_path / "t").iterdir()) == []
     assert (tmp_path / "a.mf4").read_bytes() == data
-
-
-def test_a_recorded_table_of_frames_is_decoded_as_frames(tmp_path: Path) -> None:
-    (tmp_path / "a.mf4").write_bytes(can_file([DLC], {"dlc": [8, 2, 8, 2]}, SHORT, False))
-    with (tmp_path / "a.mf4").open("rb") as stream:
-        (table,) = open_mdf(TableFile(stream, 10**4, "a.mf4", DEFAULT_LIMITS)).tables
-        frames = Frames.of_table(table)
-    assert frames.data[1, :3].tolist() == [1, 2, 0]

@@ -15,7 +15,6 @@ from recorded import write_vectors
 
 from pdhef_logtool import inspect_log
 from pdhef_logtool.logs import mcap_log
-from pdhef_logtool.logs.container import Block
 from pdhef_logtool.logs.open_log import is_log_folder, open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError
@@ -154,24 +153,6 @@ def test_rows_in_a_write_ahead_log_are_read_and_nothing_is_written_beside(tmp_pa
     assert {p.name: p.read_bytes() for p in path.parent.iterdir()} == before
 
 
-def test_a_chunk_costs_the_same_however_many_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with mcap_writer(tmp_path / "many.mcap", chunk_size=1) as writer:
-        channel = writer.register_channel("/a", "json", 0)
-        for i in range(300):
-            writer.add_message(channel, i, b'{"x": 1.0}', i)
-    asked = 0
-
-    def nbytes(block: Block) -> int:
-        nonlocal asked
-        asked += 1
-        return len(block.buffer)
-
-    monkeypatch.setattr(Block, "nbytes", property(nbytes))
-    with closing(open_log(tmp_path / "many.mcap")) as log:
-        assert len(log.read({"/a": ["x"]})["/a"].fields["x"]) == 300
-    assert 300 <= asked <= 2 * 300
-
-
 # ---- a command decompresses each chunk of a log once, whatever else the chunks contain ----
 
 #: A JSON payload that is larger than the cached part of a chunk.
@@ -204,18 +185,6 @@ def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: py
     assert len(opened) > 3
     # One more time for the example message of a topic without a schema.
     assert sorted(opened.values())[-2:] in ([1, 1], [1, 2])
-
-
-def test_large_payloads_are_read_again_when_they_are_requested(mixed: Path) -> None:
-    with closing(open_log(mixed)) as log:
-        small = next(t.name for t in log.topics if t.name != "/camera" and log.fields(t.name))
-        path = next(f.path for f in log.fields(small) if f.kind == "number")
-        before = log.read({small: [path]}, stamps=["/camera"])
-        images = log.read({"/camera": ["size"]})["/camera"]
-        after = log.read({small: [path]})[small]
-    np.testing.assert_array_equal(images.fields["size"], np.arange(len(images)) * 50)
-    np.testing.assert_array_equal(before["/camera"].log_time_ns, images.log_time_ns)
-    np.testing.assert_array_equal(before[small].fields[path], after.fields[path])
 
 
 def test_expected_fields_are_those_of_a_plain_read(mixed: Path) -> None:

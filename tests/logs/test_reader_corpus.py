@@ -59,29 +59,6 @@ def test_every_recording_ends_as_catalogued_and_every_field_decodes(shared_dir: 
     assert not problems, "\n".join(problems)
 
 
-@pytest.mark.parametrize(
-    ("file", "broken", "healthy"),
-    [
-        ("plotjuggler_pj-mcap-server/test_bad_schema.mcap", "/bad/data", "/good/data"),
-        ("plotjuggler_pj-mcap-server/test_unsupported_encoding.mcap", None, None),
-        ("ros2_rosbag2/rosbag2_tests/resources/mcap/wrong_rmw_test/wrong_rmw_test_0.mcap", "/test_topic", None),
-    ],
-)
-def test_a_channel_that_cannot_be_decoded_spoils_no_other(
-    shared_dir: Path, file: str, broken: str | None, healthy: str | None
-) -> None:
-    with closing(open_log(shared_dir / "reader_corpus" / file)) as log:
-        undecodable = [t.name for t in log.topics if not log.fields(t.name)]
-        assert undecodable
-        assert broken is None or broken in undecodable
-        for topic in undecodable:
-            with pytest.raises(MappingError, match=topic):
-                log.read({topic: ["x"]})
-        for topic in {t.name for t in log.topics} - set(undecodable):
-            assert healthy is None or topic == healthy
-            assert len(log.read({topic: numeric_paths(log, topic)})[topic]) > 0
-
-
 def test_a_database_that_its_folder_declares_in_another_format_is_not_decoded_as_cdr(shared_dir: Path) -> None:
     folder = shared_dir / "reader_corpus" / "ros2_rosbag2/rosbag2_tests/resources/sqlite3/wrong_rmw_test"
     with closing(open_log(folder)) as log:

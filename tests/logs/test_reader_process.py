@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import socket
+import subprocess
 import sys
 import tempfile
 from contextlib import closing
@@ -16,6 +17,7 @@ from pdhef_logtool.logs import formats
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError
 from pdhef_logtool.records.errors import LogError
+from tests.conftest import ROOT
 from tests.logs import planted_reader
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="readers have a process of their own on Linux only")
@@ -69,6 +71,14 @@ def test_time_and_memory_of_a_reader_are_limited_by_the_budget(tmp_path: Path) -
         open_log(_file(tmp_path, "memory"))
     with pytest.raises(LimitError, match=r"0.05 s of processor time.*--set budget=FACTOR"):
         open_log(_file(tmp_path, "hang"), DEFAULT_LIMITS.times(0.01))
+
+
+def test_a_limit_of_the_shell_on_processor_time_ends_no_reader(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time,ay\n" + "".join(f"{0.01 * i:.2f},{i}\n" for i in range(50)))
+    script = "import resource, sys; resource.setrlimit(resource.RLIMIT_CPU, (900, 900))\n"
+    script += "from pdhef_logtool.logs.open_log import open_log; open_log(sys.argv[1]).close()"
+    subprocess.run([sys.executable, "-c", script, path], check=True, cwd=ROOT)
 
 
 def test_a_column_that_ends_its_reader_is_a_loss_and_the_others_are_read(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from pdhef_logtool.logs.recording_span import (
     find_epochs,
     recorded_twice,
     shown_time,
-    steps_back,
 )
 from pdhef_logtool.records.signals import IntArray
 from tests.mcap_files import mcap_writer
@@ -43,16 +42,6 @@ def test_one_message_far_from_all_others_is_stray(stray: int) -> None:
     assert kept.sum() == 1000
 
 
-def test_the_epoch_with_most_messages_is_kept_and_a_pause_is_no_epoch() -> None:
-    boot = np.arange(400) * S // 10
-    drive = T0 + np.concatenate([np.arange(300), 12_000 + np.arange(300)]) * S // 10  # with a pause of 20 minutes
-    intervals, kept, strays = epochs(np.concatenate([boot, drive]))
-    assert [start for start, _ in intervals] == [T0, T0 + 1200 * S]
-    assert kept.tolist() == [False] * 400 + [True] * 600
-    assert not strays.any()
-    assert epochs(np.concatenate([boot, drive[:300]]))[0] == [(0, int(boot[-1]) + 1)]
-
-
 @pytest.mark.slow
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(
@@ -72,19 +61,6 @@ def test_every_piece_is_kept_stray_or_of_another_epoch(pieces: list[tuple[int, i
         assert all(end[i] <= a or start[i] >= b for a, b in intervals)
     for (_, b), (a, _) in pairwise(intervals):
         assert SILENCE_NS - 1000 < a - b < EPOCH_NS + 1000
-
-
-def test_only_a_step_that_lasts_is_one() -> None:
-    times = T0 + np.arange(1000) * S // 100
-    back = times.copy()
-    back[500:] -= 3 * S
-    assert steps_back(back).tolist() == [500]
-    late, early = times.copy(), times.copy()
-    late[500] -= 3 * S
-    early[500] = LATEST
-    burst = np.concatenate([times[:400], times[440:480], times[400:440], times[480:]])  # 0.4 s swapped with 0.4 s
-    for harmless in (times, late, early, burst):
-        assert steps_back(harmless).size == 0
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)

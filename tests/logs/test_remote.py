@@ -1,34 +1,39 @@
-"""Logs on a server: the same figures as from the file, each byte once, few requests, faults in one line."""
+"""Logs on a server: the same figures as from the file, each byte once, faults in one line, safe redirects."""
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import os
 import random
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool import Car, ReadOptions, read_drive
+from pdhef_logtool.cli.app import app
 from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import log_metadata, open_log
+from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, RedirectGuard, is_public
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource
-from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, LogError, PdhefError, UsageError
 from tests.camera_log import with_camera, write_apart
-from tests.counting_server import CountingServer, cutting, serving, stalling, status
+from tests.counting_server import CountingServer, Fault, cutting, serving, stalling, status
 
-pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
+aiohttp = pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
 
 NOTHING_YET = Wanted(frozenset())
 
@@ -39,8 +44,10 @@ def saloon() -> Car:
 
 
 @pytest.fixture(autouse=True)
-def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def _impatient_and_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote_source, "WAITS_S", (0.01, 0.02))
+    for name in ("http_proxy", "HTTP_PROXY", "https_proxy", "HTTPS_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
 
 
 def _all_of(log: DriveLog) -> list[tuple[object, ...]]:
@@ -86,26 +93,6 @@ def test_any_split_gives_the_same_bytes_and_none_twice(reads: list[tuple[int, in
 # -------------------------------------------------------------------------------------------------- the same log
 
 
-@pytest.mark.slow
-def test_a_drive_costs_no_more_than_its_file(sample_logs_dir: Path, saloon: Car) -> None:
-    file = sample_logs_dir / "faults.mcap"
-    with serving(**{file.name: file.read_bytes()}) as server:
-        found = []
-        for place in (_place(server, file.name), file):
-            with read_drive(place, saloon) as drive:
-                signals = drive.whole().signals
-                arrays = [getattr(signals, f.name) for f in dataclasses.fields(signals)]
-                found.append(([a.tobytes() for a in arrays if isinstance(a, np.ndarray)], drive.signals_sha256))
-                found[-1] += (drive.losses, drive.notes, drive.log.size)
-                sha256 = drive.sha256
-            if place is not file:
-                assert server.bytes_sent <= 1.02 * file.stat().st_size
-                assert server.twice() == 0
-                assert len(server.requests) <= 14
-                assert sha256 == identity_of(LogInput(place, "x"))
-        assert found[0] == found[1]
-
-
 def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(
     tmp_path: Path, sample_logs_dir: Path, saloon: Car
 ) -> None:
@@ -117,6 +104,7 @@ def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(
             with read_drive(place, saloon) as drive:
                 assert len(drive.whole().signals) > 900
                 hashes.append((drive.signals_sha256, drive.truth_sha256, drive.losses))
+                assert place is file or drive.sha256 == identity_of(LogInput(place, "x"))
         sensors = 6
         assert len(server.requests) <= 3 + sensors
         assert server.twice() == 0
@@ -146,18 +134,13 @@ def test_a_damaged_log_loses_the_same(tmp_path: Path, sample_logs_dir: Path, spo
 
 
 def test_other_formats_are_fetched_once_as_a_whole(tmp_path: Path, sample_logs_dir: Path) -> None:
-    import zstandard
-
+    (database,) = (sample_logs_dir / "step_rosbag2").glob("*.db3")
     plain = (sample_logs_dir / "dlc.mcap").read_bytes()
-    database = next((sample_logs_dir / "step_rosbag2").glob("*.db3"), None)
-    files = {"dlc.mcap.zst": zstandard.ZstdCompressor(1).compress(plain)}
-    if database is not None:
-        files["step.db3"] = database.read_bytes()
+    files = {"dlc.mcap.zst": zstandard.ZstdCompressor(1).compress(plain), "step.db3": database.read_bytes()}
     with serving(**files) as server:
         for name, data in files.items():
-            file = tmp_path / name
-            file.write_bytes(data)
-            assert _read(_place(server, name)) == _read(file)
+            (tmp_path / name).write_bytes(data)
+            assert _read(_place(server, name)) == _read(tmp_path / name)
         assert server.twice() == 0
 
 
@@ -304,7 +287,7 @@ def test_no_room_is_said(served: CountingServer) -> None:
 def test_nothing_secret_is_shown(served: CountingServer) -> None:
     secret = served.place("dlc.mcap").replace("http://", "http://me:hunter2@") + "?X-Amz-Signature=cafe&part=1"
     place = RemotePlace(secret)
-    assert str(place) == served.place("dlc.mcap")
+    assert (str(place), place.parent) == (served.place("dlc.mcap"), served.url)
     assert place.identity == served.place("dlc.mcap") + "?part=1"
     assert "hunter2" not in repr(find_logs([secret]))
     with closing(open_log(secret)) as log:
@@ -349,3 +332,124 @@ def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.Monke
         find_logs(["gs://bucket/one.mcap"])
     with pytest.raises(UsageError, match="s3://, http://, https://"):
         find_logs(["https://"])
+
+
+def _redirecting(to: str, code: int = 302) -> Fault:
+    return status(code, {"Location": to}, of="away.mcap")
+
+
+def _named(monkeypatch: pytest.MonkeyPatch, **addresses: list[str]) -> None:
+    """Make names of this test (``NAME.test``) resolve to addresses, the last for good."""
+
+    async def resolve(_: object, host: str, port: int = 0, family: int = 0) -> list[dict[str, Any]]:
+        of_name = addresses.get(host.lower().rstrip(".").removesuffix(".test"))
+        if of_name is None:
+            raise OSError(None, "no such host")
+        address = of_name.pop(0) if len(of_name) > 1 else of_name[0]
+        return [{"hostname": host, "host": address, "port": port, "family": socket.AF_INET, "proto": 0, "flags": 0}]
+
+    monkeypatch.setattr(aiohttp.DefaultResolver, "resolve", resolve)
+
+
+TARGETS = {
+    "by its name": "http://localhost:{port}/dlc.mcap",
+    "as a number": "http://2130706433:{port}/dlc.mcap",
+    "in IPv6": "http://[::1]:{port}/dlc.mcap",
+    "mapped to IPv6": "http://[::ffff:127.0.0.1]:{port}/dlc.mcap",
+    "of a link": "http://169.254.169.254/latest/meta-data",
+    "of a network": "http://10.0.0.1/dlc.mcap",
+    "unspecified": "http://0.0.0.0:{port}/dlc.mcap",
+}
+
+
+@pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS)
+@pytest.mark.parametrize("code", [302, 307])
+def test_a_redirect_to_another_private_host_is_refused(served: CountingServer, target: str, code: int) -> None:
+    served.fault = _redirecting(target.format(port=served.url.rpartition(":")[2]), code)
+    place = RemotePlace(served.place("away.mcap"))
+    for use in (open_log, lambda p: identity_of(LogInput(p, "x"))):
+        with pytest.raises(LogError) as refused:
+            use(place)
+        assert "a redirect to " in refused.value.got
+        assert "allow_private_redirects=true" in refused.value.remedy
+        assert "\n" not in str(refused.value)
+    assert {r.path for r in served.requests} == {"away.mcap"}, "nothing else was asked for"
+
+
+def test_a_redirect_on_the_same_host_is_followed(served: CountingServer) -> None:
+    served.fault = _redirecting("/dlc.mcap")
+    with serving(**served.files) as other:
+        for to in ("/dlc.mcap", served.place("dlc.mcap"), other.place("dlc.mcap")):
+            served.fault = _redirecting(to)
+            with closing(open_log(RemotePlace(f"{served.place('away.mcap')}?{len(to)}"))) as log:
+                assert log.lost == ()
+
+
+def _exit_code(*arguments: object) -> int:
+    try:
+        return app([str(a) for a in arguments], prog_name="pdhef", standalone_mode=False) or EXIT_OK
+    except PdhefError as error:
+        return error.exit_code
+
+
+def test_an_option_allows_it(served: CountingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    served.fault = _redirecting(served.place("dlc.mcap").replace("127.0.0.1", "localhost"))
+    url = served.place("away.mcap")
+    with (
+        pytest.raises(LogError, match="a redirect to localhost, an address of this machine or its network"),
+        read_drive(url, Car.load("saloon")),
+    ):
+        pass
+    with read_drive(url, "saloon", options=ReadOptions(allow_private_redirects=True)) as drive:
+        assert drive.losses == ()
+    assert _exit_code("inspect", url, "--fields") == EXIT_FAILURE
+    assert _exit_code("inspect", url, "--fields", "--set", "allow_private_redirects=true") == EXIT_OK
+    (tmp_path / "pdhef.toml").write_text("allow_private_redirects = true\n")
+    monkeypatch.chdir(tmp_path)
+    assert _exit_code("inspect", url, "--fields") == EXIT_OK
+
+
+def test_a_public_host_may_redirect_to_public_ones_alone(
+    served: CountingServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pdhef_logtool.logs.redirect_guard.is_public", lambda ip: ip.startswith("127."))
+    port = served.url.rpartition(":")[2]
+    _named(monkeypatch, one=["127.0.0.1"], two=["127.0.0.1"], inside=["10.0.0.1"])
+    for name, followed in (("two", True), ("inside", False)):
+        served.fault = _redirecting(f"http://{name}.test:{port}/dlc.mcap")
+        place = RemotePlace(f"http://one.test:{port}/away.mcap?{name}")
+        if followed:
+            open_log(place).close()
+        else:
+            with pytest.raises(LogError, match=r"a redirect to inside\.test"):
+                open_log(place)
+
+
+def test_a_name_that_turns_private_is_not_connected_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    _named(monkeypatch, origin=["8.8.8.8", "127.0.0.1"], other=["8.8.4.4", "10.0.0.1"], intranet=["10.1.1.1"])
+
+    async def resolved() -> None:
+        guard = RedirectGuard("origin.test")
+        for name in ("origin.test", "other.test"):
+            assert await guard.resolve(name)
+            with pytest.raises(PrivateRedirectError):
+                await guard.resolve(name)
+        assert await RedirectGuard("intranet.test").resolve("Intranet.test.")
+        monkeypatch.setenv("HTTPS_PROXY", "http://user:word@intranet.test:3128")
+        assert await RedirectGuard("origin.test").resolve("intranet.test")
+
+    asyncio.run(resolved())
+
+
+PUBLIC = {
+    "8.8.8.8": True, "2001:4860:4860::8888": True, "64:ff9b::808:808": True, "::ffff:8.8.8.8": True,
+    "127.0.0.1": False, "10.1.2.3": False, "172.16.0.1": False, "192.168.1.1": False, "169.254.169.254": False,
+    "100.64.0.1": False, "0.0.0.0": False, "224.0.1.1": False, "255.255.255.255": False, "240.0.0.1": False,
+    "::1": False, "::": False, "fe80::1%eth0": False, "fd00::1": False, "::ffff:127.0.0.1": False,
+    "::ffff:10.0.0.1": False, "64:ff9b::7f00:1": False, "2002:7f00:1::": False, "ff02::1": False,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("address", PUBLIC)
+def test_which_addresses_are_public(address: str) -> None:
+    assert is_public(address) is PUBLIC[address]

@@ -62,12 +62,3 @@ def test_same_log_and_a_changed_one(store: S3Store, sample_logs_dir: Path) -> No
         opened.read(asked)
     opened.close()
     assert identity_of(log) != known
-
-
-def test_no_such_object_and_an_empty_one(store: S3Store) -> None:
-    with pytest.raises(SourceError, match="no such object") as raised:
-        open_log(f"{store.url}/none.mcap")
-    assert "hidden" not in str(raised.value)
-    store.put("empty.mcap", b"")
-    with pytest.raises(Exception, match="an empty file"):
-        open_log(f"{store.url}/empty.mcap")

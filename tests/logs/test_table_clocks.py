@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +10,8 @@ import polars as pl
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_clocks import (
     NO_TIME,
     RELATIVE_NS,
@@ -21,7 +19,6 @@ from pdhef_logtool.logs.table_clocks import (
     ascending_rows,
     number_clock,
     text_clock,
-    unlike_lengths,
     week_clock,
 )
 from pdhef_logtool.logs.table_columns import Sheet, find_clock, tables_of
@@ -119,13 +116,6 @@ def test_a_clock_without_a_unit_is_one_of_a_usual_recording(values: FloatArray, 
     clock = _clock(time=values)
     assert (clock.stamps_ns[-1] - clock.stamps_ns[0]) * 1e-9 == pytest.approx(length_s, abs=1e-6)
     assert [note in text for text in clock.notes] == [True] * bool(note)
-
-
-def test_another_clock_of_the_table_decides_the_unit() -> None:
-    utc = pl.Series([f"2024-05-01 12:{i // 60 % 60:02d}:{i % 60:02d}" for i in range(40)])
-    seconds = np.arange(40) * 10.0  # 400 s, or 0.4 s; the dates last 39 s
-    assert np.ptp(_clock(time=np.arange(40) * 1000.0, utc=utc).stamps_ns) == 39 * 10**9
-    assert np.ptp(_clock(time=seconds).stamps_ns) == 390 * 10**9
 
 
 @pytest.mark.parametrize(
@@ -229,40 +219,28 @@ def test_rows_without_a_time_or_of_another_day_are_counted() -> None:
     assert {kind: count for kind, count, _ in _losses(losses)} == {"bad-stamp": 1, "other-epoch": 11}
 
 
-def test_clocks_of_one_file_that_differ_a_thousandfold_are_a_loss() -> None:
-    long, short, event = _times(50.0, 1000), _times(50_000.0, 1000), _times(1e4, 3)
-    assert unlike_lengths({"imu": long, "event": event}, "a") == []
-    (loss,) = unlike_lengths({"imu": long, "gnss": short, "event": event}, "a")
-    assert (loss.kind, loss.severity) == ("clock-lengths", "lost")
-    assert "gnss lasts 0.01998 s" in loss.what
-
-
-ROWS = 1000
+ROW, RANDOM = np.arange(1000), np.random.default_rng(1).random(1000)
 
 
 @pytest.mark.parametrize(
-    ("missing", "own_rows"),
+    ("there", "own_rows"),
     [
-        ("dropout", 0), ("a third", 0), ("two thirds", 0), ("every tenth", 0), ("each second", 500), ("1 Hz", 20),
-        ("1 Hz from the middle", 10), ("20 Hz", 400),
+        ((ROW < 300) | (ROW > 550), 0),
+        (RANDOM > 0.33, 0),
+        (RANDOM > 0.67, 0),
+        (ROW % 10 > 0, 0),
+        (ROW % 2 == 0, 500),
+        (ROW % 50 == 0, 20),
+        ((ROW % 50 == 0) & (ROW >= 500), 10),
+        (np.isin(ROW % 5, (0, 2)), 400),
     ],
-)  # fmt: skip
-def test_a_column_has_its_own_table_if_its_clock_is_slower(missing: str, own_rows: int) -> None:
-    row, random = np.arange(ROWS), np.random.default_rng(1).random(ROWS)
-    there = {
-        "dropout": (row < 300) | (row > 550), "a third": random > 0.33, "two thirds": random > 0.67,
-        "every tenth": row % 10 > 0, "each second": row % 2 == 0, "1 Hz": row % 50 == 0,
-        "1 Hz from the middle": (row % 50 == 0) & (row >= 500), "20 Hz": np.isin(row % 5, (0, 2)),
-    }[missing]  # fmt: skip
-    columns: dict[str, Any] = {
-        "t": row * 0.02,
-        "ay": row * 1.0,
-        "gnss": np.where(there, row, np.nan),
-        "driver": pl.Series(["me"] * ROWS),
-    }
+    ids=["dropout", "a third", "two thirds", "every tenth", "each second", "1 Hz", "1 Hz from the middle", "20 Hz"],
+)
+def test_a_column_has_its_own_table_if_its_clock_is_slower(there: NDArray[np.bool_], own_rows: int) -> None:
+    columns: dict[str, Any] = {"t": ROW * 0.02, "ay": ROW * 1.0, "gnss": np.where(there, ROW, np.nan)}
     losses: list[Loss] = []
-    tables = list(tables_of(Sheet("csv", columns, {}), "a.csv", losses))
-    assert [(t.name, len(t.stamps_ns)) for t in tables] == [("csv", ROWS)] + [("csv_2", own_rows)] * (own_rows > 0)
+    tables = list(tables_of(Sheet("csv", columns | {"driver": pl.Series(["me"] * 1000)}, {}), "a.csv", losses))
+    assert [(t.name, len(t.stamps_ns)) for t in tables] == [("csv", 1000)] + [("csv_2", own_rows)] * (own_rows > 0)
     gnss = tables[-1].load("gnss", slice(None))
     stamps = (tables[-1].stamps_ns - RELATIVE_NS) / 20_000_000
     np.testing.assert_allclose(gnss[np.isfinite(gnss)], stamps[np.isfinite(gnss)], atol=1e-6)
@@ -270,52 +248,4 @@ def test_a_column_has_its_own_table_if_its_clock_is_slower(missing: str, own_row
     assert [loss.what for loss in losses] == ["columns without numbers are left out: driver"]
 
 
-def test_a_column_of_another_length_is_a_loss() -> None:
-    losses: list[Loss] = []
-    columns = {"t": np.arange(50) * 0.02, "ay": np.zeros(50), "short": np.zeros(49)}
-    (table,) = tables_of(Sheet("csv", columns, {}), "a.csv", losses)
-    assert [field.path for field in table.fields] == ["ay"]
-    assert [loss.what for loss in losses] == ["short: 49 values for 50 times"]
-
-
 # ---- shared cases of clocks, Parquet and MAT files: duration, start and samples of each ----
-
-# Topic, rows, duration in s, start in s since 1970, and kinds of the losses with their severity.
-CASES = {
-    "hostile/t_1hz.csv": ("csv", 1500, 1499.0, 86_400, {"clock": "note"}),
-    "hostile/t_min.csv": ("csv", 1500, 29.98, 86_400, {}),
-    "hostile/excel.csv": ("csv", 1500, 29.98, 1_765_238_400, {"clock": "note"}),
-    "hostile/dropout5s.csv": ("csv", 2000, 39.98, 86_400, {}),
-    "hostile/mat5_segv_a.mat": ("mat", 300, 5.98, 86_400, {"bad-variable": "lost", "no-numbers": "note"}),
-    "hostile/mat73_19kB_15GiB.mat": ("mat", 300, 5.98, 86_400, {"bad-variable": "lost"}),
-    "hostile/mat73_external_storage.mat": ("mat", 300, 5.98, 86_400, {"bad-variable": "lost"}),
-    "tables/reference.csv": ("csv", 1000, 19.98, 86_400, {}),
-    "tables/csv_day_first_over_midnight.csv": ("csv", 1000, 19.98, 1_710_287_990, {}),
-    "tables/csv_gps_week_10_bit.csv": ("csv", 1000, 19.98, 1_714_562_382, {"clock": "note"}),
-    "tables/csv_time_restarts.csv": ("csv", 3000, 59.98, 86_400, {"time-jump": "lost"}),
-    "tables/mat_gnss_1hz.mat": ("gnss", 20, 19.0, 86_400, {}),
-    "tables/parquet_decimal_truth.parquet": ("parquet", 1000, 19.98, 1_714_564_800, {}),
-    "tables/parquet_texts.parquet": ("parquet", 1000, 19.98, 1_714_564_800, {}),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_a_shared_case_has_its_clock(case: str, shared_dir: Path) -> None:
-    path = shared_dir / "cases" / case
-    if not path.exists():
-        pytest.skip(f"{path} is absent")
-    if "mat73" in case:
-        pytest.importorskip("h5py")
-    topic, rows, duration_s, start_s, kinds = CASES[case]
-    with closing(open_log(path)) as log:
-        fields = {f.path: f for t in log.topics for f in log.fields(t.name)}
-        read = log.read({topic: [f.path for f in log.fields(topic)]})[topic]
-        # The first loss of each kind: notes may follow it.
-        assert {loss.kind: loss.severity for loss in reversed(log.lost)} == kinds
-    assert len(read) == rows
-    assert np.ptp(read.log_time_ns) * 1e-9 == pytest.approx(duration_s, abs=1e-4)
-    assert read.log_time_ns[0] * 1e-9 == pytest.approx(start_s, abs=1e-3)
-    assert "leak" not in fields
-    if case.startswith("tables/parquet"):
-        assert np.mean(read.fields["accel_y"]) == pytest.approx(-0.061, abs=1e-3)
-        assert np.mean(read.fields["lateral_velocity"]) == pytest.approx(-0.117, abs=1e-3)

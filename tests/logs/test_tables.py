@@ -1,10 +1,13 @@
-"""Logs of tables: CSV in its dialects, VBO, Parquet and MAT, against the arrays that were written."""
+"""Logs of tables against the arrays that were written: CSV, JSON lines, VBO, Parquet, MAT, their rates and folders."""
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
+import json
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,9 +21,13 @@ from pdhef_logtool import inspect_log
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
-from pdhef_logtool.logs.table_columns import field_name, split_unit
-from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.logs.table_file import TableFile, TableSettings
+from pdhef_logtool.logs.text_logs import open_json_lines
+from pdhef_logtool.mapping.choosing import tables_for
+from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_to_toml
+from pdhef_logtool.records.errors import LogError, MappingFileError, PdhefError
 from tests.command_line import called
 
 N = 200
@@ -152,6 +159,44 @@ def test_any_numbers_come_back(
     assert len(read) == len(values)
 
 
+@pytest.mark.parametrize(
+    ("texts", "numbers"),
+    [
+        (["1.5", "-2", "+.5", "3.", "1e-3", "2E+02"], [1.5, -2.0, 0.5, 3.0, 1e-3, 200.0]),
+        (["0", "0", "-0,123", "1,5E-05"], [0.0, 0.0, -0.123, 1.5e-05]),
+        (["8.734,5", "987,25", "1.234", "12.000.000"], [8734.5, 987.25, 1234.0, 12e6]),
+        (["8 734,5", "8\u00a0734,5", "12\u202f345\u202f678,0", "7"], [8734.5, 8734.5, 12345678.0, 7.0]),
+        (["8'734.5", "8’734.5", "0.5"], [8734.5, 8734.5, 0.5]),
+        (["\u22121.5", "\u2212.5", "2"], [-1.5, -0.5, 2.0]),
+        (["0x4f", "0X10", "7"], [79.0, 16.0, 7.0]),
+        (["true", "False", "TRUE"], [1.0, 0.0, 1.0]),
+        (["1.234", "0,5", "0,25"], [1234.0, 0.5, 0.25]),  # the column has decimal commas
+        (["1.234", "10.5", "11.5", "0,25"], [1.234, 10.5, 11.5, 0.25]),
+        (["1,234", "0.5"], [1234.0, 0.5]),
+    ],
+)
+def test_a_number_in_any_spelling(texts: list[str], numbers: list[float], tmp_path: Path) -> None:
+    rows = [f"{i};{text}" for i, text in enumerate(texts * 9)]
+    columns, lost = _read(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
+    np.testing.assert_array_equal(columns["a"], numbers * 9)
+    assert lost == []
+
+
+EMPTY = [
+    "", " ", "nan", "NaN", "-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND00", "#N/A", "n/a", "NULL", "None", "-", "--",
+]  # fmt: skip
+UNREADABLE = [
+    "ERR", "****", "inf", "-Infinity", "1.#INF", "12.5 km/h", "1e999", "12:00", "0x", "1,2,3", "e5", "+", "x y",
+]  # fmt: skip
+
+
+def test_cells_without_a_number_are_empty_or_a_loss(tmp_path: Path) -> None:
+    rows = [f"{i};{text}" for i, text in enumerate(["1.5", *EMPTY, *UNREADABLE, *["0.25"] * 200])]
+    columns, lost = _read(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
+    assert columns["a"][np.isfinite(columns["a"])].tolist() == [1.5, *[0.25] * 200]
+    assert lost == [("bad-cell", len(UNREADABLE))]
+
+
 def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_number(tmp_path: Path) -> None:
     rows = [f"{t:.2f},{AY[i]},{SPEED[i] if i % 10 == 0 else ''},{2 * AY[i]}" for i, t in enumerate(TIME_S)]
     with closing(_log(tmp_path / "a.csv", "\n".join(["t,ay,speed,ay", *rows]).encode())) as log:
@@ -172,6 +217,9 @@ def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_numbe
         ("latin-1", "Größe [°]", "Groesse"),
         ("cp1252", "Größe – Weg", "Groesse_Weg"),
         ("utf-8", "Wzdłużne", "Wzdluzne"),
+        ("utf-8", "Längsbeschl.\\CCP:1 (m/s²)", "Laengsbeschl"),
+        ("utf-8", "wheel speed [FL]", "wheel_speed_FL"),
+        ("utf-8", "2nd gear", "n_2nd_gear"),
     ],
 )
 def test_the_bytes_of_the_titles_show_their_encoding(encoding: str, title: str, name: str, tmp_path: Path) -> None:
@@ -279,30 +327,6 @@ def test_other_columns_decide_what_a_mark_between_digits_is(
     assert lost == ([("ambiguous-number", None)] if note else [])
 
 
-def test_bytes_that_are_no_utf_8_cost_no_other_character(tmp_path: Path) -> None:
-    data = _csv(SECONDS, "time,ay [m/s²],speed [km/h]").encode() + "2.00,1.0,caf\xe9\n".encode("latin-1")
-    columns, lost = _read(tmp_path / "a.csv", data)
-    assert len(columns["ay"]) == N + 1
-    assert ("bad-cell", 1) in lost
-    with closing(open_log(tmp_path / "a.csv")) as log:
-        assert {f.path: f.unit for f in log.fields("csv")}["ay"] == "m/s²"
-
-
-def test_a_title_may_have_two_lines(tmp_path: Path) -> None:
-    columns, lost = _read(
-        tmp_path / "a.csv", _csv(SECONDS, '"time","ay\n[m/s²]","speed, measured"') + '"2.0","1","2"\n'
-    )
-    assert {*columns} == {"ay", "speed_measured"}
-    assert lost == []
-
-
-def test_more_columns_than_the_limit_are_refused_before_they_are_read(tmp_path: Path) -> None:
-    width = 70_000
-    text = "\n".join([",".join(["time", *(f"c{i}" for i in range(width))]), *(f"{i}" + "," * width for i in range(30))])
-    with pytest.raises(PdhefError, match="array width"):
-        _log(tmp_path / "a.csv", text.encode())
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -316,15 +340,6 @@ def test_a_csv_without_header_or_times_is_refused_in_one_line(text: str, words: 
     with pytest.raises(PdhefError, match=words) as refused:
         _log(tmp_path / "a.csv", text.encode())
     assert "\n" not in str(refused.value)
-
-
-def test_names_and_units_of_titles() -> None:
-    assert split_unit("Speed (km/h)") == ("Speed", "km/h")
-    assert split_unit("wheel speed [FL]") == ("wheel speed [FL]", "")
-    assert split_unit("yaw rate_[°/s]") == ("yaw rate", "°/s")
-    assert field_name("Lat._Vel.") == "Lat_Vel"
-    assert field_name("Längsbeschl.\\CCP:1") == "Laengsbeschl"
-    assert field_name("2nd gear") == "n_2nd_gear"
 
 
 # ------------------------------------------------------------------------------------------------ VBO
@@ -376,15 +391,6 @@ def test_of_too_many_or_too_few_units_those_that_belong_to_one_quantity_are_used
         assert (loss.kind, loss.severity, loss.count) == ("units", "note", list(units.values()).count(""))
 
 
-def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:
-    data = vbo(["100000.00", "100000.01"], units="\n\n\n")
-    data = data.replace(b"YawRate\r", b"YawRate [deg/s]\r").replace(b"Y_Accel\r", b"Y_Accel (g)\r")
-    with closing(_log(tmp_path / "a.vbo", data)) as log:
-        units = {f.path: f.unit for f in log.fields("vbox")}
-        assert (units["YawRate"], units["Y_Accel"], units["latitude"]) == ("deg/s", "g", "min")
-        assert log.lost == ()
-
-
 @pytest.mark.parametrize(("east", "turn"), [(1, 90), (-1, 90), (1, 1), (-1, 1)])
 def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp_path: Path) -> None:
     head = "File created on 01/05/2024\n\n[header]\ntime\nlatitude\nlongitude\nheading\n\n[data]\n"
@@ -412,55 +418,7 @@ def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------ Parquet
 
 
-def test_a_parquet_file_with_units_nulls_and_structs(tmp_path: Path) -> None:
-    gnss = [float(v) if i % 10 == 0 else None for i, v in enumerate(SPEED)]
-    imu = pa.StructArray.from_arrays([pa.array(AY), pa.array(-AY)], ["ay [m/s²]", "ax"])
-    fields = [
-        pa.field("time", pa.timestamp("us")),
-        pa.field("speed", pa.float32(), metadata={"unit": "km/h"}),
-        pa.field("imu", imu.type),
-        pa.field("gnss_speed", pa.float64()),
-        pa.field("driver", pa.string()),
-    ]
-    stamps = NOON_NS + np.round(TIME_S * 1e9).astype(np.int64)
-    times = pa.array(stamps.astype("datetime64[ns]")).cast(pa.timestamp("us"))
-    columns = [times, pa.array(SPEED.astype(np.float32)), imu, pa.array(gnss), pa.array(["me"] * N)]
-    pq.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)), tmp_path / "a.parquet")
-    with closing(open_log(tmp_path / "a.parquet")) as log:
-        assert {(t.name, f.path): f.unit for t in log.topics for f in log.fields(t.name)} == {
-            ("parquet", "speed"): "km/h", ("parquet", "imu_ay"): "m/s²", ("parquet", "imu_ax"): "",
-            ("parquet_2", "gnss_speed"): "",
-        }  # fmt: skip
-        read = log.read({"parquet": ["imu_ay"], "parquet_2": ["gnss_speed"]})
-    np.testing.assert_array_equal(read["parquet"].fields["imu_ay"], AY)
-    np.testing.assert_array_equal(read["parquet"].log_time_ns, NOON_NS + np.round(TIME_S * 1e9).astype(np.int64))
-    np.testing.assert_array_equal(read["parquet_2"].fields["gnss_speed"], SPEED[::10])
-
-
-@pytest.mark.parametrize("kind", [pa.duration("us"), pa.time64("us")])
-def test_durations_and_times_of_day_are_times(kind: pa.DataType, tmp_path: Path) -> None:
-    clock = pa.array(np.round(TIME_S * 1e6).astype(np.int64)).cast(kind)
-    pq.write_table(pa.table({"t": clock, "ay": AY}), tmp_path / "a.parquet")
-    with closing(open_log(tmp_path / "a.parquet")) as log:
-        read = log.read({"parquet": ["ay"]})["parquet"]
-    np.testing.assert_allclose((read.log_time_ns - RELATIVE_NS) * 1e-9, TIME_S, atol=1e-9)
-
-
 # ------------------------------------------------------------------------------------------------ MAT
-
-
-def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
-    savemat(tmp_path / "a.mat", {"t": TIME_S, "ay": AY, "speed": SPEED}, do_compression=True)
-    data = bytearray((tmp_path / "a.mat").read_bytes())
-    second = 128 + 8 + int.from_bytes(data[132:136], "little")
-    data[second + 40 : second + 80] = b"\x00" * 40
-    with closing(_log(tmp_path / "b.mat", bytes(data))) as log:
-        assert [(x.kind, x.severity) for x in log.lost] == [("bad-variable", "lost")]
-        assert [f.path for f in log.fields("mat")] == ["speed"]
-    cut = (tmp_path / "a.mat").read_bytes()[:-30]
-    with closing(_log(tmp_path / "c.mat", cut)) as log:
-        assert [f.path for f in log.fields("mat")] == ["ay"]
-    assert called("inspect", tmp_path / "c.mat").returncode == 3
 
 
 @pytest.mark.parametrize(("turned_deg", "recognised"), [(0.0, True), (3.0, True), (90.0, False), (180.0, False)])
@@ -491,24 +449,6 @@ def test_speed_and_course_of_a_receiver_are_gnss_signals_if_the_path_agrees(
 # ------------------------------------------------------------------------------------------------ searching
 
 
-def test_a_search_ignores_general_files_beside_logs(tmp_path: Path) -> None:
-    for name in ("one/drive.mcap", "one/notes.csv", "two/a.csv", "two/b.parquet", "two/sub/c.vbo", "two/sub/d.mat"):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes(b"x")
-    found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}  # type: ignore[union-attr]
-    assert found == {"one/drive.mcap", "two/a.csv", "two/b.parquet", "two/sub/c.vbo"}
-    assert [log.path.name for log in find_logs([str(tmp_path / "one" / "notes.csv")])] == ["notes.csv"]
-
-
-def test_a_text_table_is_a_log_where_it_is_named_and_not_in_a_search(tmp_path: Path) -> None:
-    data = DIALECTS["tabs"][0]
-    for name in ("drive.csv", "drive.txt", "notes.txt"):
-        (tmp_path / name).write_bytes(data)
-    assert [log.path for log in find_logs([str(tmp_path)])] == [tmp_path / "drive.csv"]
-    with closing(open_log(tmp_path / "drive.txt")) as text, closing(open_log(tmp_path / "drive.csv")) as table:
-        assert [(t.name, t.messages) for t in text.topics] == [(t.name, t.messages) for t in table.topics]
-
-
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path: Path) -> None:
     rows = [(t, "Lat Acc [m/s²]", a) for t, a in zip(TIME_S, AY, strict=True)]
@@ -531,15 +471,6 @@ def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path
     np.testing.assert_allclose(read[kind].fields["Lat_Acc"], AY)
     np.testing.assert_allclose(read[kind].fields["speed"], SPEED)
     np.testing.assert_allclose(read[f"{kind}_2"].fields["gnss"], 2.0 * TIME_S[::10])
-
-
-def test_a_magnitude_and_its_sign_are_one_signal(tmp_path: Path) -> None:
-    signed = np.sin(TIME_S)
-    rows = [f"{t:.2f},{abs(v):.6f},{int(v < 0)},{int(v < 0)}" for t, v in zip(TIME_S, signed, strict=True)]
-    path = tmp_path / "a.csv"
-    path.write_text("\n".join(["time,ESP_Gierrate [rad/s],ESP_VZ_Gierrate,Other_sign", *rows, ""]))
-    source = inspect_log(path).mapping.signals["yaw_rate_rad_s"]
-    assert (source.field, source.combine) == (("ESP_Gierrate", "ESP_VZ_Gierrate"), "signed")
 
 
 @pytest.mark.parametrize("clock", ["millis", "sensorTimestamp_since1970(s)"])
@@ -579,15 +510,6 @@ def test_texts_that_name_no_signals_make_no_columns(tmp_path: Path) -> None:
         assert [f.path for t in log.topics for f in log.fields(t.name)] == ["value"]
 
 
-def test_titles_in_other_alphabets_and_short_names_of_a_clock(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("ts,车速 [km/h],横摆角速度(deg/s),左前轮速\n0.00,36,1,10\n0.01,36,2,10\n0.02,37,3,10\n")
-    with closing(open_log(path)) as log:
-        assert {f.path for t in log.topics for f in log.fields(t.name)} == {
-            "vehicle_speed", "yaw_rate", "front_left_wheel_speed"
-        }  # fmt: skip
-
-
 def _stamps_of(path: Path, text: str) -> list[int]:
     path.write_text(text)
     with closing(open_log(path)) as log:
@@ -605,3 +527,198 @@ def test_a_clock_in_two_columns_or_with_named_months(tmp_path: Path) -> None:
 def test_rows_that_share_whole_seconds_are_spread(tmp_path: Path) -> None:
     rows = "time,speed\n" + "".join(f"10:00:{(i + 3) // 5:02},{i}\n" for i in range(99))
     assert {*np.diff(_stamps_of(tmp_path / "a.csv", rows)).tolist()} == {200_000_000}
+
+
+START_S = 1_714_564_800
+
+
+def _write(path: Path, text: str) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def _columns(log: DriveLog, topic: str) -> dict[str, Any]:
+    return log.read({topic: [f.path for f in log.fields(topic)]})[topic].fields
+
+
+# ------------------------------------------------------------------------------------------------ JSON lines
+
+
+def _json_lines(path: Path, *records: object) -> Path:
+    return _write(path, "".join(f"{json.dumps(record)}\n" for record in records))
+
+
+def test_wide_json_lines_are_columns_with_exact_integers(tmp_path: Path) -> None:
+    first_ns = START_S * 10**9 + 1
+    records = [{"time": first_ns + i * 10**7, "imu": {"ay": [0.5 * i, i]}, "v [km/h]": i or None} for i in range(40)]
+    with closing(open_log(_json_lines(tmp_path / "a.jsonl", *records))) as log:
+        assert (log.kind, log.start_ns, log.lost) == ("json-lines", first_ns, ())
+        assert {f.path: f.unit for f in log.fields("json")} == {"imu_ay_0": "", "imu_ay_1": "", "v": "km/h"}
+        columns = _columns(log, "json")
+    np.testing.assert_array_equal(columns["imu_ay_0"], 0.5 * np.arange(40))
+    np.testing.assert_array_equal(columns["v"], [np.nan, *range(1, 40)])
+
+
+def test_json_lines_in_long_form_have_a_column_for_each_name(tmp_path: Path) -> None:
+    records = [{"name": n, "value": i + k, "time": START_S + 0.1 * i} for i in range(40) for k, n in enumerate("ab")]
+    with closing(open_log(_json_lines(tmp_path / "a.ndjson", *records, [1], "x"))) as log:
+        np.testing.assert_array_equal(_columns(log, "json")["b"], np.arange(40) + 1)
+        assert [(loss.kind, loss.count) for loss in log.lost] == [("bad-row", 2)]
+
+
+@pytest.mark.parametrize("text", ["", '[{"a": 1}]\n', "{\n", "x\n"])
+def test_a_file_without_objects_in_lines_is_one_line(text: str, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="a JSON object a line"):
+        open_log(_write(tmp_path / "a.json", text or "\n"))
+
+
+def test_limits_of_json_lines(tmp_path: Path) -> None:
+    """Each line has other keys: rows times columns grow as the square of the file."""
+
+    def read(limits: dict[str, int], *records: object) -> list[str]:
+        path = _json_lines(tmp_path / "a.jsonl", *records)
+        allowed = dataclasses.replace(DEFAULT_LIMITS, **limits)
+        with path.open("rb") as stream:
+            (table,) = open_json_lines(TableFile(stream, path.stat().st_size, "a", allowed)).tables
+        return [f.path for f in table.fields]
+
+    records = [{"time": 0.1 * i, f"k{i}": 1} for i in range(20)]
+    assert len(read({"array_width": 21, "table_bytes": 8 * 20 * 21, "table_ratio": 0}, *records)) == 20
+    with pytest.raises(LimitError, match="at most 20 array width"):
+        read({"array_width": 20}, *records)
+    with pytest.raises(LimitError, match="at most 3359 table bytes"):
+        read({"table_bytes": 8 * 20 * 21 - 1, "table_ratio": 0}, *records)
+    deep = {"time": 1.0, "a": {"b": {"c": 1}}}
+    assert read({"schema_depth": 3}, deep, {**deep, "time": 2.0}) == ["a_b_c"]
+    assert read({"schema_depth": 2}, deep, {**deep, "time": 2.0, "d": 1}) == ["d"]
+    assert read({}, {"time": 1.0, "a": [1] * 16, "b": [1] * 17}, {"time": 2.0})[-1] == "a_15"
+
+
+# ------------------------------------------------------------------------------------------------ rates and runs
+
+
+def test_a_table_without_times_asks_for_its_rate(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.csv", "ax,ay\n" + "".join(f"{i}.5,{i}\n" for i in range(100)))
+    with pytest.raises(LogError, match="--set rate_hz=100, or rate_hz in the mapping file"):
+        open_log(path)
+    with closing(open_log(path, settings=TableSettings(rate_hz=50.0))) as log:
+        assert np.diff(log.read({"csv": ["ay"]})["csv"].log_time_ns).tolist() == [20_000_000] * 99
+        assert [loss.severity for loss in log.lost] == ["note"]
+    long = _write(tmp_path / "b.csv", "signal,value\n" + "".join(f"{n},{i}\n" for i in range(50) for n in "ab"))
+    with pytest.raises(LogError, match="a column of times"):
+        open_log(long, settings=TableSettings(rate_hz=50.0))
+
+
+def test_a_rate_decides_a_unit_that_is_not_stated(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.csv", "time,ay\n" + "".join(f"{100 * i},{i}\n" for i in range(600)))
+    for rate_hz, length_s in ((None, 59.9), (100.0, 5.99), (1e4, 0.0599)):
+        with closing(open_log(path, settings=TableSettings(rate_hz=rate_hz))) as log:
+            assert (log.end_ns - log.start_ns) * 1e-9 == pytest.approx(length_s, abs=1e-6)
+            assert "rate_hz" in log.lost[0].what
+
+
+@pytest.mark.parametrize("ticks_per_s", [1, 10, 1000, 10_000, 1_000_000])
+@pytest.mark.parametrize("unit_m_s", [1.0, 1 / 3.6])
+def test_speed_and_positions_decide_the_unit_of_a_clock(ticks_per_s: int, unit_m_s: float, tmp_path: Path) -> None:
+    t = np.arange(0, 60, 0.1)
+    rows = zip(np.round(t * ticks_per_s, 1), 48.0 + 20.0 * t / 111_195.0, np.full(600, 20.0 / unit_m_s), strict=True)
+    text = "time,latitude,longitude,speed\n" + "".join(f"{k:g},{lat:.8f},9.5,{v}\n" for k, lat, v in rows)
+    with closing(open_log(_write(tmp_path / "a.csv", text))) as log:
+        assert (log.end_ns - log.start_ns) * 1e-9 == pytest.approx(59.9, abs=1e-6)
+
+
+def test_a_group_is_the_beginning_or_the_end_of_names(tmp_path: Path) -> None:
+    scipy_io = pytest.importorskip("scipy.io")
+    t = np.arange(100) * 0.01
+    imu = {"time": t, "ay": t}
+    scipy_io.savemat(tmp_path / "a.mat", {"run_1": {"imu": imu}, "run_2": {"imu": imu, "gps": imu}})
+    for group, names in (("run_2", ["run_2_gps", "run_2_imu"]), ("imu", ["run_1_imu", "run_2_imu"])):
+        with closing(open_log(tmp_path / "a.mat", settings=TableSettings(group=group))) as log:
+            assert [topic.name for topic in log.topics] == names
+    with pytest.raises(LogError, match="tables of the group run_3, got run_1_imu, run_2_imu, run_2_gps"):
+        open_log(tmp_path / "a.mat", settings=TableSettings(group="run_3"))
+
+
+def test_rate_and_group_of_a_mapping_file_apply_where_the_user_gives_none(tmp_path: Path) -> None:
+    mapping = load_mapping(_write(tmp_path / "m.toml", 'rate_hz = 100\ngroup = "run_1"\n'))
+    assert tables_for(mapping, TableSettings()) == TableSettings(100.0, "run_1")
+    assert tables_for(mapping, TableSettings(50.0, "run_2")) == TableSettings(50.0, "run_2")
+    assert (
+        tables_for(load_mapping(_write(tmp_path / "n.toml", mapping_to_toml(mapping))), TableSettings()).rate_hz
+        == 100.0
+    )
+    with pytest.raises(MappingFileError, match="rate_hz"):
+        load_mapping(_write(tmp_path / "o.toml", "rate_hz = 0\n"))
+
+
+# ------------------------------------------------------------------------------------------------ folders
+
+
+def _sensor(path: Path, names: str, start_s: float, rate_hz: float, n: int) -> Path:
+    rows = (f"{start_s + i / rate_hz:.3f}{f',{i}' * names.count(',')}\n" for i in range(n))
+    return _write(path, f"{names}\n{''.join(rows)}")
+
+
+def _telephone(folder: Path, start_s: float = START_S) -> Path:
+    for name in ("Accelerometer", "Gyroscope"):
+        _sensor(folder / f"{name}.csv", "time,z,y,x", start_s, 100.0, 1000)
+    _sensor(folder / "Location.csv", "time,latitude,longitude", start_s, 2.0, 20)
+    _write(folder / "Metadata.csv", "version,device\n3,phone\n")
+    return folder
+
+
+@pytest.mark.parametrize("start_s", [0.0, START_S])
+def test_files_of_one_recording_are_one_log(start_s: float, tmp_path: Path) -> None:
+    folder = _telephone(tmp_path / "telephone", start_s)
+    assert [log.path for log in find_logs(str(tmp_path))] == [folder]
+    with closing(open_log(folder)) as log:
+        assert [(t.name, t.messages) for t in log.topics] == [
+            ("Accelerometer", 1000), ("Gyroscope", 1000), ("Location", 20),
+        ]  # fmt: skip
+        np.testing.assert_array_equal(_columns(log, "Gyroscope")["x"], np.arange(1000))
+        assert {(loss.kind, loss.severity) for loss in log.lost} >= {("folder", "note"), ("bad-file", "note")}
+        assert not [loss for loss in log.lost if loss.severity == "lost"]
+    assert len(find_logs(str(folder), settings=TableSettings(folder="drives"))) == 4
+
+
+@pytest.mark.parametrize("start_s", [0.0, START_S])
+@pytest.mark.parametrize(("titles", "late_s"), [(("time,ax", "time,ax"), 0.0), (("time,ax", "time,ay,az"), 6.0)])
+def test_files_of_the_same_columns_or_other_times_are_drives(
+    titles: tuple[str, str], late_s: float, start_s: float, tmp_path: Path
+) -> None:
+    for i, title in enumerate(titles):
+        _sensor(tmp_path / "drives" / f"{i}.csv", title, start_s + i * late_s, 100.0, 1000)
+    folder = tmp_path / "drives"
+    assert [log.path.name for log in find_logs(str(folder))] == ["0.csv", "1.csv"]
+    with pytest.raises(LogError, match=r"a folder of 2 logs.*--set folder=recording"):
+        open_log(folder)
+    forced = TableSettings(folder="recording")
+    assert [log.path for log in find_logs(str(folder), settings=forced)] == [folder]
+    with closing(open_log(folder, settings=forced)) as log:
+        assert [topic.name for topic in log.topics] == ["n_0", "n_1"]
+
+
+def test_a_damaged_file_of_a_recording_is_a_loss(tmp_path: Path) -> None:
+    folder = _telephone(tmp_path / "telephone")
+    _write(folder / "Gravity.csv", "\n".join("damaged" * 3 for _ in range(9)))
+    with closing(open_log(folder)) as log:
+        assert [loss.where for loss in log.lost if loss.severity == "lost"] == [str(folder / "Gravity.csv")]
+
+
+@pytest.mark.parametrize(
+    ("files", "logs"),
+    [
+        ("one/drive.mcap one/notes.csv two/a.csv two/b.parquet", "one/drive.mcap two/a.csv two/b.parquet"),
+        ("two/sub/c.vbo two/sub/d.mat", "two/sub/c.vbo"),
+        ("one/a.csv one/b.log", "one/a.csv"),
+        ("two/c.log two/d.jsonl two/history.jsonl", "two/c.log two/d.jsonl"),
+        ("three/e.vbo three/f.csv", "three/e.vbo"),
+    ],
+)
+def test_a_search_takes_general_files_only_where_there_are_no_others(files: str, logs: str, tmp_path: Path) -> None:
+    for name in files.split():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("x")
+    found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}  # type: ignore[union-attr]
+    assert found == set(logs.split())

@@ -129,34 +129,6 @@ def test_what_is_written_is_read_back_by_this_and_by_other_readers(tmp_path: Pat
         assert log.lost == ()
 
 
-def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
-    def interrupted() -> None:
-        with McapLogWriter(tmp_path / "log.mcap") as writer:
-            writer.add_topic("/imu", "sensor_msgs/msg/Imu")
-            raise RuntimeError("stop")
-
-    with pytest.raises(RuntimeError, match="stop"):
-        interrupted()
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("fields", "problem"),
-    [
-        ({"angular_velocity.q": np.zeros(3)}, "angular_velocity.q"),
-        ({"angular_velocity.z": np.zeros(2)}, "3 rows"),
-        ({"angular_velocity": np.zeros((3, 2))}, r"\[N, 3\]"),
-        ({"orientation_covariance": np.zeros((3, 8))}, r"\[N, 9\]"),
-        ({"header.stamp": np.zeros(3)}, "int64 nanoseconds"),
-        ({"header.frame_id": np.zeros(3)}, "frame_id"),
-    ],
-)
-def test_columns_that_do_not_fit_are_named(fields: dict[str, np.ndarray], problem: str) -> None:
-    encoder = CdrEncoder("/imu", "sensor_msgs/msg/Imu", message_definition("sensor_msgs/msg/Imu"), {})
-    with pytest.raises(MappingError, match=problem):
-        encoder.encode(3, fields)
-
-
 def test_errors_of_use_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="a place to write to"):

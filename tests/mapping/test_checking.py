@@ -39,22 +39,18 @@ def mapping(**sources: SignalSource) -> Mapping:
 
 
 def test_what_is_there_passes() -> None:
-    check_mapping(
-        Mapping(
-            signals={
-                "ax_m_s2": SignalSource("ax_m_s2", "/imu/data", "linear_acceleration.x"),
-                "ay_m_s2": SignalSource("ay_m_s2", "/steer", "gyro[1]", stamp="stamp"),
-                "speed_m_s": SignalSource("speed_m_s", "/steer", "data[4]"),
-                "steer_rad": SignalSource("steer_rad", "/imu/data", "seconds", stamp="seconds", stamp_unit="s"),
-            },
-            truth={
-                "enu_velocity_m_s": SignalSource("enu_velocity_m_s", "/steer", "gyro"),
-                "ecef_position_m": SignalSource("ecef_position_m", "/steer", ("angle", "gyro[0]", "gyro[1]")),
-            },
-            quality=QualityGate("/steer", "angle", min=0.0),
-        ),
-        log(),
+    sources = (
+        SignalSource("ax_m_s2", "/imu/data", "linear_acceleration.x"),
+        SignalSource("ay_m_s2", "/steer", "gyro[1]", stamp="stamp"),
+        SignalSource("speed_m_s", "/steer", "data[4]"),
+        SignalSource("steer_rad", "/imu/data", "seconds", stamp="seconds", stamp_unit="s"),
     )
+    vectors = (
+        SignalSource("enu_velocity_m_s", "/steer", "gyro"),
+        SignalSource("ecef_position_m", "/steer", ("angle", "gyro[0]", "gyro[1]")),
+    )
+    gate = QualityGate("/steer", "angle", min=0.0)
+    check_mapping(Mapping({s.name: s for s in sources}, {s.name: s for s in vectors}, quality=gate), log())
 
 
 def test_everything_that_lacks_is_named_with_the_nearest() -> None:
@@ -98,18 +94,11 @@ def test_the_kind_of_the_stamp_is_checked(stamp: str, unit: str, said: str) -> N
 
 
 def test_stamps_that_the_file_leaves_open_come_from_the_schema() -> None:
-    got = resolve_mapping(
-        log(),
-        Mapping(
-            signals={
-                "ax_m_s2": SignalSource("ax_m_s2", "/imu/data", "linear_acceleration.x"),
-                "steer_rad": SignalSource("steer_rad", "/steer", "angle"),
-                "speed_m_s": SignalSource("speed_m_s", "/bare", "data"),
-                "ay_m_s2": SignalSource("ay_m_s2", "/imu/data", "linear_acceleration.y", stamp="publish_time"),
-            },
-            quality=QualityGate("/steer", "angle", min=0.0),
-        ),
-    )
+    open_ = (("ax_m_s2", "/imu/data", "linear_acceleration.x"), ("steer_rad", "/steer", "angle"))
+    sources = {n: SignalSource(n, *where) for n, *where in (*open_, ("speed_m_s", "/bare", "data"))}
+    stated = SignalSource("ay_m_s2", "/imu/data", "linear_acceleration.y", stamp="publish_time")
+    gate = QualityGate("/steer", "angle", min=0.0)
+    got = resolve_mapping(log(), Mapping({**sources, "ay_m_s2": stated}, quality=gate))
     assert {n: s.stamp for n, s in got.signals.items()} == {
         "ax_m_s2": "header.stamp",
         "steer_rad": "stamp",

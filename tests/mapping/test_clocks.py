@@ -1,4 +1,4 @@
-"""Device clocks against log time: the fitted line, its robustness, and the survey that all windows share."""
+"""Device clocks against log time, and unusable header stamps: log time replaces them and a note reports it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, clock_key, fit_clocks
-from pdhef_logtool.mapping.clocks import apply_clock, fit_clock_line
+from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, clock_key, fit_clocks, read_signals
+from pdhef_logtool.mapping.clocks import apply_clock, fit_clock_line, why_unusable, with_usable_stamps
 from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.runs.inspection import inspect_drive_log, render_inspection
+from pdhef_logtool.runs.inspection.step_statistics import Steps
+from tests.command_line import rendered
 
 T0 = 1_700_000_000_000_000_000
 
@@ -33,19 +37,13 @@ def test_the_line_finds_offset_and_drift(
     device = np.rint((offset_s + true_s * (1 - drift_ppm * 1e-6)) * 1e9).astype(np.int64)
     if outliers:
         log_time[rng.choice(n, 60, replace=False)] -= 2_000_000_000
+    shuffle = rng.permutation(n)
     reference, reference_log, drift, _ = fit_clock_line(device, log_time)
+    assert fit_clock_line(device[shuffle], log_time[shuffle])[:3] == (reference, reference_log, drift)
     clock = ClockModel(reference_stamp_ns=reference, reference_log_ns=reference_log, drift=drift)
     error_s = (apply_clock(device, clock) - (T0 + np.rint(true_s * 1e9).astype(np.int64))) * 1e-9
     # The time is known up to the smallest delay (3 ms here) and a low quantile of the jitter.
     assert np.abs(error_s - 0.003).max() < 0.3 * jitter_ms * 1e-3 + 1e-5
-
-
-def test_the_order_of_messages_does_not_matter() -> None:
-    rng = np.random.default_rng(4)
-    device = np.arange(1000, dtype=np.int64) * 10_000_000
-    log_time = T0 + device + rng.integers(0, 9_000_000, 1000)
-    shuffle = rng.permutation(1000)
-    assert fit_clock_line(device, log_time) == fit_clock_line(device[shuffle], log_time[shuffle])
 
 
 def test_a_step_of_the_clock_shows_in_the_residual() -> None:
@@ -87,3 +85,184 @@ def test_a_device_clock_without_stamps_is_one_line() -> None:
     source = SignalSource("ay_m_s2", "/imu", "a", stamp="t", stamp_unit="s", clock="device")
     with pytest.raises(MappingError, match="no usable stamp"):
         fit_clocks(log, Mapping(signals={"ay_m_s2": source}), log.start_ns, log.end_ns)
+
+
+MS, S = 1_000_000, 1_000_000_000
+START = 1_700_000_000 * S
+N = 1000
+TRUE = START + np.arange(N, dtype=np.int64) * 10 * MS
+LOG = TRUE + 3 * MS + np.random.default_rng(0).integers(0, MS, N)
+
+#: When a driver sent them, not when the sensor measured.
+JITTERY = LOG - MS - np.random.default_rng(1).integers(0, 8, N) * MS // 2
+
+
+def stepped(by_ns: int) -> IntArray:
+    return TRUE + np.where(np.arange(N) < N // 2, 0, by_ns)
+
+
+UNUSABLE = {
+    "back by 3 s": (stepped(-3 * S), "step back"),
+    "back by an hour": (stepped(-3600 * S), "step back"),
+    "ahead by an hour": (stepped(3600 * S), "far off"),
+    "in fives": (TRUE // (50 * MS) * (50 * MS), "repeat"),
+}
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_log_time_serves(name: str) -> None:
+    stamps, why = UNUSABLE[name]
+    assert why in why_unusable(stamps, LOG)
+    log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": stamps, "v": np.arange(float(N))})})
+    source = SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp", latency_s=0.001)
+    mapping = Mapping(signals={"ay_m_s2": source})
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    found = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    np.testing.assert_array_equal(found.signals["ay_m_s2"].stamps_ns, LOG - MS)
+    np.testing.assert_array_equal(found.signals["ay_m_s2"].arrival_ns, LOG)
+    assert [(x.kind, x.severity) for x in found.losses] == [("log-time-serves", "note")]
+    assert why in found.losses[0].what
+    assert +found.counts["signal", "ay_m_s2"] == {"read": N}
+
+
+def test_sound_stamps_stay() -> None:
+    late = LOG.copy()
+    late[300:500] += np.linspace(5 * S, 0, 200).astype(np.int64)  # held up for five seconds, then sent in order
+    twice = np.repeat(TRUE, 2)
+    copied = np.sort(np.concatenate([LOG, LOG + MS]))  # every message again a millisecond later
+    in_one_packet = np.repeat(TRUE[::5], 5)
+    together = np.repeat(LOG[4::5], 5) + np.tile(np.arange(5) * 10_000, N // 5)
+    wild = TRUE.copy()
+    wild[[5, 100, 101, 700]] = [1, START + 10**18, START - 10**17, START + 500 * S]
+    swapped = np.concatenate([TRUE[:400], TRUE[440:480], TRUE[400:440], TRUE[480:]])
+    for stamps, log_time in (
+        (TRUE, LOG),
+        (TRUE, np.maximum.accumulate(late)),
+        (twice, copied),
+        (in_one_packet, together),
+        (wild, LOG),
+        (swapped, LOG),
+        (TRUE - 3600 * S, LOG),
+    ):
+        assert why_unusable(stamps, log_time) == ""
+
+
+@pytest.mark.parametrize(("behind_ns", "serves"), [(3600 * S, True), (-3 * S, True), (20 * MS, False)])
+def test_one_topic_of_another_clock(behind_ns: int, serves: bool) -> None:
+    """A clock offset shared by all topics is accepted; a topic with a different offset has unusable stamps."""
+    topics = {
+        "/imu": FakeTopic("a/b", LOG, {"header.stamp": TRUE - behind_ns, "v": np.arange(float(N))}),
+        "/steer": FakeTopic("a/b", LOG, {"header.stamp": TRUE, "v": np.arange(float(N))}),
+    }
+    both = {
+        "ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp"),
+        "steer_rad": SignalSource("steer_rad", "/steer", "v", stamp="header.stamp"),
+    }
+    log = FakeLog(topics)
+    clocks = fit_clocks(log, Mapping(signals=both), log.start_ns, log.end_ns)
+    assert bool(clocks["/imu.header.stamp"].unusable) == serves
+    assert not clocks["/steer.header.stamp"].unusable
+    alone = fit_clocks(log, Mapping(signals={"ay_m_s2": both["ay_m_s2"]}), log.start_ns, log.end_ns)
+    assert not alone["/imu.header.stamp"].unusable
+
+
+def test_a_step_between_the_parts_of_a_survey_is_found() -> None:
+    n = 3600 * 10
+    true = START + np.arange(n, dtype=np.int64) * 100 * MS
+    stamps = true - np.where(np.arange(n) < 17_437, 0, 3 * S)
+    log = FakeLog({"/imu": FakeTopic("a/b", true + 5 * MS, {"header.stamp": stamps, "v": np.zeros(n)})})
+    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    assert "step back by 2.9 s" in clocks["/imu.header.stamp"].unusable
+
+
+def test_zero_stamps_lose_no_topic() -> None:
+    zeros = np.zeros(N, np.int64)
+    log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": zeros, "v": np.arange(float(N))})})
+    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    assert clocks["/imu.header.stamp"].unusable == "100% of its stamps are zero or no time"
+    assert clocks["/imu.header.stamp"].median_period_s == pytest.approx(0.01, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("inner", "outer", "chosen"),
+    [
+        (np.zeros(N, np.int64), TRUE, "header.stamp"),
+        (np.full(N, START), TRUE, "header.stamp"),
+        (TRUE, np.zeros(N, np.int64), "imu.header.stamp"),
+        (TRUE, TRUE + 5, "imu.header.stamp"),
+        (np.zeros(N, np.int64), np.zeros(N, np.int64), "imu.header.stamp"),
+        (JITTERY, TRUE, "header.stamp"),
+        (TRUE, JITTERY, "imu.header.stamp"),
+        (JITTERY, TRUE - 3600 * S, "imu.header.stamp"),  # regular, and of another clock
+        (START + (TRUE - START) // 1000, TRUE, "header.stamp"),  # microseconds taken for nanoseconds
+    ],
+)
+def test_the_stamp_of_a_nested_message_that_is_a_time_is_read(inner: IntArray, outer: IntArray, chosen: str) -> None:
+    fields = {"header.stamp": outer, "imu.header.stamp": inner, "imu.v": np.arange(float(N))}
+    log = FakeLog({"/state": FakeTopic("a/b", LOG, fields)})
+    source = SignalSource("ay_m_s2", "/state", "imu.v", stamp="imu.header.stamp")
+    mapping = with_usable_stamps(log, Mapping(signals={"ay_m_s2": source}))
+    assert mapping.signals["ay_m_s2"].stamp == chosen
+    assert bool(mapping.notes) == (chosen == "header.stamp")
+
+
+#: Written a hundred at a time.
+BURSTS = np.repeat(TRUE[99::100], 100) + 20 * MS + np.tile(np.arange(100) * 1000, N // 100)
+
+
+@pytest.mark.parametrize(
+    ("header", "published", "recorded", "chosen"),
+    [
+        (None, TRUE + MS, BURSTS, "publish_time"),
+        (None, BURSTS, BURSTS, "log_time"),  # a recorder that has no other time
+        (None, TRUE * 0, BURSTS, "log_time"),
+        (None, TRUE - 3600 * S, BURSTS, "log_time"),  # regular, and of another clock
+        (None, TRUE + MS, LOG, "log_time"),
+        (TRUE, TRUE + MS, BURSTS, "header.stamp"),
+        (TRUE * 0, TRUE + MS, BURSTS, "publish_time"),
+        (TRUE * 0, BURSTS, BURSTS, "header.stamp"),  # log time is used, with the reason in the notes
+    ],
+)
+def test_the_time_of_publication_is_read_where_it_is_the_only_regular_one(
+    header: IntArray | None, published: IntArray, recorded: IntArray, chosen: str
+) -> None:
+    fields = {"v": np.arange(float(N))} | ({} if header is None else {"header.stamp": header})
+    log = FakeLog({"/imu": FakeTopic("a/b", recorded, fields, publish_time_ns=published)})
+    own = "log_time" if header is None else "header.stamp"
+    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp=own)})
+    better = with_usable_stamps(log, mapping)
+    assert better.signals["ay_m_s2"].stamp == chosen
+    assert bool(better.notes) == (chosen != own)
+    clocks = fit_clocks(log, better, log.start_ns, log.end_ns)
+    if chosen == "publish_time":
+        read = read_signals(log, better, clocks, log.start_ns, log.end_ns)
+        np.testing.assert_array_equal(read.signals["ay_m_s2"].stamps_ns, published)
+
+
+@given(
+    burst=st.integers(1, 12), spread_us=st.integers(0, 3000), period_ms=st.integers(40, 300), seed=st.integers(0, 99)
+)
+def test_the_rate_of_any_burst_pattern_is_messages_over_time(
+    burst: int, spread_us: int, period_ms: int, seed: int
+) -> None:
+    jitter = np.random.default_rng(seed).integers(0, 1 + 1000 * spread_us, 200 * burst)
+    stamps = np.sort(START + np.repeat(np.arange(200) * period_ms * MS, burst) + jitter)
+    assert Steps.of([stamps]).rate_hz == pytest.approx(burst * 1000.0 / period_ms, rel=0.06)
+
+
+def test_a_delay_of_another_clock_is_named_and_not_shown_as_a_delay() -> None:
+    count = np.arange(300, dtype=np.int64)
+    text = {}
+    for name, offset in (("simulation", START), ("boot", 3600 * S), ("arrival", 20 * MS)):
+        stamps = START + count * 10 * MS - offset
+        fields = {"header.stamp": stamps, "angular_velocity.z": np.sin(count * 0.01)}
+        log = FakeLog(
+            {"/imu": FakeTopic("sensor_msgs/msg/Imu", START + count * 10 * MS, fields, publish_time_ns=stamps)}
+        )
+        text[name] = rendered(render_inspection, inspect_drive_log(log), 120)
+    assert "simulation clock" in text["simulation"]
+    assert "other clock" in text["boot"]
+    assert "clock" not in text["arrival"].split("Mapping")[0]
+    assert "e+" not in "".join(text.values()).split("Values")[0]

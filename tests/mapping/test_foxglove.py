@@ -30,7 +30,6 @@ _TYPES: dict[str, list[tuple[str, int, Any, str]]] = {
         ("timestamp", 6, ".google.protobuf.Timestamp", ""), ("frame_id", 7, _STRING, ""),
         ("heading", 10, _DOUBLE, "optional"), ("course", 13, _DOUBLE, "optional"),
     ],
-    "PoseInFrame": [("timestamp", 1, ".google.protobuf.Timestamp", ""), ("pose", 3, ".foxglove.Pose", "")],
     "PosesInFrame": [("timestamp", 1, ".google.protobuf.Timestamp", ""), ("poses", 3, ".foxglove.Pose", "repeated")],
     "Odometry": [
         ("timestamp", 1, ".google.protobuf.Timestamp", ""), ("pose", 4, ".foxglove.Pose", ""),
@@ -137,40 +136,33 @@ def test_a_heading_that_repeats_the_course_is_no_yaw(tmp_path: Path) -> None:
     assert any("repeats the course" in note for note in found.mapping.notes)
 
 
+def _pose(x_m: float) -> dict[str, dict[str, float]]:
+    orientation = {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+    return {"position": {"x": x_m, "y": 0.5, "z": 0.0}, "orientation": orientation}
+
+
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_odometry_is_truth_or_speed_by_its_name(tmp_path: Path, encoding: str) -> None:
-    def row(i: int, scale: float) -> dict[str, Any]:
-        return {
-            "pose": {
-                "position": {"x": 2.0 * i, "y": 0.5, "z": 0.0},
-                "orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8},
-            },
-            "linear_velocity": {"x": 20.0 * scale, "y": 0.01 * i, "z": 0.0},
-            "angular_velocity": {"x": 0.0, "y": 0.0, "z": 0.3 + 0.01 * i},
-        }
+    def odometry(scale: float) -> tuple[str, str, bytes, list[bytes]]:
+        rows = [
+            {
+                "pose": _pose(2.0 * i),
+                "linear_velocity": {"x": 20.0 * scale, "y": 0.01 * i, "z": 0.0},
+                "angular_velocity": {"x": 0.0, "y": 0.0, "z": 0.3 + 0.01 * i},
+            }
+            for i in range(40)
+        ]
+        return _build(encoding, "Odometry", rows)
 
-    truth = _build(encoding, "Odometry", [row(i, 1.0) for i in range(40)])
-    wheels = _build(encoding, "Odometry", [row(i, 1.01) for i in range(40)])
-    found, got = _map(_write(tmp_path / "a.mcap", {"/ground_truth/state": truth, "/wheel/odom": wheels}))
-    sources = {n: s.topic for n, s in (*found.mapping.signals.items(), *found.mapping.truth.items())}
-    assert sources == {
-        "speed_m_s": "/wheel/odom",
-        **dict.fromkeys(("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m", "quat_wxyz"), "/ground_truth/state"),
-    }
+    topics = {"/ground_truth/state": odometry(1.0), "/wheel/odom": odometry(1.01)}
+    found, got = _map(_write(tmp_path / "a.mcap", topics))
+    assert {s.topic for s in found.mapping.signals.values()} == {"/wheel/odom"}
+    truth = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m", "quat_wxyz"}
+    assert {n: s.topic for n, s in found.mapping.truth.items()} == dict.fromkeys(truth, "/ground_truth/state")
     np.testing.assert_allclose(got["speed_m_s"].values, 20.2)
-    np.testing.assert_allclose(got["vy_m_s"].values, 0.01 * np.arange(40))
     np.testing.assert_allclose(got["yaw_rate_rad_s"].values, 0.3 + 0.01 * np.arange(40))
     np.testing.assert_allclose(got["quat_wxyz"].values[0], [0.8, 0.0, 0.0, 0.6])
     assert got["vx_m_s"].stamps_ns[1] == 100 * S + S // 10
-
-
-@pytest.mark.parametrize("encoding", ["protobuf", "json"])
-def test_a_pose_in_frame_is_a_pose(tmp_path: Path, encoding: str) -> None:
-    rows = [{"pose": {"position": {"x": 2.0 * i, "y": 1.0, "z": 0.0},
-                      "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}} for i in range(40)]  # fmt: skip
-    found, got = _map(_write(tmp_path / "a.mcap", {"/vicon/car": _build(encoding, "PoseInFrame", rows)}))
-    assert set(found.mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
-    np.testing.assert_allclose(got["x_m"].values, 2.0 * np.arange(40))
 
 
 def test_a_list_of_poses_is_said_and_not_guessed(tmp_path: Path) -> None:

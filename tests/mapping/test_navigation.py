@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import AutoMapping, SignalSource, auto_map, fit_clocks
+from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_values
 from pdhef_logtool.mapping.joints import joint_names
 from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_from_dict, mapping_to_toml
 from pdhef_logtool.mapping.navigation import receiver_signals
 from pdhef_logtool.records.errors import MappingFileError
+from studies.strangers import containers
+from studies.strangers.containers import Topic
 from tests.fake_drive_log import FakeLog, FakeTopic
 
 N = 3000
@@ -37,8 +39,12 @@ def topic(type_name: str, fields: dict[str, np.ndarray], *examples: object) -> F
 
 
 def found(**contents: FakeTopic) -> AutoMapping:
-    imu = topic("sensor_msgs/msg/Imu", IMU)
-    return auto_map(FakeLog({"/imu": imu} | {f"/{k}": v for k, v in contents.items()}))
+    return auto_map(FakeLog({"/imu": topic("sensor_msgs/msg/Imu", IMU)} | {f"/{k}": v for k, v in contents.items()}))
+
+
+def of_table(**columns: np.ndarray) -> AutoMapping:
+    """The mapping of a table without types."""
+    return auto_map(FakeLog({"csv": FakeTopic("table", T, columns)}))
 
 
 def speed_of(auto: AutoMapping, east: np.ndarray = EAST, north: np.ndarray = NORTH) -> np.ndarray:
@@ -57,21 +63,16 @@ def test_a_velocity_east_and_north_gives_the_speed(witness: dict[str, FakeTopic]
     np.testing.assert_allclose(speed_of(auto), V)
     assert any("/vel" in n and "never negative" in n for n in auto.mapping.notes)
     assert not auto.ambiguities
+    in_km_h = found(vel=twist(3.6), **witness)
+    assert not witness or "speed_m_s" not in in_km_h.mapping.signals
 
 
 @pytest.mark.parametrize("names", [("VelN", "VelE"), ("v_n", "v_e"), ("north_speed", "east_speed")])
 def test_north_and_east_in_a_table_of_everything_are_speed_and_receiver(names: tuple[str, str]) -> None:
     table = {"AccX": IMU["linear_acceleration.x"], "AccY": IMU["linear_acceleration.y"], "GyroZ": RATE}
-    table |= dict(zip(names, (NORTH, EAST), strict=True))
-    signals = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping.signals
+    signals = of_table(**table, **dict(zip(names, (NORTH, EAST), strict=True))).mapping.signals
     assert signals["speed_m_s"].paths == names[::-1]
     assert signals["gnss_velocity_north_m_s"].paths + signals["gnss_velocity_east_m_s"].paths == names
-
-
-def test_a_velocity_in_another_unit_is_not_taken() -> None:
-    auto = found(vel=twist(3.6), fix=topic("sensor_msgs/msg/NavSatFix", FIX))
-    assert "speed_m_s" not in auto.mapping.signals
-    assert any("/vel" in str(a) for a in auto.ambiguities)
 
 
 def test_the_truths_velocity_stands_in_with_a_mark() -> None:
@@ -102,24 +103,17 @@ def joints(*examples: object) -> FakeTopic:
 
 
 def test_joints_by_the_names_in_the_messages() -> None:
-    auto = found(joint_states=joints({"name": list(NAMES)}, {"name": list(NAMES)}))
-    signals = auto.mapping.signals
+    signals = found(joint_states=joints({"name": list(NAMES)}, {"name": list(NAMES)})).mapping.signals
     steer = signals["steer_rad"]
     assert (steer.paths, steer.scale) == (("position[0]", "position[2]"), (0.5, 0.5))
-    assert signals["wheel_speed_rl_rad_s"].field == "velocity[1]"
-    assert signals["wheel_speed_rr_rad_s"].field == "velocity[3]"
-    assert isinstance(signals["wheel_speed_rl_rad_s"], SignalSource)
-
-
-def test_joints_that_change_their_order_are_not_used_and_said() -> None:
+    assert (signals["wheel_speed_rl_rad_s"].field, signals["wheel_speed_rr_rad_s"].field) == (
+        "velocity[1]",
+        "velocity[3]",
+    )
     auto = found(joint_states=joints({"name": list(NAMES)}, {"name": list(reversed(NAMES))}))
     assert not {"steer_rad", "wheel_speed_rl_rad_s"} & set(auto.mapping.signals)
     assert any("/joint_states" in n and "their order differ" in n for n in auto.mapping.notes)
-
-
-def test_joints_of_a_command_are_no_sensor() -> None:
-    auto = found(joint_command=joints({"name": list(NAMES)}))
-    assert "steer_rad" not in auto.mapping.signals
+    assert "steer_rad" not in found(joint_command=joints({"name": list(NAMES)})).mapping.signals
 
 
 @pytest.mark.parametrize("swap", [False, True])
@@ -135,40 +129,25 @@ def test_a_twist_that_turns_with_the_car_is_a_receivers_velocity(name: str, swap
     assert (east, north) == (("twist.linear.y", "twist.linear.x") if swap else ("twist.linear.x", "twist.linear.y"))
 
 
-def test_a_vector_of_letters_over_ground_in_a_table_is_a_receivers_velocity() -> None:
-    table = {"Acc_X": IMU["linear_acceleration.x"], "Acc_Y": IMU["linear_acceleration.y"], "Gyr_Z": RATE}
-    signals = auto_map(
-        FakeLog({"csv": FakeTopic("table", T, {**table, "Vel_X": EAST, "Vel_Y": NORTH})})
-    ).mapping.signals
-    assert signals["gnss_velocity_east_m_s"].paths == ("Vel_X",)
-    assert signals["gnss_velocity_north_m_s"].paths == ("Vel_Y",)
-
-
 def test_position_speed_and_heading_of_one_table_are_a_receivers() -> None:
-    heading = 90.0 - np.degrees(YAW)
-    table = {"LATITUDE": FIX["latitude"], "LONGITUDE": FIX["longitude"], "SPEED_KPH": 3.6 * V, "HEADING_DEG": heading}
-    signals = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping.signals
+    place = {"LATITUDE": FIX["latitude"], "LONGITUDE": FIX["longitude"]}
+    signals = of_table(**place, SPEED_KPH=3.6 * V, HEADING_DEG=90.0 - np.degrees(YAW)).mapping.signals
     assert {"gnss_latitude_deg", "gnss_longitude_deg", "gnss_speed_m_s", "gnss_course_rad"} <= set(signals)
     assert signals["gnss_speed_m_s"].scale == pytest.approx(1.0 / 3.6)
 
 
 def test_letters_are_signals_where_physics_shows_them() -> None:
-    delta = 2.9 * RATE / V
-    table = {"u": V, "v": 0.3 * RATE, "r": RATE, "delta": delta, "a_x": IMU["linear_acceleration.x"]}
-    table["a_y"] = np.roll(V * RATE, -8)
-    mapping = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping
+    forces = {"a_x": IMU["linear_acceleration.x"], "a_y": np.roll(V * RATE, -8)}
+    mapping = of_table(u=V, v=0.3 * RATE, r=RATE, delta=2.9 * RATE / V, **forces).mapping
     paths = {n: s.paths[0] for n, s in mapping.signals.items()}
-    assert paths["speed_m_s"] == "u"
-    assert paths["yaw_rate_rad_s"] == "r"
+    assert (paths["speed_m_s"], paths["yaw_rate_rad_s"]) == ("u", "r")
     assert {c.name for c in mapping.checks} >= {"truth.source"}
 
 
 @pytest.mark.parametrize("name", ["steer_angle_status", "steer_angle_state"])
 def test_a_status_that_is_an_angle_is_read_and_an_enumeration_is_not(name: str) -> None:
-    angles, modes = 2.9 * RATE / V, np.rint(S) % 3.0
-    table = {"yaw_rate": RATE, "speed": V, "accel_y": V * RATE}
-    for values, is_read in ((angles, True), (modes, False)):
-        signals = auto_map(FakeLog({"csv": FakeTopic("table", T, {**table, name: values})})).mapping.signals
+    for values, is_read in ((2.9 * RATE / V, True), (np.rint(S) % 3.0, False)):
+        signals = of_table(yaw_rate=RATE, speed=V, accel_y=V * RATE, **{name: values}).mapping.signals
         assert ("steer_rad" in signals or "steering_wheel_rad" in signals) == is_read
 
 
@@ -180,7 +159,6 @@ def test_an_imu_with_z_down_is_undecided_without_a_drive_that_shows_it() -> None
     assert ("imu.mounting", "undecided") in {(c.name, c.verdict) for c in checks}
 
 
-STAMP = np.arange(200, dtype=np.int64) * 100_000_000 + 1_700_000_000_000_000_000
 NAV_PVT = ("vel_n", "vel_e", "g_speed", "h_acc", "s_acc", "fix_type", "lat", "lon")
 
 
@@ -227,30 +205,15 @@ def test_a_message_with_a_heading_is_no_sensor(fields):
     assert receiver_signals("/ins", "log_time", fields) == {}
 
 
-def test_the_accuracy_of_a_fix_is_the_root_of_its_variances():
-    paths = ["latitude", "longitude", "position_covariance_type", "status.status", "position_covariance"]
-    accuracy = receiver_signals("/fix", "log_time", paths)["gnss_position_accuracy_m"]
-    assert (accuracy.combine, accuracy.scale) == ("root", (0.5, 0.5))
-    assert accuracy.paths == ("position_covariance[0]", "position_covariance[4]")
-
-
-def _log(**topics):
+def _noise(type_name: str, *fields: str) -> FakeTopic:
     rng = np.random.default_rng(0)
-    imu = {
-        f"{part}.{axis}": rng.standard_normal(200)
-        for part in ("linear_acceleration", "angular_velocity")
-        for axis in "xyz"
-    }
-    contents = {"/imu": FakeTopic("sensor_msgs/msg/Imu", STAMP, imu)}
-    for name, (type_name, fields) in topics.items():
-        contents[f"/{name.replace('__', '/')}"] = FakeTopic(
-            type_name, STAMP, {f: rng.standard_normal(200) for f in fields}
-        )
-    return FakeLog(contents)
+    return FakeTopic(type_name, T[:200], {f: rng.standard_normal(200) for f in fields})
 
 
 def test_a_receiver_is_mapped_with_its_quality_and_rates_of_the_imu():
-    signals = auto_map(_log(gps__pvt=("ublox_msgs/msg/NavPVT", NAV_PVT))).mapping.signals
+    parts = (f"{part}.{axis}" for part in ("linear_acceleration", "angular_velocity") for axis in "xyz")
+    imu, pvt = _noise("sensor_msgs/msg/Imu", *parts), _noise("ublox_msgs/msg/NavPVT", *NAV_PVT)
+    signals = auto_map(FakeLog({"/imu": imu, "/gps/pvt": pvt})).mapping.signals
     assert signals["gnss_velocity_east_m_s"].label == "/gps/pvt.vel_e"
     assert {"gnss_fix_type", "gnss_velocity_accuracy_m_s", "gnss_position_accuracy_m"} <= set(signals)
     assert signals["roll_rate_rad_s"].field == "angular_velocity.x"
@@ -258,44 +221,23 @@ def test_a_receiver_is_mapped_with_its_quality_and_rates_of_the_imu():
 
 
 def test_an_instrument_that_is_ground_truth_is_no_sensor():
-    log = _log(
-        truth__twist=("geometry_msgs/msg/TwistStamped", ("twist.linear.x", "twist.linear.y", "twist.angular.z")),
-        truth__pvt=("ublox_msgs/msg/NavPVT", NAV_PVT),
-    )
+    velocity = _noise("geometry_msgs/msg/TwistStamped", "twist.linear.x", "twist.linear.y", "twist.angular.z")
+    log = FakeLog({"/truth/twist": velocity, "/truth/pvt": _noise("ublox_msgs/msg/NavPVT", *NAV_PVT)})
     assert not [name for name in auto_map(log).mapping.signals if name.startswith("gnss_")]
 
 
-def test_a_heading_of_two_antennas_is_never_mapped_by_itself():
-    fields = (*NAV_PVT, "heading")
-    assert "gnss_heading_rad" not in auto_map(_log(gps__pvt=("vendor_msgs/msg/Pvt", fields))).mapping.signals
-
-
-def write(path: Path, *, ros1: bool) -> Path:
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-    types: Any = store.types
-    time = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-
-    header = types["std_msgs/msg/Header"](stamp=time, frame_id="", **({"seq": 0} if ros1 else {}))
-    values = np.array([0.1, 0.2])
-    joints = types["sensor_msgs/msg/JointState"](
-        header=header, name=["left_steer", "right_steer"], position=values, velocity=values, effort=values
+def write(path: Path, container: str) -> Path:
+    """Write a log of two steered joints."""
+    values = np.tile([0.1, 0.2], (3, 1))
+    fields = dict.fromkeys(("position", "velocity", "effort"), values)
+    joints = Topic(
+        "/joint_states", "sensor_msgs/msg/JointState", T[:3], T[:3], fields, {"name": "left_steer right_steer"}
     )
-    with Writer1(path) if ros1 else Writer2(path, version=8) as writer:
-        name = "sensor_msgs/msg/JointState"
-        connection = writer.add_connection("/joint_states", name, typestore=store)
-        data = store.serialize_ros1(joints, name) if ros1 else store.serialize_cdr(joints, name)
-        for i in range(3):
-            writer.write(connection, START + i * 10_000_000, data)
-    return path
+    return containers.write([joints], path, container)
 
 
-@pytest.mark.parametrize("name", ["log.bag", "log"])
-def test_joints_of_real_messages(tmp_path: Path, name: str) -> None:
-    log = open_log(write(tmp_path / name, ros1=name.endswith(".bag")))
-    (topic,) = (t for t in log.topics if t.name == "/joint_states")
-    assert joint_names(log, topic) == ("left_steer", "right_steer")
-    log.close()
+@pytest.mark.parametrize("container", ["rosbag1", "rosbag2"])
+def test_joints_of_real_messages(tmp_path: Path, container: str) -> None:
+    with closing(open_log(write(tmp_path / "log", container))) as log:
+        (topic,) = (t for t in log.topics if t.name == "/joint_states")
+        assert joint_names(log, topic) == ("left_steer", "right_steer")

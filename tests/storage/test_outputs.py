@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import shutil
@@ -14,7 +15,6 @@ import pytest
 
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.records.processes import process_name
-from pdhef_logtool.storage import outputs
 from pdhef_logtool.storage.files import scratch_folder, write_bytes
 from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction, OutputFolder, check_no_input
 
@@ -31,10 +31,15 @@ def texts(folder: Path) -> dict[str, str]:
     return {p.relative_to(folder).as_posix(): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+def without_exchange(*_: object, **__: object) -> object:
+    """Stand for a C library without renameat2."""
+    return object()
+
+
 @pytest.fixture(params=[True, False], ids=["exchange", "renames"])
 def exchange(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
     if not request.param:
-        monkeypatch.setattr(outputs, "_exchanged", lambda *_: False)
+        monkeypatch.setattr(ctypes, "CDLL", without_exchange)
     return bool(request.param)
 
 
@@ -139,7 +144,7 @@ def test_a_kill_between_the_two_renames_is_repaired(tmp_path: Path, monkeypatch:
     make(tmp_path / "logs" / "x", OLD)
     child = os.fork()
     if child == 0:  # ends like a killed process, without clean-up
-        outputs._exchanged = lambda *_: False
+        ctypes.CDLL = without_exchange  # type: ignore[misc,assignment]
         rename = Path.rename
 
         def dies(self: Path, target: Path) -> Path:
@@ -162,11 +167,11 @@ def test_a_kill_between_the_two_renames_is_repaired(tmp_path: Path, monkeypatch:
 
 HOLD = """
 import sys, time, pathlib
-from pdhef_logtool.storage import outputs
 from pdhef_logtool.storage.outputs import OutputFolder
 if sys.argv[2] == "file":
-    def none(_): raise OSError(22, "no lock")
-    outputs._locked = none
+    import fcntl
+    def none(*_): raise OSError(22, "no lock")
+    fcntl.flock = none
 with OutputFolder(pathlib.Path(sys.argv[1]), ("logs",)) as held:
     change = held.begin("logs/x")
     change.file("half").write_bytes(b"half")
@@ -175,14 +180,14 @@ with OutputFolder(pathlib.Path(sys.argv[1]), ("logs",)) as held:
 """
 
 
-def _no_kernel_lock(_: int) -> bool:
+def _no_kernel_lock(*_: int) -> None:
     raise OSError(errno.EINVAL, "no lock")
 
 
 @pytest.fixture(params=["kernel", "file"])
 def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     if request.param == "file":
-        monkeypatch.setattr(outputs, "_locked", _no_kernel_lock)
+        monkeypatch.setattr("fcntl.flock", _no_kernel_lock)
     return str(request.param)
 
 
@@ -210,7 +215,7 @@ def test_the_same_process_is_refused_too(tmp_path: Path, kind: str) -> None:
 
 
 def test_a_lock_file_of_another_host_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outputs, "_locked", _no_kernel_lock)
+    monkeypatch.setattr("fcntl.flock", _no_kernel_lock)
     (tmp_path / LOCK_FILE).write_text("00000000-1-1")
     with pytest.raises(OutputError, match=f"remove {LOCK_FILE}"):
         FolderLock(tmp_path).acquire()

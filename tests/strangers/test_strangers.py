@@ -1,4 +1,4 @@
-"""The scorer against known series, the containers against what was written, and a handful of the logs."""
+"""The scorer against known series, the containers against what was written, CAN with DBC, and some of the logs."""
 
 from __future__ import annotations
 
@@ -9,17 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pdhef_logtool import inspect_log
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import fit_clocks, read_signals
+from pdhef_logtool.mapping.can_frames import decoded_frames
 from pdhef_logtool.records.signals import Channel
-from studies.strangers.__main__ import result_of, score_recording
+from studies.strangers.__main__ import score_recording
 from studies.strangers.answers import Answer, load_answers
 from studies.strangers.cars import Series, drive
-from studies.strangers.containers import write
-from studies.strangers.layouts import layout, layouts
-from studies.strangers.mountings import mountings, right_angles
-from studies.strangers.page import Result, merged, page
-from studies.strangers.recordings import ITEMS, answers, imu, road_car, scalar
-from studies.strangers.scoring import Finding, Score, Told, agrees, bias_of, score_log
+from studies.strangers.containers import Topic, write
+from studies.strangers.layouts import layout
+from studies.strangers.recordings import answers, imu, road_car, scalar
+from studies.strangers.scoring import agrees
+from tests.mcap_files import copied, mcap_writer
 
 _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
 _WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
@@ -50,24 +53,8 @@ def test_values_decide_whether_a_channel_is_right(values: np.ndarray, shift_ns: 
     assert agrees(channel, Series(_NS, _NS, _WAVE), 0.01) is right
 
 
-def test_all_turns_by_right_angles_are_there_once() -> None:
-    turns = right_angles()
-    assert len({t.tobytes() for t in turns}) == 24
-    assert np.array_equal(turns[0], np.eye(3))
-    assert all(np.allclose(t @ t.T, np.eye(3)) and np.linalg.det(t) > 0.0 for t in turns)
-
-
-_CONTAINERS = (
-    "mcap",
-    "mcap-json",
-    "mcap-json-bare",
-    "mcap-ros1",
-    "mcap-protobuf",
-    "rosbag1",
-    "rosbag2",
-    "rosbag2-bare",
-    "rosbag2-mcap",
-)
+_MCAP = ("mcap", "mcap-json", "mcap-json-bare", "mcap-ros1", "mcap-protobuf")
+_CONTAINERS = (*_MCAP, "rosbag1", "rosbag2", "rosbag2-bare", "rosbag2-mcap")
 
 
 @pytest.mark.parametrize("container", _CONTAINERS)
@@ -91,15 +78,6 @@ def test_containers_give_back_what_was_written(container: str, tmp_path: Path) -
     assert np.allclose(read["/speed"].fields["data"], force.values[:, 0], atol=1e-5)
 
 
-def test_the_sign_of_a_weak_signal_counts_and_an_accelerometer_may_have_a_bias() -> None:
-    weak, right = 0.01 * _WAVE, Series(_NS, _NS, _WAVE)
-    assert agrees(_channel(weak), replace(right, values=weak), 0.03)
-    assert not agrees(_channel(-weak), replace(right, values=weak), 0.03)
-    assert agrees(_channel(_WAVE + 0.25), right, 0.1, bias_of("ay_m_s2"))
-    assert not agrees(_channel(_WAVE + 0.85), right, 0.1, bias_of("ay_m_s2"))
-    assert bias_of("yaw_rate_rad_s") == 0.0
-
-
 @pytest.mark.slow
 def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
     sound = score_recording(layout("autoware"), tmp_path)
@@ -120,61 +98,6 @@ def test_wrong_units_and_signs_are_corrected_or_told(name: str, tmp_path: Path) 
     assert result.named is not False
 
 
-def test_told_means_that_a_check_or_a_doubt_is_on_the_channel() -> None:
-    told = Told(({"name": "a.sign", "subject": "ay_m_s2", "verdict": "failed"},), ())
-    findings = (
-        Finding("ay", "wrong", True, frozenset({"failed"}), "x"),
-        Finding("ax", "right", True, frozenset(), "y"),
-    )
-    result = result_of(Score(findings, ("alarm",), None, told), "n", "fault", "w")
-    assert result.items == {"ay": "wrong, reported", "ax": "right"}
-    assert result.verdicts == {"ax": "none"}
-    worse = replace(result, items={"ay": "wrong, not reported", "ax": "missing"}, silent=("ay",))
-    both = merged([result, worse])
-    assert both.items == {"ay": "wrong, not reported", "ax": "missing"}
-
-
-def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    car = drive("short")
-    path = write((imu(car.force.times(-1.0), car.rate),), tmp_path / "log", "mcap")
-    right = answers(car, "imu")
-    from studies.strangers import scoring
-
-    found = scoring.look(path)
-    check = {"name": "ay.sign", "subject": "ay_m_s2", "verdict": "undecided"}
-    monkeypatch.setattr(scoring, "look", lambda _: (found[0], Told((check,), ()), found[2]))
-    by_item = {f.item: f for f in score_log(path, right).findings}
-    assert (by_item["ay"].verdict, by_item["ay"].told) == ("wrong", True)
-    assert (by_item["ax"].verdict, by_item["ax"].told) == ("wrong", False)
-    assert by_item["yaw rate"].verdict == "right"
-
-
-@pytest.mark.slow
-def test_forty_kinds_with_distinct_names_and_pages() -> None:
-    last = [*layouts("held-out")]
-    own = [*mountings(), *layouts()]
-    assert len({r.name for r in own}) == len(own)
-    assert len({r.counted_as for r in own}) >= 40
-    assert len(last) == 13
-    # A layout is documented by a page, or `what` describes its file or its types; a fault is one of a documented log.
-    assert all(r.page.startswith("https://") or (r.page == "" and len(r.what) > 10) for r in own)
-    assert sum(r.page != "" for r in own) >= 40
-    names = {n for channels in ITEMS.values() for n in channels}
-    assert all(set(r.right) <= names for r in own)
-
-
-def test_the_page_says_what_is_wrong() -> None:
-    rows = [
-        Result("a", "fault", "w", "", {"ay": "wrong, not reported"}, silent=("ay (ay_m_s2 = /x.y)",), named=False),
-        Result("b", "layout", "w", "https://x", {"ax": "right"}, verdicts={"ax": "passed"}),
-    ]
-    text = page(rows, "")
-    assert "- a: wrong, not reported: ay (ay_m_s2 = /x.y)" in text
-    assert "- a: cause not named" in text
-    assert "[w](https://x)" in text
-    assert "all passed for 1, some undecided for 0, some failed for 0, no check for 0" in text
-
-
 def test_a_log_without_type_names_is_still_scored(tmp_path: Path) -> None:
     result = score_recording(layout("vbox"), tmp_path)
     assert set(result.items) >= {"ax", "ay", "yaw rate", "speed"}
@@ -189,3 +112,72 @@ def test_answers_are_found_in_their_recordings(answer: Answer, shared_dir: Path)
     right, allowed = answer.series()
     assert set(right) == set(answer.right)
     assert set(allowed) == set(answer.allowed)
+
+
+def _topics(names: tuple[str, str]) -> list[Topic]:
+    """A yaw rate on one bus and a steering angle on the other, with the same identifiers of messages."""
+    car = drive("brief")
+    fields = {"YAW_RATE [deg/s]": np.degrees(car.rate.values[:, 2]), "LAT_ACC [m/s^2]": car.force.values[:, 1]}
+    clock, wheel = car.force, car.steering_wheel
+    angle = {"STEERING_WHEEL_ANGLE [deg]": np.degrees(wheel.values)}
+    return [
+        Topic("/Kinematics", names[0], clock.stamps_ns, clock.arrival_ns, fields),
+        Topic("/Steering", names[1], wheel.stamps_ns, wheel.arrival_ns, angle),
+    ]
+
+
+def _without_attachments(source: Path, target: Path, metadata: dict[str, bytes]) -> None:
+    """Copy the messages of an MCAP, with DBC texts as a metadata record."""
+    with mcap_writer(target) as writer:
+        list(copied(source, writer))
+        if metadata:
+            writer.add_metadata("dbc", {name: text.decode() for name, text in metadata.items()})
+
+
+@pytest.mark.parametrize("place", ["attachments", "metadata", "given"])
+def test_frames_in_mcap_are_decoded_by_the_files_in_it_or_given_with_it(tmp_path: Path, place: str) -> None:
+    path = write(_topics(("chassis", "steering")), tmp_path / "log", "can-mcap")
+    msgs = None
+    if place != "attachments":
+        with closing(open_log(path)) as log:
+            texts = {p.name: p.read_bytes() for p in log.databases}
+        for name, text in texts.items():
+            (tmp_path / name).write_bytes(text)
+        mine = tmp_path / "bare.mcap"
+        _without_attachments(path, mine, texts if place == "metadata" else {})
+        path, msgs = mine, tmp_path if place == "given" else None
+    found = inspect_log(path, options=ReadOptions(msgs=msgs))
+    sources = {name: (s.topic, s.field, s.scale) for name, s in found.mapping.signals.items()}
+    degree = pytest.approx(np.radians(1.0))
+    assert sources == {
+        "ay_m_s2": ("/chassis/received_messages", "can:Kinematics.LAT_ACC", 1.0),
+        "yaw_rate_rad_s": ("/chassis/received_messages", "can:Kinematics.YAW_RATE", degree),
+        "steering_wheel_rad": ("/steering/received_messages", "can:Steering.STEERING_WHEEL_ANGLE", degree),
+    }
+    with closing(open_log(path, msgs=msgs)) as log:
+        clocks = fit_clocks(log, found.mapping, log.start_ns, log.end_ns)
+        read = read_signals(log, found.mapping, clocks, log.start_ns, log.end_ns).signals
+    expected = drive("brief").rate.values[:, 2]
+    assert np.allclose(read["yaw_rate_rad_s"].values, expected, atol=np.radians(0.05))
+
+
+@pytest.mark.parametrize("container", ["can-blf", "can-asc", "can-mdf", "can-mcap"])
+def test_an_identifier_of_two_buses_is_decoded_by_the_file_that_fits_its_bus(tmp_path: Path, container: str) -> None:
+    pytest.importorskip("can")
+    pytest.importorskip("asammdf")
+    one, two = _topics(("a", "b"))
+    path = write([one, two, replace(two, name="/More")], tmp_path / "log", container)
+    msgs = path if path.is_dir() else None
+    with closing(open_log(path, msgs=msgs)) as log:
+        if msgs is None:
+            frames = [t for t in log.topics if t.type_name.startswith("can_msgs")]
+            log = decoded_frames(log, frames) or log
+            assert {t.name for t in log.topics if ".can:" in t.name} == {
+                "/a/received_messages.can:Kinematics",
+                "/b/received_messages.can:Steering",
+                "/b/received_messages.can:More",
+            }
+        else:
+            counts = {t.name: t.messages for t in log.topics}
+            wanted = {"Kinematics": len(one.stamps_ns), "Steering": len(two.stamps_ns), "More": len(two.stamps_ns)}
+            assert {name: counts[name] for name in wanted} == wanted

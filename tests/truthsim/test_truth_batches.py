@@ -59,15 +59,6 @@ def test_a_suite_s_manifest_tells_what_is_there(suite: tuple[Path, dict], tmp_pa
     assert hashlib.sha256((tmp_path / "x.mcap").read_bytes()).hexdigest() == manifest["drives"][1]["sha256"]
 
 
-def test_a_larger_suite_begins_with_the_smaller_one() -> None:
-    small, large = plan_suite(5, 7), plan_suite(50, 7)
-    assert large[:5] == small
-    assert plan_suite(5, 8) != small
-    assert [j.candidates[0].vehicle for j in plan_suite(3, 7)] == ["sedan"] * 3
-    others = [j.candidates[0].vehicle for j in plan_suite(20, 7, vehicles="randomised")]
-    assert len(set(others)) == 20 and all(v.startswith("sedan~") for v in others)
-
-
 def test_draws_fill_the_range_and_the_splits() -> None:
     jobs = plan_suite(750, 1)
     specs = [job.candidates[0] for job in jobs]
@@ -167,15 +158,9 @@ def test_rows_are_the_same_drives_with_one_thing_wrong() -> None:
     base = drives["in-domain"]
     same = operator.attrgetter("manoeuvre", "speed_km_h", "friction", "seed", "duration_s")
     for row in ("mass-plus-20", "burst-20", "gyro-stuck", "delay-30", "other-tyres", "randomised-vehicle", "bias"):
-        drive = drives[row]
-        assert same(drive) == same(base), row
-        assert (drive.vehicle != base.vehicle) is not (drive.faults != base.faults), row
-    assert drives["unseen-manoeuvre"].manoeuvre == "fishhook"
+        assert same(drives[row]) == same(base), row
+        assert (drives[row].vehicle != base.vehicle) is not (drives[row].faults != base.faults), row
     assert 0.15 <= drives["low-friction"].friction <= 0.25
-    assert (drives["paper-b"].speed_km_h, drives["paper-b"].friction) == (60.0, 0.3)
-    for row in ("in-domain", "extrapolation"):
-        drive = drives[row]
-        assert is_held_out(drive.manoeuvre, drive.speed_km_h, drive.friction) is (row == "extrapolation")
 
 
 @pytest.mark.parametrize(

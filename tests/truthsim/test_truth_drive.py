@@ -143,15 +143,6 @@ def test_a_road_is_ordinary_and_has_a_standstill(road: Drive) -> None:
             assert np.abs(truth[name][still]).max() < 1e-3, name
 
 
-@pytest.mark.slow
-def test_seeds_make_other_roads_and_other_noise_and_repeat() -> None:
-    road, again, other = (simulate_drive("road", seed=seed, duration_s=15.0) for seed in (3, 3, 4))
-    assert np.array_equal(again.truth["x_m"], road.truth["x_m"])
-    assert np.array_equal(again.channels["imu"].fields["ay_m_s2"], road.channels["imu"].fields["ay_m_s2"])
-    assert not np.array_equal(other.truth["x_m"], road.truth["x_m"])
-    assert not np.array_equal(other.channels["imu"].fields["ay_m_s2"], road.channels["imu"].fields["ay_m_s2"])
-
-
 def test_a_spin_is_dropped_unless_asked_for() -> None:
     # A car oversteers if its rear axle steers out of the bend.
     loose = Vehicle()._replace(rear_compliance_rad_per_n=-4e-5)

@@ -60,16 +60,8 @@ def test_other_libraries_find_every_topic_with_its_type(read_back, drive: Drive)
 
 def test_stamps_are_measurement_times_and_log_times_arrivals(read_back) -> None:
     messages, _, _ = read_back
-    for topic, delay_ns in (
-        ("/imu/data", 10_000_000),
-        ("/vehicle/status/steering_status", 10_000_000),
-        ("/vehicle/wheel_speeds", 10_000_000),
-        ("/rtk/odometry", 20_000_000),
-        ("/rtk/fix", 20_000_000),
-        ("/rtk/quality", 20_000_000),
-        ("/truth/perfect/odometry", 0),
-        ("/truth/perfect/state", 0),
-    ):
+    for topic in TYPES:
+        delay_ns = 0 if "truth" in topic else 20_000_000 if "rtk" in topic else 10_000_000
         for log_time, publish_time, message in messages[topic]:
             stamp = nanoseconds(message.stamp if topic.endswith("steering_status") else message.header.stamp)
             assert stamp == publish_time and log_time - publish_time == delay_ns
@@ -78,60 +70,32 @@ def test_stamps_are_measurement_times_and_log_times_arrivals(read_back) -> None:
     assert steering[0] - START_NS == 3_000_000 and set(np.diff(steering)) == {10_000_000}
 
 
+#: Topic and field of a message, channel and field of the sensor.
+FIELDS = [
+    ("/imu/data", "linear_acceleration.x", "imu", "ax_m_s2"),
+    ("/imu/data", "linear_acceleration.y", "imu", "ay_m_s2"),
+    ("/imu/data", "angular_velocity.z", "imu", "yaw_rate_rad_s"),
+    ("/vehicle/status/steering_status", "steering_tire_angle", "steering", "steer_rad"),
+    *(("/vehicle/wheel_speeds", f"{w}_m_s", "wheels", f"{w}_m_s") for w in ("fl", "fr", "rl", "rr")),
+    ("/rtk/odometry", "twist.twist.linear.y", "rtk", "vy_m_s"),
+    ("/rtk/odometry", "pose.pose.position.x", "rtk", "x_m"),
+    ("/rtk/fix", "latitude", "fix", "lat_deg"),
+]
+
+
 def test_values_survive(read_back, drive: Drive) -> None:
     messages, _, _ = read_back
-    imu = drive.channels["imu"].fields
-    last = messages["/imu/data"][-1][2]
-    assert (last.linear_acceleration.x, last.linear_acceleration.y) == (imu["ax_m_s2"][-1], imu["ay_m_s2"][-1])
-    assert last.angular_velocity.z == imu["yaw_rate_rad_s"][-1]
-    assert last.orientation_covariance[0] == -1.0
-    assert last.linear_acceleration_covariance[4] == pytest.approx(0.12**2)
-    steering = messages["/vehicle/status/steering_status"][-1][2].steering_tire_angle
-    assert steering == np.float32(drive.channels["steering"].fields["steer_rad"][-1])
-    wheels = messages["/vehicle/wheel_speeds"][-1][2]
-    assert [getattr(wheels, f"{w}_m_s") for w in ("fl", "fr", "rl", "rr")] == [
-        drive.channels["wheels"].fields[f"{w}_m_s"][-1] for w in ("fl", "fr", "rl", "rr")
-    ]
-    odometry = messages["/rtk/odometry"][-1][2]
-    rtk = drive.channels["rtk"].fields
-    assert odometry.twist.twist.linear.y == pytest.approx(rtk["vy_m_s"][-1], abs=1e-5)
-    assert odometry.pose.pose.position.x == pytest.approx(rtk["x_m"][-1], abs=1e-5)
+    for topic, path, channel, name in FIELDS:
+        found = [operator.attrgetter(path)(m) for _, _, m in messages[topic]]
+        assert found == pytest.approx(drive.channels[channel].fields[name], abs=1e-5, rel=1e-7), path
+    imu, odometry, fix = (messages[topic][-1][2] for topic in ("/imu/data", "/rtk/odometry", "/rtk/fix"))
+    assert imu.orientation_covariance[0] == -1.0
+    assert imu.linear_acceleration_covariance[4] == pytest.approx(0.12**2)
     assert odometry.pose.covariance[0] == pytest.approx(1e-4) and odometry.twist.covariance[7] > 0.0
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "base_link")
-    fix = messages["/rtk/fix"][-1][2]
-    assert fix.latitude == drive.channels["fix"].fields["lat_deg"][-1]
     assert fix.status.status == 2 and fix.position_covariance_type == 2
     assert fix.position_covariance[[0, 4, 8]] == pytest.approx([1e-4, 1e-4, 4e-4])
     assert messages["/rtk/quality"][-1][2].quality == 4
-
-
-def test_perfect_truth_is_exact(read_back, drive: Drive) -> None:
-    messages, _, _ = read_back
-    q = np.array(
-        [[getattr(m.pose.pose.orientation, k) for k in "wxyz"] for _, _, m in messages["/truth/perfect/odometry"]]
-    )
-    w, x, y, z = q.T
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    truth = drive.truth
-    assert np.abs(np.unwrap(yaw) - truth["yaw_rad"]).max() < 1e-6
-    assert np.abs(roll - truth["roll_rad"]).max() < 1e-6
-    states = [m for _, _, m in messages["/truth/perfect/state"]]
-    for name in ("vx_m_s", "vy_m_s", "sideslip_rad", "ay_m_s2", "roll_rad", "steer_rad"):
-        assert np.abs(np.array([getattr(m, name) for m in states]) - truth[name]).max() < 1e-7, name
-    twist = np.array([m.twist.twist.linear.y for _, _, m in messages["/truth/perfect/odometry"]])
-    assert np.abs(twist - truth["vy_m_s"]).max() < 1e-7
-    assert states[-1].friction == pytest.approx(0.85, abs=1e-7)
-    assert states[-1].vertical_force_n.sum() == pytest.approx(1440.0 * 9.80665, rel=2e-3)
-
-
-def test_metadata_says_how_it_was_made(read_back) -> None:
-    _, _, metadata = read_back
-    assert metadata["command"] == "pdhef simulate step-steer --speed 100 --mu 0.85 --seed 2"
-    assert (metadata["friction"], metadata["seed"], metadata["spun"]) == ("0.85", "2", "false")
-    assert json.loads(metadata["vehicle"])["mass_kg"] == 1440.0
-    assert json.loads(metadata["noise"])["acceleration_m_s2"] == 0.12
-    assert set(json.loads(metadata["versions"])) >= {"pdhef-logtool", "numpy"}
 
 
 @pytest.fixture(scope="module")

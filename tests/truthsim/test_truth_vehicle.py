@@ -1,13 +1,19 @@
-"""The truth vehicle beyond the gates: forces and accelerations, braking, wheel lift, other simulators."""
+"""The truth vehicle beyond the gates, and its files: wheel lift, other simulators, shipped, wrong and random cars."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pdhef_logtool.records.errors import VehicleError
+from truthsim.linear_theory import steady_roll, understeer_gradient_rad_per_m_s2
 from truthsim.manoeuvres import Plan
 from truthsim.motion import Motion, simulate_motion
+from truthsim.randomisation import randomise
 from truthsim.vehicle import Vehicle
+from truthsim.vehicle_files import VEHICLES, load_vehicle
 
 CAR = Vehicle()
 LF, LR, L, M, IZ, TRACK, H_CG = 1.16, 1.71, 2.87, 1440.0, 1523.0, 1.57, 0.64  # the paper's Table 3
@@ -19,24 +25,6 @@ def open_loop(speed: float, steer: np.ndarray) -> Plan:
 
 def loads(motion: Motion) -> np.ndarray:
     return np.stack([motion.column(f"fz_{w}_n") for w in ("fl", "fr", "rl", "rr")], axis=1)
-
-
-def test_geometry_is_table_3() -> None:
-    assert (CAR.mass_kg, CAR.yaw_inertia_kg_m2, CAR.cg_to_front_axle_m, CAR.cg_to_rear_axle_m) == (M, IZ, LF, LR)
-    assert (CAR.track_m, CAR.cg_height_m, CAR.wheel_radius_m) == (TRACK, H_CG, 0.30)
-
-
-def test_outer_wheels_turn_faster_and_driven_wheels_slip() -> None:
-    steer = np.concatenate([np.linspace(0.0, 0.03, 1000), np.full(7000, 0.03)])
-    motion = simulate_motion(open_loop(15.0, steer), 0.85)
-    rim = {w: 0.30 * motion.column(f"spin_{w}_rad_s")[-1] for w in ("fl", "fr", "rl", "rr")}
-    v_x, r = motion.column("vx_m_s")[-1], motion.column("yaw_rate_rad_s")[-1]
-    assert r > 0.1
-    assert rim["rr"] - rim["rl"] == pytest.approx(TRACK * r, rel=0.03)
-    assert 0.5 * (rim["rl"] + rim["rr"]) == pytest.approx(v_x, rel=2e-3)
-    straight = simulate_motion(open_loop(40.0, np.zeros(4000)), 0.85)
-    front = 0.30 * straight.column("spin_fl_rad_s")[-1] / straight.column("vx_m_s")[-1] - 1.0
-    assert 5e-4 < front < 2e-2
 
 
 def test_a_wheel_leaves_the_road_and_comes_back() -> None:
@@ -116,3 +104,67 @@ def test_with_the_other_s_values_the_difference_goes(shared_dir) -> None:
     for gain, car in ((1.1, LIKE_THE_OTHER), (-1.0, LIKE_THE_OTHER), (1.0, CAR._replace(yaw_inertia_kg_m2=-IZ))):
         with pytest.raises(AssertionError), np.errstate(all="ignore"):
             check_bands(against_another_simulator(shared_dir, *step, car, gain=gain), CLOSE)
+
+
+SHIPPED = Path(__file__).resolve().parents[2] / "truthsim" / "vehicles"
+SEDAN = (SHIPPED / "sedan.toml").read_text()
+DEG_PER_G = np.degrees(1.0) * 9.80665
+
+
+def test_the_default_is_the_sedan_s_file() -> None:
+    assert load_vehicle("sedan") == Vehicle()
+    assert {p.stem for p in SHIPPED.glob("*.toml")} == set(VEHICLES)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_shipped_vehicles_handle_like_cars_of_their_kind(name: str) -> None:
+    car = load_vehicle(name)
+    assert 1.5 < understeer_gradient_rad_per_m_s2(car, 0.85) * DEG_PER_G < 4.0
+    angle, (front, rear) = steady_roll(car)
+    assert 3.0 < angle * DEG_PER_G < 6.0
+    assert 0.5 < front / (front + rear) < 0.65
+    motion = simulate_motion(Plan(25.0, 4.0, steer_rad=np.linspace(0.0, 0.10, 4001)), 0.85, vehicle=car)
+    assert np.isfinite(motion.observed).all()
+    assert 0.6 < motion.column("ay_m_s2").max() / 9.80665 < 0.88
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("mass_kg = 1440.0\n", "", ("mass_kg: is missing",)),
+        ("mass_kg = 1440.0", "mass_kg = nan", ("mass_kg", "nan", "finite")),
+        ("track_m = ", "trakc_m = ", ("track_m: is missing", "trakc_m: unknown, did you mean track_m?")),
+        ("ackermann = 0.5", "ackermann = 1.5", ("ackermann", "1.5")),
+        ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 400.0", ("unsprung",)),
+        ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 1.0", ("300 rad/s",)),
+        ("cg_height_m = 0.64", "cg_height_m = 6.4", ("upright",)),
+        ("front_roll_centre_height_m = 0.1", "front_roll_centre_height_m = 0.9", ("roll and pitch centres",)),
+        ("lateral_relaxation_min_m = 0.3", "lateral_relaxation_min_m = 0.9", ("front_tyre", "lateral_relaxation")),
+    ],
+)
+def test_a_wrong_file_is_one_clear_line(tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
+    assert old in SEDAN
+    path = tmp_path / "car.toml"
+    path.write_text(SEDAN.replace(old, new, 1))
+    with pytest.raises(VehicleError) as caught:
+        load_vehicle(path)
+    assert "\n" not in str(caught.value) and "car.toml" in str(caught.value)
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_an_own_file_is_read_and_a_missing_one_named(tmp_path: Path) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text(SEDAN.replace("mass_kg = 1440.0", "mass_kg = 1500"))
+    assert load_vehicle(path) == Vehicle()._replace(mass_kg=1500.0)
+    with pytest.raises(VehicleError, match="sedan, suv, hatchback"):
+        load_vehicle("lorry")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VEHICLES)
+def test_randomised_cars_drive(name: str) -> None:
+    steer = 0.03 * np.sin(2.0 * np.pi * 0.7 * np.arange(0.0, 4.0, 1e-3))
+    for seed in range(8):
+        motion = simulate_motion(Plan(22.0, 3.9, steer_rad=steer), 0.7, vehicle=randomise(load_vehicle(name), seed))
+        assert np.isfinite(motion.observed).all()
+        assert 0.25 < np.abs(motion.column("ay_m_s2")).max() / 9.80665 < 0.72
