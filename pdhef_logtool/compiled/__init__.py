@@ -1,5 +1,5 @@
 """Machine code that numba compiles, kept between processes.
 
-:mod:`~.cache` provides ``njit``, :mod:`~.sources` the digest of all sources under which the code is kept. It imports
-only :mod:`~pdhef_logtool.records`, because every package with kernels imports it.
+:mod:`~.cache` provides the decorator of kernels, :mod:`~.sources` the digest of all sources under which the code is
+kept. It imports only :mod:`~pdhef_logtool.records`, because every package with kernels imports it.
 """

@@ -33,7 +33,7 @@ from pdhef_logtool.mapping.navigation import (
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighing, weigh
-from pdhef_logtool.records.signals import FloatArray, has_gnss
+from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
 TRUTH_WORDS, NAVIGATION_WORDS = _TOPICS["truth"], _TOPICS["navigation"]
@@ -53,6 +53,7 @@ NEAR_1_G = 0.08
 
 #: Types with velocities in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
+WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
 #: Required fields of known types; an IMU needs any of them, the others need all.
@@ -190,6 +191,7 @@ def auto_map(
     _map_imu(draft, topics)
     _map_steering(draft, topics)
     _map_speed(draft, topics)
+    _map_wheel_speeds(draft, topics)
     _map_truth(draft, topics, prefer_truth)
     _map_truth_friction(draft, topics, prefer_truth)
     _map_documented_truth(draft, topics, vendors)
@@ -423,7 +425,7 @@ def _is_well_known(topic: TopicInfo) -> bool:
     """Return whether a topic was mapped by its type already."""
     tables = (TWIST_FIELDS, _FIELDS["pose"], _FIELDS["steering"], _FIELDS["speed"], _FIELDS["several_positions"])
     kind = _type(topic)
-    return kind in IMU_TYPES | FIX_TYPES or any(kind in table for table in tables)
+    return kind in IMU_TYPES | FIX_TYPES | WHEEL_SPEED_TYPES or any(kind in table for table in tables)
 
 
 def _role(topic: TopicInfo) -> Role:
@@ -651,6 +653,15 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
         why = "its name does not suggest ground truth"
         draft.notes.append(f"{chosen.name} contains a lateral velocity, which is not used: {why}")
+
+
+def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
+    candidates = [t for t in topics if _type(t) in WHEEL_SPEED_TYPES and not _words(t.name) & TRUTH_WORDS]
+    chosen = draft.choose("wheel speeds", candidates, lambda _: (), "the first of its kind")
+    if chosen is None:
+        return
+    for wheel in WHEELS:
+        draft.take(draft.signals, f"wheel_speed_{wheel}_m_s", chosen.name, f"{wheel}_m_s")
 
 
 # ------------------------------------------------------------------------------------------------ ground truth

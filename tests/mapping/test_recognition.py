@@ -143,6 +143,7 @@ def test_commands_are_no_sensors() -> None:
     assert fields_of(auto) == {
         "steer_rad": ("/drive", "drive.steering_angle", "header.stamp"),
         "speed_m_s": ("/vehicle/twist", "linear.x", "log_time"),
+        "yaw_rate_rad_s": ("/vehicle/twist", "angular.z", "log_time"),
     }
     assert any("command" in n for n in auto.mapping.notes)
 
