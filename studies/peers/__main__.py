@@ -105,10 +105,11 @@ def earlier_model(tool: Tool, drive: PeerDrive) -> str | Path:
     for other in PEER_DRIVES:
         if other.drive == drive.drive or _recorder(other) != _recorder(drive):
             continue
-        folder = tool_run(tool, other, "auto", "file")
-        calibration = None if folder is None else calibration_of(folder)
-        if folder is not None and calibration and not calibration["refused"]:
-            models.append((calibration["seconds"], next(folder.glob("logs/*/model.toml"))))
+        if (folder := tool_run(tool, other, "auto", "file")) is None:
+            continue
+        (report,) = reports(folder).values()
+        if (calibration := report["self_calibration"]) and not calibration["refused"]:
+            models.append((report["log"]["duration_s"], next(folder.glob("logs/*/model.toml"))))
     return max(models)[1] if models else "off"
 
 

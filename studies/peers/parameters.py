@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies.pages import number, table
-from studies.peers.drives import PEER_DRIVES
+from studies.peers.drives import PEER_DRIVES, PeerDrive, vehicle_of
 
 NORMAL_95 = 1.959964
 #: Parameters of the car; biases, offsets and delays belong to a drive.
@@ -31,23 +31,21 @@ def pairs_table(documents: Sequence[dict[str, Any]]) -> str:
     drives = [drive.log for drive in PEER_DRIVES if drive.log in fitted]
     of = {drive.log: drive for drive in PEER_DRIVES}
     pairs = [(a, b) for a, b in combinations(drives, 2) if of[a].car == of[b].car and of[a].drive != of[b].drive]
-    every = {name: np.array([_difference(fitted[a][name], fitted[b][name]) for a, b in pairs]) for name in OF_CAR}
+    every = {name: np.array([_difference(name, of[a], of[b], fitted) for a, b in pairs]) for name in OF_CAR}
     body = [_row(name, rows) for name, rows in [*every.items(), ("all", np.concatenate(list(every.values())))]]
-    head = ["parameter", "pairs", "within 1.96 σ", "RMS of difference / σ", "excited in both", "within, of those"]
-    return table(head, body, right_from=1)
+    return table(["parameter", "pairs", "within 1.96 σ", "RMS of difference / σ"], body, right_from=1)
 
 
-def _difference(a: dict[str, Any], b: dict[str, Any]) -> tuple[float, bool]:
-    """Return the difference over its 1-sigma, and whether both drives excite the parameter."""
-    channel = a["name"] == STEERING  # over the file's, for drives of a car have different steering channels
-    values = [p["value"] / p["prior"] if channel else p["value"] for p in (a, b)]
-    values = [math.log(value) if a["log"] else value for value in values]
-    return (values[0] - values[1]) / math.hypot(a["sd"], b["sd"]), a["excited"] and b["excited"]
+def _difference(name: str, a: PeerDrive, b: PeerDrive, fitted: Mapping[str, Mapping[str, dict[str, Any]]]) -> float:
+    """Return the difference over its 1-sigma; steering ratios are over the file's, for the channels differ."""
+    of_a, of_b = fitted[a.log][name], fitted[b.log][name]
+    files = [vehicle_of(drive).steering_ratio if name == STEERING else 1.0 for drive in (a, b)]
+    values = [of_one["value"] / file for of_one, file in zip((of_a, of_b), files, strict=True)]
+    values = [math.log(value) if of_a["log"] else value for value in values]
+    return float((values[0] - values[1]) / math.hypot(of_a["sd"], of_b["sd"]))
 
 
 def _row(name: str, rows: NDArray[np.float64]) -> list[str]:
-    """Return the cells of the differences [pairs, 2]."""
-    within, both = np.abs(rows[:, 0]) <= NORMAL_95, rows[:, 1] > 0.0
-    share = f"{np.mean(within[both]):.0%}" if both.any() else "–"
-    rms = number(float(np.sqrt(np.mean(rows[:, 0] ** 2))), 2)
-    return [name, str(len(rows)), f"{np.mean(within):.0%}", rms, str(int(both.sum())), share]
+    """Return the cells of the differences [pairs]."""
+    within, rms = np.abs(rows) <= NORMAL_95, number(float(np.sqrt(np.mean(rows**2))), 2)
+    return [name, str(len(rows)), f"{np.mean(within):.0%}", rms]
