@@ -225,3 +225,12 @@ def test_a_run_of_it_scores_and_calls_nothing_causal(
     sound = pl.read_parquet(tmp_path / "sound/logs/dlc/estimates.parquet").filter(estimator="phy-ukf")
     both = rows.join(sound, on="stamp_ns").filter("valid", "valid_right")
     assert (both["vy_m_s"] - both["vy_m_s_right"]).abs().max() < 1e-9  # type: ignore[operator]
+
+
+def test_a_pause_of_twenty_minutes_is_no_epoch(sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+    log = tmp_path / "pause.mcap"
+    rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: 1200 * S if at_s > 4.0 else 0)
+    drive, whole = read(log, car)
+    assert kinds(drive) == {}
+    assert all(s.used == s.total for s in drive.sample_ledger)
+    assert len(whole.signals) == 951

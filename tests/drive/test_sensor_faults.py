@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from reference_car import drive, make_signals, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import Sensors, default_vehicle
+from pdhef_logtool.drive.sample_noise import MAX_SPIKES
 from pdhef_logtool.drive.sensor_faults import COLUMNS, without_faults
 from pdhef_logtool.evaluation.reasons import reason_intervals
 from pdhef_logtool.records import reasons
@@ -246,3 +247,32 @@ def test_faults_are_found_from_earlier_samples(clean):
         part = found(with_column(noisy, 1, (t > 4.0) & (t < 5.0), 0.0).rows(0, count))
         for name in (*COLUMNS, "extra_variance"):
             np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[:count])
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize(("sigmas", "is_reported"), [(40.0, False), (700.0, True)])
+def test_one_spike_is_reported_only_far_beyond_any_tail(channel, sigmas, is_reported, clean):
+    at = np.arange(len(clean)) == 1100
+    result = found(with_column(clean, channel, at, getattr(clean, COLUMNS[channel]) + sigmas * S0[channel]))
+    assert unused(result, channel)[1100]
+    np.testing.assert_array_equal(reason(result) != 0, at & is_reported)
+
+
+def test_a_jump_is_followed_after_two_samples(clean):
+    jumped = times(clean) >= 5.0
+    result = found(with_column(clean, 0, jumped, clean.ay_m_s2 + 8.0))
+    spiked = np.flatnonzero(unused(result, 0))
+    assert 1 <= len(spiked) <= MAX_SPIKES
+    assert (spiked < np.argmax(jumped) + MAX_SPIKES).all()
+
+
+def test_a_quantised_gyro_that_is_stuck_is_found_once_the_car_turns():
+    made = drive(slalom(0.03, 0.3), 30.0, speed=20.0)
+    r = np.round(made.r / 0.005) * 0.005
+    t = made.time_s
+    r[(t > 20) & (t < 24)] = r[np.argmax(t > 20)]
+    s = replace(made.signals, yaw_rate_rad_s=r)
+    s.friction[:] = 0.85
+    stuck = reason(found(s)) & reasons.STUCK_YAW_RATE > 0
+    assert not stuck[(t < 20) | (t > 24)].any()
+    assert stuck[(t > 22) & (t < 23.9)].mean() > 0.9

@@ -500,3 +500,28 @@ def test_sideslip_alone_is_scored_above_the_measured_low_speed_limit(log: Path) 
     assert not scored[standing].any()
     assert not ((seconds > 14.01) & (seconds < 15.99)).any()
     np.testing.assert_allclose(whole.truth.measured_speed_m_s[driving], 20.0, atol=0.01)
+
+
+def test_measured_lateral_acceleration_is_moved_too():
+    stamps, _ = drive(rate=100)
+    t = (stamps - T0) * 1e-9
+    r = 0.4 * np.sin(t)
+    x, y = 1.5, -0.5
+    channels = {
+        "vx_m_s": channel("vx_m_s", stamps, 10 + 0 * t),
+        "vy_m_s": channel("vy_m_s", stamps, 0 * t),
+        "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, r),
+        "ay_m_s2": channel("ay_m_s2", stamps, 10 * r + 0.4 * np.cos(t) * x - r**2 * y),
+    }
+    track = derive_truth(channels, truth_position_m=(x, y, 0.0)).track
+    good = np.isfinite(track.ay_m_s2)
+    np.testing.assert_allclose(track.ay_m_s2[good], 10 * r[good], atol=1e-5)
+
+
+def test_without_a_yaw_rate_velocities_stay_and_the_report_says_so():
+    stamps, d = drive(2.0)
+    channels = {n: channel(n, stamps, v) for n, v in {"vx_m_s": d.vx, "vy_m_s": d.vy}.items()}
+    truth = derive_truth(channels, truth_position_m=(1.0, 0.0, 0.0))
+    np.testing.assert_array_equal(truth.track.vy_m_s, d.vy)
+    assert "no yaw rate" in truth.derivation["cg"]
+    assert np.isnan(truth.track.ay_m_s2).all()

@@ -648,3 +648,36 @@ def test_a_dbc_that_matches_nothing_is_named(tmp_path: Path) -> None:
     notes = " ".join(map(str, inspect_log(path, options=ReadOptions(msgs=tmp_path / "car.dbc")).to_dict()["notes"]))
     assert "car.dbc contains none of their identifiers" in notes
     assert "--set msgs" not in notes
+
+
+def test_an_object_that_covers_others_costs_itself(tmp_path: Path) -> None:
+    marker = bytearray(blf_object(96, bytes(48), 0))
+    marker[8:12] = struct.pack("<I", 1001)
+    parts = [bytearray(container(numbered(5, first=i))) for i in range(40, 60, 5)]
+    parts[1][8:12] = struct.pack("<I", len(parts[1]) + 50)
+    objects = numbered(5) + bytes(marker) + numbered(35, first=5)
+    tables = read(blf(tmp_path / "a.blf", container(objects), *map(bytes, parts)))
+    assert set(range(60)) - set(numbers_of(tables)) <= set(range(45, 50))
+    assert {loss.kind for loss in tables.losses} == {"bad-chunk"}
+
+
+def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "a.blf", [sent(i / 100, 256, struct.pack("<I", i)) for i in range(600)], max_container_size=2000
+    )
+    data = path.read_bytes()
+    (tmp_path / "b.blf").write_bytes(data[: len(data) // 2])
+    tables = read(tmp_path / "b.blf")
+    found = numbers_of(tables)
+    assert found == list(range(len(found)))
+    assert 200 < len(found) < 400
+    assert [loss.kind for loss in tables.losses] == ["truncated"]
+
+
+def test_many_damaged_places_are_counted(tmp_path: Path) -> None:
+    bad = container(numbered(1))[:32] + b"no zlib!"
+    parts = [bad[:8] + struct.pack("<I", len(bad)) + bad[12:]] * 50
+    tables = read(blf(tmp_path / "a.blf", container(numbered(5)), *parts))
+    assert numbers_of(tables) == list(range(5))
+    assert len(tables.losses) < 30
+    assert sum(loss.count or 1 for loss in tables.losses) == 50

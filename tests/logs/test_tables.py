@@ -722,3 +722,59 @@ def test_a_search_takes_general_files_only_where_there_are_no_others(files: str,
         (tmp_path / name).write_text("x")
     found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}  # type: ignore[union-attr]
     assert found == set(logs.split())
+
+
+def test_bytes_that_are_no_utf_8_cost_no_other_character(tmp_path: Path) -> None:
+    data = _csv(SECONDS, "time,ay [m/s²],speed [km/h]").encode() + "2.00,1.0,caf\xe9\n".encode("latin-1")
+    columns, lost = _read(tmp_path / "a.csv", data)
+    assert len(columns["ay"]) == N + 1
+    assert ("bad-cell", 1) in lost
+    with closing(open_log(tmp_path / "a.csv")) as log:
+        assert {f.path: f.unit for f in log.fields("csv")}["ay"] == "m/s²"
+
+
+def test_a_title_may_have_two_lines(tmp_path: Path) -> None:
+    columns, lost = _read(
+        tmp_path / "a.csv", _csv(SECONDS, '"time","ay\n[m/s²]","speed, measured"') + '"2.0","1","2"\n'
+    )
+    assert {*columns} == {"ay", "speed_measured"}
+    assert lost == []
+
+
+def test_more_columns_than_the_limit_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    width = 70_000
+    text = "\n".join([",".join(["time", *(f"c{i}" for i in range(width))]), *(f"{i}" + "," * width for i in range(30))])
+    with pytest.raises(PdhefError, match="array width"):
+        _log(tmp_path / "a.csv", text.encode())
+
+
+def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:
+    data = vbo(["100000.00", "100000.01"], units="\n\n\n")
+    data = data.replace(b"YawRate\r", b"YawRate [deg/s]\r").replace(b"Y_Accel\r", b"Y_Accel (g)\r")
+    with closing(_log(tmp_path / "a.vbo", data)) as log:
+        units = {f.path: f.unit for f in log.fields("vbox")}
+        assert (units["YawRate"], units["Y_Accel"], units["latitude"]) == ("deg/s", "g", "min")
+        assert log.lost == ()
+
+
+def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"t": TIME_S, "ay": AY, "speed": SPEED}, do_compression=True)
+    data = bytearray((tmp_path / "a.mat").read_bytes())
+    second = 128 + 8 + int.from_bytes(data[132:136], "little")
+    data[second + 40 : second + 80] = b"\x00" * 40
+    with closing(_log(tmp_path / "b.mat", bytes(data))) as log:
+        assert [(x.kind, x.severity) for x in log.lost] == [("bad-variable", "lost")]
+        assert [f.path for f in log.fields("mat")] == ["speed"]
+    cut = (tmp_path / "a.mat").read_bytes()[:-30]
+    with closing(_log(tmp_path / "c.mat", cut)) as log:
+        assert [f.path for f in log.fields("mat")] == ["ay"]
+    assert called("inspect", tmp_path / "c.mat").returncode == 3
+
+
+def test_a_magnitude_and_its_sign_are_one_signal(tmp_path: Path) -> None:
+    signed = np.sin(TIME_S)
+    rows = [f"{t:.2f},{abs(v):.6f},{int(v < 0)},{int(v < 0)}" for t, v in zip(TIME_S, signed, strict=True)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["time,ESP_Gierrate [rad/s],ESP_VZ_Gierrate,Other_sign", *rows, ""]))
+    source = inspect_log(path).mapping.signals["yaw_rate_rad_s"]
+    assert (source.field, source.combine) == (("ESP_Gierrate", "ESP_VZ_Gierrate"), "signed")
