@@ -377,3 +377,14 @@ def test_signals_hold_no_truth():
     sensor_fields = {f.name for f in fields(Signals)}
     only_truth = set(TRUTH_UNITS) - set(ALIGNED_SIGNALS)
     assert not sensor_fields & only_truth
+
+
+@settings(derandomize=True, deadline=None, max_examples=10)
+@given(seed=st.integers(0, 2**32 - 1), log_low=st.floats(-4, -1), speed=st.floats(4.0, 50.0))
+def test_covariance_is_definite_on_any_clock(seed, log_low, speed):
+    """Steps from 0.1 ms to 0.3 s, in any order."""
+    rng = np.random.default_rng(seed)
+    dt = 10 ** rng.uniform(log_low, math.log10(0.3), 120)
+    made = drive(slalom(min(0.3, 8.0 / speed**2), 0.5), speed=speed, step_s=dt)
+    signals = with_noise(made.signals, seed % 1000)
+    check_sane(run("phy-ukf", signals), "phy-ukf", signals)

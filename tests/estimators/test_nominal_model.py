@@ -119,3 +119,23 @@ def test_tyre_known_by_its_stiffness(mu, front):
     assert STIFFNESS_CAR.cornering_stiffness_n_per_rad(front, mu) == pytest.approx(stiffness, rel=1e-12)
     gradient = MASS_KG / WHEELBASE_M * (REAR_M / STIFFNESS[0] - FRONT_M / STIFFNESS[1])
     assert STIFFNESS_CAR.understeer_gradient_rad_per_m_s2(mu) == pytest.approx(gradient, rel=1e-12)
+
+
+@pytest.mark.parametrize("car", [SEDAN, STIFFNESS_CAR], ids=["magic", "stiffness"])
+@pytest.mark.parametrize("vx", [5.0, 15.0, 30.0, 45.0])
+def test_steady_state_gains_are_those_of_the_linear_single_track_model(car, vx):
+    p, steer = model_parameters(car), 1e-4
+    if car is SEDAN:
+        cf, cr = 12.3 * 1.41 * 7600 * FRICTION, 15.4 * 1.17 * 6110 * FRICTION
+    else:
+        cf, cr = STIFFNESS
+    gradient = MASS_KG / WHEELBASE_M * (REAR_M / cf - FRONT_M / cr)
+    vy = r = 0.0
+    for _ in range(2000):
+        _, vy, r = nominal_model.rk4_step(vx, vy, r, steer, 0.0, FRICTION, 0.01, 2, p)
+    yaw_gain = vx / (WHEELBASE_M + gradient * vx**2)
+    assert r / steer == pytest.approx(yaw_gain, rel=1e-5)
+    # sideslip gain: (l_r - m l_f v^2 / (L C_r)) / (L + K v^2)
+    sideslip_gain = (REAR_M - MASS_KG * FRONT_M * vx**2 / (WHEELBASE_M * cr)) / (WHEELBASE_M + gradient * vx**2)
+    assert vy / vx / steer == pytest.approx(sideslip_gain, rel=1e-5, abs=1e-5)
+    assert car.understeer_gradient_rad_per_m_s2(FRICTION) == pytest.approx(gradient, rel=1e-12)

@@ -83,3 +83,33 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
         errors.append(np.sqrt(np.mean((track.vy_m_s - made.vy)[200:] ** 2)))
     assert errors[1] < 0.05 * errors[0]
     assert errors[1] < errors[2] < errors[0]
+
+
+def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None:
+    """The car drives straight under a side force of m · 1 m/s² that the nominal model does not know."""
+    count, speed, force = 1500, 25.0, 1.0
+    stamps = 10**18 + np.arange(count, dtype=np.int64) * 10_000_000
+    vy, r = 0.0, 0.0
+    cf = VEHICLE.cornering_stiffness_n_per_rad(True, 0.85)
+    cr = VEHICLE.cornering_stiffness_n_per_rad(False, 0.85)
+    lf, lr, m, iz = VEHICLE.cg_to_front_axle_m, VEHICLE.cg_to_rear_axle_m, VEHICLE.mass_kg, VEHICLE.yaw_inertia_kg_m2
+    truth, ay = np.empty((count, 2)), np.empty(count)
+    for k in range(count):
+        truth[k] = vy, r
+        ff, fr = -cf * (vy + lf * r) / speed, -cr * (vy - lr * r) / speed
+        ay[k] = (ff + fr) / m + force
+        vy, r = vy + 0.01 * (ay[k] - speed * r), r + 0.01 * (lf * ff - lr * fr) / iz
+    gain = 1.0 + 9.80665 * VEHICLE.roll_gradient_rad_per_m_s2
+    nan = np.full(count, np.nan)
+    signals = Signals(
+        stamps, stamps, np.zeros(count), -truth[:, 0] * truth[:, 1], gain * ay, truth[:, 1], np.full(count, speed),
+        nan, np.full((count, 4), np.nan), frozenset(ALIGNED_SIGNALS),
+    )  # fmt: skip
+    error = {}
+    for trust in (0.0, 0.5, 1.0):
+        track, _ = run_window(hybrid(network=random_network(constant=(force, 0.0)), trust=trust), signals)
+        error[trust] = float(np.abs(track.vy_m_s - truth[:, 0])[500:].mean())
+        if trust == 1.0:
+            assert track.ay_m_s2[500:] == pytest.approx(ay[500:], abs=0.003)
+    assert error[1.0] < 0.05 * error[0.0]
+    assert error[1.0] < error[0.5] < error[0.0]

@@ -144,3 +144,9 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimato
     track = run_window(estimator, signals)[0]
     assert not track.valid[back & silent].any()
     assert track.valid[~back & (good.time_s > 0.5)].all()
+
+
+@pytest.mark.parametrize("slope", [-2.0, 2.0])
+def test_a_steep_hill_is_no_slip(good, slope):
+    hill = replace(good.signals, ax_m_s2=good.signals.ax_m_s2 + slope)
+    assert believable(hill, SENSORS, None, None)[0] is hill

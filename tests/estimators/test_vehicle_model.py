@@ -201,3 +201,14 @@ def test_the_accelerometer_reads_what_the_equations_say(names, speed):
     x, v = state_of(oracle, steer, 0.0, FRICTION, vx=speed), oracle.as_vehicle()
     bias = ENTRIES["b_ay"] if "biases" in names else 0.0
     assert ay_of(v, x, steer) + bias == pytest.approx(oracle.sensed_ay(x, steer), rel=1e-12)
+
+
+def test_a_vanishing_lag_is_no_lag():
+    """From one limit to the other without a jump, and stable where the lag is far below the step."""
+    ends = []
+    for v in (vehicle(), *(vehicle("lag", relaxation_length_m=s) for s in (1e-3, 1e-9))):
+        x = np.array([25.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        for k in range(100):
+            x = moved(v, x, HeldInputs(0.03 * math.sin(0.06 * k), 0.0, True, FRICTION), 0.01)
+        ends.append(x)
+    np.testing.assert_allclose(ends[1:], [ends[0]] * 2, rtol=2e-3, atol=2e-3)

@@ -341,3 +341,32 @@ def test_a_hopelessly_wrong_model_is_flagged(column):
     signals = with_noise(made.signals, 6)
     track, _ = run_window(UKF, replace(signals, **{column: -getattr(signals, column)}), None)
     assert track.diverged[300:].mean() > 0.6
+
+
+def test_standstill_determines_the_biases_of_the_sensors():
+    made = stop_and_go()
+    signals = still_noise(made.signals, (made.time_s >= 5.0) & (made.time_s <= 9.0))
+    signals = replace(signals, ax_m_s2=signals.ax_m_s2 + 0.5)  # 3 degrees of grade
+    assert posteriors(signals).x[850, 3] == pytest.approx(0.5, abs=0.15)
+    with_biases = VehicleUkf(vehicle("biases", "roll", "lag"))
+    signals = replace(signals, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.004)
+    steps, layout = posteriors(signals, with_biases), with_biases.layout
+    assert steps.x[880, layout.sensor_bias + 1] == pytest.approx(0.004, abs=0.0012)
+    contained = [0, 1, 2, 4, 5, layout.roll, layout.roll + 1]
+    assert (steps.x[550:900, contained] == 0.0).all()
+
+
+def test_with_axle_forces_a_lost_steering_angle_is_a_state(good):
+    """The rear axle, a_y and yaw rate determine v_y; without them too, the filter waits for its steering."""
+    lost = (good.time_s > 3.0) & (good.time_s < 6.0)
+    signals = edited(good.signals, "steer_rad", lost, np.nan)
+    steps, bias = posteriors(signals, PHYSICS), PHYSICS.layout.steer_bias
+    unknown, known = (good.time_s > 3.215) & (good.time_s < 6.0), (good.time_s < 3.195) | (good.time_s >= 6.0)
+    assert steps.valid.all()
+    assert (steps.P[unknown, bias, bias] > 0.0).all() and (steps.P[known, bias, bias] == 0.0).all()
+    error = np.arctan2(steps.x[:, 1], steps.x[:, 0]) - good.sideslip
+    assert np.abs(error[unknown]).max() < 0.5 * DEGREE
+    for column in ("ay_m_s2", "yaw_rate_rad_s"):
+        signals = edited(signals, column, lost, np.nan)
+    blind = posteriors(signals, PHYSICS).valid
+    assert not blind[(good.time_s > 4.5) & (good.time_s < 6.0)].any() and blind[good.time_s > 6.05].all()

@@ -211,3 +211,18 @@ def test_named_truth_replaces_the_recognised_one(annotated: Path, config: RunCon
     difference = (a - b)[np.isfinite(a - b)]
     # The latency of ground truth without a yaw rate cannot be measured, so that the two are compared stamp by stamp.
     assert _value(report, "vy_m_s", "rmse") == pytest.approx(math.sqrt(float(np.mean(difference**2))), rel=1e-6)
+
+
+def test_key_figures_of_manoeuvres_are_those_of_the_run(sample_logs_dir: Path, tmp_path: Path) -> None:
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", estimators=("zero",))
+    run_logs([str(sample_logs_dir / "step.mcap")], tmp_path, config)
+
+    def steps(metrics: list[dict[str, Any]]) -> dict[Key, float]:
+        chosen = [m for m in metrics if m["metric"].startswith("step_")]
+        return {(m["estimator"], m["signal"], m["metric"]): m["value"] for m in chosen}
+
+    of_run = steps(pl.read_parquet(tmp_path / "logs/step/metrics.parquet").to_dicts())
+    (log,) = score_log(str(tmp_path / "logs/step/annotated.mcap"), config, estimates=["/pdhef/zero/state"]).results
+    assert log.report is not None
+    assert steps(log.report["metrics"]) == pytest.approx(of_run, rel=1e-5)
+    assert {estimator for estimator, *_ in of_run} == {"zero", "truth"}

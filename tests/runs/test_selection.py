@@ -118,3 +118,8 @@ def test_the_truth_of_a_log_never_chooses(
     assert answers[0] == answers[1]
     a, b = ((tmp_path / n / "logs/dlc/metrics.parquet").read_bytes() for n in ("right", "shuffled"))
     assert a != b
+
+
+@pytest.mark.parametrize("lacks", [{"ay_m_s2"}, {"yaw_rate_rad_s"}, {"ay_m_s2", "yaw_rate_rad_s"}])
+def test_physics_runs_without_a_measurement(lacks: set[str]) -> None:
+    assert {"physics", "pd-hef"} <= set(default_names(Car.load("saloon"), EVERY - lacks))
