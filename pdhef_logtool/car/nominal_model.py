@@ -51,14 +51,23 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
 
     With ``roll_correction``, the measured a_y is (1 + g·K_φ) times the planar a_y (docs/method.md#model).
     """
-    front, rear = vehicle.tyres.front, vehicle.tyres.rear
+    bf, cf, df, ef = vehicle.magic_formula(True, 1.0)
+    br, cr, dr, er = vehicle.magic_formula(False, 1.0)
     return ModelParameters(
-        vehicle.mass_kg,
-        vehicle.yaw_inertia_kg_m2,
-        vehicle.cg_to_front_axle_m,
-        vehicle.cg_to_rear_axle_m,
-        *(*vehicle.magic_formula(True, 1.0), front.keeps_stiffness),
-        *(*vehicle.magic_formula(False, 1.0), rear.keeps_stiffness),
+        mass_kg=vehicle.mass_kg,
+        yaw_inertia_kg_m2=vehicle.yaw_inertia_kg_m2,
+        front_m=vehicle.cg_to_front_axle_m,
+        rear_m=vehicle.cg_to_rear_axle_m,
+        front_B=bf,
+        front_C=cf,
+        front_D_n=df,
+        front_E=ef,
+        front_fixed_stiffness=vehicle.tyres.front.keeps_stiffness,
+        rear_B=br,
+        rear_C=cr,
+        rear_D_n=dr,
+        rear_E=er,
+        rear_fixed_stiffness=vehicle.tyres.rear.keeps_stiffness,
         blend_low_m_s=BLEND_START_SHARE * vehicle.low_speed_blend_m_s,
         blend_high_m_s=vehicle.low_speed_blend_m_s,
         imu_x_m=vehicle.imu_position_m[0],

@@ -39,6 +39,7 @@ _WORDS = {name: frozenset(words.split()) for name, words in VOCABULARY["words"].
 COUNTING = _WORDS["counting"]
 #: Words by which names that are written as one word are cut.
 _KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
+_WHOLE, _BARE = _KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS
 _CORNERS: dict[str, str] = VOCABULARY["corners"]
 _GERMAN: dict[str, str] = VOCABULARY["german_corners"]
 #: Names of the wheels in the order of WHEELS, and a name of a wheel in the name of a field.
@@ -55,7 +56,7 @@ def words_of(name: str) -> tuple[str, ...]:
     name = _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name.translate(LATIN))
     name = _CORNER_AT_END.sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
-        for piece in [part] if part.lower() in _KNOWN | _WORDS["whole"] else _CAMEL.findall(part):
+        for piece in [part] if part.lower() in _WHOLE else _CAMEL.findall(part):
             words += [english for word in _unglued(piece.lower()) for english in _SYNONYMS.get(word, word).split()]
     return tuple(words)
 
@@ -212,7 +213,7 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
     scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
     scopes.append((0.9, (*inner, *leaf_words), path))
     # The topic's name describes its fields only if the leaf identifies no quantity.
-    if all(w in _WORDS["bare"] | _UNIT_WORDS or not w.isalpha() for w in leaf_words):
+    if all(w in _BARE or not w.isalpha() for w in leaf_words):
         scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
         quantity = _quantity(words, leaf_words, column, strength, named)
@@ -285,6 +286,7 @@ _QUANTITIES: tuple[tuple[_Rule, tuple[str, ...]], ...] = tuple(
     (_rule(text), tuple(quantity)) for text, quantity in VOCABULARY["quantities"].items()
 )
 _PLACE_WORDS = frozenset({"gps", "gnss", "ins", "pos", "position", "abs"})
+_PLACE_OR_UNIT = _PLACE_WORDS | _UNIT_WORDS
 
 
 def _quantity(
@@ -307,7 +309,7 @@ def _quantity(
         "@v_axis": leaf_words[0] == "v" and leaf_words[1:2] != () and leaf_words[1] in _AXES,
         "@bare_v": "v" in leaf <= _WORDS["of_v"],
         **{f"@unit_{kind.replace(' ', '_')}": bool(unit_of(named, kind)[0]) for kind in UNITS},
-        **{f"@place_{w}": leaf - {w} <= _PLACE_WORDS | _UNIT_WORDS for w in leaf - _PLACE_WORDS},
+        **{f"@place_{w}": leaf - {w} <= _PLACE_OR_UNIT for w in leaf - _PLACE_WORDS},
     }
     tokens |= {flag for flag, is_set in flags.items() if is_set}
     for trait, rule in _TRAITS:

@@ -286,7 +286,7 @@ def stranger_rows() -> Iterator[GateRow]:
 def fuzz(part: str, options: tuple[str, ...], tool: Tool) -> Figures:
     """Count how commands end on mutated files."""
     work = tool.work / "-".join(("fuzz", part, *(o.strip("-") for o in options)))
-    done = tool.python("studies.torture", "--work", work, "--only", part, "--jobs", "1", *options,
+    done = tool.python("studies.torture", part, "--work", work, "--jobs", "1", *options,
                        "--out", work / "none.md")  # fmt: skip
     file = work / f"{part}.json"
     if not file.is_file():

@@ -160,10 +160,9 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=500, help="mutants of each table and CAN format")
     parser.add_argument("--format", action="append", choices=FORMATS, help="a table or CAN format; may be given again")
     parser.add_argument("parts", nargs="*", help="parts; all without one")
-    parser.add_argument("--only", action="append", default=[], help="a part, as `make gates` asks for it")
     parser.add_argument("--out", type=Path, default=DOCS / "reliability.md")
     given = parser.parse_args()
-    parts = [*given.parts, *given.only]
+    parts: list[str] = given.parts
     work: Path = given.work
     work.mkdir(parents=True, exist_ok=True)
     todo: dict[str, Callable[[], Any]] = {
