@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from pdhef_logtool.car.parts import LIMIT_GAIN, FilterNoise
@@ -52,6 +53,7 @@ class Posterior:
     from_earlier : whether earlier drives determine the prior.
     reached_friction : friction of ``vehicle`` if the fit is rejected because the car slides; None otherwise.
     seconds : used driving. level_m_s2 : its lateral acceleration; 0 if unknown.
+    r_std : larger measurement noise that the drive shows, by measurement.
     """
 
     vehicle: VehicleParameters
@@ -63,6 +65,7 @@ class Posterior:
     reached_friction: float | None = None
     seconds: float = 0.0
     level_m_s2: float = 0.0
+    r_std: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def causal(self) -> bool:
@@ -73,7 +76,7 @@ class Posterior:
     def noise(self) -> FilterNoise:
         """Noise of ``physics`` on ``vehicle``."""
         ay_std = max(AY_STD, self.vehicle.sensors.ay_std_m_s2)
-        return FilterNoise(q_std=Q_STD, r_std={"ay_m_s2": ay_std}, limit_gain=LIMIT_GAIN)
+        return FilterNoise(q_std=Q_STD, r_std={"ay_m_s2": ay_std, **self.r_std}, limit_gain=LIMIT_GAIN)
 
     @property
     def text(self) -> str:
@@ -86,7 +89,9 @@ class Posterior:
         excited, idle = ([p for p in self.parameters if p.excited is is_excited] for is_excited in (True, False))
         shown = ", ".join(p.text for p in excited) or "no parameter is excited"
         rest = f"; not excited: {', '.join(p.name for p in idle)}" if idle and excited else ""
-        return f"calibrated without ground truth on {self.seconds:.0f} s: {shown}{rest}"
+        noise = ", ".join(f"{name} {value:.2g}" for name, value in self.r_std.items())
+        noisy = f"; noise of the measurements as in the log: {noise}" if noise else ""
+        return f"calibrated without ground truth on {self.seconds:.0f} s: {shown}{rest}{noisy}"
 
     @property
     def note(self) -> str:

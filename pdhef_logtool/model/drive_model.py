@@ -54,7 +54,10 @@ class DriveModel:
         ``auto`` fits the car to the drive. With a model file the car has the parameters of earlier drives, with ``off``
         the prior means about its vehicle file; both are independent of this drive.
         """
-        from pdhef_logtool.model.fit import fit_car  # compiled code is imported on demand
+        # Compiled code is imported on demand.
+        from pdhef_logtool.estimators.vehicle_ukf import of_car
+        from pdhef_logtool.model.fit import fit_car
+        from pdhef_logtool.model.measured_noise import measured_noise
 
         car, earlier = drive.car, drive.car.taught_prior
         # A validated car is not calibrated; the paper's suite has no speed for it.
@@ -62,7 +65,13 @@ class DriveModel:
             return cls.of(drive)
         if drive.options.model != AUTO or lacking(drive):
             return cls.of(drive, prior_posterior(car.vehicle, earlier))
-        return cls.of(drive, fit_car(read_driving(drive), car.vehicle, earlier))
+        posterior = fit_car(read_driving(drive), car.vehicle, earlier)
+        model = cls.of(drive, posterior)
+        if model.car.self_calibrated is None:
+            return model
+        physics = of_car(model.car.calibrated_car)
+        r_std = measured_noise(model.calibrated(drive.whole().signals), physics)
+        return cls.of(drive, replace(posterior, r_std=r_std)) if r_std else model
 
     @classmethod
     def of(cls, drive: Drive, posterior: Posterior | None = None) -> DriveModel:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, rms
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, described, rms
 from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
 from pdhef_logtool.records.signals import FloatArray
 
@@ -21,7 +21,15 @@ def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
     """Yield the modelled minus the measured yaw rate; NaN across gaps, at low speed, and without steering."""
     if drive.calibrated is None:
         return
-    signals, vehicle, delay_s = drive.calibrated
+    tracks = drive.tracks.values()
+    errors = yaw_rate_errors(drive.calibrated, (np.where(t.valid, t.vy_m_s, np.nan) for t in tracks))
+    for track, error in zip(tracks, errors, strict=True):
+        yield Columns(track.name, "yaw_rate_rad_s", {"yaw_consistency": error})
+
+
+def yaw_rate_errors(calibrated: CalibratedSignals, vys: Iterable[FloatArray]) -> Iterator[FloatArray]:
+    """Yield the modelled minus the measured yaw rate [N], rad/s, for each v_y [N], m/s, NaN where there is none."""
+    signals, vehicle, delay_s = calibrated
     t, rate = signals.stamps_ns, signals.yaw_rate_rad_s
     steer = np.interp(t - round(delay_s * 1e9), t, signals.steer_rad)
     friction = np.where(np.isfinite(signals.friction), signals.friction, vehicle.assumed_friction)
@@ -30,11 +38,11 @@ def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
     speed, axles = carried_speed(signals), _axles(vehicle)
     # 1/m²: the inverse square of the radius of gyration.
     constants = vehicle.mass_kg / vehicle.yaw_inertia_kg_m2, vehicle.low_speed_blend_m_s
-    for track in drive.tracks.values():
-        vy, modelled = np.where(track.valid, track.vy_m_s, np.nan), np.full(len(t), np.nan)
+    for vy in vys:
+        modelled = np.full(len(t), np.nan)
         inputs = dt, speed, vy, steer, friction, rate
         _yaw_rates(inputs, axles, *constants, max(vehicle.relaxation_length_m, 0.01), modelled)
-        yield Columns(track.name, "yaw_rate_rad_s", {"yaw_consistency": modelled - rate})
+        yield modelled - rate
 
 
 def _axles(vehicle: VehicleParameters) -> FloatArray:

@@ -1,0 +1,63 @@
+"""Measurement noise of ``physics`` as a drive shows it, without ground truth.
+
+The normalised squared innovations of a consistent filter have the distribution χ² (Bar-Shalom et al. 2001, chapter 5).
+If those of a drive are far larger, its sensors are noisier than assumed, or the model is wrong. The noise is then
+raised to the robust spread of the innovations, but only as far as the model still explains the measured yaw rate: if
+the model is wrong, more noise makes the estimate follow it. See docs/method.md#self-calibration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pdhef_logtool.car.parts import MEASUREMENTS
+from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, VehicleUkf
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
+from pdhef_logtool.evaluation.metrics.yaw_consistency import yaw_rate_errors
+from pdhef_logtool.records.signals import FloatArray
+
+#: Median of χ² with 3 degrees of freedom over 3; beyond this multiple of it the innovations are inconsistent.
+MEDIAN_NIS, INCONSISTENT = 0.789, 1.3
+#: A step more noise may raise the yaw consistency up to this factor of that with the assumed noise.
+EXPLAINED = 1.05
+#: Noise as a share of the innovations, whose spread includes that of the prediction; largest number of steps.
+SHARE, STEPS = 0.9, 3
+#: Longest part of a drive that is used, in its middle: five minutes at 100 Hz.
+MOST_STAMPS = 30_000
+#: Scale of a normal distribution's median absolute value.
+_OF_MEDIAN = 1.4826
+
+
+def measured_noise(calibrated: CalibratedSignals, physics: VehicleUkf) -> dict[str, float]:
+    """Return raised 1-sigmas by measurement (``r_std``); empty if the innovations are consistent."""
+    first = max(0, (len(calibrated.signals) - MOST_STAMPS) // 2)
+    calibrated = calibrated._replace(signals=calibrated.signals.rows(first, first + MOST_STAMPS))
+    assumed = r_std = physics.measurement_std
+    steps, _ = physics.run(calibrated.signals, None)
+    allowed = EXPLAINED * _yaw_consistency(calibrated, steps) if _is_inconsistent(steps) else 0.0
+    for _ in range(STEPS):
+        if not _is_inconsistent(steps):
+            break
+        seen = np.abs(steps.innovation)
+        spread = [_OF_MEDIAN * float(np.median(s)) if (s := c[np.isfinite(c)]).size else 0.0 for c in seen.T]
+        raised = np.maximum(r_std, SHARE * np.array(spread))
+        steps, _ = replace(physics, r_std=tuple(raised.tolist())).run(calibrated.signals, None)
+        if not _yaw_consistency(calibrated, steps) <= allowed:
+            break
+        r_std = raised
+    return {m: float(new) for m, new, old in zip(MEASUREMENTS, r_std, assumed, strict=True) if new > old}
+
+
+def _is_inconsistent(steps: PosteriorSteps) -> bool:
+    used = steps.nis_dof > 0.0
+    return bool(used.any()) and float(np.median(steps.nis[used] / steps.nis_dof[used])) > INCONSISTENT * MEDIAN_NIS
+
+
+def _yaw_consistency(calibrated: CalibratedSignals, steps: PosteriorSteps) -> float:
+    """Return the RMS of the modelled minus the measured yaw rate, rad/s; infinite without any."""
+    vy: FloatArray = np.where(steps.valid, steps.x[:, 1], np.nan)
+    errors = next(yaw_rate_errors(calibrated, [vy]))
+    known = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")
