@@ -127,9 +127,9 @@ def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:
     physics, signals = make_estimator(PHYSICS, car), model.apply(drive.whole.signals).calibrated
     assert isinstance(physics, AdaptivePhysics)
     steps, _ = physics.run(signals, None)
-    track, _ = compensate(physics, signals, steps)
-    features = features_of(physics, signals)
     arrived = release(signals.ready_ns, signals.stamps_ns)
+    track = compensate(physics, signals, steps, arrived, signals.stamps_ns)
+    features = features_of(physics, signals)
     error = signal_error(track, drive.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
     settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS
     error = np.where(arrived.arrived & settled, error, np.nan)

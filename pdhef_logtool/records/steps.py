@@ -63,14 +63,14 @@ def _cut(column: Any, part: slice) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Release:
-    """Newest available step at each scored stamp, [M]: ``arrived`` is False without any, and ``row`` is then 0.
-
-    ``needed`` is the first step that later stamps may need.
-    """
+    """Newest available step at each scored stamp, [M]: ``arrived`` is False without any, and ``row`` is then 0."""
 
     arrived: BoolArray
     row: IntArray
-    needed: int
+
+    def rows(self, part: slice, first_step: int) -> Release:
+        """Return the stamps of a slice, with steps counted from ``first_step``."""
+        return Release(self.arrived[part], self.row[part] - first_step)
 
 
 def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
@@ -79,8 +79,7 @@ def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
     ``ready_ns`` [K] is non-decreasing.
     """
     index = np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
-    row = np.maximum(index, 0)
-    return Release(index >= 0, row, int(row[-1]) if len(row) else 0)
+    return Release(index >= 0, np.maximum(index, 0))
 
 
 def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
@@ -122,14 +121,9 @@ class Extrapolation:
     horizon_s: FloatArray
     usable: BoolArray
 
-    def rows(self, part: slice, first_step: int) -> Extrapolation:
-        """Return the stamps of a slice, with steps counted from ``first_step``."""
-        return Extrapolation(self.step[part] - first_step, self.arrived[part], self.horizon_s[part], self.usable[part])
 
-
-def extrapolation(steps_ns: IntArray, ready_ns: IntArray, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
-    """Choose the step for each scored stamp [M] from steps [K] with stamps, availability times and validity."""
-    chosen = release(ready_ns, stamps_ns)
+def extrapolation(steps_ns: IntArray, chosen: Release, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
+    """Return the extrapolation to scored stamps [M] from the chosen ones of steps [K] with stamps and validity."""
     horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.row]) * 1e-9, np.nan)
     usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.row]
     return Extrapolation(chosen.row, chosen.arrived, horizon_s, usable)

@@ -11,7 +11,7 @@ from reference_car import drive, forces, runge_kutta, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.hybrid_paper import Constants, PaperHybridUkf
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
 from pdhef_logtool.records.readings import without_impossible
@@ -149,7 +149,7 @@ def numpy_reference(signals: Signals, bundle: ModelBundle, constants: Constants)
 def test_it_is_the_papers_equations_in_plain_numpy(weaving, constants):
     bundle = make_bundle()
     want = numpy_reference(weaving, bundle, constants)
-    track, _ = run_window(PaperHybridUkf(VEHICLE, NetworkService(bundle), constants=constants), weaving)
+    track = run_estimator(PaperHybridUkf(VEHICLE, NetworkService(bundle), constants=constants), weaving)
     got = {
         "vx": track.vx_m_s, "vy": track.vy_m_s, "r": track.yaw_rate_rad_s, "beta": track.network_trust,
         "r_scale": track.r_scale, "ay": track.ay_m_s2, "vy_var": track.vy_std_m_s**2,

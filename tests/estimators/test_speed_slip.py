@@ -11,7 +11,7 @@ from reference_car import drive, rolling_drive, slalom, with_noise
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import stepwise, vehicle_ukf
 from pdhef_logtool.estimators.kinematic import Kinematic
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.open_loop import OpenLoop
 from pdhef_logtool.estimators.speed_slip import TIMEOUT_S, believable
 from pdhef_logtool.estimators.vehicle_ukf import U_SPEED, VehicleUkf, nominal_filter
@@ -70,10 +70,10 @@ def test_spinning_wheels_are_not_believed(good, size):
 @pytest.mark.slow
 def test_all_estimators_heed_it(good, estimator, monkeypatch):
     slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s))
-    gated, undisturbed = (run_window(estimator, s)[0] for s in (slipping, good.signals))
+    gated, undisturbed = (run_estimator(estimator, s) for s in (slipping, good.signals))
     for module in (stepwise, vehicle_ukf):
         monkeypatch.setattr(module, "believable", lambda signals, _sensors, memory, _before_ns, **_: (signals, memory))
-    plain, same = (run_window(estimator, s)[0] for s in (slipping, good.signals))
+    plain, same = (run_estimator(estimator, s) for s in (slipping, good.signals))
 
     def worst(track):
         return np.nanmax(np.abs(track.vx_m_s - good.vx)[good.time_s > 0.5])
@@ -96,7 +96,7 @@ def test_locked_wheels_are_not_believed_however_long_it_takes():
     assert np.isnan(out[sliding & np.isfinite(locked.speed_m_s)]).all()
     stands = made.time_s > 14.0
     np.testing.assert_array_equal(out[stands], locked.speed_m_s[stands])
-    track = run_window(FILTERS[0], locked)[0]
+    track = run_estimator(FILTERS[0], locked)
     assert np.abs(track.vx_m_s - made.vx)[sliding].max() < 1.0
     assert np.abs(track.vx_m_s[-100:]).max() < 0.02
 
@@ -141,7 +141,7 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimato
     back = steps.x[:, 0] < 0.0
     assert back[-500:].all()
     assert (steps.inputs[back & silent, U_SPEED] > 0.5).all()
-    track = run_window(estimator, signals)[0]
+    track = run_estimator(estimator, signals)
     assert not track.valid[back & silent].any()
     assert track.valid[~back & (good.time_s > 0.5)].all()
 
