@@ -34,7 +34,7 @@ from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, c
 from pdhef_logtool.estimators.vehicle_model import VX
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, VehicleUkf, of_car, sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
 from pdhef_logtool.residual_model.interface import ResidualModel
 
@@ -216,17 +216,16 @@ class AdaptivePhysics:
     def run(self, signals: Signals, state: AdaptiveState | None) -> tuple[MixtureSteps, AdaptiveState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         checked, inputs = self.inputs(signals, state.inputs if state else None)
-        faults, rate, filters = checked.faults, self.trust * checked.rate, self.filters
+        rate, filters = self.trust * checked.rate, self.filters
         before: Sequence[FilterState | None] = state.filters if state else [None] * len(filters)
         members = zip(filters, before, self.residual_shares, strict=True)
-        runs = [f.run(signals, b, share * rate, faults.extra_r) for f, b, share in members]
+        runs = [f.run(signals, b, share * rate, checked.extra_r) for f, b, share in members]
         steps = tuple(filter_steps for filter_steps, _ in runs)
-        dt_s = step_durations_s(signals.stamps_ns, state.filters[0].last_stamp_ns if state else None)
         evidence = state.evidence.copy() if state else np.zeros(len(filters))
-        weights = weights_of(steps, dt_s, evidence)
-        raised = r_scale(faults.extra_r, self.physics.measurement_std)
+        weights = weights_of(steps, signals.steps_s, evidence)
+        raised = r_scale(checked.extra_r, self.physics.measurement_std)
         after = AdaptiveState(inputs, tuple(state for _, state in runs), evidence)
-        return MixtureSteps(steps, weights, raised, faults.reason, self.trust * checked.residual.gain), after
+        return MixtureSteps(steps, weights, raised, checked.reason, self.trust * checked.gain), after
 
     def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate each filter's steps and mix them (see :class:`~.base.ModelPredictor`)."""

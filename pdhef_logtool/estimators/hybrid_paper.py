@@ -32,7 +32,7 @@ from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.unscented import update
 from pdhef_logtool.estimators.vehicle_model import NOMINAL, PLACES, READINGS, VX, WIDTH, Z_AY
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import Extrapolation, last_stamp_ns
+from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
@@ -253,18 +253,17 @@ class PaperHybridUkf:
 
         Return its steps, and the states for the next window.
         """
-        before_ns = state.last_stamp_ns if state else None
-        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, before_ns)
+        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None)
         count, n, nominal = len(signals), NOMINAL.size, self.parallel
         belief, remembered = ukf.resume(state, n), np.zeros(1, ADAPTED) if adapted is None else adapted.copy()
         parallel = physics.written, nominal.expected_ay(physics.prior, physics.inputs)
         steps, columns = ukf.no_posterior(signals.stamps_ns, n, rate), (np.empty(count), np.empty(count))
         steps = replace(steps, inputs=physics.inputs)
-        window, r0 = ukf.make_window(signals, state, rate), self.measurement_variance
+        window, r0 = ukf.make_window(signals, rate), self.measurement_variance
         tuning, kept = nominal.tuning._replace(q_std=np.array(self.q_std)), (belief, remembered)
         _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, kept, steps.written, columns)
-        after = ukf.FilterState(belief, last_stamp_ns(signals.stamps_ns, before_ns), slip)
-        return PaperSteps(steps.stamps_ns, *[*steps.written, rate, *columns]), after, remembered
+        paper_steps = PaperSteps(steps.stamps_ns, *[*steps.written, rate, *columns])
+        return paper_steps, ukf.FilterState(belief, slip), remembered
 
 
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:

@@ -10,22 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pdhef_logtool.estimators import vehicle_ukf as ukf
 from pdhef_logtool.estimators.vehicle_model import AX_BIAS, FRONT, REAR, VX
-from pdhef_logtool.estimators.vehicle_ukf import (
-    U_FRICTION,
-    U_SPEED,
-    U_STEER,
-    U_STEER_KNOWN,
-    FilterState,
-    PosteriorSteps,
-    VehicleUkf,
-    nominal_filter,
-    of_car,
-    rolls_forward,
-)
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.steps import step_durations_s
 from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL
 from pdhef_logtool.residual_model.features import make_features
 
@@ -36,21 +24,23 @@ if TYPE_CHECKING:
 _BODY = 4
 
 
-def filter_of(car: Car, model: str, *, use_speed: bool = True) -> VehicleUkf:
+def filter_of(car: Car, model: str, *, use_speed: bool = True) -> ukf.VehicleUkf:
     """Return the parallel filter for networks of a model, one of :data:`~.bundle.MODELS`."""
     return (
-        of_car(car, use_speed=use_speed) if model == PHYSICS_MODEL else nominal_filter(car.vehicle, use_speed=use_speed)
+        ukf.of_car(car, use_speed=use_speed)
+        if model == PHYSICS_MODEL
+        else ukf.nominal_filter(car.vehicle, use_speed=use_speed)
     )
 
 
 def run_features(
-    physics: VehicleUkf,
+    physics: ukf.VehicleUkf,
     signals: Signals,
-    state: FilterState | None,
+    state: ukf.FilterState | None,
     *,
     seen: Signals | None = None,
     extra_r: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray, PosteriorSteps, FilterState]:
+) -> tuple[FloatArray, FloatArray, ukf.PosteriorSteps, ukf.FilterState]:
     """Run the parallel filter over a window; the network sees measurements less the biases that the filter estimates.
 
     Parameters
@@ -77,12 +67,12 @@ def run_features(
         bias = steps.x[:, [layout.steer_bias, layout.sensor_bias, layout.sensor_bias + 1, AX_BIAS]]
     of_steer, of_ay, of_rate, of_ax = bias.T
     features = make_features(
-        steps.inputs[:, U_STEER] - of_steer, usable.ay_m_s2 - of_ay, usable.yaw_rate_rad_s - of_rate,
+        steps.inputs[:, ukf.U_STEER] - of_steer, usable.ay_m_s2 - of_ay, usable.yaw_rate_rad_s - of_rate,
         steps.x, steps.prior, physics.expected_ay(steps.x, steps.inputs) - of_ay,
-        steps.inputs[:, U_FRICTION], usable.ax_m_s2 - of_ax, body,
+        steps.inputs[:, ukf.U_FRICTION], usable.ax_m_s2 - of_ax, body,
     )  # fmt: skip
-    steers = steps.inputs[:, U_STEER_KNOWN] > 0.0
-    features[~(steps.valid & steers & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
-    dt_s = step_durations_s(signals.stamps_ns, state.last_stamp_ns if state else None)
+    steers = steps.inputs[:, ukf.U_STEER_KNOWN] > 0.0
+    features[~(steps.valid & steers & ukf.rolls_forward(steps.x[:, VX], steps.inputs[:, ukf.U_SPEED]))] = np.nan
+    dt_s = signals.steps_s
     dt_s[~np.isfinite(steps.prior[:, VX])] = np.nan
     return features, dt_s, steps, after

@@ -22,17 +22,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import pairwise
 
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import FORGET_S, AdaptivePhysics, gather_evidence, mix, weigh
-from pdhef_logtool.estimators.checked_inputs import r_scale
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, r_scale
 from pdhef_logtool.estimators.rts import smooth_covariances, smooth_states
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, StepLinks, VehicleUkf
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 #: Minimum look-ahead of a step; the maximum is twice as much. Sensor biases have time constants of minutes: compared
@@ -103,11 +104,11 @@ class SmoothedPhysics:
 
     def smooth(self, signals: Signals) -> StateTrack:
         """Return the track of a drive (see :class:`~.base.Smoother`)."""
-        rate, gain, extra_r, reason = self._inputs(signals)
-        tracks, weights = self._filtered(signals, rate, extra_r)
+        checked, trust = self._inputs(signals), self.filtered.trust
+        tracks, weights = self._filtered(signals, trust * checked.rate, checked.extra_r)
         track = mix(weights, tracks) if len(tracks) > 1 else tracks[0]
-        raised = r_scale(extra_r, self.filtered.physics.measurement_std)
-        track = self.filtered.described(track, weights, gain, raised, reason)
+        raised = r_scale(checked.extra_r, self.filtered.physics.measurement_std)
+        track = self.filtered.described(track, weights, trust * checked.gain, raised, checked.reason)
         return replace(
             track,
             name=self.name,
@@ -116,15 +117,13 @@ class SmoothedPhysics:
             mixture_weight=track.mixture_weight if len(tracks) > 1 else np.empty(0),
         )
 
-    def _inputs(self, signals: Signals) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        """Return residual rate times gain [N, 2], gain [N], extra variance [N, 2] and reasons [N]."""
-        state, columns = None, []
+    def _inputs(self, signals: Signals) -> CheckedInputs:
+        """Return faults and residual of a drive."""
+        state, parts = None, []
         for part in blocks(signals.stamps_ns, self.block_s):
             checked, state = self.filtered.inputs(signals.rows(part.start, part.stop), state)
-            faults, trust = checked.faults, self.filtered.trust
-            columns.append((trust * checked.rate, trust * checked.residual.gain, faults.extra_r, faults.reason))
-        rate, gain, extra_r, reason = (np.concatenate(column) for column in zip(*columns, strict=True))
-        return rate, gain, extra_r, reason
+            parts.append(checked)
+        return reduce(CheckedInputs.joined, parts)
 
     def _filtered(self, signals: Signals, rate: FloatArray, extra_r: FloatArray) -> tuple[list[StateTrack], FloatArray]:
         """Return the smoothed tracks of all filters [H], and their weights [N, H]."""
@@ -134,7 +133,7 @@ class SmoothedPhysics:
         if len(drives) == 1:
             return tracks, np.ones((len(signals), 1))
         likelihood, starts = np.stack([of_one for _, of_one, _ in drives], axis=1), drives[0][2]
-        dt_s = step_durations_s(signals.stamps_ns, None)
+        dt_s = signals.steps_s
         evidence = gather_evidence(dt_s, likelihood, starts, np.zeros(len(drives)))
         _add_later(dt_s, likelihood, starts, evidence)
         return tracks, weigh(evidence, np.stack([t.valid for t in tracks], axis=1))

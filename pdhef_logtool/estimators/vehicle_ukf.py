@@ -61,13 +61,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     settle_forces,
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import (
-    RESTART_GAP_S,
-    Extrapolation,
-    StepColumns,
-    last_stamp_ns,
-    step_durations_s,
-)
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 if TYPE_CHECKING:
@@ -677,7 +671,6 @@ class FilterState:
     """Filter state between windows."""
 
     belief: Belief
-    last_stamp_ns: int | None
     slip: FloatArray
 
 
@@ -695,16 +688,11 @@ class StepLinks(StepColumns):
     cross: FloatArray
 
 
-def make_window(
-    signals: Signals,
-    state: FilterState | None,
-    residual_rate: FloatArray | None = None,
-    extra_r: FloatArray | None = None,
-) -> Window:
+def make_window(signals: Signals, residual_rate: FloatArray | None = None, extra_r: FloatArray | None = None) -> Window:
     """Return the window that a kernel reads; without ``residual_rate`` or ``extra_r`` they are 0."""
     nothing = np.zeros((len(signals), 2))
     return Window(
-        step_durations_s(signals.stamps_ns, state.last_stamp_ns if state else None),
+        signals.steps_s,
         signals.steer_rad,
         signals.ax_m_s2,
         signals.ay_m_s2,
@@ -892,14 +880,13 @@ class VehicleUkf:
         linked: bool = True,
     ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
         """Return the result of :meth:`run`, bit for bit, and the links between the steps if they are ``linked``."""
-        before_ns = state.last_stamp_ns if state else None
-        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, before_ns)
-        window, count, n = make_window(signals, state, residual_rate, extra_r), len(signals), self.layout.size
+        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None)
+        window, count, n = make_window(signals, residual_rate, extra_r), len(signals), self.layout.size
         steps, belief = no_posterior(signals.stamps_ns, n, window.residual_rate), resume(state, n)
         rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
         _filter(window, self.tuning, self.parameters, belief, steps.written, links)
-        return steps, FilterState(belief, last_stamp_ns(signals.stamps_ns, before_ns), slip), StepLinks(*links)
+        return steps, FilterState(belief, slip), StepLinks(*links)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the filter's model (see :class:`~.base.ModelPredictor`)."""

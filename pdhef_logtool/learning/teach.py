@@ -18,6 +18,7 @@ from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.checked_inputs import without_bursts
 from pdhef_logtool.estimators.latency_compensation import compensate
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.residual_response import residual_response
@@ -140,8 +141,8 @@ def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:
 
 def features_of(physics: AdaptivePhysics, signals: Signals) -> SlowFeatures:
     """Return the features of a drive's steps, as the filter in service computes them."""
-    faults = physics.inputs(signals, None)[0].faults
-    table, dt_s, *_ = run_features(physics.physics, signals, None, seen=faults.network, extra_r=faults.extra_r)
+    extra_r = np.nan_to_num(signals.extra_variance)
+    table, dt_s, *_ = run_features(physics.physics, signals, None, seen=without_bursts(signals), extra_r=extra_r)
     return slow_features(table, dt_s, None)[0]
 
 

@@ -74,7 +74,7 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
     if not len(signals):
         none = np.empty(0, dtype=np.int64)
         return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2))
-    signals, _ = believable(signals, vehicle.sensors, None, None)
+    signals, _ = believable(signals, vehicle.sensors, None)
     start_ns = int(signals.stamps_ns[0])
     cell = (signals.stamps_ns - start_ns) // round(STEP_S * 1e9)
     cells, place = np.unique(cell, return_inverse=True)

@@ -82,26 +82,12 @@ def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
     return Release(index >= 0, np.maximum(index, 0))
 
 
-def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
-    """Return the duration before each step, [K]; NaN at the first step without an earlier stamp ``before_ns``."""
-    dt = np.empty(len(stamps_ns))
-    if len(dt):
-        dt[0] = np.nan if before_ns is None else (int(stamps_ns[0]) - before_ns) * 1e-9
-        dt[1:] = np.diff(stamps_ns) * 1e-9
-    return dt
-
-
 def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
     """Extend measurements [N], which are finite at single stamps, over up to :data:`RESTART_GAP_S`."""
     finite = np.isfinite(values)
     last = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0]), -1))
     fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RESTART_GAP_S * 1e9)
     return np.where(fresh, values[np.maximum(last, 0)], np.nan)
-
-
-def last_stamp_ns(stamps_ns: IntArray, before_ns: int | None) -> int | None:
-    """Return the last stamp of a window, or ``before_ns`` for an empty window."""
-    return int(stamps_ns[-1]) if len(stamps_ns) else before_ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -240,7 +240,7 @@ def test_a_single_spike_is_as_if_the_sample_were_missing(column, estimator, good
 @pytest.mark.parametrize(("column", "offset"), [("ay_m_s2", 12.0), ("yaw_rate_rad_s", 0.5), ("speed_m_s", 8.0)])
 def test_the_gate_holds_for_a_fifth_of_a_second_and_never_longer(column, offset, good, monkeypatch):
     # The check of wheel slip would remove speeds that change as no car's do.
-    monkeypatch.setattr(vehicle_ukf, "believable", lambda signals, _sensors, memory, _before_ns: (signals, memory))
+    monkeypatch.setattr(vehicle_ukf, "believable", lambda signals, _sensors, memory: (signals, memory))
     late = good.time_s >= 4.0
     changed = replace(good.signals, **{column: getattr(good.signals, column) + np.where(late, offset, 0.0)})
     steps, undisturbed = posteriors(changed), posteriors(good.signals)

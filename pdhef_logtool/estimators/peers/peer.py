@@ -12,8 +12,8 @@ from pdhef_logtool.estimators.base import VX, VY, YAW_RATE, Steps
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import StepColumns, last_known, step_durations_s
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, step_durations_s
+from pdhef_logtool.records.steps import StepColumns, last_known
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -96,7 +96,7 @@ class Peer:
             samples, memory = state.samples.joined(samples), state.memory.copy()
         stamps_ns, first = samples.stamps_ns, len(samples.vx) - len(vx)
         if len(vx):
-            self.estimate(samples, first, step_durations_s(stamps_ns, None), memory)
+            self.estimate(samples, first, step_durations_s(stamps_ns), memory)
         self._roll(samples)
         values, rates = np.full((2, len(stamps_ns), 4), np.nan)
         values[:, VX], values[:, VY], values[:, YAW_RATE] = samples.vx, *samples.states.T
