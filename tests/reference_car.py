@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
 
 MASS_KG, YAW_INERTIA, FRONT_M, REAR_M = 1440.0, 1523.0, 1.16, 1.71
 WHEELBASE_M = FRONT_M + REAR_M
@@ -187,13 +187,9 @@ def with_noise(signals: Signals, seed: int, scale: float = 1.0) -> Signals:
 
 def cut(signals: Signals, first: int, end: int) -> Signals:
     """The window [first, end) of aligned signals."""
-    return replace(
-        signals, **{f.name: getattr(signals, f.name)[first:end] for f in fields(signals) if f.name != "available"}
-    )
+    return signals.rows(first, end)
 
 
 def keep(signals: Signals, mask: np.ndarray) -> Signals:
     """Only the stamps of ``mask``: a recorder that lost the others."""
-    return replace(
-        signals, **{f.name: getattr(signals, f.name)[mask] for f in fields(signals) if f.name != "available"}
-    )
+    return replace(signals, **{name: getattr(signals, name)[mask] for name in SIGNAL_COLUMNS})

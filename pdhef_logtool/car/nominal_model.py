@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from pdhef_logtool.car.elementary_functions import arctangent, sine
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 
@@ -20,6 +21,8 @@ BLEND_START_SHARE = 0.5
 #: Largest product of step and fastest pole of an RK4 step; longer steps are divided.
 MAX_STEP_TIMES_POLE = 1.0
 MAX_SUBSTEPS = 32
+
+_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
 class ModelParameters(NamedTuple):
@@ -44,6 +47,19 @@ class ModelParameters(NamedTuple):
     imu_x_m: float
     imu_y_m: float
     ay_roll_gain: float  # relative excess of a tilted accelerometer over the planar a_y; 0 = not corrected
+
+
+class Prepared(NamedTuple):
+    """Constants of a step by steering and friction, common to all points."""
+
+    cos: float
+    r_kin_per_vx: float
+    b_front: float
+    b_rear: float
+    peak_front: float  # over the mass, m/s²
+    peak_rear: float
+    inertia: float  # m / I_z
+    per_blend: float
 
 
 def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = False) -> ModelParameters:
@@ -77,61 +93,73 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
 
 
 @njit(cache=True)
-def magic_formula_force(alpha, B, C, D_n, E, fixed_stiffness, friction):  # type: ignore[no-untyped-def]
-    """Return the lateral axle force in N at slip angle ``alpha`` in rad (Eq 2)."""
-    b = B / friction if fixed_stiffness else B
-    ba = b * alpha
-    return friction * D_n * math.sin(C * math.atan(ba - E * (ba - math.atan(ba))))
-
-
-@njit(cache=True)
 def dynamic_share(vx, p):  # type: ignore[no-untyped-def]
     """Return the weight in [0, 1] of the dynamic model at speed ``vx``; the rest is kinematic."""
     w = (vx - p.blend_low_m_s) / (p.blend_high_m_s - p.blend_low_m_s)
     return min(1.0, max(0.0, w))
 
 
-@njit(cache=True)
-def lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[no-untyped-def]
+@_inline
+def prepare(steer, friction, p):  # type: ignore[no-untyped-def]
+    """Return the constants of the model at a steering angle and a friction."""
+    return Prepared(
+        math.cos(steer),
+        math.tan(steer) / (p.front_m + p.rear_m),
+        p.front_B / friction if p.front_fixed_stiffness else p.front_B,
+        p.rear_B / friction if p.rear_fixed_stiffness else p.rear_B,
+        friction * p.front_D_n / p.mass_kg,
+        friction * p.rear_D_n / p.mass_kg,
+        p.mass_kg / p.yaw_inertia_kg_m2,
+        1.0 / (p.blend_high_m_s - p.blend_low_m_s),
+    )
+
+
+# positional: numbers of one point in an inner loop for vectorization.
+@_inline
+def magic_formula(v, vy, r, angle, c, p):  # type: ignore[no-untyped-def]
+    """Return F_yf/m and F_yr/m of the tyres in m/s² (Eq 2-4), each along its own axle."""
+    front = c.b_front * (angle - arctangent(vy + p.front_m * r, v))
+    rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
+    front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
+    rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
+    return c.peak_front * sine(p.front_C * front), c.peak_rear * sine(p.rear_C * rear)
+
+
+@_inline
+def accelerations(vx, vy, r, steer, c, p):  # type: ignore[no-untyped-def]
     """Return (F_yf cos δ + F_yr)/m in m/s² and (l_f F_yf cos δ − l_r F_yr)/I_z in rad/s² (Eq 1-4)."""
-    v = max(vx, p.blend_low_m_s)
-    alpha_f = steer - math.atan((vy + p.front_m * r) / v)
-    alpha_r = -math.atan((vy - p.rear_m * r) / v)
-    ff = magic_formula_force(alpha_f, p.front_B, p.front_C, p.front_D_n, p.front_E, p.front_fixed_stiffness, friction)
-    fr = magic_formula_force(alpha_r, p.rear_B, p.rear_C, p.rear_D_n, p.rear_E, p.rear_fixed_stiffness, friction)
-    ffc = ff * math.cos(steer)
-    return (ffc + fr) / p.mass_kg, (p.front_m * ffc - p.rear_m * fr) / p.yaw_inertia_kg_m2
+    ff, fr = magic_formula(max(vx, p.blend_low_m_s), vy, r, steer, c, p)
+    ff *= c.cos
+    return ff + fr, c.inertia * (p.front_m * ff - p.rear_m * fr)
 
 
-@njit(cache=True)
-def state_derivative(vx, vy, r, steer, ax, friction, p):  # type: ignore[no-untyped-def]
+@_inline
+def derivative(vx, vy, r, ax, steer, c, p):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r] (Eq 1-4, blended to the kinematic model at low speed).
 
     ``ax`` is the accelerometer's longitudinal acceleration at the IMU, m/s².
     """
-    w = dynamic_share(vx, p)
-    ay = 0.0
-    rdot = 0.0
-    if w > 0.0:
-        ay, rdot = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p)
-    vy_dot = w * (ay - vx * r)
-    r_dot = w * rdot
-    if w < 1.0:
-        r_kin = vx * math.tan(steer) / (p.front_m + p.rear_m)
-        vy_dot += (1.0 - w) * (p.rear_m * r_kin - vy) / KINEMATIC_TIME_CONSTANT_S
-        r_dot += (1.0 - w) * (r_kin - r) / KINEMATIC_TIME_CONSTANT_S
+    w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * c.per_blend))
+    ay, turn = accelerations(vx, vy, r, steer, c, p)
+    r_kin = vx * c.r_kin_per_vx
+    follow = (1.0 - w) * (1.0 / KINEMATIC_TIME_CONSTANT_S)
+    vy_dot = w * (ay - vx * r) + (follow * (p.rear_m * r_kin - vy) if w < 1.0 else 0.0)
+    r_dot = w * turn + (follow * (r_kin - r) if w < 1.0 else 0.0)  # tan δ may be infinite
     # a_cg = a_imu − ω̇ × p − ω × (ω × p), x component
-    vx_dot = ax + r_dot * p.imu_y_m + r * r * p.imu_x_m + vy * r
-    return vx_dot, vy_dot, r_dot
+    return ax + r_dot * p.imu_y_m + r * r * p.imu_x_m + vy * r, vy_dot, r_dot
+
+
+@njit(cache=True)
+def state_derivative(vx, vy, r, steer, ax, friction, p):  # type: ignore[no-untyped-def]
+    """Return d/dt [v_x, v_y, r], see :func:`derivative`."""
+    return derivative(vx, vy, r, ax, steer, prepare(steer, friction, p), p)
 
 
 @njit(cache=True)
 def planar_lateral_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[no-untyped-def]
     """Return the lateral acceleration at the centre of gravity in m/s²; v_x r in the kinematic range."""
     w = dynamic_share(vx, p)
-    if w == 0.0:
-        return vx * r
-    ay, _ = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p)
+    ay, _ = accelerations(vx, vy, r, steer, prepare(steer, friction, p), p)
     return w * ay + (1.0 - w) * vx * r
 
 
@@ -151,13 +179,13 @@ def substeps(vx, dt, friction, p):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def rk4_step(vx, vy, r, steer, ax, friction, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance [v_x, v_y, r] by ``dt`` s in ``n`` RK4 steps with constant inputs."""
-    h = dt / n
+    h, c = dt / n, prepare(steer, friction, p)
+    g = 0.5 * h
     for _ in range(n):
-        a1, b1, c1 = state_derivative(vx, vy, r, steer, ax, friction, p)
-        g = 0.5 * h
-        a2, b2, c2 = state_derivative(vx + g * a1, vy + g * b1, r + g * c1, steer, ax, friction, p)
-        a3, b3, c3 = state_derivative(vx + g * a2, vy + g * b2, r + g * c2, steer, ax, friction, p)
-        a4, b4, c4 = state_derivative(vx + h * a3, vy + h * b3, r + h * c3, steer, ax, friction, p)
+        a1, b1, c1 = derivative(vx, vy, r, ax, steer, c, p)
+        a2, b2, c2 = derivative(vx + g * a1, vy + g * b1, r + g * c1, ax, steer, c, p)
+        a3, b3, c3 = derivative(vx + g * a2, vy + g * b2, r + g * c2, ax, steer, c, p)
+        a4, b4, c4 = derivative(vx + h * a3, vy + h * b3, r + h * c3, ax, steer, c, p)
         vx += h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
         vy += h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4)
         r += h / 6.0 * (c1 + 2.0 * c2 + 2.0 * c3 + c4)

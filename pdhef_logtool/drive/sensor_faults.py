@@ -28,7 +28,6 @@ from pdhef_logtool.drive.sample_noise import scan
 from pdhef_logtool.drive.sensor_changes import CELL_S, Cells, cells_of, long_runs
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import step_durations_s
 
 #: The two channels; the bits of the yaw rate are the bits of a_y, shifted left by one.
 COLUMNS = ("ay_m_s2", "yaw_rate_rad_s")
@@ -90,7 +89,7 @@ def _without_stuck(
     column: FloatArray, signals: Signals, cells: Cells, turning: FloatArray, sensors: Sensors
 ) -> IntArray:
     """Remove the stuck samples of a column [N] in place; return its stuck and missing samples as faults of a_y."""
-    steps_s, finite = step_durations_s(signals.stamps_ns, None), np.isfinite(column)
+    steps_s, finite = signals.steps_s, np.isfinite(column)
     clock = np.cumsum(np.where(steps_s <= sensors.speed_hold_s, steps_s, 0.0))
     unseen_s = clock - np.maximum.accumulate(np.where(finite, clock, 0.0))
     faults = np.where(~finite & (unseen_s >= sensors.imu_hold_s), MISSING_AY, 0)

@@ -73,22 +73,13 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
-    """Origin of the local ENU frame: ECEF position in m, latitude and longitude in rad."""
-
-    ecef_m: tuple[float, float, float]
-    lat_rad: float
-    lon_rad: float
-
-
-@dataclass(frozen=True, slots=True)
 class TruthPlan:
     """Derivation of one log's ground truth, decided once from the first ten minutes.
 
     Attributes
     ----------
     base : channel that provides the stamps of the ground truth. period_s : its median period.
-    velocity : derivation of the body velocity.
+    velocity : derivation of the body velocity. origin : of the local ENU frame, ECEF in m.
     max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
     position_m : measurement point of the ground truth from the CG, ISO 8855. roll_gradient_rad_per_m_s2 : of the car.
     """
@@ -99,7 +90,7 @@ class TruthPlan:
     period_s: float
     max_gap_s: Mapping[str, float]
     half_window: int
-    origin: Origin | None
+    origin: tuple[float, float, float] | None
     attitude: Attitude | None
     position_m: tuple[float, float, float]
     roll_gradient_rad_per_m_s2: float = 0.0
@@ -121,7 +112,6 @@ def plan_truth(
     channels: Mapping[str, Channel],
     *,
     truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    max_gap_s: float | None = None,
     roll_gradient_rad_per_m_s2: float = 0.0,
 ) -> TruthPlan | None:
     """Decide clock, derivation, local frame and the convention of the quaternion.
@@ -129,7 +119,7 @@ def plan_truth(
     Parameters
     ----------
     channels : truth channels by name, quality gate applied (samples that failed are absent).
-    truth_position_m : measurement point from the CG. max_gap_s : default three median periods.
+    truth_position_m : measurement point from the CG.
     roll_gradient_rad_per_m_s2 : of the car; separates body roll from the bank of the road.
 
     Returns
@@ -143,7 +133,7 @@ def plan_truth(
     origin = _find_origin(survey)
     source, base = _velocity_source(has, survey, origin)
     periods = {name: float(np.median(np.diff(c.stamps_ns))) * 1e-9 for name, c in survey.items()}
-    gaps = {name: GAP_PERIODS * p if max_gap_s is None else max_gap_s for name, p in periods.items()}
+    gaps = {name: GAP_PERIODS * p for name, p in periods.items()}
     half_window = max(2, round(DIFFERENTIATION_HALF_S / periods[base]))
     place, gradient = truth_position_m, roll_gradient_rad_per_m_s2
     plan = TruthPlan(base, source, has, periods[base], gaps, half_window, origin, None, place, gradient)
@@ -156,7 +146,6 @@ def derive_truth(
     truth_channels: Mapping[str, Channel],
     *,
     truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    max_gap_s: float | None = None,
     plan: TruthPlan | None = None,
 ) -> TruthTrack:
     """Derive body velocity, yaw rate, sideslip, a_y and pose at the CG from the mapped truth channels.
@@ -164,7 +153,7 @@ def derive_truth(
     Parameters
     ----------
     truth_channels : quality gate applied.
-    truth_position_m, max_gap_s : as for :func:`plan_truth`; not used with a ``plan``.
+    truth_position_m : as for :func:`plan_truth`; not used with a ``plan``.
     plan : from :func:`plan_truth` over the log's beginning; computed from these channels by default.
 
     Returns
@@ -174,7 +163,7 @@ def derive_truth(
         at the CG, or the mapped sideslip without velocities. ``yaw_rad`` is wrapped.
     """
     if plan is None:
-        plan = plan_truth(truth_channels, truth_position_m=truth_position_m, max_gap_s=max_gap_s)
+        plan = plan_truth(truth_channels, truth_position_m=truth_position_m)
     if plan is None:
         return TruthTrack(track=make_track("truth", np.empty(0, dtype=np.int64)), max_gap_s=0.0)
     source = _Source(truth_channels, plan)
@@ -280,7 +269,7 @@ def _first(has: frozenset[str], *names: str) -> str | None:
     return next((n for n in names if n in has), None)
 
 
-def _velocity_source(has: frozenset[str], survey: Mapping[str, Channel], origin: Origin | None) -> tuple[str, str]:
+def _velocity_source(has: frozenset[str], survey: Mapping[str, Channel], origin: object) -> tuple[str, str]:
     velocity = _first(has, "enu_velocity_m_s", "ecef_velocity_m_s")
     # Without a position on Earth, east and north of an ECEF velocity are unknown, and a yaw cannot be applied.
     placeless = velocity == "ecef_velocity_m_s" and origin is None
@@ -306,7 +295,8 @@ def _pairs(has: frozenset[str]) -> frozenset[str]:
     return frozenset().union(*(p for p in pairs if p <= has))
 
 
-def _find_origin(survey: Mapping[str, Channel]) -> Origin | None:
+def _find_origin(survey: Mapping[str, Channel]) -> tuple[float, float, float] | None:
+    """Return the first position on Earth, ECEF in m; None without positions."""
     if "ecef_position_m" in survey:
         ecef = survey["ecef_position_m"].values[:1]
     elif {"lat_deg", "lon_deg"} <= set(survey):
@@ -314,9 +304,8 @@ def _find_origin(survey: Mapping[str, Channel]) -> Origin | None:
         ecef = ecef_from_geodetic(survey["lat_deg"].values[:1], survey["lon_deg"].values[:1], alt)
     else:
         return None
-    lat, lon, _ = geodetic_from_ecef(ecef)[0]
-    x, y, z = ecef[0]
-    return Origin(ecef_m=(float(x), float(y), float(z)), lat_rad=float(lat), lon_rad=float(lon))
+    x, y, z = map(float, ecef[0])
+    return x, y, z
 
 
 def _find_attitude(source: _Source) -> Attitude:
@@ -392,8 +381,10 @@ class _Source:
         return "ECEF" if only_ecef else "ENU"
 
     def _from_ecef(self) -> FloatArray:
-        origin = self.plan.origin
-        return np.eye(3) if origin is None else enu_from_ecef_rotation(origin.lat_rad, origin.lon_rad)
+        if self.plan.origin is None:
+            return np.eye(3)
+        lat_rad, lon_rad, _ = map(float, geodetic_from_ecef(np.array([self.plan.origin]))[0])
+        return enu_from_ecef_rotation(lat_rad, lon_rad)
 
     def position(self) -> FloatArray:
         """Return [N, 3] in the local ENU frame; an unknown height is 0."""
@@ -407,7 +398,7 @@ class _Source:
         else:
             lat, lon = self.column("lat_deg"), self.column("lon_deg")
             ecef = ecef_from_geodetic(lat, lon, self.column("alt_m") if "alt_m" in self else np.zeros_like(lat))
-        return _turn(self._from_ecef(), ecef - np.array(self.plan.origin.ecef_m))
+        return _turn(self._from_ecef(), ecef - np.array(self.plan.origin))
 
     def reference_velocity(self) -> FloatArray:
         """Return [N, 3] in the reference frame, differentiated from the position if there is no velocity."""

@@ -15,6 +15,7 @@ from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, VehicleUkf
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import StepColumns
 from pdhef_logtool.residual_model.interface import Residual, ResidualModel, checked_residual
 
 
@@ -27,41 +28,28 @@ class InputState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorFaults:
-    """Faults of a_y and yaw rate at each step, as the drive found them.
+class CheckedInputs(StepColumns):
+    """Faults of a_y and yaw rate as the drive found them, and the residual of the steps.
 
     Attributes
     ----------
     extra_r : [N, 2], variance in excess of the usual one, m²/s⁴ and rad²/s²; 0 without a fault.
     reason : int64 [N], reported faults, bits of :mod:`pdhef_logtool.records.reasons`.
-    network : signals for the network's features, without samples of a burst.
+    rate : [N, 2], of v_y and r within the model's region of validity, m/s² and rad/s².
+    gain : [N], 1 inside this region, 0 outside.
     """
 
     extra_r: FloatArray
     reason: IntArray
-    network: Signals
-
-    @classmethod
-    def of(cls, signals: Signals) -> SensorFaults:
-        """Return the faults of the signals [N]."""
-        extra, names = np.nan_to_num(signals.extra_variance), ("ay_m_s2", "yaw_rate_rad_s")
-        seen: dict[str, Any] = {
-            n: np.where(extra[:, i] > 0.0, np.nan, getattr(signals, n)) for i, n in enumerate(names)
-        }
-        return cls(extra, np.nan_to_num(signals.faults).astype(np.int64), replace(signals, **seen))
+    rate: FloatArray
+    gain: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CheckedInputs:
-    """Faults of the sensors, and the residual of the steps."""
-
-    faults: SensorFaults
-    residual: Residual
-
-    @property
-    def rate(self) -> FloatArray:
-        """Rates of v_y and r within the model's region of validity, [N, 2], m/s² and rad/s²."""
-        return self.residual.gain[:, None] * self.residual.rate
+def without_bursts(signals: Signals) -> Signals:
+    """Return the signals for the network's features, without samples of a burst of noise."""
+    burst, names = np.nan_to_num(signals.extra_variance) > 0.0, ("ay_m_s2", "yaw_rate_rad_s")
+    seen: dict[str, Any] = {n: np.where(burst[:, i], np.nan, getattr(signals, n)) for i, n in enumerate(names)}
+    return replace(signals, **seen)
 
 
 def check_inputs(
@@ -71,20 +59,15 @@ def check_inputs(
 
     Without a model the residual is 0. Joined windows give the same bits as one call over the whole log.
     """
-    faults = SensorFaults.of(signals)
-    if model is None:
-        return CheckedInputs(faults, Residual.zero(len(signals))), InputState()
-    before = state.physics if state else None
-    features, dt_s, _, after = run_features(physics, signals, before, seen=faults.network, extra_r=faults.extra_r)
-    package = package_of(model)
-    with contained(f"residual model {type(model).__name__}", package):
-        residual, said = model.residual(features, dt_s, state.model if state else None)
-        if package:
-            residual = checked_residual(residual, len(signals))
-    return CheckedInputs(faults, residual), InputState(after, said)
-
-
-def r_scale(extra_r: FloatArray, r_std: FloatArray) -> FloatArray:
-    """Return the larger factor on R of a_y or yaw rate by the detector, [N], for a filter's 1-sigmas [≥2]."""
-    factor: FloatArray = 1.0 + (extra_r / np.square(r_std[:2])).max(axis=1, initial=0.0)
-    return factor
+    extra_r, reason = np.nan_to_num(signals.extra_variance), np.nan_to_num(signals.faults).astype(np.int64)
+    residual, after = Residual.zero(len(signals)), InputState()
+    if model is not None:
+        before, seen = state or InputState(), without_bursts(signals)
+        features, dt_s, _, of_filter = run_features(physics, signals, before.physics, seen=seen, extra_r=extra_r)
+        package = package_of(model)
+        with contained(f"residual model {type(model).__name__}", package):
+            residual, of_model = model.residual(features, dt_s, before.model)
+            if package:
+                residual = checked_residual(residual, len(signals))
+        after = InputState(of_filter, of_model)
+    return CheckedInputs(extra_r, reason, residual.gain[:, None] * residual.rate, residual.gain), after

@@ -1,6 +1,7 @@
-"""``pure-lstm``: a network that outputs v_y directly, with the inputs of the hybrid filter's network.
+"""``pure-lstm`` and ``linear-regression``: models that output v_y, with the inputs of the hybrid filter's network.
 
-The paper's Pure-LSTM with the same information as PD-HEF: sensors, outputs of the parallel physics filter, friction.
+The paper's Pure-LSTM with the same information as PD-HEF: sensors, outputs of the parallel physics filter, friction;
+and a baseline with sideslip as a linear function of the low-passed features.
 v_x is the parallel filter's, the yaw rate the gyro's. Over the latency, v_x and v_y are extrapolated to the scored
 stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 """
@@ -8,22 +9,20 @@ stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.base import VX, VY, Steps
 from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, nominal_filter
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
-from pdhef_logtool.residual_model.service import NetworkService
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
 
@@ -37,7 +36,7 @@ class DirectNetwork:
     weights: ClassVar[str] = "network"
 
     vehicle: VehicleParameters
-    network: NetworkService | LinearModel
+    network: ModelBundle | LinearModel
     use_speed: bool = True
     name: str = "pure-lstm"
     causal: bool = True
@@ -63,8 +62,21 @@ class DirectNetwork:
         return Steps(values, rates, usable), (after, carried)
 
 
+class LinearRegression(DirectNetwork):
+    """Sideslip by a linear regression on the network's features, through a low pass: v_y = v_x tan β."""
+
+    algorithm = "linear-regression"
+    weights: ClassVar[str] = "coefficients"
+
+
 def build(name: str, car: Car, options: Options) -> DirectNetwork:
     """Return ``pure-lstm`` for a car with such a network."""
     del name
     assert car.network is not None and car.network.pure_lstm is not None
-    return DirectNetwork(car.vehicle, NetworkService(car.network.pure_lstm), use_speed=options.use_speed)
+    return DirectNetwork(car.vehicle, car.network.pure_lstm, use_speed=options.use_speed)
+
+
+def build_regression(name: str, car: Car, options: Options) -> LinearRegression:
+    """Return ``linear-regression`` for a car with such a model."""
+    assert car.network is not None and car.network.linear_regression is not None
+    return LinearRegression(car.vehicle, car.network.linear_regression, use_speed=options.use_speed, name=name)

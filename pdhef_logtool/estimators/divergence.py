@@ -27,7 +27,7 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, release, step_durations_s
+from pdhef_logtool.records.steps import RESTART_GAP_S, release
 from pdhef_logtool.records.tracks import StateTrack
 
 ON_RAD, OFF_RAD = math.radians(5.0), math.radians(3.0)
@@ -67,10 +67,9 @@ def wrong_branch(track: StateTrack, signals: Signals, vehicle: VehicleParameters
     signals = without_impossible(signals)
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
     flags = np.empty(len(signals), dtype=np.bool_)
-    dt_s = step_durations_s(signals.stamps_ns, None)
     motion = (
-        dt_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
-        track.valid,
+        signals.steps_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s,
+        track.yaw_rate_rad_s, track.valid,
     )  # fmt: skip
     sensors = vehicle.sensors
     car = (
@@ -80,7 +79,7 @@ def wrong_branch(track: StateTrack, signals: Signals, vehicle: VehicleParameters
     )  # fmt: skip
     _watch(motion, car, np.zeros(MEMORY_SIZE), flags)
     released = release(signals.ready_ns, signals.stamps_ns)
-    return np.asarray(flags[released.row] & released.arrived, dtype=np.bool_)
+    return np.asarray(flags[released.step] & released.arrived, dtype=np.bool_)
 
 
 @njit(cache=True)

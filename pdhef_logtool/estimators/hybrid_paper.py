@@ -32,10 +32,10 @@ from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.unscented import update
 from pdhef_logtool.estimators.vehicle_model import NOMINAL, PLACES, READINGS, VX, WIDTH, Z_AY
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import Extrapolation, last_stamp_ns
+from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
-from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -81,7 +81,7 @@ class PaperState:
     """States of the parallel filter, the network and this filter between windows; ``adapted`` [1] is β and C."""
 
     physics: ukf.FilterState
-    network: NetworkCarry
+    network: Any
     filtered: ukf.FilterState
     adapted: np.ndarray[Any, Any]
 
@@ -192,7 +192,7 @@ class PaperHybridUkf:
     options = ("constants",)
 
     vehicle: VehicleParameters
-    network: NetworkService
+    network: ModelBundle
     q_std: tuple[float, float, float, float] = ukf.PHY_UKF_Q_STD
     use_speed: bool = True
     name: str = "pd-hef-paper"
@@ -202,7 +202,7 @@ class PaperHybridUkf:
     @property
     def notes(self) -> tuple[str, ...]:
         """State where this is not the paper's filter: its network may have other features than the paper's six."""
-        names = self.network.bundle.feature_names
+        names = self.network.feature_names
         if names == PAPER_FEATURES:
             return ()
         return (f"the network has {len(names)} features, not the paper's {len(PAPER_FEATURES)}: {', '.join(names)}",)
@@ -253,24 +253,22 @@ class PaperHybridUkf:
 
         Return its steps, and the states for the next window.
         """
-        before_ns = state.last_stamp_ns if state else None
-        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, before_ns)
+        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None)
         count, n, nominal = len(signals), NOMINAL.size, self.parallel
         belief, remembered = ukf.resume(state, n), np.zeros(1, ADAPTED) if adapted is None else adapted.copy()
         parallel = physics.written, nominal.expected_ay(physics.prior, physics.inputs)
         steps, columns = ukf.no_posterior(signals.stamps_ns, n, rate), (np.empty(count), np.empty(count))
         steps = replace(steps, inputs=physics.inputs)
-        window, r0 = ukf.make_window(signals, state, rate), self.measurement_variance
+        window, r0 = ukf.make_window(signals, rate), self.measurement_variance
         tuning, kept = nominal.tuning._replace(q_std=np.array(self.q_std)), (belief, remembered)
         _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, kept, steps.written, columns)
-        after = ukf.FilterState(belief, last_stamp_ns(signals.stamps_ns, before_ns), slip)
-        return PaperSteps(steps.stamps_ns, *[*steps.written, rate, *columns]), after, remembered
+        paper_steps = PaperSteps(steps.stamps_ns, *[*steps.written, rate, *columns])
+        return paper_steps, ukf.FilterState(belief, slip), remembered
 
 
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:
     """Return ``pd-hef-paper`` of a car: with the paper's network where there is one beside the car's."""
     del name
-    paper = None if car.network is None else car.network.paper_network
-    network = options.service(car) if paper is None else NetworkService(paper)
-    assert isinstance(network, NetworkService), "the table lets no other residual model in"
+    network = car.network if car.network is None or car.network.paper_network is None else car.network.paper_network
+    assert isinstance(network, ModelBundle), "the table lets no other residual model in"
     return PaperHybridUkf(car.vehicle, network, use_speed=options.use_speed)

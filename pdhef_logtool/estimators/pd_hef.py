@@ -7,21 +7,17 @@ The network acts on the car that it was trained for; without such a network the 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.presets import options_of
+from pdhef_logtool.estimators.presets import Options, options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 from pdhef_logtool.estimators.vehicle_ukf import of_car
 
 #: The preset that uses the taught part of a car.
 PRESET = "pd-hef"
 FILTER_ALONE = "taught residual not used: it was fitted to the error of the filter, which differs from the smoother's"
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 
 def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
@@ -44,7 +40,7 @@ def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     gain, note = _gain(name, car)
     return AdaptivePhysics(
         of_car(car, use_speed=options.use_speed),
-        options.service(car) if gain > 0.0 else None,
+        car.network.residual_model if gain > 0.0 and car.network is not None else None,
         gain,
         adaptive="fixed-r" not in options_of(name),
         name=name,

@@ -18,9 +18,8 @@ import numpy as np
 
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, weights_of
 from pdhef_logtool.estimators.vehicle_model import VX, VY
-from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, StepLinks
+from pdhef_logtool.estimators.vehicle_ukf import LinkedSteps, PosteriorSteps
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import step_durations_s
 
 #: Constant rate of the run for b, m/s²: small against the forces of a tyre.
 PROBE_M_S2 = 0.05
@@ -53,13 +52,13 @@ class ResidualResponse:
 def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray) -> ResidualResponse:
     """Return the response on a drive; ``row`` [N] is the newest step of each stamp."""
     checked, _ = physics.inputs(signals, None)
-    faults, probe = checked.faults, np.zeros((len(signals), 2))
+    probe = np.zeros((len(signals), 2))
     probe[:, 0] = PROBE_M_S2
     runs, transitions, drives = [], [], []
     for physics_filter, share in zip(physics.filters, physics.residual_shares, strict=True):
-        steps, _, links = physics_filter.linked_steps(signals, None, None, faults.extra_r)
-        moved, _ = physics_filter.run(signals, None, share * probe, faults.extra_r)
-        transition = _transition(steps, links)
+        links, _ = physics_filter.linked_steps(signals, None, None, checked.extra_r)
+        moved, _ = physics_filter.run(signals, None, share * probe, checked.extra_r)
+        steps, transition = links.posterior, _transition(links)
         change = np.nan_to_num((moved.x - steps.x) / PROBE_M_S2)
         drive = np.zeros_like(change)
         drive[1:] = change[1:] - np.einsum("kij,kj->ki", transition[1:], change[:-1])
@@ -67,13 +66,14 @@ def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray)
         runs.append(steps)
         transitions.append(transition)
         drives.append(drive)
-    weights = weights_of(runs, step_durations_s(signals.stamps_ns, None), np.zeros(len(runs)))
+    weights = weights_of(runs, signals.steps_s, np.zeros(len(runs)))
     sideslip = np.stack([w * _sideslip_per_vy(s) for w, s in zip(weights.T, runs, strict=True)])
     return ResidualResponse(transitions, drives, sideslip, row)
 
 
-def _transition(steps: PosteriorSteps, links: StepLinks) -> FloatArray:
+def _transition(links: LinkedSteps) -> FloatArray:
     """Return A [K, n, n], 0 where a step does not follow the one before it."""
+    steps = links.posterior
     out = np.zeros_like(steps.P)
     linked = np.flatnonzero(links.linked)
     linked = linked[linked > 0]

@@ -22,17 +22,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import pairwise
 
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import FORGET_S, AdaptivePhysics, gather_evidence, mix, weigh
-from pdhef_logtool.estimators.checked_inputs import r_scale
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs
 from pdhef_logtool.estimators.rts import smooth_covariances, smooth_states
-from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, StepLinks, VehicleUkf
+from pdhef_logtool.estimators.vehicle_ukf import FilterState, LinkedSteps, VehicleUkf
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 #: Minimum look-ahead of a step; the maximum is twice as much. Sensor biases have time constants of minutes: compared
@@ -42,21 +43,12 @@ BLOCK_S = 60.0
 NOT_CAUSAL = "not causal: estimates use later measurements; to be ranked apart from causal estimators"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ForwardSteps(StepColumns):
-    """Steps of a filter's forward pass: posteriors and the links between them."""
-
-    posterior: PosteriorSteps
-    links: StepLinks
-
-
-def smooth_steps(forward: ForwardSteps) -> tuple[FloatArray, FloatArray]:
+def smooth_steps(forward: LinkedSteps) -> tuple[FloatArray, FloatArray]:
     """Return the smoothed states [K, n] and covariances [K, n, n] of steps."""
-    steps, links = forward.posterior, forward.links
-    linked = links.linked[:, None]
+    steps, linked = forward.posterior, forward.linked[:, None]
     predicted_x = np.where(linked, steps.prior, steps.x)
-    predicted_P = np.where(linked[:, :, None], links.predicted_P, steps.P)
-    cross = np.where(linked[:, :, None], links.cross, 0.0)
+    predicted_P = np.where(linked[:, :, None], forward.predicted_P, steps.P)
+    cross = np.where(linked[:, :, None], forward.cross, 0.0)
     return smooth_states(steps.x, predicted_x, predicted_P, cross), smooth_covariances(steps.P, predicted_P, cross)
 
 
@@ -103,11 +95,10 @@ class SmoothedPhysics:
 
     def smooth(self, signals: Signals) -> StateTrack:
         """Return the track of a drive (see :class:`~.base.Smoother`)."""
-        rate, gain, extra_r, reason = self._inputs(signals)
-        tracks, weights = self._filtered(signals, rate, extra_r)
+        checked = self._inputs(signals)
+        tracks, weights = self._filtered(signals, self.filtered.trust * checked.rate, checked.extra_r)
         track = mix(weights, tracks) if len(tracks) > 1 else tracks[0]
-        raised = r_scale(extra_r, self.filtered.physics.measurement_std)
-        track = self.filtered.described(track, weights, gain, raised, reason)
+        track = self.filtered.described(track, weights, checked)
         return replace(
             track,
             name=self.name,
@@ -116,15 +107,13 @@ class SmoothedPhysics:
             mixture_weight=track.mixture_weight if len(tracks) > 1 else np.empty(0),
         )
 
-    def _inputs(self, signals: Signals) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-        """Return residual rate times gain [N, 2], gain [N], extra variance [N, 2] and reasons [N]."""
-        state, columns = None, []
+    def _inputs(self, signals: Signals) -> CheckedInputs:
+        """Return faults and residual of a drive."""
+        state, parts = None, []
         for part in blocks(signals.stamps_ns, self.block_s):
             checked, state = self.filtered.inputs(signals.rows(part.start, part.stop), state)
-            faults, trust = checked.faults, self.filtered.trust
-            columns.append((trust * checked.rate, trust * checked.residual.gain, faults.extra_r, faults.reason))
-        rate, gain, extra_r, reason = (np.concatenate(column) for column in zip(*columns, strict=True))
-        return rate, gain, extra_r, reason
+            parts.append(checked)
+        return reduce(CheckedInputs.joined, parts)
 
     def _filtered(self, signals: Signals, rate: FloatArray, extra_r: FloatArray) -> tuple[list[StateTrack], FloatArray]:
         """Return the smoothed tracks of all filters [H], and their weights [N, H]."""
@@ -134,7 +123,7 @@ class SmoothedPhysics:
         if len(drives) == 1:
             return tracks, np.ones((len(signals), 1))
         likelihood, starts = np.stack([of_one for _, of_one, _ in drives], axis=1), drives[0][2]
-        dt_s = step_durations_s(signals.stamps_ns, None)
+        dt_s = signals.steps_s
         evidence = gather_evidence(dt_s, likelihood, starts, np.zeros(len(drives)))
         _add_later(dt_s, likelihood, starts, evidence)
         return tracks, weigh(evidence, np.stack([t.valid for t in tracks], axis=1))
@@ -145,13 +134,12 @@ class SmoothedPhysics:
         """Filter a drive and smooth it block by block; return its track, log-likelihood and starts, [N]."""
         before: FilterState | None = None
         tracks, likelihood, starts = [], [], []
-        pending: ForwardSteps | None = None
+        pending: LinkedSteps | None = None
         for part in blocks(signals.stamps_ns, self.block_s):
             given = (signals.rows(part.start, part.stop), before, rate[part], extra_r[part])
-            steps, before, links = physics.linked_steps(*given)
-            likelihood.append(steps.log_likelihood)
-            starts.append(~np.isfinite(steps.prior[:, 0]))
-            forward = ForwardSteps(steps, links)
+            forward, before = physics.linked_steps(*given)
+            likelihood.append(forward.posterior.log_likelihood)
+            starts.append(~np.isfinite(forward.posterior.prior[:, 0]))
             if pending is not None:
                 tracks.append(smoothed_track(physics, pending, forward))
             pending = forward
@@ -160,13 +148,12 @@ class SmoothedPhysics:
         return concatenate(tracks), np.concatenate(likelihood), np.concatenate(starts)
 
 
-def smoothed_track(physics: VehicleUkf, steps: ForwardSteps, following: ForwardSteps | None) -> StateTrack:
+def smoothed_track(physics: VehicleUkf, steps: LinkedSteps, following: LinkedSteps | None) -> StateTrack:
     """Return the smoothed track of steps, with those that follow them."""
     x, P = smooth_steps(steps if following is None else steps.joined(following))
     posterior = steps.posterior
-    count = len(posterior.stamps_ns)
-    at_steps = Extrapolation(np.arange(count), np.ones(count, np.bool_), np.zeros(count), posterior.valid)
-    return physics.predict(replace(posterior, x=x[:count], P=P[:count]), at_steps, posterior.stamps_ns)
+    count, in_place = len(posterior.stamps_ns), Extrapolation.none(posterior.valid)
+    return physics.predict(replace(posterior, x=x[:count], P=P[:count]), in_place, posterior.stamps_ns)
 
 
 def blocks(stamps_ns: IntArray, block_s: float) -> Iterator[slice]:

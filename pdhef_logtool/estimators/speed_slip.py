@@ -28,7 +28,7 @@ from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, step_durations_s
+from pdhef_logtool.records.steps import RESTART_GAP_S
 
 #: Allowed difference between the change of speed and the accelerometer; no hill is steeper.
 CONTRADICTION_M_S2 = 3.0
@@ -247,7 +247,7 @@ def _gate(window, sensor, m, believed, reckoned):  # type: ignore[no-untyped-def
 
 
 def believable(
-    signals: Signals, sensors: Sensors, memory: FloatArray | None, before_ns: int | None, *, reckoned: bool = False
+    signals: Signals, sensors: Sensors, memory: FloatArray | None, *, reckoned: bool = False
 ) -> tuple[Signals, FloatArray]:
     """Return the signals without impossible readings and without the speed samples of slipping wheels, and the memory.
 
@@ -256,14 +256,13 @@ def believable(
 
     Parameters
     ----------
-    sensors : profile of the speed sensor. memory, before_ns : after the previous window; None at the start of a log.
+    sensors : profile of the speed sensor. memory : after the previous window; None at the start of a log.
     reckoned : replace missing samples by the dead-reckoned speed, for estimators that need one.
     """
     signals = without_impossible(signals)
     memory = np.zeros(_MEMORY) if memory is None else memory.copy()
     believed, with_reckoned = np.empty(len(signals)), np.empty(len(signals))
-    dt_s = step_durations_s(signals.stamps_ns, before_ns)
-    window = (dt_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
+    window = (signals.steps_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
     bound = max(LEAST_BOUND_M_S, BOUND_SIGMAS * sensors.speed_std_m_s)
     limits = (bound, sensors.speed_zero_m_s, sensors.speed_least_m_s)
     if _gate(window, limits, memory, believed, with_reckoned):

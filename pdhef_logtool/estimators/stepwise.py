@@ -13,7 +13,6 @@ from pdhef_logtool.estimators.base import VX, Steps
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,7 +20,6 @@ class StepState:
     """State of a baseline between windows, including its state vector."""
 
     state: FloatArray
-    last_stamp_ns: int | None
     slip: FloatArray | None = None
 
 
@@ -35,14 +33,12 @@ def prepared_steps(
     """
     count, slip = len(signals), None
     state = np.full(state_size, np.nan) if before is None else before.state.copy()
-    before_ns = before.last_stamp_ns if before else None
     if slip_sensors is None:
         signals = without_impossible(signals)
     else:
-        signals, slip = believable(signals, slip_sensors, before.slip if before else None, before_ns, reckoned=True)
+        signals, slip = believable(signals, slip_sensors, before.slip if before else None, reckoned=True)
     steps = Steps(np.full((count, 4), np.nan), np.zeros((count, 4)), np.zeros(count, dtype=np.bool_))
-    after = StepState(state, last_stamp_ns(signals.stamps_ns, before_ns), slip)
-    return signals, step_durations_s(signals.stamps_ns, before_ns), steps, after
+    return signals, signals.steps_s, steps, StepState(state, slip)
 
 
 def measured_speed(signals: Signals, hold_s: float, before: StepState | None) -> tuple[FloatArray, StepState]:

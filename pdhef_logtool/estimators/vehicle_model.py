@@ -35,12 +35,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.car.elementary_functions import arctangent, sine
 from pdhef_logtool.car.nominal_model import (
     KINEMATIC_TIME_CONSTANT_S,
     MAX_SUBSTEPS,
+    Prepared,
+    accelerations,
+    derivative,
     dynamic_share,
+    magic_formula,
     planar_lateral_acceleration,
+    prepare,
     substeps,
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
@@ -163,23 +167,10 @@ def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
     )
 
 
-class _Nominal(NamedTuple):
-    """Constants of a step by steering and friction, common to all points."""
-
-    cos: float
-    r_kin_per_vx: float
-    b_front: float
-    b_rear: float
-    peak_front: float  # over the mass, m/s²
-    peak_rear: float
-    inertia: float  # m / I_z
-    per_blend: float
-
-
 class _Step(NamedTuple):
     """Constants of a step of the model with axle forces, common to all points."""
 
-    nominal: _Nominal
+    nominal: Prepared
     ax: float
     front_grip: float  # factor by braking
     rear_grip: float
@@ -209,21 +200,6 @@ def grip_under_braking(ax, friction, load_per_ax):  # type: ignore[no-untyped-de
 
 
 @_inline
-def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
-    """Return the constants of the nominal model at a steering angle."""
-    return _Nominal(
-        math.cos(steer),
-        math.tan(steer) / (p.front_m + p.rear_m),
-        p.front_B / friction if p.front_fixed_stiffness else p.front_B,
-        p.rear_B / friction if p.rear_fixed_stiffness else p.rear_B,
-        friction * p.front_D_n / p.mass_kg,
-        friction * p.rear_D_n / p.mass_kg,
-        p.mass_kg / p.yaw_inertia_kg_m2,
-        1.0 / (p.blend_high_m_s - p.blend_low_m_s),
-    )
-
-
-@_inline
 def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
     """Return the constants of a step of ``h`` s at a speed of about ``vx``."""
     kept, tyre_s = 0.0, h
@@ -232,7 +208,7 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
         kept = math.exp(-x)
         tyre_s = h * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else h * (0.5 + x / 12.0)
     return _Step(
-        _prepare_nominal(steer, friction, p),
+        prepare(steer, friction, p),
         ax,
         grip_under_braking(ax, friction, f.front_load_per_ax),
         grip_under_braking(ax, friction, f.rear_load_per_ax),
@@ -241,17 +217,6 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
         f.load_sensitivity if f.front_holds_transfer else 0.0,
         f.load_sensitivity if f.rear_holds_transfer else 0.0,
     )
-
-
-# positional: numbers of one point in an inner loop for vectorization.
-@_inline
-def _magic_formula(v, vy, r, angle, c, p):  # type: ignore[no-untyped-def]
-    """Return F_yf/m and F_yr/m of the tyres in m/s² (Eq 3, 4), each along its own axle."""
-    front = c.b_front * (angle - arctangent(vy + p.front_m * r, v))
-    rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
-    front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
-    rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
-    return c.peak_front * sine(p.front_C * front), c.peak_rear * sine(p.rear_C * rear)
 
 
 @_inline
@@ -265,7 +230,7 @@ def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
 @_inline
 def _tyre_forces(v, vy, r, angle, ay, force, c, p, f):  # type: ignore[no-untyped-def]
     """Return the steady F_yf/m and F_yr/m in m/s²; the load transfer depends on ``ay``."""
-    ff, fr = _magic_formula(v, vy, r, angle, c.nominal, p)
+    ff, fr = magic_formula(v, vy, r, angle, c.nominal, p)
     ff *= c.front_grip
     fr *= c.rear_grip
     factor = _transfer_factor(ay, f.load_sensitivity, f)
@@ -361,29 +326,9 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
 
 
 @_inline
-def _nominal_accelerations(vx, vy, r, steer, c, p):  # type: ignore[no-untyped-def]
-    """Return a_y in m/s² and the yaw acceleration in rad/s² of the tyres (Eq 1-4)."""
-    ff, fr = _magic_formula(max(vx, p.blend_low_m_s), vy, r, steer, c, p)
-    ff *= c.cos
-    return ff + fr, c.inertia * (p.front_m * ff - p.rear_m * fr)
-
-
-@_inline
-def _nominal_derivative(vx, vy, r, ax, steer, c, p):  # type: ignore[no-untyped-def]
-    """Return d/dt [v_x, v_y, r] (Eq 1-4 with the blend to the kinematic model)."""
-    w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * c.per_blend))
-    ay, turn = _nominal_accelerations(vx, vy, r, steer, c, p)
-    r_kin = vx * c.r_kin_per_vx
-    follow = (1.0 - w) * (1.0 / KINEMATIC_TIME_CONSTANT_S)
-    vy_dot = w * (ay - vx * r) + (follow * (p.rear_m * r_kin - vy) if w < 1.0 else 0.0)
-    r_dot = w * turn + (follow * (r_kin - r) if w < 1.0 else 0.0)  # tan δ may be infinite
-    return ax + r_dot * p.imu_y_m + r * r * p.imu_x_m + vy * r, vy_dot, r_dot
-
-
-@_inline
 def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance states of the nominal model in ``n`` RK4 steps."""
-    c, steer = _prepare_nominal(over.steer, over.friction, p), over.steer
+    c, steer = prepare(over.steer, over.friction, p), over.steer
     h = dt / n
     g, sixth = 0.5 * h, h / 6.0
     for _ in range(n):
@@ -392,10 +337,10 @@ def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untype
             for j in range(LANES):
                 x, y, r = block[VX * WIDTH + j], block[VY * WIDTH + j], block[YAW_RATE * WIDTH + j]
                 ax = over.ax - block[AX_BIAS * WIDTH + j]
-                x1, y1, r1 = _nominal_derivative(x, y, r, ax, steer, c, p)
-                x2, y2, r2 = _nominal_derivative(x + g * x1, y + g * y1, r + g * r1, ax, steer, c, p)
-                x3, y3, r3 = _nominal_derivative(x + g * x2, y + g * y2, r + g * r2, ax, steer, c, p)
-                x4, y4, r4 = _nominal_derivative(x + h * x3, y + h * y3, r + h * r3, ax, steer, c, p)
+                x1, y1, r1 = derivative(x, y, r, ax, steer, c, p)
+                x2, y2, r2 = derivative(x + g * x1, y + g * y1, r + g * r1, ax, steer, c, p)
+                x3, y3, r3 = derivative(x + g * x2, y + g * y2, r + g * r2, ax, steer, c, p)
+                x4, y4, r4 = derivative(x + h * x3, y + h * y3, r + h * r3, ax, steer, c, p)
                 block[VX * WIDTH + j] = x + sixth * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
                 block[VY * WIDTH + j] = y + sixth * (y1 + 2.0 * y2 + 2.0 * y3 + y4)
                 block[YAW_RATE * WIDTH + j] = r + sixth * (r1 + 2.0 * r2 + 2.0 * r3 + r4)
@@ -422,7 +367,7 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
 
     ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
     """
-    nominal = _prepare_nominal(steer, friction, p)
+    nominal = prepare(steer, friction, p)
     forces = layout.forces >= 0
     tilt = p.ay_roll_gain if not forces else 0.0 if layout.roll >= 0 else GRAVITY_M_S2 * f.roll_gradient
     c, inertia = math.cos(steer), p.mass_kg / p.yaw_inertia_kg_m2
@@ -433,40 +378,10 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
             front, rear = points[FRONT * WIDTH + j] * c, points[REAR * WIDTH + j]
             ay, turn = front + rear, inertia * (p.front_m * front - p.rear_m * rear)
         else:
-            ay, turn = _nominal_accelerations(vx, vy, r, steer, nominal, p)
+            ay, turn = accelerations(vx, vy, r, steer, nominal, p)
         ay = w * (ay + max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
         ay = (1.0 + tilt) * ay + w * turn * p.imu_x_m - r * r * p.imu_y_m + GRAVITY_M_S2 * points[ROLL * WIDTH + j]
         out[j] = ay
-
-
-# positional: as advance.
-@_inline
-def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, covariance):  # type: ignore[no-untyped-def]
-    """Write the covariance [n] of the accelerometer's reading with the state; return its mean and variance.
-
-    They are those of the sigma points of :func:`read_ay` where all are in the dynamic range of a model with axle
-    forces: it is linear except for r². ``slope`` [WIDTH] is overwritten.
-    """
-    turn, curve, n = p.mass_kg / p.yaw_inertia_kg_m2 * p.imu_x_m, -p.imu_y_m, x.shape[0]
-    tilt = 1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient
-    slope[:] = 0.0
-    slope[FRONT], slope[REAR] = math.cos(steer) * (tilt + turn * p.front_m), tilt - turn * p.rear_m
-    slope[ROLL], slope[FORCE_SCALE] = GRAVITY_M_S2, tilt * rate_vy
-    rate, variance = x[YAW_RATE], P[YAW_RATE, YAW_RATE]
-    slope[YAW_RATE] = 2.0 * curve * rate
-    # The points have the fourth powers of the row of r in the root of the covariance, here its squares.
-    of_vx = P[YAW_RATE, VX] ** 2 / P[VX, VX]
-    of_vy = (P[YAW_RATE, VY] - P[VY, VX] * P[YAW_RATE, VX] / P[VX, VX]) ** 2 / (P[VY, VY] - P[VY, VX] ** 2 / P[VX, VX])
-    of_rate = variance - of_vx - of_vy
-    s = curve * curve * (variance * variance + n * (of_vx * of_vx + of_vy * of_vy + of_rate * of_rate))
-    mean = tilt * rate_vy + curve * (variance - rate * rate)
-    for a in range(n):
-        covariance[a] = 0.0
-        for i in range(n):
-            covariance[a] += slope[places[i]] * P[i, a]
-        s += covariance[a] * slope[places[a]]
-        mean += slope[places[a]] * x[a]
-    return mean, s
 
 
 @njit(cache=True)

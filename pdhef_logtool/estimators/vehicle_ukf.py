@@ -57,18 +57,11 @@ from pdhef_logtool.estimators.vehicle_model import (
     physics_parameters,
     planar_ay,
     push,
-    quadratic_ay,
     read_ay,
     settle_forces,
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import (
-    RESTART_GAP_S,
-    Extrapolation,
-    StepColumns,
-    last_stamp_ns,
-    step_durations_s,
-)
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 if TYPE_CHECKING:
@@ -365,18 +358,13 @@ def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_ha
     """Write the expected readings [3], the lower triangle of their covariance with R, and the cross covariance [3, n].
 
     ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
-    the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
+    the sigma points of a_y are sufficient.
     """
     m = changing(layout)
-    s, n = layout.force_scale, x.shape[0]
-    least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
-    if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
-        z_hat[Z_AY], S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz[Z_AY])
-    else:
-        cholesky(P, L)
-        draw(x, L, places, m, points)
-        read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
-        z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
+    cholesky(P, L)
+    draw(x, L, places, m, points)
+    read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+    z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
         z_hat[i] = x[entry]
         for a in range(x.shape[0]):
@@ -683,34 +671,29 @@ class FilterState:
     """Filter state between windows."""
 
     belief: Belief
-    last_stamp_ns: int | None
     slip: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StepLinks(StepColumns):
-    """Further inputs of a smoother, one row per step; length 0 if not requested.
+class LinkedSteps(StepColumns):
+    """Posteriors of a forward pass, and the links between them for a smoother; of length 0 if not requested.
 
     ``linked`` [K]: the state follows from that of the step before; not at a start, a failure or a standstill.
     ``predicted_P`` [K, n, n] is the covariance before the update, with the inflation by an opened gate; ``cross``
     [K, n, n] the covariance between the state of the step before (rows) and the predicted state (columns).
     """
 
+    posterior: PosteriorSteps
     linked: BoolArray
     predicted_P: FloatArray
     cross: FloatArray
 
 
-def make_window(
-    signals: Signals,
-    state: FilterState | None,
-    residual_rate: FloatArray | None = None,
-    extra_r: FloatArray | None = None,
-) -> Window:
+def make_window(signals: Signals, residual_rate: FloatArray | None = None, extra_r: FloatArray | None = None) -> Window:
     """Return the window that a kernel reads; without ``residual_rate`` or ``extra_r`` they are 0."""
     nothing = np.zeros((len(signals), 2))
     return Window(
-        step_durations_s(signals.stamps_ns, state.last_stamp_ns if state else None),
+        signals.steps_s,
         signals.steer_rad,
         signals.ax_m_s2,
         signals.ay_m_s2,
@@ -885,8 +868,8 @@ class VehicleUkf:
         ``residual_rate`` [N, 2] is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
         """
-        steps, after, _ = self.linked_steps(signals, state, residual_rate, extra_r, linked=False)
-        return steps, after
+        steps, after = self.linked_steps(signals, state, residual_rate, extra_r, linked=False)
+        return steps.posterior, after
 
     def linked_steps(
         self,
@@ -896,16 +879,15 @@ class VehicleUkf:
         extra_r: FloatArray | None = None,
         *,
         linked: bool = True,
-    ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
-        """Return the result of :meth:`run`, bit for bit, and the links between the steps if they are ``linked``."""
-        before_ns = state.last_stamp_ns if state else None
-        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, before_ns)
-        window, count, n = make_window(signals, state, residual_rate, extra_r), len(signals), self.layout.size
+    ) -> tuple[LinkedSteps, FilterState]:
+        """Return the result of :meth:`run`, bit for bit, with the links between the steps if they are ``linked``."""
+        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None)
+        window, count, n = make_window(signals, residual_rate, extra_r), len(signals), self.layout.size
         steps, belief = no_posterior(signals.stamps_ns, n, window.residual_rate), resume(state, n)
         rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
         _filter(window, self.tuning, self.parameters, belief, steps.written, links)
-        return steps, FilterState(belief, last_stamp_ns(signals.stamps_ns, before_ns), slip), StepLinks(*links)
+        return LinkedSteps(steps, *links), FilterState(belief, slip)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the filter's model (see :class:`~.base.ModelPredictor`)."""

@@ -18,7 +18,8 @@ from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.latency_compensation import compensate
+from pdhef_logtool.estimators.checked_inputs import without_bursts
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import FEATURES, make_estimator
@@ -126,22 +127,21 @@ def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:
     car = model.car
     physics, signals = make_estimator(PHYSICS, car), model.apply(drive.whole.signals).calibrated
     assert isinstance(physics, AdaptivePhysics)
-    steps, _ = physics.run(signals, None)
-    track, _ = compensate(physics, signals, steps)
-    features = features_of(physics, signals)
     arrived = release(signals.ready_ns, signals.stamps_ns)
+    track = run_estimator(physics, signals)
+    features = features_of(physics, signals)
     error = signal_error(track, drive.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
     settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS
     error = np.where(arrived.arrived & settled, error, np.nan)
-    response = residual_response(physics, signals, arrived.row)
+    response = residual_response(physics, signals, arrived.step)
     weight = weight_of(np.nan_to_num(drive.truth.sideslip_std_rad))
     return TaughtDrive(drive.drive.name, signals.stamps_ns, features, -error, response, weight)
 
 
 def features_of(physics: AdaptivePhysics, signals: Signals) -> SlowFeatures:
     """Return the features of a drive's steps, as the filter in service computes them."""
-    faults = physics.inputs(signals, None)[0].faults
-    table, dt_s, *_ = run_features(physics.physics, signals, None, seen=faults.network, extra_r=faults.extra_r)
+    extra_r = np.nan_to_num(signals.extra_variance)
+    table, dt_s, *_ = run_features(physics.physics, signals, None, seen=without_bursts(signals), extra_r=extra_r)
     return slow_features(table, dt_s, None)[0]
 
 

@@ -32,39 +32,8 @@ from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.posterior import FittedParameter, Posterior
 from pdhef_logtool.car.vehicle import STIFFNESS_TYRE_SHAPE, VehicleParameters
+from pdhef_logtool.model import equations, priors
 from pdhef_logtool.model.driving import STEP_S, Driving
-from pdhef_logtool.model.equations import (
-    AY,
-    BANK_HZ,
-    OF_AY,
-    OF_RATE,
-    SPEED,
-    YAW_RATE,
-    TrackParameters,
-    errors,
-    low_pass,
-    slow_parts,
-)
-from pdhef_logtool.model.priors import (
-    AY_BIAS,
-    AY_GAIN,
-    IMU_X,
-    INERTIA,
-    PEAK,
-    RATE_BIAS,
-    RATIO,
-    REAR_STIFFNESS,
-    RELAXATION,
-    STEER_DELAY,
-    STEER_OFFSET,
-    STEER_RATIO,
-    Prior,
-    coefficients,
-    front_stiffness,
-    parameters_of,
-    prior_of,
-    vehicle_with,
-)
 from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import FloatArray
 
@@ -89,7 +58,7 @@ ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
 REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
 #: Model error common to a whole drive, as a share of each prior's standard deviation: with it at least 95 % of the
 #: parameters of simulated cars are within 1.96 standard deviations. The lag of tyres and body affects the delay.
-SHARED_SHARE, SHARED_SHARES = 0.2, {STEER_DELAY: 0.4}
+SHARED_SHARE, SHARED_SHARES = 0.2, {priors.STEER_DELAY: 0.4}
 #: Minimum driving above the low-speed limit.
 LEAST_S = 5.0
 #: A fit is rejected if its error exceeds this share of the RMS of yaw rate or of a_y, and ``ERROR_STD``: sign or topic
@@ -141,13 +110,13 @@ def fit_car(driving: Driving, vehicle_file: VehicleParameters, earlier: Sequence
 
 def level_of(driving: Driving) -> float:
     """Return the RMS of a_y, m/s², weighted by its square, so that straight driving hardly contributes."""
-    ay2 = driving.columns[AY, driving.settled] ** 2
+    ay2 = driving.columns[equations.AY, driving.settled] ** 2
     return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
 
 
 def peak_reached(driving: Driving, vehicle_file: VehicleParameters) -> float:
     """Return the share of the file's peak force that the a_y of the driving needs."""
-    ay = driving.columns[AY, driving.settled]
+    ay = driving.columns[equations.AY, driving.settled]
     most = sum(vehicle_file.magic_formula(front, vehicle_file.assumed_friction)[2] for front in (True, False))
     return float(np.quantile(np.abs(ay), REACHED_QUANTILE)) * vehicle_file.mass_kg / most
 
@@ -159,14 +128,14 @@ class CarFit:
         self, driving: Driving, vehicle_file: VehicleParameters, earlier: Sequence[TaughtParameter] = ()
     ) -> None:
         least_peak = REACHED_SHARE * peak_reached(driving, vehicle_file)
-        self.prior: Prior = prior_of(vehicle_file, earlier, level_of(driving), least_peak=least_peak)
+        self.prior: priors.Prior = priors.prior_of(vehicle_file, earlier, level_of(driving), least_peak=least_peak)
         self.parameters = self.prior.of_cars
         self._driving, self.vehicle_file = driving, vehicle_file
-        self._filter = low_pass(CUTOFF_HZ, STEP_S)
+        self._filter = equations.low_pass(CUTOFF_HZ, STEP_S)
         self._kept = np.flatnonzero(driving.settled)[::KEPT_STEPS]
         grid = driving.columns.shape[1]
         self._columns = np.concatenate([driving.columns, np.empty((2, grid))])
-        slow_parts(self._columns, driving.stretches, low_pass(BANK_HZ, STEP_S))
+        equations.slow_parts(self._columns, driving.stretches, equations.low_pass(equations.BANK_HZ, STEP_S))
         self._out, self._differences = np.full((3, grid), np.nan), np.full((2, grid), np.nan)
         self._block = np.unique(self._kept * STEP_S // BLOCK_S, return_inverse=True)[1]
         self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
@@ -179,7 +148,7 @@ class CarFit:
         values: starting from the fit without the taught prior, the taught fit often stays in the same minimum.
         """
         self._error_std = self._least_std
-        slippery = [p.theta(p.low) if p.name == PEAK else 0.0 for p in self.parameters]
+        slippery = [p.theta(p.low) if p.name == priors.PEAK else 0.0 for p in self.parameters]
         descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
         theta = min(descents, key=lambda end: self._cost(self.errors_of(end), end))
         for _ in range(SCALES):
@@ -210,12 +179,12 @@ class CarFit:
     def rms(self, values: Mapping[str, float]) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y for parameters by name."""
         rms = self._rms(self._errors(values))
-        return float(rms[OF_RATE]), float(rms[OF_AY])
+        return float(rms[equations.OF_RATE]), float(rms[equations.OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
         """Return the model's v_y / v_x of all used samples [K]."""
         self._errors(self.values(theta))
-        return np.asarray(self._out[2, self._kept] / self._columns[SPEED, self._kept], dtype=np.float64)
+        return np.asarray(self._out[2, self._kept] / self._columns[equations.SPEED, self._kept], dtype=np.float64)
 
     def values(self, theta: FloatArray) -> dict[str, float]:
         """Return the parameters by name."""
@@ -223,7 +192,7 @@ class CarFit:
 
     def vehicle(self, theta: FloatArray) -> VehicleParameters:
         """Return the vehicle file with the parameters."""
-        return vehicle_with(self.vehicle_file, self.values(theta))
+        return priors.vehicle_with(self.vehicle_file, self.values(theta))
 
     def fitted(self, theta: FloatArray, covariance: FloatArray) -> tuple[FittedParameter, ...]:
         """Return the parameters of a posterior, with mean and standard deviation of their prior."""
@@ -236,12 +205,15 @@ class CarFit:
     def refusal(self, theta: FloatArray) -> tuple[str, bool]:
         """Return why a fit is rejected, its error is too large or the car slides, and whether it slides."""
         rms = self.rms(self.values(theta))
-        for name, column, row in (("yaw rate", YAW_RATE, OF_RATE), ("lateral acceleration", AY, OF_AY)):
+        for name, column, row in (
+            ("yaw rate", equations.YAW_RATE, equations.OF_RATE),
+            ("lateral acceleration", equations.AY, equations.OF_AY),
+        ):
             measured = self._columns[column, self._driving.settled]
             share = rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
             if share > LARGEST_SHARE and rms[row] > ERROR_STD[row]:
                 return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible", False
-        turning = self._columns[YAW_RATE, self._kept] / self._columns[SPEED, self._kept]
+        turning = self._columns[equations.YAW_RATE, self._kept] / self._columns[equations.SPEED, self._kept]
         rear_slip = self.vehicle_file.cg_to_rear_axle_m * turning - self.sideslip(theta)
         sliding = float(np.mean(np.abs(rear_slip) > SLIDING_RAD))
         if sliding > SLIDING_SHARE and sliding * self._driving.seconds > SLIDING_S:
@@ -251,13 +223,13 @@ class CarFit:
     def _errors(self, values: Mapping[str, float]) -> FloatArray:
         driving, kept = self._driving, self._kept
         track = _track_of(values, self.vehicle_file)
-        errors(self._columns, driving.stretches, STEP_S, track, self._filter, self._out, self._differences)
+        equations.errors(self._columns, driving.stretches, STEP_S, track, self._filter, self._out, self._differences)
         if not driving.has_ay:
-            self._differences[OF_AY] = 0.0
+            self._differences[equations.OF_AY] = 0.0
         rows = self._differences[:, kept]
         if driving.slopes is not None:
             weights = driving.weights[kept]
-            error = self._out[2, kept] / self._columns[SPEED, kept] - driving.slopes[kept]
+            error = self._out[2, kept] / self._columns[equations.SPEED, kept] - driving.slopes[kept]
             fast = error - running_mean(error, round(0.5 * SLOW_S / (KEPT_STEPS * STEP_S)), weights)
             rows = np.vstack([rows, np.nan_to_num(np.sqrt(weights) * fast)])
         return np.asarray(rows / self._error_std[:, None], dtype=np.float64)
@@ -323,36 +295,29 @@ class CarFit:
         return evidence, np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
 
 
-def _file_values(file: VehicleParameters) -> dict[str, float]:
-    """Return the parameters of a vehicle file by name."""
-    front, rear = coefficients(file)
-    tyres = {RATIO: front / rear, REAR_STIFFNESS: rear * file.axle_load_n(False)}
-    return {p.name: p.mean for p in parameters_of(file)} | tyres
-
-
-def _track_of(values: Mapping[str, float], file: VehicleParameters) -> TrackParameters:
+def _track_of(values: Mapping[str, float], file: VehicleParameters) -> equations.TrackParameters:
     """Return the model of parameters for signals that were read with a vehicle file."""
-    mu, mass, rear = file.assumed_friction, file.mass_kg, values[REAR_STIFFNESS]
-    front_peak, rear_peak = (values[PEAK] * file.magic_formula(front, mu)[2] / mass for front in (True, False))
-    gain = file.steering_ratio / values[STEER_RATIO]
-    return TrackParameters(
+    mu, mass, rear = file.assumed_friction, file.mass_kg, values[priors.REAR_STIFFNESS]
+    front_peak, rear_peak = (values[priors.PEAK] * file.magic_formula(front, mu)[2] / mass for front in (True, False))
+    gain = file.steering_ratio / values[priors.STEER_RATIO]
+    return equations.TrackParameters(
         front_m=file.cg_to_front_axle_m,
         rear_m=file.cg_to_rear_axle_m,
-        mass_over_inertia=mass / values[INERTIA],
-        front_stiffness=front_stiffness(file, values[RATIO], rear) / mass,
+        mass_over_inertia=mass / values[priors.INERTIA],
+        front_stiffness=priors.front_stiffness(file, values[priors.RATIO], rear) / mass,
         rear_stiffness=rear / mass,
         front_peak=front_peak,
         rear_peak=rear_peak,
         shape=STIFFNESS_TYRE_SHAPE,
         friction=mu,
-        relaxation_m=values[RELAXATION],
-        ay_gain=values[AY_GAIN],
-        imu_x_m=values[IMU_X],
-        ay_bias=values[AY_BIAS] - file.sensors.ay_bias_m_s2,
-        rate_bias=values[RATE_BIAS] - file.sensors.yaw_rate_bias_rad_s,
+        relaxation_m=values[priors.RELAXATION],
+        ay_gain=values[priors.AY_GAIN],
+        imu_x_m=values[priors.IMU_X],
+        ay_bias=values[priors.AY_BIAS] - file.sensors.ay_bias_m_s2,
+        rate_bias=values[priors.RATE_BIAS] - file.sensors.yaw_rate_bias_rad_s,
         steer_gain=gain,
-        steer_added=gain * file.steer_offset_rad - values[STEER_OFFSET],
-        steer_delay=values[STEER_DELAY] / STEP_S,
+        steer_added=gain * file.steer_offset_rad - values[priors.STEER_OFFSET],
+        steer_delay=values[priors.STEER_DELAY] / STEP_S,
     )
 
 

@@ -40,7 +40,7 @@ from pdhef_logtool.model.priors import prior_variations
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.records.signals import SIGNAL_COLUMNS, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, release, step_durations_s
+from pdhef_logtool.records.steps import RESTART_GAP_S, release
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
 #: Factor of the consistency of a whole drive, and s_car; from seven simulated cars and real drives of four cars.
@@ -117,7 +117,7 @@ class Interval:
             steps, state = physics.run(read.rows(piece.start, piece.stop).copy(), state)
             vy[piece] = np.where(steps.valid, steps.x[:, VY], np.nan)
         released = release(signals.ready_ns, signals.stamps_ns)
-        return np.where(released.arrived, vy[released.row], np.nan)
+        return np.where(released.arrived, vy[released.step], np.nan)
 
 
 @dataclass(slots=True)
@@ -234,9 +234,9 @@ def running_consistency(track: StateTrack, signals: Signals, roll_gradient_rad_p
     )
     rising = ay / (1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2) - track.vx_m_s * rate
     running = np.empty(len(track))
-    _run(step_durations_s(read.stamps_ns, None), rising, track.vy_m_s, running)
+    _run(read.steps_s, rising, track.vy_m_s, running)
     released = release(read.ready_ns, read.stamps_ns)
-    return np.where(released.arrived, running[released.row], 0.0)
+    return np.where(released.arrived, running[released.step], 0.0)
 
 
 @njit(cache=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +166,7 @@ class Signals:
     roll_rate_rad_s, pitch_rate_rad_s : float64 [N]. Missing columns are filled with NaN.
     extra_variance : float64 [N, 2], variance of a_y and yaw rate in excess of the usual one, m²/s⁴ and rad²/s².
     faults : float64 [N], bits of :mod:`pdhef_logtool.records.reasons`.
+    before_ns : int64 [1], stamp before the first one; [0] at the start of a drive.
     """
 
     stamps_ns: IntArray
@@ -188,6 +189,7 @@ class Signals:
     pitch_rate_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
     extra_variance: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     faults: FloatArray = field(default_factory=lambda: np.empty(0))
+    before_ns: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         """Fill missing columns with NaN."""
@@ -203,16 +205,35 @@ class Signals:
     def __repr__(self) -> str:
         return f"<Signals: {len(self)} stamps of {', '.join(sorted(self.available))}>"
 
+    @property
+    def steps_s(self) -> FloatArray:
+        """Duration before each stamp, [N]; NaN at the start of a drive."""
+        return step_durations_s(np.append(self.before_ns, self.stamps_ns))[len(self.before_ns) :]
+
     def rows(self, start: int, end: int) -> Signals:
         """Return the stamps [start, end)."""
-        return Signals(**{c: getattr(self, c)[start:end] for c in SIGNAL_COLUMNS}, available=self.available)
+        columns: dict[str, Any] = {c: getattr(self, c)[start:end] for c in SIGNAL_COLUMNS}
+        before_ns = self.stamps_ns[start - 1 : start] if start else self.before_ns
+        return replace(self, **columns, before_ns=before_ns)
 
     def copy(self) -> Signals:
         """Return the same signals in arrays that may be written."""
         return replace(self, **{c: getattr(self, c).copy() for c in SIGNAL_COLUMNS})
 
+    def read_only(self) -> Signals:
+        """Return the same signals in views that cannot be written."""
+        columns: dict[str, Any] = {c: getattr(self, c).view() for c in SIGNAL_COLUMNS}
+        for column in columns.values():
+            column.setflags(write=False)
+        return replace(self, **columns)
 
-SIGNAL_COLUMNS = tuple(f.name for f in fields(Signals) if f.name != "available")
+
+SIGNAL_COLUMNS = tuple(f.name for f in fields(Signals) if f.name not in ("available", "before_ns"))
+
+
+def step_durations_s(stamps_ns: IntArray) -> FloatArray:
+    """Return the duration before each step, [K]; NaN at the first one."""
+    return np.append(np.full(min(len(stamps_ns), 1), np.nan), np.diff(stamps_ns) * 1e-9)
 
 
 def has_gnss(names: Collection[str]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
@@ -21,56 +22,41 @@ class StepColumns:
 
     def joined(self, other: Self) -> Self:
         """Append the steps of the next window."""
-        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
-        return type(self)(*(_joined(a, b) for a, b in pairs))
+        return _mapped(lambda a, b: np.concatenate([a, b]), self, other)  # type: ignore[no-any-return]
 
-    def since(self, index: int) -> Self:
-        """Return the steps from ``index``."""
-        return self._cut(slice(index, None))
-
-    def until(self, index: int) -> Self:
-        """Return the steps before ``index``."""
-        return self._cut(slice(index))
-
-    def _cut(self, part: slice) -> Self:
-        return type(self)(*(_cut(getattr(self, f.name), part) for f in fields(self)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ExtendedSteps(StepColumns):
-    """Base of the steps of an estimator with further columns."""
-
-    steps: Any
+    def at(self, rows: slice | IntArray) -> Self:
+        """Return the steps of a slice or of indices."""
+        return _mapped(lambda column: column[rows], self)  # type: ignore[no-any-return]
 
     @property
-    def valid(self) -> BoolArray:
-        """Whether there is an estimate, [K]."""
-        valid: BoolArray = self.steps.valid
-        return valid
+    def arrays(self) -> list[Any]:
+        """All arrays of the record."""
+        arrays: list[Any] = []
+        _mapped(arrays.append, self)
+        return arrays
 
 
-def _joined(a: Any, b: Any) -> Any:
-    if isinstance(a, tuple):
-        return tuple(_joined(x, y) for x, y in zip(a, b, strict=True))
-    return a.joined(b) if isinstance(a, StepColumns) else np.concatenate([a, b])
-
-
-def _cut(column: Any, part: slice) -> Any:
-    if isinstance(column, tuple):
-        return tuple(_cut(x, part) for x in column)
-    return column._cut(part) if isinstance(column, StepColumns) else column[part]
+def _mapped(function: Callable[..., Any], *columns: Any) -> Any:
+    """Return a function of the arrays of a record, a tuple or an array, and of others with the same entries."""
+    first = columns[0]
+    if isinstance(first, tuple):
+        return tuple(_mapped(function, *parts) for parts in zip(*columns, strict=True))
+    if isinstance(first, StepColumns):
+        names = [f.name for f in fields(first)]
+        return type(first)(*(_mapped(function, *(getattr(c, name) for c in columns)) for name in names))
+    return function(*columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Release:
-    """Newest available step at each scored stamp, [M]: ``arrived`` is False without any, and ``row`` is then 0.
+    """Newest available step at each scored stamp, [M]: ``arrived`` is False without any, and ``step`` is then 0."""
 
-    ``needed`` is the first step that later stamps may need.
-    """
-
+    step: IntArray
     arrived: BoolArray
-    row: IntArray
-    needed: int
+
+    def rows(self, part: slice, first_step: int) -> Release:
+        """Return the stamps of a slice, with steps counted from ``first_step``."""
+        return Release(self.step[part] - first_step, self.arrived[part])
 
 
 def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
@@ -79,17 +65,7 @@ def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
     ``ready_ns`` [K] is non-decreasing.
     """
     index = np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
-    row = np.maximum(index, 0)
-    return Release(index >= 0, row, int(row[-1]) if len(row) else 0)
-
-
-def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
-    """Return the duration before each step, [K]; NaN at the first step without an earlier stamp ``before_ns``."""
-    dt = np.empty(len(stamps_ns))
-    if len(dt):
-        dt[0] = np.nan if before_ns is None else (int(stamps_ns[0]) - before_ns) * 1e-9
-        dt[1:] = np.diff(stamps_ns) * 1e-9
-    return dt
+    return Release(np.maximum(index, 0), index >= 0)
 
 
 def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
@@ -100,36 +76,28 @@ def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
     return np.where(fresh, values[np.maximum(last, 0)], np.nan)
 
 
-def last_stamp_ns(stamps_ns: IntArray, before_ns: int | None) -> int | None:
-    """Return the last stamp of a window, or ``before_ns`` for an empty window."""
-    return int(stamps_ns[-1]) if len(stamps_ns) else before_ns
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Extrapolation:
+class Extrapolation(Release):
     """Start step and duration of the extrapolation to each scored stamp, [M].
 
     Attributes
     ----------
-    step : int64, newest step with all data arrived by the stamp; 0 without one.
-    arrived : whether there is one.
     horizon_s : time from the step to the stamp; NaN without one.
     usable : whether the step is valid and at most ``MAX_PREDICTION_S`` old.
     """
 
-    step: IntArray
-    arrived: BoolArray
     horizon_s: FloatArray
     usable: BoolArray
 
-    def rows(self, part: slice, first_step: int) -> Extrapolation:
-        """Return the stamps of a slice, with steps counted from ``first_step``."""
-        return Extrapolation(self.step[part] - first_step, self.arrived[part], self.horizon_s[part], self.usable[part])
+    @classmethod
+    def none(cls, valid: BoolArray) -> Extrapolation:
+        """Return no extrapolation: the stamps are those of the steps [K]."""
+        count = len(valid)
+        return cls(np.arange(count), np.ones(count, np.bool_), np.zeros(count), valid)
 
 
-def extrapolation(steps_ns: IntArray, ready_ns: IntArray, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
-    """Choose the step for each scored stamp [M] from steps [K] with stamps, availability times and validity."""
-    chosen = release(ready_ns, stamps_ns)
-    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.row]) * 1e-9, np.nan)
-    usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.row]
-    return Extrapolation(chosen.row, chosen.arrived, horizon_s, usable)
+def extrapolation(steps_ns: IntArray, chosen: Release, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
+    """Return the extrapolation to scored stamps [M] from the chosen ones of steps [K] with stamps and validity."""
+    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.step]) * 1e-9, np.nan)
+    usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.step]
+    return Extrapolation(chosen.step, chosen.arrived, horizon_s, usable)

@@ -264,13 +264,9 @@ def _drive_at(drive: Drive, truth: TruthTrack | None, stamps_ns: IntArray) -> Wh
         stamps = recorded.signals.stamps_ns[is_finite]
         return Bracket(stamps, stamps_ns, gap_ns(stamps)).linear(values[is_finite])
 
-    signals = Signals(
-        stamps_ns=stamps_ns,
-        ready_ns=stamps_ns,
-        wheel_speed_m_s=np.full((len(stamps_ns), len(WHEELS)), np.nan),
-        available=recorded.signals.available,
-        **{name: column(name) for name in ALIGNED_SIGNALS},
-    )
+    columns: dict[str, Any] = {name: column(name) for name in ALIGNED_SIGNALS}
+    wheels = np.full((len(stamps_ns), len(WHEELS)), np.nan)
+    signals = Signals(stamps_ns, stamps_ns, wheel_speed_m_s=wheels, available=recorded.signals.available, **columns)
     latency_s, standstill_m_s = plan.truth_latency_s, plan.vehicle.standstill_m_s
     true = None if truth is None else truth_at(truth, stamps_ns, latency_s, standstill_m_s=standstill_m_s)
     return WholeDrive(drive.name, plan, drive.friction.fill(signals), true, drive.log.start_ns, recorded.changes)

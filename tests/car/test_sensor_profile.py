@@ -119,8 +119,8 @@ def test_the_lowest_speed_of_wheels_with_few_pulses_is_no_slip() -> None:
     t = seconds(rolling)
     gone = (t > 3.0) & (t < 4.0)
     silent = masked(rolling, "speed_m_s", gone, 0.0)
-    assert believable(silent, Sensors(), None, None)[0] is not silent
-    assert believable(silent, Sensors(speed_least_m_s=2.0), None, None)[0] is silent
+    assert believable(silent, Sensors(), None)[0] is not silent
+    assert believable(silent, Sensors(speed_least_m_s=2.0), None)[0] is silent
 
 
 def test_a_standstill_has_the_speed_and_the_yaw_rate_of_the_profile() -> None:

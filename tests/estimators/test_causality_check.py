@@ -18,7 +18,6 @@ from reference_car import cut, drive, slalom, with_noise
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps, make_steps
 from pdhef_logtool.estimators.causality_check import CausalityCheck
-from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Spec
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -75,7 +74,9 @@ def signals() -> Signals:
 def reason(estimator: Any, signals: Signals, *windows: tuple[int, int]) -> str:
     check, state = CausalityCheck(), None
     for first, end in windows or ((0, len(signals)),):
-        _, state = run_window(estimator, cut(signals, first, end), state, causality=check)
+        part, before = cut(signals, first, end), check.state_before(estimator, state)
+        steps, state = estimator.run(part, state)
+        check.check(estimator, part, before, steps)
     return check.failed.get(estimator.name, "")
 
 

@@ -13,7 +13,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.gnss_aided import GnssAided
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.signals import GNSS_COMPONENTS
@@ -65,8 +65,8 @@ def _error_deg(drive, track):
 def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(low_grip, bare):
     drive, signals = low_grip
     causality = CausalityCheck()
-    plain, _ = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
-    aided, coverage = _error_deg(drive, run_window(_aided(bare), signals, causality=causality)[0])
+    plain, _ = _error_deg(drive, run_estimator(make_estimator("physics", bare), signals))
+    aided, coverage = _error_deg(drive, run_estimator(_aided(bare), signals, causality=causality))
     assert not causality.failed
     assert plain > 0.8
     assert aided < 0.6 * plain
@@ -93,8 +93,8 @@ def test_a_sample_acts_when_it_arrives_and_not_before(low_grip, bare, share, lat
 
 def test_without_a_sample_the_estimate_is_that_of_the_filter_bit_for_bit(fishhook, bare):
     drive, _ = fishhook
-    plain, _ = run_window(make_estimator("physics", bare), drive.signals)
-    aided, _ = run_window(_aided(bare), drive.signals)
+    plain = run_estimator(make_estimator("physics", bare), drive.signals)
+    aided = run_estimator(_aided(bare), drive.signals)
     np.testing.assert_array_equal(aided.vy_m_s, plain.vy_m_s)
     np.testing.assert_array_equal(aided.covariance, plain.covariance)
 
@@ -120,8 +120,8 @@ def test_wrong_gnss_costs_nothing(request, bare, driven, fault):
         velocity += 0.4 * np.random.default_rng(2).standard_normal(velocity.shape)
     else:
         signals = replace(signals, gnss_late_s=np.full(len(t), 3.0))
-    plain, _ = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
-    aided, _ = _error_deg(drive, run_window(_aided(bare), replace(signals, gnss_velocity_m_s=velocity))[0])
+    plain, _ = _error_deg(drive, run_estimator(make_estimator("physics", bare), signals))
+    aided, _ = _error_deg(drive, run_estimator(_aided(bare), replace(signals, gnss_velocity_m_s=velocity)))
     assert aided < plain + max(0.05 * plain, 0.003)
 
 

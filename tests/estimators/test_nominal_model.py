@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 from pdhef_logtool.car import nominal_model
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, default_vehicle
+from pdhef_logtool.compiled.cache import njit
 
 SEDAN = default_vehicle()
 P = model_parameters(SEDAN)
@@ -98,22 +99,28 @@ def test_a_reference_friction_keeps_the_stiffness_and_scales_the_peak(front, mu)
     assert car.magic_formula(front, mu)[2] == pytest.approx(mu / 0.85 * SEDAN.magic_formula(front, 0.85)[2])
 
 
+@njit
+def tyre_forces(v, vy, angle, mu, p):
+    return nominal_model.magic_formula(v, vy, 0.0, angle, nominal_model.prepare(0.0, mu, p), p)
+
+
 @exact
 @given(st.floats(0.05, 2.0), st.booleans())
 def test_tyre_known_by_its_stiffness(mu, front):
     """The slope is the given one at any friction, the force never exceeds friction times the load and gets near it."""
     p = model_parameters(STIFFNESS_CAR)
-    tyre = (
-        (p.front_B, p.front_C, p.front_D_n, p.front_E, p.front_fixed_stiffness)
-        if front
-        else (p.rear_B, p.rear_C, p.rear_D_n, p.rear_E, p.rear_fixed_stiffness)
-    )
+
+    def force(slip):
+        """The front axle slips by steering, the rear axle by a lateral velocity."""
+        angle, vy = (slip, 0.0) if front else (0.0, -np.tan(slip))
+        return MASS_KG * tyre_forces(1.0, vy, angle, mu, p)[0 if front else 1]
+
     stiffness = STIFFNESS[0] if front else STIFFNESS[1]
     load = MASS_KG * 9.80665 * (REAR_M if front else FRONT_M) / WHEELBASE_M
     h = 1e-7
-    slope = nominal_model.magic_formula_force(h, *tyre, mu) / h
+    slope = force(h) / h
     assert slope == pytest.approx(stiffness, rel=1e-6)
-    sweep = [nominal_model.magic_formula_force(a, *tyre, mu) for a in np.linspace(0, 1.5, 400)]
+    sweep = [force(a) for a in np.linspace(0, 1.5, 400)]
     assert max(sweep) <= mu * load * (1 + 1e-12)
     assert max(sweep) > 0.99 * mu * load or mu > 1.5  # the stiffest road needs more slip than the sweep has
     assert STIFFNESS_CAR.cornering_stiffness_n_per_rad(front, mu) == pytest.approx(stiffness, rel=1e-12)

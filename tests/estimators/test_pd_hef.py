@@ -12,12 +12,11 @@ from reference_car import FRICTION, drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.residual_model.service import NetworkService
 
 pytestmark = pytest.mark.slow
 
@@ -38,19 +37,19 @@ def _same(a: StateTrack, b: StateTrack) -> bool:
 
 def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) -> AdaptivePhysics:
     vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(parts, True))})
-    return AdaptivePhysics(VehicleUkf(vehicle), NetworkService(network or random_network()), trust)
+    return AdaptivePhysics(VehicleUkf(vehicle), network or random_network(), trust)
 
 
 @pytest.mark.parametrize("parts", [(), ("lag", "roll", "biases", "bank"), tuple(PhysicsParts.model_fields)])
 def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...], signals: Signals) -> None:
     trusted = hybrid(*parts)
-    physics, _ = run_window(AdaptivePhysics(trusted.physics, name="physics"), signals)
-    for change in ({"trust": 0.0}, {"network": NetworkService(random_network(constant=(0.0, 0.0)))}):
-        track, _ = run_window(replace(trusted, **change), signals)
+    physics = run_estimator(AdaptivePhysics(trusted.physics, name="physics"), signals)
+    for change in ({"trust": 0.0}, {"network": random_network(constant=(0.0, 0.0))}):
+        track = run_estimator(replace(trusted, **change), signals)
         for f in fields(StateTrack):
             if f.name not in ("name", "network_trust"):
                 np.testing.assert_array_equal(getattr(track, f.name), getattr(physics, f.name), err_msg=f.name)
-    assert not _same(run_window(trusted, signals)[0], physics)
+    assert not _same(run_estimator(trusted, signals), physics)
 
 
 def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none(
@@ -76,10 +75,10 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
     made = Pushed(oracle.has).drive(lambda t: 0.02 * np.sin(2.0 * t), 8.0)
     # A force, so that the accelerometer feels it.
     signals = replace(made.signals, ay_m_s2=made.signals.ay_m_s2 + 0.8, friction=np.full(len(made.signals), FRICTION))
-    network = NetworkService(random_network(constant=(0.8, 0.15)))
+    network = random_network(constant=(0.8, 0.15))
     errors = []
     for trust in (0.0, 1.0, 0.5):
-        track, _ = run_window(AdaptivePhysics(VehicleUkf(oracle.as_vehicle()), network, trust), signals)
+        track = run_estimator(AdaptivePhysics(VehicleUkf(oracle.as_vehicle()), network, trust), signals)
         errors.append(np.sqrt(np.mean((track.vy_m_s - made.vy)[200:] ** 2)))
     assert errors[1] < 0.05 * errors[0]
     assert errors[1] < errors[2] < errors[0]
@@ -107,7 +106,7 @@ def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None
     )  # fmt: skip
     error = {}
     for trust in (0.0, 0.5, 1.0):
-        track, _ = run_window(hybrid(network=random_network(constant=(force, 0.0)), trust=trust), signals)
+        track = run_estimator(hybrid(network=random_network(constant=(force, 0.0)), trust=trust), signals)
         error[trust] = float(np.abs(track.vy_m_s - truth[:, 0])[500:].mean())
         if trust == 1.0:
             assert track.ay_m_s2[500:] == pytest.approx(ay[500:], abs=0.003)

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.peers.single_track import single_track
 from pdhef_logtool.estimators.table import PEERS, all_names, make_estimator
 from pdhef_logtool.records.signals import Signals
@@ -64,7 +64,7 @@ def simulated() -> tuple[Signals, np.ndarray]:
 @pytest.mark.parametrize("name", all_names(Car.of(default_vehicle()), PEERS))
 def test_a_peer_recovers_a_linear_car_within_its_bound(name, simulated):
     signals, sideslip = simulated
-    track, _ = run_window(make_estimator(name, Car.of(linear_sedan())), signals)
+    track = run_estimator(make_estimator(name, Car.of(linear_sedan())), signals)
     error = np.degrees(np.sqrt(np.mean((track.sideslip_rad - sideslip) ** 2)))
     assert error < BOUNDS_DEG[name]
     assert np.degrees(np.sqrt(np.mean(sideslip**2))) == pytest.approx(0.37, abs=0.01)
@@ -75,6 +75,6 @@ def test_the_learner_learns_an_offset_of_steering(simulated):
     errors = {}
     for name in ("learned-single-track", "linear-kf:open-loop"):
         estimator = make_estimator(name, Car.of(linear_sedan()))
-        track, _ = run_window(estimator, replace(signals, steer_rad=signals.steer_rad + 0.005))
+        track = run_estimator(estimator, replace(signals, steer_rad=signals.steer_rad + 0.005))
         errors[name] = abs(np.degrees(np.mean((track.sideslip_rad - sideslip)[-1000:])))  # two periods
     assert errors["learned-single-track"] < 0.8 * errors["linear-kf:open-loop"]

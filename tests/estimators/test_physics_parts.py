@@ -14,7 +14,7 @@ from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, ph
 from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, VehicleParameters, correct_signals
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, physics_filter
 from pdhef_logtool.records.signals import Signals
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 
 def sideslip_rmse(estimator, made: Drive, signals: Signals) -> float:
-    track, _ = run_window(estimator, signals)
+    track = run_estimator(estimator, signals)
     late = made.time_s > 1.0
     assert track.valid[late].all()
     return float(np.sqrt(np.mean((track.sideslip_rad - made.sideslip)[late] ** 2)))
@@ -43,7 +43,7 @@ def test_beyond_the_linear_range_kinematics_count_more():
     plain, yields = (sideslip_rmse(VehicleUkf(soft, limit_gain=gain), made, noisy) for gain in (0.0, 6.0))
     assert yields < 0.9 * plain
     linear = with_noise(oracle.drive(slalom(0.003, 0.5), 8.0).signals, 1)
-    plain, yields = (run_window(VehicleUkf(v, limit_gain=gain), linear)[0].vy_m_s for gain in (0.0, 6.0))
+    plain, yields = (run_estimator(VehicleUkf(v, limit_gain=gain), linear).vy_m_s for gain in (0.0, 6.0))
     np.testing.assert_array_equal(plain, yields)
 
 
@@ -84,7 +84,7 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
     assert estimator.vehicle == fitted
     assert resolve(adaptive).physics_sha256 == physics_sha256(fitted) != physics_sha256(own)
     assert resolve(estimator).identity == resolve(physics_filter(fitted, FilterNoise())).identity
-    ours, _ = run_window(estimator, calibrated_signals(correct_signals(noisy, own), car))
+    ours = run_estimator(estimator, calibrated_signals(correct_signals(noisy, own), car))
     raw = replace(noisy, steer_rad=noisy.steer_rad * own.steering_ratio / 15.0)
-    want, _ = run_window(physics_filter(fitted, FilterNoise()), correct_signals(raw, fitted), None)
+    want = run_estimator(physics_filter(fitted, FilterNoise()), correct_signals(raw, fitted))
     np.testing.assert_allclose(ours.sideslip_rad, want.sideslip_rad, rtol=1e-9, atol=1e-12)

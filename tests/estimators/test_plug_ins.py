@@ -17,7 +17,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps, make_steps
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import Spec, runnable
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Signals
@@ -74,7 +74,7 @@ def signals() -> Signals:
         (end_process, "expected an estimator that runs, got SystemExit: 0"),
         (write_through_view, "got ValueError: assignment destination is read-only"),
         (lambda s, _: 3, "expected a pair of steps and state, got int"),
-        (lambda s, _: (sound(s).until(7), None), r"expected steps, one per sample \(401\), got 7 steps"),
+        (lambda s, _: (sound(s).at(slice(7)), None), r"expected steps, one per sample \(401\), got 7 steps"),
         (lambda s, _: (None, None), r"expected steps, one per sample \(401\), got NoneType"),
         (lambda s, _: (replace(sound(s), values=np.zeros((len(s), 3))), None), r"shape \(401, 4\), got \(401, 3\)"),
         (lambda s, _: (replace(sound(s), rates=np.zeros((9, 4))), None), r"one per sample \(401\), got 9 steps"),
@@ -85,12 +85,12 @@ def test_what_a_plug_in_does_wrong_is_an_error_that_names_it(
     misbehave: Callable[..., Any], got: str, signals: Signals
 ) -> None:
     with pytest.raises(EstimatorError, match=r"^plug \(plug-in test_plug_ins\): .*" + got):
-        run_window(PlugIn(misbehave), signals)
+        run_estimator(PlugIn(misbehave), signals)
 
 
 def test_no_plug_in_changes_the_signals_of_others(signals: Signals) -> None:
     before = signals.yaw_rate_rad_s.copy()
-    track, _ = run_window(PlugIn(write_by_force), signals)
+    track = run_estimator(PlugIn(write_by_force), signals)
     assert np.nanmax(track.yaw_rate_rad_s) == 0.5
     np.testing.assert_array_equal(signals.yaw_rate_rad_s, before)
     assert signals.yaw_rate_rad_s.flags.writeable
@@ -105,7 +105,7 @@ def test_what_a_plug_in_prints_goes_to_stderr_and_its_folder_is_left_again(
 
     folder = Path.cwd()
     try:
-        run_window(PlugIn(prints), signals)
+        run_estimator(PlugIn(prints), signals)
         assert Path.cwd() == folder
     finally:
         os.chdir(folder)

@@ -13,8 +13,9 @@ from half_slip_package import install
 from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators import latency_compensation
 from pdhef_logtool.estimators.causality_check import CausalityCheck
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import EstimatorError, ModelError
 from pdhef_logtool.records.signals import Signals
@@ -52,12 +53,8 @@ def signals() -> Signals:
     return with_noise(drive(slalom(0.03, 0.5), 4.0, speed=22.0).signals, seed=3)
 
 
-def tracks(network: str, *parts: Signals, check: CausalityCheck | None = None) -> list[StateTrack]:
-    estimator, state, found = make_estimator("pd-hef:gain=1", Car.load(network=network)), None, []
-    for part in parts:
-        track, state = run_window(estimator, part, state, causality=check)
-        found.append(track)
-    return found
+def track_of(network: str, signals: Signals, check: CausalityCheck | None = None) -> StateTrack:
+    return run_estimator(make_estimator("pd-hef:gain=1", Car.load(network=network)), signals, check)
 
 
 def test_the_documented_network_acts_in_the_filter_causally(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,13 +62,12 @@ def test_the_documented_network_acts_in_the_filter_causally(tmp_path: Path, monk
     code = dedent((interface.__doc__ or "").partition("into calls::\n")[2])
     name = with_model(tmp_path, code, monkeypatch, "tyre_gru")
     whole = signals()
-    (track,) = tracks(name, whole, check=CausalityCheck())
-    physics, _ = run_window(make_estimator("physics", Car.load(network="none")), whole, None)
+    track = track_of(name, whole, CausalityCheck())
+    physics = run_estimator(make_estimator("physics", Car.load(network="none")), whole)
     assert np.nanmax(np.abs(track.sideslip_rad - physics.sideslip_rad)) > 1e-4
     assert set(track.network_trust[track.valid]) == {1.0}
-    first, second = tracks(name, whole.rows(0, 150), whole.rows(150, len(whole)))
-    joined = np.concatenate([first.sideslip_rad, second.sideslip_rad])
-    assert np.array_equal(joined, track.sideslip_rad, equal_nan=True)
+    monkeypatch.setattr(latency_compensation, "PIECE_STEPS", 150)
+    assert np.array_equal(track_of(name, whole).sideslip_rad, track.sideslip_rad, equal_nan=True)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +81,7 @@ def test_the_documented_network_acts_in_the_filter_causally(tmp_path: Path, monk
 def test_a_faulty_model_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, reason: str) -> None:
     name = with_model(tmp_path, CONSTANT.format(line=line), monkeypatch, "faulty_model")
     with pytest.raises(EstimatorError, match=reason) as error:
-        tracks(name, signals())
+        track_of(name, signals())
     assert "faulty_model" in str(error.value)
 
 

@@ -11,7 +11,7 @@ from reference_car import drive, rolling_drive, slalom, with_noise
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import stepwise, vehicle_ukf
 from pdhef_logtool.estimators.kinematic import Kinematic
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.open_loop import OpenLoop
 from pdhef_logtool.estimators.speed_slip import TIMEOUT_S, believable
 from pdhef_logtool.estimators.vehicle_ukf import U_SPEED, VehicleUkf, nominal_filter
@@ -41,14 +41,14 @@ def good():
 
 
 def believed(signals: Signals, **options) -> np.ndarray:
-    return believable(signals, SENSORS, None, None, **options)[0].speed_m_s
+    return believable(signals, SENSORS, None, **options)[0].speed_m_s
 
 
 def test_a_drive_without_slip_is_left_alone(good):
-    assert believable(good.signals, SENSORS, None, None)[0] is good.signals
+    assert believable(good.signals, SENSORS, None)[0] is good.signals
     made = drive(slalom(0.06, 0.7), 12.0, acceleration=lambda t: -6.0 if 4.0 < t < 6.0 else 0.0)
     noisy = with_noise(made.signals, 5)
-    assert believable(noisy, SENSORS, None, None)[0] is noisy
+    assert believable(noisy, SENSORS, None)[0] is noisy
 
 
 @pytest.mark.parametrize("size", [10.0, 20.0])
@@ -70,10 +70,10 @@ def test_spinning_wheels_are_not_believed(good, size):
 @pytest.mark.slow
 def test_all_estimators_heed_it(good, estimator, monkeypatch):
     slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s))
-    gated, undisturbed = (run_window(estimator, s)[0] for s in (slipping, good.signals))
+    gated, undisturbed = (run_estimator(estimator, s) for s in (slipping, good.signals))
     for module in (stepwise, vehicle_ukf):
-        monkeypatch.setattr(module, "believable", lambda signals, _sensors, memory, _before_ns, **_: (signals, memory))
-    plain, same = (run_window(estimator, s)[0] for s in (slipping, good.signals))
+        monkeypatch.setattr(module, "believable", lambda signals, _sensors, memory, **_: (signals, memory))
+    plain, same = (run_estimator(estimator, s) for s in (slipping, good.signals))
 
     def worst(track):
         return np.nanmax(np.abs(track.vx_m_s - good.vx)[good.time_s > 0.5])
@@ -96,7 +96,7 @@ def test_locked_wheels_are_not_believed_however_long_it_takes():
     assert np.isnan(out[sliding & np.isfinite(locked.speed_m_s)]).all()
     stands = made.time_s > 14.0
     np.testing.assert_array_equal(out[stands], locked.speed_m_s[stands])
-    track = run_window(FILTERS[0], locked)[0]
+    track = run_estimator(FILTERS[0], locked)
     assert np.abs(track.vx_m_s - made.vx)[sliding].max() < 1.0
     assert np.abs(track.vx_m_s[-100:]).max() < 0.02
 
@@ -109,7 +109,7 @@ def test_a_standstill_and_the_floor_of_the_pulses_are_no_slip(good):
     signals = with_noise(made.signals, 8)
     read = np.where(signals.speed_m_s < 0.8, np.where(np.isfinite(signals.speed_m_s), 0.0, np.nan), signals.speed_m_s)
     floor = replace(signals, speed_m_s=read)
-    assert believable(floor, SENSORS, None, None)[0] is floor
+    assert believable(floor, SENSORS, None)[0] is floor
 
 
 def test_a_speed_that_lasts_is_believed_in_the_end(good):
@@ -123,7 +123,7 @@ def test_a_speed_that_lasts_is_believed_in_the_end(good):
 def test_without_an_accelerometer_nothing_is_gated(good):
     blind = replace(good.signals, ax_m_s2=np.full(len(good.signals), np.nan))
     blind = replace(blind, speed_m_s=blind.speed_m_s + spin(good.time_s))
-    assert believable(blind, SENSORS, None, None)[0] is blind
+    assert believable(blind, SENSORS, None)[0] is blind
 
 
 @pytest.mark.parametrize("estimator", FILTERS, ids=lambda e: e.name)
@@ -141,7 +141,7 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimato
     back = steps.x[:, 0] < 0.0
     assert back[-500:].all()
     assert (steps.inputs[back & silent, U_SPEED] > 0.5).all()
-    track = run_window(estimator, signals)[0]
+    track = run_estimator(estimator, signals)
     assert not track.valid[back & silent].any()
     assert track.valid[~back & (good.time_s > 0.5)].all()
 
@@ -149,4 +149,4 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimato
 @pytest.mark.parametrize("slope", [-2.0, 2.0])
 def test_a_steep_hill_is_no_slip(good, slope):
     hill = replace(good.signals, ax_m_s2=good.signals.ax_m_s2 + slope)
-    assert believable(hill, SENSORS, None, None)[0] is hill
+    assert believable(hill, SENSORS, None)[0] is hill

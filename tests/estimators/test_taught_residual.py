@@ -16,7 +16,7 @@ from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.causality_check import CausalityCheck
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
@@ -42,12 +42,8 @@ def signals() -> Signals:
     return replace(s, friction=np.full(len(s), 0.85))
 
 
-def track_of(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
-    estimator, state, tracks = make_estimator(name, car), None, []
-    for part in parts:
-        track, state = run_window(estimator, part, state)
-        tracks.append(track)
-    return tracks
+def track_of(name: str, car: Car, signals: Signals) -> StateTrack:
+    return run_estimator(make_estimator(name, car), signals)
 
 
 def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:
@@ -69,15 +65,15 @@ def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:
 def test_it_is_causal(signals: Signals) -> None:
     estimator, check = make_estimator("pd-hef", taught_car(linear_residual())), CausalityCheck()
     assert estimator.causal
-    run_window(estimator, signals, causality=check)
+    run_estimator(estimator, signals, check)
     later = replace(signals, yaw_rate_rad_s=np.where(np.arange(len(signals)) > 300, 0.0, signals.yaw_rate_rad_s))
-    ran = [run_window(estimator, s, None)[0].sideslip_rad[:300] for s in (signals, later)]
+    ran = [run_estimator(estimator, s).sideslip_rad[:300] for s in (signals, later)]
     assert np.array_equal(*ran, equal_nan=True)
 
 
 def test_beyond_the_taught_speed_it_is_physics(signals: Signals) -> None:
     car = taught_car(linear_residual(fastest_m_s=10.0))
-    (physics,), (hybrid,) = (track_of(name, car, signals) for name in ("physics", "pd-hef"))
+    physics, hybrid = (track_of(name, car, signals) for name in ("physics", "pd-hef"))
     assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
     assert np.nanmax(hybrid.network_trust) == 0.0
 
@@ -91,7 +87,7 @@ def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signal
         assert acts(of_log) is calibrated
         without = of_log if not calibrated else plain
         assert any("residual gain 0" in note for note in without.notes)  # type: ignore[attr-defined]
-    (track,) = track_of(
+    track = track_of(
         "pd-hef", replace(taught_car(linear_residual(), calibrated=True), self_calibrated=calibration), signals
     )
     assert np.nanmax(track.network_trust) == 1.0
@@ -104,9 +100,7 @@ def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> Non
 
 
 def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
-    (physics,), (hybrid,) = (
-        track_of(name, taught_car(linear_residual(0.0)), signals) for name in ("physics", "pd-hef")
-    )
+    physics, hybrid = (track_of(name, taught_car(linear_residual(0.0)), signals) for name in ("physics", "pd-hef"))
     assert np.array_equal(hybrid.vx_m_s, physics.vx_m_s, equal_nan=True)
     assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
     assert np.allclose(hybrid.vy_m_s, physics.vy_m_s, atol=1e-12, equal_nan=True)

@@ -15,6 +15,7 @@ from reference_car import FRICTION
 from pdhef_logtool.car import nominal_model
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
     LANES,
@@ -44,6 +45,11 @@ IMU = (0.4, -0.2)
 TOLERANCE = 1e-12
 ENTRIES = {"vx": 25.0, "vy": 0.2, "r": 0.1, "b_ax": 0.1, "ff": 1.5, "fr": 1.0, "phi": 0.03, "phi_dot": -0.1}
 ENTRIES |= {"bank": 0.03, "s": 0.06, "b_delta": 0.002, "b_ay": 0.1, "b_r": 0.003}
+
+
+@njit
+def accelerations(vx, vy, r, steer, mu, p):
+    return nominal_model.accelerations(vx, vy, r, steer, nominal_model.prepare(steer, mu, p), p)
 
 
 def state_of(oracle: Oracle, steer: float, ax: float, mu: float, **changes: float) -> np.ndarray:
@@ -132,7 +138,7 @@ def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(c
         want[i, :3] = end[0], *(end[1:] + half)
         w = nominal_model.dynamic_share(state[0], p)
         ay = nominal_model.planar_lateral_acceleration(*state[:3], steer, mu, p) + w * rate[0]
-        _, yaw = nominal_model.lateral_acceleration_and_yaw_acceleration(*state[:3], steer, mu, p) if w else (0.0, 0.0)
+        _, yaw = accelerations(*state[:3], steer, mu, p)
         want_reading[i] = (1.0 + p.ay_roll_gain) * ay + w * yaw * p.imu_x_m - state[2] ** 2 * p.imu_y_m
     np.testing.assert_allclose(reading[:LANES], want_reading, rtol=TOLERANCE, atol=TOLERANCE)
     np.testing.assert_allclose(block[[VX, VY, YAW_RATE, AX_BIAS], :LANES].T, want, rtol=TOLERANCE, atol=TOLERANCE)

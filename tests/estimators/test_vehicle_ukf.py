@@ -28,7 +28,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import vehicle_ukf
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.estimators.vehicle_model import LANES, PLACES, WIDTH, advance, physics_parameters
 from pdhef_logtool.estimators.vehicle_ukf import (
@@ -106,7 +106,7 @@ def force_models(*names: str) -> tuple[VehicleUkf, Motion, Sensor]:
 
 
 def filterpy_run(signals, estimator, motion, sensor, residual_rate, extra_r):
-    """Return the columns of PosteriorSteps and StepLinks by filterpy.
+    """Return the columns of LinkedSteps by filterpy.
 
     An entry without variance is no state of filterpy. Its two sigma points are at the first one, to which κ gives their
     weights.
@@ -195,7 +195,8 @@ def test_it_is_the_unscented_kalman_filter_of_filterpy(made, irregular):
     t = (irregular.stamps_ns - irregular.stamps_ns[0]) * 1e-9
     rate = np.column_stack([0.3 * np.sin(t), 0.1 * np.cos(3.0 * t)])
     extra_r = np.where(t[:, None] < 4.0, 0.0, [0.1, 1e-4])
-    steps, _, links = estimator.linked_steps(irregular, None, rate, extra_r)
+    links, _ = estimator.linked_steps(irregular, None, rate, extra_r)
+    steps = links.posterior
     assert steps.x[0, :3] == pytest.approx(
         [irregular.speed_m_s[0], *(irregular.yaw_rate_rad_s[0] * np.array([REAR_M, 1]))]
     )
@@ -240,7 +241,7 @@ def test_a_single_spike_is_as_if_the_sample_were_missing(column, estimator, good
 @pytest.mark.parametrize(("column", "offset"), [("ay_m_s2", 12.0), ("yaw_rate_rad_s", 0.5), ("speed_m_s", 8.0)])
 def test_the_gate_holds_for_a_fifth_of_a_second_and_never_longer(column, offset, good, monkeypatch):
     # The check of wheel slip would remove speeds that change as no car's do.
-    monkeypatch.setattr(vehicle_ukf, "believable", lambda signals, _sensors, memory, _before_ns: (signals, memory))
+    monkeypatch.setattr(vehicle_ukf, "believable", lambda signals, _sensors, memory: (signals, memory))
     late = good.time_s >= 4.0
     changed = replace(good.signals, **{column: getattr(good.signals, column) + np.where(late, offset, 0.0)})
     steps, undisturbed = posteriors(changed), posteriors(good.signals)
@@ -297,14 +298,14 @@ def test_standstill_holds_and_lets_go(bias, estimator):
 def test_esp_suite_ignores_the_speed_after_the_start(good):
     esp = make_estimator("phy-ukf", Car.of(VEHICLE), Options(use_speed=False))
     garbled = edited(good.signals, "speed_m_s", slice(1, None), 3.0)
-    a, b = run_window(esp, good.signals)[0], run_window(esp, garbled)[0]
+    a, b = run_estimator(esp, good.signals), run_estimator(esp, garbled)
     np.testing.assert_array_equal(a.vx_m_s, b.vx_m_s)
     np.testing.assert_array_equal(a.covariance, b.covariance)
     assert a.valid.all()
     other_start = edited(good.signals, "speed_m_s", 0, 20.0)
-    assert abs(run_window(esp, other_start)[0].vx_m_s[5] - 20.0) < 0.5
+    assert abs(run_estimator(esp, other_start).vx_m_s[5] - 20.0) < 0.5
     assert np.abs(a.vx_m_s - good.vx).max() < 3.0
-    full, _ = run_window(make_estimator("phy-ukf", Car.of(VEHICLE)), good.signals)
+    full = run_estimator(make_estimator("phy-ukf", Car.of(VEHICLE)), good.signals)
     assert a.vx_std_m_s[-1] > 3 * full.vx_std_m_s[-1]
 
 
@@ -321,8 +322,8 @@ def test_friction_comes_from_the_log_where_it_is_known():
     assert error(made.signals) > 10 * error(known)
     sparse = edited(known, "friction", np.arange(len(known)) % 100 != 0, np.nan)  # the last value is kept
     assert error(sparse) < 0.02 * DEGREE
-    assert (run_window(UKF, sparse)[0].friction[1:] == 0.4).all()
-    assert (run_window(UKF, made.signals)[0].friction == FRICTION).all()
+    assert (run_estimator(UKF, sparse).friction[1:] == 0.4).all()
+    assert (run_estimator(UKF, made.signals).friction == FRICTION).all()
 
 
 # --- divergence and consistency --------------------------------------------------------------------------------------
@@ -331,7 +332,7 @@ def test_friction_comes_from_the_log_where_it_is_known():
 @pytest.mark.parametrize("amplitude", [0.0, 0.03, 0.05])
 def test_a_good_drive_is_not_flagged(amplitude):
     made = drive(slalom(amplitude, 0.5), 10.0, tyre=tanh_tyre)
-    track, _ = run_window(UKF, with_noise(made.signals, 6), None)
+    track = run_estimator(UKF, with_noise(made.signals, 6))
     assert not track.diverged.any()
 
 
@@ -339,7 +340,7 @@ def test_a_good_drive_is_not_flagged(amplitude):
 def test_a_hopelessly_wrong_model_is_flagged(column):
     made = drive(slalom(0.05, 0.5), 10.0)
     signals = with_noise(made.signals, 6)
-    track, _ = run_window(UKF, replace(signals, **{column: -getattr(signals, column)}), None)
+    track = run_estimator(UKF, replace(signals, **{column: -getattr(signals, column)}))
     assert track.diverged[300:].mean() > 0.6
 
 

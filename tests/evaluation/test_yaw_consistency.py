@@ -11,7 +11,7 @@ import pytest
 from pdhef_logtool import Car, read_drive
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.drive.reading import WholeDrive
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
@@ -42,7 +42,7 @@ def test_the_true_sideslip_explains_the_yaw_rate_and_zero_does_not(sample_logs_d
     assert whole.truth is not None
     road = replace(whole, signals=whole.signals.rows(0, 6000), truth=whole.truth.rows(0, 6000))
     assert road.truth is not None
-    zero = run_window(make_estimator("zero", SALOON), road.signals)[0]
+    zero = run_estimator(make_estimator("zero", SALOON), road.signals)
     true, none = figure([road.truth, zero], road)
     assert true < 0.1 * float(np.sqrt(np.nanmean(road.signals.yaw_rate_rad_s**2)))
     assert none > 3.0 * true

@@ -12,8 +12,12 @@ import pytest
 import torch
 from made_models import random_network
 
+from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
+from pdhef_logtool.estimators.parallel_physics import make_features
+from pdhef_logtool.estimators.vehicle_model import FRONT, REAR
+from pdhef_logtool.estimators.vehicle_ukf import U_FRICTION, U_STEER, VehicleUkf, no_posterior
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
     OUTPUT_COUNT,
@@ -22,23 +26,31 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     load_bundle,
 )
-from pdhef_logtool.residual_model.features import FEATURES, make_features
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.interface import LIMITS
 from pdhef_logtool.residual_model.network import ResidualNetwork
-from pdhef_logtool.residual_model.service import LIMITS, NetworkService
 
 make_bundle = partial(random_network, hidden=16, layers=2, head=(8,), scales=(2.0, 0.7))
 
 
 def test_features_by_hand() -> None:
-    posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
-    prior = np.array([[19.0, 0.2, 0.08, 0.0]])
-    measured = (np.array([0.02]), np.array([1.5]), np.array([0.11]))
-    body = np.arange(1.0, 5.0)[None]
-    given = (np.array([1.4]), np.array([0.8]), np.array([-0.5]), body)
-    features = make_features(*measured, posterior, prior, *given)
+    physics, stamps = (
+        VehicleUkf(default_vehicle().model_copy(update={"physics": PhysicsParts(roll=True)})),
+        np.arange(1),
+    )
+    body = {physics.layout.roll: 1.0, physics.layout.roll + 1: 2.0, FRONT: 3.0, REAR: 4.0}
+    steps = no_posterior(stamps, physics.layout.size, np.zeros((1, 2)))
+    steps.x[:], steps.inputs[:], steps.valid[:] = 0.0, 0.0, True
+    steps.x[:, :3], steps.prior[:] = (20.0, 0.4, 0.1), 0.0
+    steps.x[:, [*body]], steps.prior[:, :3] = [*body.values()], (19.0, 0.2, 0.08)
+    steps.inputs[:, [U_STEER, U_FRICTION]] = 0.02, 0.8
+    ay, rate, ax = (np.array([value]) for value in (1.5, 0.11, -0.5))
+    nothing = np.full(1, np.nan)
+    seen = Signals(stamps, stamps, nothing, ax, ay, rate, nothing, nothing, np.full((1, 4), np.nan))
+    features = make_features(physics, steps, seen)
     beta = np.arctan2(0.4, 20.0) - np.arctan2(0.2, 19.0)
     used = 1.5 / (0.8 * 9.80665)
-    expected = [20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, used, *body[0]]
+    expected = [20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, used, *body.values()]
     np.testing.assert_allclose(features, [expected], rtol=1e-12)
     assert len(FEATURES) == len(expected)
 
@@ -50,13 +62,13 @@ def test_an_odd_network_is_odd_to_the_last_digits() -> None:
     rng = np.random.default_rng(5)
     features = rng.normal(size=(300, len(FEATURES)))
     starts = np.zeros(300, dtype=np.bool_)
-    out, _ = NetworkService(bundle).run(features, starts, None)
-    mirrored, _ = NetworkService(bundle).run(features * bundle.signs, starts, None)
+    out, _ = bundle.run(features, starts, None)
+    mirrored, _ = bundle.run(features * bundle.signs, starts, None)
     np.testing.assert_allclose(mirrored, -out, atol=1e-6)
-    other, _ = NetworkService(replace(bundle, odd=False)).run(features, starts, None)
+    other, _ = replace(bundle, odd=False).run(features, starts, None)
     assert np.abs(other - out).max() > 1e-4
-    first, carry = NetworkService(bundle).run(features[:77], starts[:77], None)
-    second, _ = NetworkService(bundle).run(features[77:], starts[77:], carry)
+    first, carry = bundle.run(features[:77], starts[:77], None)
+    second, _ = bundle.run(features[77:], starts[77:], carry)
     np.testing.assert_array_equal(np.concatenate([first, second]), out)
 
 
@@ -103,7 +115,7 @@ def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
 def test_service_equals_torch(hidden: int) -> None:
     bundle = make_bundle(hidden=hidden)
     features = np.random.default_rng(0).normal(size=(300, len(FEATURES)))
-    rates, _ = NetworkService(bundle).run(features, np.zeros(len(features), dtype=np.bool_), None)
+    rates, _ = bundle.run(features, np.zeros(len(features), dtype=np.bool_), None)
     expected = said_by_torch(bundle, bundle.normalise(features)) * np.array(bundle.normalisation.target_std)
     np.testing.assert_allclose(rates, expected, atol=2e-6)
 
@@ -118,7 +130,7 @@ def test_shipped_networks_say_what_torch_makes_of_them() -> None:
             features = np.zeros((400, len(FEATURES)))
             spread = 2.0 * rng.normal(size=(400, len(n.feature_std)))
             features[:, bundle.columns] = np.array(n.feature_mean) + np.array(n.feature_std) * spread
-            said, _ = NetworkService(bundle).run(features, np.zeros(400, dtype=np.bool_), None)
+            said, _ = bundle.run(features, np.zeros(400, dtype=np.bool_), None)
             scaled = bundle.normalise(features)
             expected = said_by_torch(bundle, scaled)
             if bundle.odd:
@@ -134,7 +146,7 @@ def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
-    service = NetworkService(make_bundle())
+    service = make_bundle()
     rng = np.random.default_rng(2)
     features = rng.normal(size=(300, len(FEATURES)))
     starts = np.zeros(300, dtype=np.bool_)
@@ -150,7 +162,7 @@ def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
 
 def test_causality_and_limits() -> None:
     bundle = make_bundle()
-    service = NetworkService(bundle)
+    service = bundle
     features = np.random.default_rng(3).normal(size=(400, len(FEATURES)))
     starts = np.zeros(400, dtype=np.bool_)
     before, _ = service.run(features, starts, None)

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import VX, VY, YAW_RATE, Steps
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S
+from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import StepColumns, last_known, step_durations_s
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, step_durations_s
+from pdhef_logtool.records.steps import StepColumns, last_known
 
 #: Rate of the published filters, Hz. Their noise per sample is converted from it to the step between two samples.
 PUBLISHED_HZ = 100.0
@@ -96,7 +94,7 @@ class Peer:
             samples, memory = state.samples.joined(samples), state.memory.copy()
         stamps_ns, first = samples.stamps_ns, len(samples.vx) - len(vx)
         if len(vx):
-            self.estimate(samples, first, step_durations_s(stamps_ns, None), memory)
+            self.estimate(samples, first, step_durations_s(stamps_ns), memory)
         self._roll(samples)
         values, rates = np.full((2, len(stamps_ns), 4), np.nan)
         values[:, VX], values[:, VY], values[:, YAW_RATE] = samples.vx, *samples.states.T
@@ -105,5 +103,5 @@ class Peer:
         rates[:, VY] = (values[:, VY] - values[before, VY]) / span_s
         valid = np.isfinite(values[:, : YAW_RATE + 1]).all(axis=1)
         kept = int(np.searchsorted(stamps_ns, stamps_ns[-1] - HISTORY_NS)) if len(stamps_ns) else 0
-        steps = Steps(values, np.nan_to_num(rates), valid).since(first)
-        return steps, PeerState(speed, samples.since(kept), memory)
+        steps = Steps(values, np.nan_to_num(rates), valid).at(slice(first, None))
+        return steps, PeerState(speed, samples.at(slice(kept, None)), memory)
