@@ -1,4 +1,4 @@
-"""``pdhef run``, ``metrics`` and ``view``: estimate on logs, score recorded estimates, show the recordings."""
+"""``pdhef run``, ``metrics``, ``view`` and ``plan init``: estimate, score recorded estimates, show recordings."""
 
 from __future__ import annotations
 
@@ -110,8 +110,8 @@ def _finish(result: RunResult) -> NoReturn:
     from pdhef_logtool.cli.run_tables import render_fleet, render_run
 
     if result.is_fleet and result.output is not None:
+        from pdhef_logtool.results.fleet import summarise
         from pdhef_logtool.results.opened_run import open_run
-        from pdhef_logtool.results.summary import summarise
 
         summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
         console.show(summary, render_fleet)
@@ -189,3 +189,17 @@ def open_viewer(recordings: Sequence[Path | str], *, web: bool) -> int:
     """Open recordings or a catalog in one viewer, not reachable from the network, and return its exit code."""
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--new", *(["--web-viewer"] if web else [])]
     return subprocess.call([*command, *map(str, recordings)])  # noqa: S603 (our own interpreter)
+
+
+@options.command()
+def plan(action: str, *, output: Path) -> None:
+    """Write a validation plan: requirements for run, metrics and compare."""
+    from pdhef_logtool.evaluation.plan_example import EXAMPLE
+    from pdhef_logtool.storage.files import write_bytes
+
+    if action != "init":
+        raise UsageError(expected="init", got=action, where="pdhef plan", remedy="pdhef plan init -o plan.toml")
+    if output.exists():
+        raise UsageError(expected="a new file", got="one that exists", where=str(output), remedy="choose another name")
+    write_bytes(output, EXAMPLE.encode())
+    console.say(f"{output} written; use it: pdhef run LOGS -o OUT --plan {output}")

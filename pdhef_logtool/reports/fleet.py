@@ -12,11 +12,9 @@ import numpy as np
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.reports.charts import BarsFigure, Charts, Interval, IntervalsFigure, against
-from pdhef_logtool.reports.colours import INK, colour
+from pdhef_logtool.reports.charts import INK, BarsFigure, Charts, Interval, IntervalsFigure, against, colour
 from pdhef_logtool.reports.page import render
-from pdhef_logtool.results.breakdown import LEAST_DRIVES
-from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
+from pdhef_logtool.results.fleet import ANSWER, JUDGED, LEAST_DRIVES, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 from pdhef_logtool.storage.documents import jsonable
 

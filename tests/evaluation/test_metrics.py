@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, position_error
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive, score_track
+from pdhef_logtool.evaluation.metrics.errors import lag_s
 from pdhef_logtool.evaluation.metrics.innovations import nees
-from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 T0 = 1_700_000_000_000_000_000

@@ -13,7 +13,7 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.operating_space import Cell, OperatingSpace
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.results.palette import colour_rgb
+from pdhef_logtool.results.plotted import colour_rgb
 from pdhef_logtool.results.run_report import (
     LogOutcome,
     build_run,

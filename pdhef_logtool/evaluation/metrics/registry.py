@@ -12,7 +12,6 @@ from pdhef_logtool.records.tracks import StateTrack
 #: Modules of this package that export ``METRICS``. Add the name of a new one here.
 MODULES = (
     "errors",
-    "lag",
     "innovations",
     "lateral_consistency",
     "yaw_consistency",

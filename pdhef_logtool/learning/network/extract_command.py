@@ -42,7 +42,7 @@ from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.reporting import FleetProgress
+from pdhef_logtool.runs.fleet import FleetProgress
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path

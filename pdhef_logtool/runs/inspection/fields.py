@@ -21,8 +21,7 @@ from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.runs.inspection.rendering import table_of
-from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed
-from pdhef_logtool.runs.inspection.step_statistics import number_text
+from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed, number_text
 from pdhef_logtool.storage.documents import jsonable
 
 #: Arrays inside of arrays, or of structs.
