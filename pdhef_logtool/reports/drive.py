@@ -56,7 +56,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
             figures = None if path is None else drive_figures(path, report, roles)
         except OutputError as error:
             wrong = f"the figures cannot be drawn: {error}"
-    charts = Charts() if figures is None else figures.charts
+    charts = Charts() if figures is None else figures["charts"]
     texts, names = (report.get("answer") or {}).get("texts") or {}, () if roles is None else roles.names
     key_figures = whole_figures(report, (TRUTH, *names), manoeuvres=True)
     html = render(

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -49,27 +49,8 @@ class Tracks:
         return replace(slow, sideslip_rad=beta, sideslip_std_rad=std)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DriveSeries:
-    """Series of one track for the figures; angles in degrees.
-
-    Envelopes [cells, 2] of sideslip, yaw rate, speed, a_y and steering; largest values [cells] of the absolute
-    ``error``; the 95 % CI [cells]; points [3, K] in the planes: stamp, x and y. ``invalid``, ``reason`` at each stamp
-    [N]. Confidence interval, motion and planes are None except for the ground truth and the selected estimate.
-    """
-
-    name: str
-    sideslip: FloatArray
-    error: FloatArray | None
-    invalid: BoolArray
-    reason: IntArray
-    band: tuple[FloatArray, FloatArray] | None = None
-    yaw_rate: FloatArray | None = None
-    speed: FloatArray | None = None
-    ay: FloatArray | None = None
-    path: FloatArray | None = None
-    ay_sideslip: FloatArray | None = None
-    steer: FloatArray | None = None
+#: Series of a track by name, of :func:`gather`.
+DriveSeries: TypeAlias = dict[str, Any]
 
 
 def thinned(points: FloatArray | None, most: int) -> FloatArray:
@@ -100,7 +81,11 @@ class Reference:
 
 
 def gather(name: str, tracks: Tracks, grid: Grid, reference: Reference | None, *, whole: bool) -> DriveSeries:
-    """Return the series of one track.
+    """Return the series of one track for the figures, by name; angles in degrees.
+
+    Envelopes [cells, 2] of ``sideslip``, ``yaw_rate``, ``speed``, ``ay`` and ``steer``; largest values [cells] of the
+    absolute ``error``; ``band``: the 95 % CI [cells]; points [3, K] in the planes ``path`` and ``ay_sideslip``: stamp,
+    x and y. ``invalid``, ``reason`` at each stamp [N].
 
     Parameters
     ----------
@@ -112,7 +97,7 @@ def gather(name: str, tracks: Tracks, grid: Grid, reference: Reference | None, *
     beta = drawn.sideslip_rad * DEGREES
     in_cells = partial(envelope, grid, stamps)
     error = None if reference is None else in_cells(np.abs(reference.error(track)) * DEGREES).max(axis=1)
-    made = DriveSeries(name, in_cells(beta), error, ~track.valid, track.reason)
+    made = {"sideslip": in_cells(beta), "error": error, "invalid": ~track.valid, "reason": track.reason}
     if not whole:
         return made
     half = NORMAL_95 * drawn.sideslip_std_rad * DEGREES
@@ -121,16 +106,15 @@ def gather(name: str, tracks: Tracks, grid: Grid, reference: Reference | None, *
         rows = first_known(grid, stamps, np.isfinite(x) & np.isfinite(y))
         return np.stack([stamps[rows].astype(np.float64), x[rows], y[rows]])
 
-    return replace(
-        made,
-        band=(in_cells(beta - half).min(axis=1), in_cells(beta + half).max(axis=1)),
-        yaw_rate=in_cells(track.yaw_rate_rad_s * DEGREES),
-        speed=in_cells(track.vx_m_s),
-        ay=in_cells(track.ay_m_s2),
-        path=points(track.x_m, track.y_m),
-        ay_sideslip=points(np.abs(track.ay_m_s2), beta),
-        steer=in_cells(track.steer_rad * DEGREES) if len(track.steer_rad) else None,
-    )
+    return made | {
+        "band": (in_cells(beta - half).min(axis=1), in_cells(beta + half).max(axis=1)),
+        "yaw_rate": in_cells(track.yaw_rate_rad_s * DEGREES),
+        "speed": in_cells(track.vx_m_s),
+        "ay": in_cells(track.ay_m_s2),
+        "path": points(track.x_m, track.y_m),
+        "ay_sideslip": points(np.abs(track.ay_m_s2), beta),
+        "steer": in_cells(track.steer_rad * DEGREES) if len(track.steer_rad) else None,
+    }
 
 
 #: Storage resolution of figures: in degrees, and in °/s, m/s or m/s².
@@ -178,28 +162,12 @@ class Peak(ErrorPlace):
     during: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DriveFigures:
-    """The figures of a drive, and the related texts of the page.
-
-    ``scored``: whether any sideslip error is available. ``moves``: whether any sideslip is available above the
-    low-speed blend. ``absent``: estimators of the report that the file does not contain.
-    """
-
-    charts: draw.Charts
-    peaks: Sequence[Peak]
-    scored: bool
-    moves: bool
-    absent: Sequence[str]
-
-    @property
-    def in_plane(self) -> bool:
-        """Whether there is a figure without a time axis."""
-        return not self.charts.figures.keys().isdisjoint(("path", "ay_sideslip"))
-
-
-def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveFigures | None:
+def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> dict[str, Any] | None:
     """Return the figures of a drive; None if the file contains no row of the selected estimate.
+
+    ``charts``, and for the texts of the page: ``peaks`` (the largest errors), ``scored`` (whether any sideslip error is
+    available), ``moves`` (any sideslip above the low-speed blend), ``in_plane`` (a figure without a time axis), and
+    ``absent`` (estimators of the report that the file does not contain).
 
     Parameters
     ----------
@@ -228,13 +196,13 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
             error_of = None if name == TRUTH else against
             series[name] = gather(name, tracks, grid, error_of, whole=name in (TRUTH, roles.main))
     charts = draw.Charts(grid, origin_ns)
-    moves = bool(np.isfinite(series[roles.main].sideslip).any())
+    moves = bool(np.isfinite(series[roles.main]["sideslip"]).any())
     _add_over_time(charts, series, roles, peaks, scored=scored)
     rows = _rows(report, series, roles, stamps, origin_ns)
     charts.figures["strip"] = draw.StripFigure("Faults, gaps and segments", rows)
     if TRUTH in series:
         _add_path(charts, series, roles, _axes(report))
-    in_plane = {n: thinned(series[n].ay_sideslip, _MOST_POINTS) for n in (TRUTH, roles.main) if n in series}
+    in_plane = {n: thinned(series[n].get("ay_sideslip"), _MOST_POINTS) for n in (TRUTH, roles.main) if n in series}
     clouds = [
         draw.Cloud(n, draw.colour(n), x, y, _seconds(at_ns, charts))
         for n, (at_ns, x, y) in in_plane.items()
@@ -245,8 +213,13 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
             "|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °", clouds
         )
     _add_worst(charts, answer, reference, peaks)
-    absent = [n for n in roles.names if n not in tracks.names]
-    return DriveFigures(charts, peaks, scored, moves, absent)
+    shown = {
+        "peaks": peaks,
+        "scored": scored,
+        "moves": moves,
+        "absent": [n for n in roles.names if n not in tracks.names],
+    }
+    return {**shown, "charts": charts, "in_plane": not charts.figures.keys().isdisjoint(("path", "ay_sideslip"))}
 
 
 def _reference(tracks: Tracks, peaks: Sequence[Peak]) -> Reference | None:
@@ -271,7 +244,7 @@ def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: 
     lines = []
     for name in sorted(names, key=lambda n: n != roles.main):
         if name in series:
-            drawn = getattr(series[name], values)
+            drawn = series[name].get(values)
             if drawn is not None and np.isfinite(drawn).any():
                 lines.append(roles.series(name, drawn))
     return lines
@@ -281,7 +254,8 @@ def _add_over_time(
     charts: draw.Charts, series: Mapping[str, DriveSeries], roles: Roles, peaks: Sequence[Peak], *, scored: bool
 ) -> None:
     """Add sideslip, its error or the estimators' disagreement, steering, yaw rate, lateral acceleration and speed."""
-    figures, band, steer = charts.figures, series[roles.main].band, series[roles.main].steer
+    figures, main = charts.figures, series[roles.main]
+    band, steer = main.get("band"), main.get("steer")
     if lines := _lines(series, roles, "sideslip", (TRUTH, *roles.names)):
         bands = []
         if band is not None and np.isfinite(band[0]).any():
@@ -323,7 +297,7 @@ def _rows(
     longest = max(_GAP_S * 1e9, _GAP_STEPS * float(np.median(steps)) if steps.size else 0.0)
     losses = [x for x in report["losses"] if x.get("start_ns") is not None]
     rows = [
-        draw.Row("no estimate", draw.FAULT, spans(series[roles.main].invalid, f"{roles.main} is not valid")),
+        draw.Row("no estimate", draw.FAULT, spans(series[roles.main]["invalid"], f"{roles.main} is not valid")),
         draw.Row(
             "gap in the log", draw.FAULT, [span(stamps[i], stamps[i + 1], "") for i in np.flatnonzero(steps > longest)]
         ),
@@ -331,8 +305,8 @@ def _rows(
             "lost", draw.FAULT, [span(x["start_ns"], x.get("end_ns") or x["start_ns"], x["what"]) for x in losses]
         ),
     ]
-    seer = next((n for n in roles.names if n in series and len(series[n].reason)), None)
-    if seer is not None and len(reason := series[seer].reason) == len(stamps):
+    seer = next((n for n in roles.names if n in series and len(series[n]["reason"])), None)
+    if seer is not None and len(reason := series[seer]["reason"]) == len(stamps):
         rows += [draw.Row(r.text, draw.NOTE, spans((reason & r.bit) != 0, f"seen by {seer}")) for r in REASONS]
     by_name = gathered((s["name"], span(s["start_ns"], s["end_ns"], s["text"])) for s in report["segments"])
     for name in sorted(by_name, key=lambda n: (not n.endswith(" diverged"), n)):
@@ -372,7 +346,7 @@ def _axes(report: Mapping[str, Any]) -> tuple[str, str]:
 
 def _add_path(charts: draw.Charts, series: Mapping[str, DriveSeries], roles: Roles, axes: tuple[str, str]) -> None:
     """Add the dead-reckoned path, aligned with the ground truth's at the start."""
-    truth, estimate = (thinned(series[n].path, _MOST_POINTS) for n in (TRUTH, roles.main))
+    truth, estimate = (thinned(series[n].get("path"), _MOST_POINTS) for n in (TRUTH, roles.main))
     if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
         return
     common, at_truth, at_own = np.intersect1d(truth[0], estimate[0], return_indices=True)
@@ -381,18 +355,20 @@ def _add_path(charts: draw.Charts, series: Mapping[str, DriveSeries], roles: Rol
     if len(common) > 1:
         title = "Path, aligned with the ground truth at the start"
         aligned = aligned_path(estimate[1:, at_own], truth[1:, at_truth])
-        clouds += _by_error(aligned, common, series[roles.main], charts)
+        clouds += _by_error(aligned, common, roles.main, series[roles.main]["error"], charts)
     charts.figures["path"] = draw.PointsFigure(title, *axes, clouds, equal=True)
 
 
-def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, charts: draw.Charts) -> list[draw.Cloud]:
-    """Return the path [2, K] in three classes of the absolute sideslip error."""
+def _by_error(
+    aligned: FloatArray, at_ns: FloatArray, name: str, largest: FloatArray | None, charts: draw.Charts
+) -> list[draw.Cloud]:
+    """Return the path [2, K] of a track in three classes of its ``largest`` absolute sideslip error in each cell."""
     assert charts.grid is not None
-    largest = np.zeros(charts.grid.cells) if estimate.error is None else estimate.error
+    largest = np.zeros(charts.grid.cells) if largest is None else largest
     cell = np.clip((at_ns - charts.grid.start_ns) // charts.grid.cell_ns, 0, len(largest) - 1).astype(np.int64)
     error = np.nan_to_num(largest[cell], nan=0.0)
     if not (error > 0.0).any():
-        return [draw.Cloud(estimate.name, draw.colour(estimate.name), aligned[0], aligned[1], _seconds(at_ns, charts))]
+        return [draw.Cloud(name, draw.colour(name), aligned[0], aligned[1], _seconds(at_ns, charts))]
     first, second = (float(f"{q:.1g}") for q in np.quantile(error[error > 0.0], (0.5, 0.9)))
     edges = (0.0, first, second, np.inf)
     names = (f"error below {first:g}°", f"{first:g} to {second:g}°", f"above {second:g}°")

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
-from pdhef_logtool.evaluation.operating_space import OperatingSpace
-from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, ScoredDrive, requirement_blocks
+from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, requirement_blocks
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan, default_plan, load_plan
 from pdhef_logtool.records.errors import UsageError
@@ -45,12 +44,9 @@ def drive_blocks(
     ``main`` : the selected estimate, for requirements that name no estimator.
     """
     blocks: list[RequirementBlocks] = []
-    read, slow, dependent = drive.tracks.get, drive.low_speed_m_s, frozenset(drive.dependent)
-    for base in (drive.truth, read(REFERENCE)):
-        if base is not None:
-            scored = ScoredDrive(read, base, drive.masks, slow, dependent, estimated=base is not drive.truth)
-            left = [r for r in requirements if all(b.of != r.measured for b in blocks)]
-            blocks += requirement_blocks(left, main, scored)
+    for base in filter(None, (drive.truth, drive.tracks.get(REFERENCE))):
+        left = [r for r in requirements if all(b.of != r.measured for b in blocks)]
+        blocks += requirement_blocks(left, main, drive, base)
     return blocks
 
 
@@ -60,7 +56,7 @@ def judge_drive(
     main: str | None,
     rows: Sequence[MetricRow],
     blocks: Sequence[RequirementBlocks],
-    space: OperatingSpace,
+    space: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the entries of report.json on one drive: verdicts of a plan file, blocks of time, operating space."""
     stated = [{k: v for k, v in jsonable(block).items() if v != []} for block in blocks]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.operating_space import Cell, OperatingSpace
+from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.plotted import colour_rgb
@@ -60,7 +60,9 @@ def test_report_follows_its_schema(tmp_path):
     assert [m["value"] for m in document["metrics"]] == [np.deg2rad(0.5), None]
     assert document["segments"] == [{"name": "nonlinear", "start_ns": 1, "end_ns": 2, "text": "|ay| above 0.5 g"}]
     assert document["losses"][0]["severity"] == "lost"
-    space = OperatingSpace([Cell(3, 2, 1.5, 0, float("nan"))], 12.3, 2.5, 0.9)
+    cell = {"speed": 3, "ay": 2, "seconds": 1.5, "scored": 0, "sideslip_mse_rad2": float("nan")}
+    space = {"cells": [cell], "speed_max_m_s": 12.3, "ay_max_m_s2": 2.5, "friction_median": 0.9}
+    space |= {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2}
     more = report(metadata={"vehicle": "a"}, operating_space=space, faults=None)
     follows({**more, "estimators": []})
     assert more["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None and more["faults"] is None
