@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from rich.console import Console
 from rich.text import Text
 
 from pdhef_logtool.cli.console import print_indented, table, three_lines
@@ -16,9 +16,6 @@ from pdhef_logtool.results import comparing
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.junit import Case, cases_bytes, plan_cases
 from pdhef_logtool.storage.files import write_bytes
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 #: Number of drives at either end of a list.
 _MOST_DRIVES = 5
@@ -55,11 +52,8 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
 
 
 def _print(rows: Sequence[Sequence[str]], console: Console, *heads: str, fold: int = 1) -> None:
-    made = table(*heads, fold=fold)
-    for row in rows:
-        made.add_row(*row)
     console.print()
-    console.print(made)
+    console.print(table(*heads, rows=rows, fold=fold))
 
 
 def _print_figures(comparison: Comparison, console: Console) -> None:

@@ -106,9 +106,10 @@ def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
     if csv or console.as_json:
         print(rows.write_csv() if csv else rows.write_json())  # noqa: T201
         return
-    made = console.table(
-        *(f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items()), fold=len(rows.columns)
-    )
-    for row in rows.iter_rows():
-        made.add_row(*("-" if x is None else f"{x:.4g}" if isinstance(x, float) else printable(str(x)) for x in row))
-    console.stdout().print(made)
+
+    def text(value: object) -> str:
+        return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else printable(str(value))
+
+    heads = (f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items())
+    texts = (map(text, row) for row in rows.iter_rows())
+    console.stdout().print(console.table(*heads, rows=texts, fold=len(rows.columns)))

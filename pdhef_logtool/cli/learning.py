@@ -101,10 +101,9 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
 
 def render_extraction(result: ExtractResult, console: Console) -> None:
     """Print the data of the dataset by split; the manifest lists the drives."""
-    splits = table("split", ">drives", ">usable rows", ">rows")
-    for name, of in result.manifest["splits"].items():
-        splits.add_row(name, *(str(of[key]) for key in ("drives", "usable_rows", "rows")))
-    console.print(splits)
+    keys, splits = ("drives", "usable_rows", "rows"), result.manifest["splits"].items()
+    rows = ((name, *(str(of[key]) for key in keys)) for name, of in splits)
+    console.print(table("split", ">drives", ">usable rows", ">rows", rows=rows))
     console.print(f"dataset in {result.output}", soft_wrap=True)
 
 

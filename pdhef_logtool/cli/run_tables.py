@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
+from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, three_lines
 from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
+from pdhef_logtool.evaluation.metrics.metric import Metric
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.statistics import gathered
@@ -29,12 +31,7 @@ from pdhef_logtool.results.selected_estimate import (
     is_worse,
     result_of,
 )
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pdhef_logtool.evaluation.metrics.metric import Metric
-    from pdhef_logtool.runs.run_result import RunResult
+from pdhef_logtool.runs.run_result import RunResult
 
 _Report: TypeAlias = Mapping[str, Any]
 #: Signal, segment and metric.
@@ -164,20 +161,18 @@ def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
     console.print(_fleet_head(summary))
     console.print()
     if summary["errors"]:
-        spread = table("sideslip by", ">drives", ">median °", ">p90 °", ">largest °")
-        for of in summary["errors"]:
-            figures = (cell(of[f"{name}_rad"], DEGREES, 3) for name in ("median", "p90", "max"))
-            spread.add_row(of["estimator"], str(of["drives"]), *figures)
+        keys, errors = ("median_rad", "p90_rad", "max_rad"), summary["errors"]
+        rows = ((of["estimator"], str(of["drives"]), *(cell(of[key], DEGREES, 3) for key in keys)) for of in errors)
         console.print(f"RMSE of sideslip over {summary['scored']} drives with an independent ground truth")
-        console.print(spread)
+        console.print(table("sideslip by", ">drives", ">median °", ">p90 °", ">largest °", rows=rows))
         console.print()
     if summary["worst"]:
         names = list(dict.fromkeys(n for d in summary["worst"] for n in d["errors_rad"] if n != d["main"]))[:3]
-        worst = table("worst drives", "by", ">RMSE °", *(f">{n} °" for n in names), fold=1)
-        for drive in summary["worst"]:
-            errors = (cell(drive["errors_rad"].get(n), DEGREES, 3) for n in (drive["main"], *names))
-            worst.add_row(drive["log"], drive["main"], *errors)
-        console.print(worst)
+        rows = (
+            (d["log"], d["main"], *(cell(d["errors_rad"].get(n), DEGREES, 3) for n in (d["main"], *names)))
+            for d in summary["worst"]
+        )
+        console.print(table("worst drives", "by", ">RMSE °", *(f">{n} °" for n in names), rows=rows, fold=1))
         console.print()
     for kind in summary["failed"]:
         console.print(Text.assemble((f"{kind['count']} failed: ", "bold"), kind["reason"]))

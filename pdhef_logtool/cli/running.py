@@ -25,10 +25,8 @@ def _list_estimators(show: bool) -> None:
     if show:
         from pdhef_logtool.estimators.table import all_specs
 
-        table = console.table("name", "description")
-        for spec in all_specs():
-            table.add_row(spec.name, spec.text)
-        console.stdout().print(table)
+        rows = ((spec.name, spec.text) for spec in all_specs())
+        console.stdout().print(console.table("name", "description", rows=rows))
         raise typer.Exit
 
 
@@ -194,12 +192,12 @@ def open_viewer(recordings: Sequence[Path | str], *, web: bool) -> int:
 @options.command()
 def plan(action: str, *, output: Path) -> None:
     """Write a validation plan: requirements for run, metrics and compare."""
-    from pdhef_logtool.evaluation.plan_example import EXAMPLE
+    from pdhef_logtool.evaluation.validation_plan import example_plan
     from pdhef_logtool.storage.files import write_bytes
 
     if action != "init":
         raise UsageError(expected="init", got=action, where="pdhef plan", remedy="pdhef plan init -o plan.toml")
     if output.exists():
         raise UsageError(expected="a new file", got="one that exists", where=str(output), remedy="choose another name")
-    write_bytes(output, EXAMPLE.encode())
+    write_bytes(output, example_plan().encode())
     console.say(f"{output} written; use it: pdhef run LOGS -o OUT --plan {output}")

@@ -111,10 +111,8 @@ def _list_manoeuvres() -> None:
         rows = [{"name": name, **{f: getattr(m, f) for f in fields}} for name, m in MANOEUVRES.items()]
         console.print_json({"manoeuvres": rows})
         return
-    table = console.table("name", "km/h", "mu", "s", "what it is")
-    for name, m in MANOEUVRES.items():
-        table.add_row(name, f"{m.speed_km_h:g}", f"{m.friction:g}", f"{m.duration_s:g}", m.description)
-    console.stdout().print(table)
+    figures = ((n, *(f"{getattr(m, f):g}" for f in fields[1:]), m.description) for n, m in MANOEUVRES.items())
+    console.stdout().print(console.table("name", "km/h", "mu", "s", "what it is", rows=figures))
 
 
 @options.command()

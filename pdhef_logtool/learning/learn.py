@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -121,13 +121,8 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
     return LearnResult(output, records, model.evidence, figures)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Read:
-    """Driving and sensors of a drive; ``opened`` : its content for teaching, None without ground truth."""
-
-    driving: Driving | None
-    sensors: Sensors
-    opened: OpenedDrive | None
+#: Driving and sensors of a drive, and its content for teaching, None without ground truth.
+_Read: TypeAlias = "tuple[Driving | None, Sensors, OpenedDrive | None]"
 
 
 def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
@@ -138,14 +133,14 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
         with read_drive(log, car, drives.mapping, config.read_options) as drive:
             record, opened = open_drive(drive, config)
             if opened is not None:
-                return record, _Read(opened.driving, drive.plan.sensors, opened)
+                return record, (opened.driving, drive.plan.sensors, opened)
             start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
             driving = None if lacking(drive) else read_driving(drive)
             record = replace(record, seconds=end_s - start_s, span_s=(start_s, end_s))
-            return record, _Read(driving, drive.plan.sensors, None)
+            return record, (driving, drive.plan.sensors, None)
 
     records, content = drives.read(read, 0.3)
-    teachers = [r.opened for r in content if r.opened is not None]
+    teachers = [opened for *_, opened in content if opened is not None]
     if not teachers and config.reference != "on":
         return _without_truth(records, content, car)
     _check("" if teachers else "none", "at least one drive with a true sideslip and the signals of a calibration")
@@ -153,7 +148,7 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
     few = "" if seconds >= LEAST_S else f"{seconds:.1f} s"
     _check(few, f"at least {LEAST_S:g} s of driving with ground truth above {slow:g} m/s")
     taught = learn_from(teachers, progress)
-    sensors = next(r.sensors for r in content if r.opened is not None)
+    sensors = teachers[0].drive.plan.sensors
     stated = {name: getattr(taught, name) for name in ("parameters", "calibrated", "truth", "evidence")}
     return records, model_of(car, sensors, residual=taught.ladder.model, **stated), figures_of(taught)
 
@@ -162,10 +157,10 @@ def _without_truth(
     records: Sequence[DriveRecord], content: Sequence[_Read], car: Car
 ) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
     """Return the records of drives without ground truth, their model, and figures."""
-    fits = [None if r.driving is None else fit_car(r.driving, car.vehicle) for r in content]
+    fits = [None if driving is None else fit_car(driving, car.vehicle) for driving, *_ in content]
     left_out = [r.left_out if fit is None else fit.refused for r, fit in zip(records, fits, strict=True)]
     records = tuple(replace(r, left_out=reason) for r, reason in zip(records, left_out, strict=True))
-    used = [(fit, r.sensors) for fit, r in zip(fits, content, strict=True) if fit is not None and not fit.refused]
+    used = [(fit, of[1]) for fit, of in zip(fits, content, strict=True) if fit is not None and not fit.refused]
     _check(
         "" if used else next(iter(left_out), "no drive"),
         "driving that calibrates the car, such as lane changes and bends",

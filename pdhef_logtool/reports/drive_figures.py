@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
-from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.records.geometry import DEGREES, wrap_angle
@@ -51,6 +50,8 @@ class Tracks:
 
 #: Series of a track by name, of :func:`gather`.
 DriveSeries: TypeAlias = dict[str, Any]
+#: One of the largest errors of a report.
+_Peak: TypeAlias = Mapping[str, Any]
 
 
 def thinned(points: FloatArray | None, most: int) -> FloatArray:
@@ -154,14 +155,6 @@ class Roles:
         return draw.Series(name, draw.colour(name), values, width, dash, group=name)
 
 
-@dataclass(frozen=True, slots=True)
-class Peak(ErrorPlace):
-    """One of the largest errors with its seconds from the log's start, and the segments that contain it."""
-
-    at_s: float
-    during: str
-
-
 def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> dict[str, Any] | None:
     """Return the figures of a drive; None if the file contains no row of the selected estimate.
 
@@ -222,21 +215,21 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> dict[s
     return {**shown, "charts": charts, "in_plane": not charts.figures.keys().isdisjoint(("path", "ay_sideslip"))}
 
 
-def _reference(tracks: Tracks, peaks: Sequence[Peak]) -> Reference | None:
+def _reference(tracks: Tracks, peaks: Sequence[_Peak]) -> Reference | None:
     """Return the reference of the report's largest errors; None if it is not available."""
-    against = peaks[0].against if peaks else ""
+    against = peaks[0]["against"] if peaks else ""
     return Reference(tracks.read(against), against == TRUTH, tracks) if against in tracks.names else None
 
 
-def _peaks(report: Mapping[str, Any]) -> tuple[Peak, ...]:
-    """Return the largest errors of a report."""
-    peaks = []
+def _peaks(report: Mapping[str, Any]) -> list[_Peak]:
+    """Return the largest errors of a report, with seconds from the log's start and the segments that contain them."""
+    peaks = list[_Peak]()
     for place in report.get("largest_errors") or ():
         stamp = int(place["stamp_ns"])
         names = [s["name"] for s in report["segments"] if s["start_ns"] <= stamp < s["end_ns"]]
         at_s, during = (stamp - int(report["log"]["start_ns"])) * 1e-9, ", ".join(dict.fromkeys(names))
-        peaks.append(Peak(**place, at_s=at_s, during=during))
-    return tuple(peaks)
+        peaks.append({**place, "at_s": at_s, "during": during})
+    return peaks
 
 
 def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: Sequence[str]) -> list[draw.Series]:
@@ -251,7 +244,7 @@ def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: 
 
 
 def _add_over_time(
-    charts: draw.Charts, series: Mapping[str, DriveSeries], roles: Roles, peaks: Sequence[Peak], *, scored: bool
+    charts: draw.Charts, series: Mapping[str, DriveSeries], roles: Roles, peaks: Sequence[_Peak], *, scored: bool
 ) -> None:
     """Add sideslip, its error or the estimators' disagreement, steering, yaw rate, lateral acceleration and speed."""
     figures, main = charts.figures, series[roles.main]
@@ -266,7 +259,7 @@ def _add_over_time(
     if lines := _lines(series, roles, "error", roles.names):
         apart = f"Disagreement: sideslip difference from {roles.main}, absolute"
         title = "Absolute error of sideslip, largest of each cell" if scored else apart
-        marks = [draw.Mark(str(i + 1), p.at_s, abs(p.error_rad) * DEGREES) for i, p in enumerate(peaks)]
+        marks = [draw.Mark(str(i + 1), p["at_s"], abs(p["error_rad"]) * DEGREES) for i, p in enumerate(peaks)]
         figures["error"] = draw.TimeFigure(title, "°", lines, marks=marks, level=0.0, resolution=_DEGREES_SEEN)
     if steer is not None and np.isfinite(steer).any():
         lines = [draw.Series("measured", draw.INK, steer)]
@@ -315,24 +308,24 @@ def _rows(
     return rows or [draw.Row("nothing", draw.PLAIN, [])]
 
 
-def _add_worst(charts: draw.Charts, answer: StateTrack, reference: Reference | None, peaks: Sequence[Peak]) -> None:
+def _add_worst(charts: draw.Charts, answer: StateTrack, reference: Reference | None, peaks: Sequence[_Peak]) -> None:
     """Add the sideslip around the largest error, the only figure of the first screen."""
     if reference is None or not peaks:
         return
     worst = peaks[0]
     clouds = []
     for track in (answer, reference.track):
-        near = track.between(worst.stamp_ns - _AROUND_NS, worst.stamp_ns + _AROUND_NS + 1)
+        near = track.between(worst["stamp_ns"] - _AROUND_NS, worst["stamp_ns"] + _AROUND_NS + 1)
         stamps, beta = near.stamps_ns, near.sideslip_rad * DEGREES
         step = max(1, len(stamps) // _MOST_AROUND)
         clouds.append(
             draw.Cloud(track.name, draw.colour(track.name), _seconds(stamps[::step], charts), beta[::step], line=True)
         )
     kind = "error" if reference.scored else "difference"
-    here = np.array([worst.at_s]), np.array([worst.estimate_rad * DEGREES])
+    here = np.array([worst["at_s"]]), np.array([worst["estimate_rad"] * DEGREES])
     clouds.append(draw.Cloud(f"largest {kind}", draw.FAULT, *here))
-    title = f"Largest {kind} after the first 2 s: {abs(worst.error_rad) * DEGREES:.2f}° at {worst.at_s:.1f} s"
-    title += f" during {worst.during}" if worst.during else ""
+    title = f"Largest {kind} after the first 2 s: {abs(worst['error_rad']) * DEGREES:.2f}° at {worst['at_s']:.1f} s"
+    title += f" during {worst['during']}" if worst["during"] else ""
     charts.figures["worst"] = draw.PointsFigure(title, "s from the log's start", "sideslip in °", clouds)
 
 

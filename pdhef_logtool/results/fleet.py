@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
@@ -21,14 +21,10 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
-from pdhef_logtool.evaluation.statistics import FACTORS, Factors, dependence, deviate, holm, numbered
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.selected_estimate import NAIVE
-
-if TYPE_CHECKING:
-    import polars as pl
 
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
@@ -491,13 +487,13 @@ class _Test:
 
     def effect(self, p: float, level: float, sign: float = 1.0) -> Effect:
         """Return it with a corrected p-value, and the interval at a level (0.05: 95 %); ``sign`` -1: other group."""
-        width, difference = deviate(1.0 - 0.5 * level, self.freedom) * self.error, sign * self.difference
+        width, difference = statistics.deviate(1.0 - 0.5 * level, self.freedom) * self.error, sign * self.difference
         low, high = difference - width, min(difference + width, _LARGEST_LOG)
         return Effect(math.expm1(difference), math.expm1(low), math.expm1(high), p)
 
 
 def breakdowns(
-    errors: FloatArray, keys: Sequence[Mapping[str, str]], factors: Factors, by: Sequence[str] = ()
+    errors: FloatArray, keys: Sequence[Mapping[str, str]], factors: statistics.Factors, by: Sequence[str] = ()
 ) -> tuple[Breakdown, ...]:
     """Return drives by each key that separates them, the strongest evidence first.
 
@@ -521,8 +517,8 @@ def breakdowns(
 def _alike(errors: FloatArray, columns: Mapping[str, _Texts]) -> dict[str, tuple[str, ...]]:
     """Return for the first key of each way to separate the scored drives the other keys that do the same."""
     first: dict[bytes, list[str]] = {}
-    for key in sorted(columns, key=lambda key: (key not in FACTORS, key)):
-        part = numbered([value or "" for value in columns[key][errors > 0.0]])
+    for key in sorted(columns, key=lambda key: (key not in statistics.FACTORS, key)):
+        part = statistics.numbered([value or "" for value in columns[key][errors > 0.0]])
         first.setdefault(part.tobytes(), []).append(key)
     return {key: tuple(others) for key, *others in first.values()}
 
@@ -531,11 +527,11 @@ def _tests(key: str, errors: FloatArray, values: _Texts, drives: Mapping[str, _T
     """Return the comparison of each value with the other drives, or the reason why it is impossible."""
     use = (errors > 0.0) & np.array([v is not None for v in values], dtype=np.bool_)
     logs, names = np.log(errors[use]), values[use]
-    part = numbered(names)
+    part = statistics.numbered(names)
     factors = {
         name: of[use]
         for name, of in drives.items()
-        if key != name and not np.array_equal(numbered(of[use]), part) and len({*filter(None, of[use])}) > 1
+        if key != name and not np.array_equal(statistics.numbered(of[use]), part) and len({*filter(None, of[use])}) > 1
     }
     return {value: _test(logs, names == value, factors) for value in dict.fromkeys(values) if value is not None}
 
@@ -562,7 +558,7 @@ def _test(logs: FloatArray, inside: BoolArray, factors: Mapping[str, _Texts]) ->
     variance = sum(variances)
     if variance == 0.0:
         return _Test(means[0] - means[1], 0.0, math.inf)
-    drives = dependence(scores, factors, weights)
+    drives = statistics.dependence(scores, factors, weights)
     uncertain = sum(v**2 / f for v, f in zip(variances, freedoms, strict=True)) / variance**2
     freedom = 1.0 / (uncertain + (0.0 if math.isinf(drives.freedom) else 1.0 / drives.freedom))
     return _Test(means[0] - means[1], math.sqrt(variance * drives.design_effect), freedom)
@@ -581,7 +577,9 @@ def _corrected(tests: Mapping[str, Mapping[str, _Test | str]]) -> dict[str, dict
             once += [(test, key, [value]) for value, test in made.items()]
     raw = [test.p for test, _, _ in once]
     steps = len(raw)
-    for p, corrected, (test, key, values) in sorted(zip(raw, holm(raw), once, strict=True), key=lambda row: row[0]):
+    for p, corrected, (test, key, values) in sorted(
+        zip(raw, statistics.holm(raw), once, strict=True), key=lambda row: row[0]
+    ):
         for value, sign in zip(values, (1.0, -1.0), strict=False):
             results[key][value] = test.effect(corrected, SIGNIFICANT / steps, sign)
         steps -= p <= SIGNIFICANT / steps and corrected < SIGNIFICANT

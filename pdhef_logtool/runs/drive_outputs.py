@@ -31,11 +31,11 @@ from pdhef_logtool.results.opened_run import (
     TABLES_FOLDER,
     table_file,
 )
-from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
+from pdhef_logtool.results.parquet_sink import write_estimates
 from pdhef_logtool.results.plotted import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
 from pdhef_logtool.results.sink import TRUTH, Event
-from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_tables
+from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_metrics, write_tables
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import file_sha256

@@ -12,15 +12,14 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.priors import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference
     from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
-
-from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.records.tracks import StateTrack
 
 #: A drive is smoothed in spans of this length, which overlap by twice the margin: memory does not grow with the drive.
 SPAN_S, MARGIN_S = 600.0, 30.0

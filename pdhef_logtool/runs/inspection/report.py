@@ -102,12 +102,13 @@ class Steps:
         steps = self.steps_s
         return float(np.quantile(np.abs(steps - self.median_s), 0.95)) if steps.shape[0] else float("nan")
 
-    def longest(self, since_ns: int, above_s: float = MIN_GAP_S) -> tuple[float, float]:
+    def longest(self, since_ns: int, above_s: float = MIN_GAP_S) -> dict[str, float]:
         """Return the longest step above a limit and its start since a stamp, both in s; NaN without one."""
         i = int(np.argmax(self.steps_s)) if self.steps_s.shape[0] else 0
-        if not (self.steps_s[i : i + 1] > above_s).any():
-            return float("nan"), float("nan")
-        return float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * 1e-9
+        gap = math.nan, math.nan
+        if (self.steps_s[i : i + 1] > above_s).any():
+            gap = float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * 1e-9
+        return dict(zip(("largest_gap_s", "largest_gap_at_s"), gap, strict=True))
 
     @property
     def gap_limit_s(self) -> float:
@@ -154,6 +155,14 @@ _IN_DOCUMENT = (
     "truth", "truth_quality", "missing", "ambiguities", "notes", "checks", "proposals", "lost", "candidates",
     "estimators",
 )  # fmt: skip
+
+
+_FIGURES: dict[str, Callable[[FloatArray], Any]] = {
+    "mean": np.mean,
+    "std": np.std,
+    "minimum": np.min,
+    "maximum": np.max,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,7 +432,6 @@ def _topic_reports(
 
 
 def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log: DriveLog) -> TopicReport:
-    gap_s, gap_at_s = steps.longest(log.start_ns)
     log_s = (log.end_ns - log.start_ns) * 1e-9
     numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
     delays = np.concatenate([np.empty(0), *((c.log_time_ns - c.publish_time_ns) * 1e-9 for c in stamps)])
@@ -435,8 +443,7 @@ def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log
         messages=topic.messages,
         rate_hz=steps.rate_hz if steps.count else topic.messages / log_s if log_s > 0.0 else math.nan,
         jitter_p95_s=steps.jitter_p95_s,
-        largest_gap_s=gap_s,
-        largest_gap_at_s=gap_at_s,
+        **steps.longest(log.start_ns),
         delay_median_s=median,
         delay_p95_s=late,
         fields=numbers[:MAX_LISTED_FIELDS],
@@ -455,7 +462,6 @@ def _signal_report(
     steps = Steps.of([c.stamps_ns for c in channels])
     lengths = (c.values if c.values.ndim == 1 else np.linalg.norm(c.values, axis=1) for c in channels)
     values = np.concatenate([np.empty(0), *lengths])
-    gap_s, gap_at_s = steps.longest(log.start_ns, steps.gap_limit_s)
     places = {f"{source.name} ({source.label})"}
     if section == "truth" and quality is not None:
         places.add(f"{source.name} ({quality.describe()})")
@@ -463,9 +469,7 @@ def _signal_report(
     # Messages that were sorted back are used.
     dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.read_topic and x.kind in TOPIC_DROPS}
     with np.errstate(over="ignore", invalid="ignore"):  # values that are no measurements
-        mean, std, minimum, maximum = (
-            float(f(values)) if values.size else math.nan for f in (np.mean, np.std, np.min, np.max)
-        )
+        figures = {name: float(f(values)) if values.size else math.nan for name, f in _FIGURES.items()}
     return SignalReport(
         name=source.name,
         unit=(SIGNAL_UNITS if section == "signals" else TRUTH_UNITS)[source.name],
@@ -474,13 +478,9 @@ def _signal_report(
         samples=steps.count,
         rate_hz=steps.rate_hz,
         latency_s=clock.median_delay_s + source.latency_s,
-        mean=mean,
-        std=std,
-        minimum=minimum,
-        maximum=maximum,
+        **figures,
         gaps=steps.gaps,
-        largest_gap_s=gap_s,
-        largest_gap_at_s=gap_at_s,
+        **steps.longest(log.start_ns, steps.gap_limit_s),
         dropped=dropped,
     )
 
