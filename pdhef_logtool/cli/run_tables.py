@@ -14,7 +14,7 @@ from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, three_lines
 from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import LABELS, read_unit

@@ -238,10 +238,9 @@ class _Blocks:
         """Add a series and return its reference for the script."""
         key = (id(values), resolution)
         if key not in self._known:
-            made = encode(values, resolution)
             name = f"b{len(self.texts)}"
-            self.texts[name] = made.base64
-            self._known[key] = {"block": name, "low": made.low, "step": made.step, "count": made.count}
+            self.texts[name], scale = encode(values, resolution)
+            self._known[key] = {"block": name, **scale}
         return self._known[key]
 
     def entries(self, record: Any, resolution: float) -> dict[str, Any]:

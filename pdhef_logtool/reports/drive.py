@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics.handling import responses
-from pdhef_logtool.evaluation.metrics.metric import Metric
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.metric import Metric, registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import AY_NOTE, LABELS, SCORED_SIGNALS, SIGNALS, read_unit
 from pdhef_logtool.records.errors import OutputError

@@ -18,7 +18,7 @@ import numpy as np
 import polars as pl
 
 from pdhef_logtool.evaluation import statistics
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.segments import SEGMENTS

@@ -15,7 +15,7 @@ from typing import Any
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.selected_estimate import TEMPLATES, MainFacts, answer_of
