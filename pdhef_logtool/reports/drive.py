@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics.handling import responses
@@ -14,6 +13,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import Roles, drive_figures
 from pdhef_logtool.reports.page import render
+from pdhef_logtool.reports.pages import Page
 from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.selected_estimate import NAIVE
@@ -28,17 +28,7 @@ IN_PLANE = ("path", "ay_sideslip")
 _MOST_ROWS = 200
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DrivePage:
-    """The page of a drive: the HTML, its figures, the error of a file that could not be read, the key figures."""
-
-    html: bytes
-    charts: Charts
-    wrong: str = ""
-    key_figures: dict[str, Any] | None = None
-
-
-def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
+def drive_page(log: OpenedLog, back: str = "") -> Page:
     """Return the page of a log of a run; for a failed log, a page with the reason.
 
     ``back``: address of the page of the whole run, empty without one. Raises OutputError for a damaged report.json.
@@ -46,7 +36,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
     report = log.report()
     if report is None or not isinstance(report.get("log"), dict):
         cause, remedy = cause_and_remedy(log.outcome.removeprefix("failed: "))
-        return DrivePage(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
+        return Page(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
     figures, path, wrong = None, None, ""
     roles = roles_of(report)
     if roles is not None:
@@ -84,7 +74,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         over_time=OVER_TIME,
         in_plane=IN_PLANE,
     )
-    return DrivePage(html, charts, wrong, key_figures)
+    return Page(html, charts, wrong, key_figures=key_figures)
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:

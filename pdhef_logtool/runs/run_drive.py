@@ -20,7 +20,7 @@ from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.operating_space import operating_space
-from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
+from pdhef_logtool.evaluation.reasons import Interval, sensor_fault, sensor_faults
 from pdhef_logtool.evaluation.statistics import day_and_route
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP, ValidationPlan
 from pdhef_logtool.logs.discovery import LogInput
@@ -228,7 +228,7 @@ def _estimator_entries(run: PreparedDrive) -> Iterator[dict[str, Any]]:
 
 def _faults(
     run: PreparedDrive, selected: str | None, read: Callable[[str], StateTrack | None]
-) -> tuple[SensorFault, ...] | None:
+) -> list[dict[str, Any]] | None:
     """Return the changes of the sensors, and the faults that the selected estimate detects, or else physics.
 
     None without changes where neither detects any.
@@ -236,11 +236,9 @@ def _faults(
     tracks = [read(name) for name in dict.fromkeys((selected, PHYSICS)) if name in run.names]
     detected = (sensor_faults(track) for track in tracks if track is not None)
     faults = next((faults for faults in detected if faults is not None), None)
-    changes = tuple(
-        SensorFault(c.sensor, c.kind, 1, (c.end_ns - c.start_ns) * 1e-9, (Interval(c.start_ns, c.end_ns),))
-        for c in run.drive.recorded().changes
-    )
-    return (*changes, *(faults or ())) if changes or faults is not None else None
+    of_drive = run.drive.recorded().changes
+    changes = [sensor_fault(c.sensor, c.kind, [Interval(c.start_ns, c.end_ns)]) for c in of_drive]
+    return [*changes, *(faults or ())] if changes or faults is not None else None
 
 
 def _metadata(drive: Drive) -> dict[str, str]:

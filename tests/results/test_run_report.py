@@ -11,7 +11,7 @@ import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
-from pdhef_logtool.evaluation.reasons import Interval, SensorFault
+from pdhef_logtool.evaluation.reasons import Interval, sensor_fault
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.plotted import colour_rgb
 from pdhef_logtool.results.run_report import (
@@ -70,11 +70,8 @@ def test_report_follows_its_schema(tmp_path):
 
 def test_faults_are_in_words():
     spans = [Interval(int(a * 1e9), int(b * 1e9)) for a, b in ((1.2, 1.21), (3.45, 3.46), (7, 8), (9, 9.01))]
-    stuck, spike = (
-        SensorFault("yaw_rate_rad_s", "stuck", 1, 1.0, (spans[2],)),
-        SensorFault("ay_m_s2", "spike", 60, 1.0, tuple(spans)),
-    )
-    document = report(None, faults=[stuck, spike], estimators=[ran("phy-ukf", algorithm=None)])
+    stuck, spike = sensor_fault("yaw_rate_rad_s", "stuck", spans[2:3]), sensor_fault("ay_m_s2", "spike", spans)
+    document = report(None, faults=[stuck, {**spike, "count": 60}], estimators=[ran("phy-ukf", algorithm=None)])
     follows(document)
     words = "yaw rate stuck 7.0-8.0 s; a_y spike 1.20 s, 3.45 s, 7.0-8.0 s and 57 more"
     assert f"- {words}" in report_markdown(document).splitlines()
