@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from pdhef_logtool.results.opened_run import open_run as open_run
     from pdhef_logtool.results.querying import query as query
     from pdhef_logtool.runs.config import RunConfig as RunConfig
+    from pdhef_logtool.runs.estimating import choose as choose
     from pdhef_logtool.runs.fleet import Schedule as Schedule
     from pdhef_logtool.runs.fleet import run_logs as run  # noqa: F401
     from pdhef_logtool.runs.frames import estimate as estimate
     from pdhef_logtool.runs.frames import score as score
     from pdhef_logtool.runs.inspection import inspect_log as inspect_log
-    from pdhef_logtool.runs.preparing import choose as choose
 
 #: Module of each public name, ``module`` or ``module:name in it``.
 _HOMES = {
@@ -51,7 +51,7 @@ _HOMES = {
     "query": "results.querying",
     "RunConfig": "runs.config",
     "Schedule": "runs.fleet",
-    "choose": "runs.preparing",
+    "choose": "runs.estimating",
     "estimate": "runs.frames",
     "score": "runs.frames",
     "run": "runs.fleet:run_logs",

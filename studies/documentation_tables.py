@@ -15,7 +15,7 @@ from pdhef_logtool.car.assumed_values import RULES
 from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.drive.check_table import TABLE
 from pdhef_logtool.estimators.table import SPECS
-from pdhef_logtool.evaluation.metrics import registry as metrics
+from pdhef_logtool.evaluation.metrics import metric as metrics
 from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.opened_run import TABLES

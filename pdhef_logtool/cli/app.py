@@ -37,7 +37,7 @@ app = typer.Typer(
     epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost, a check or some logs failed, "
     "4 a requirement or regression gate failed, 130 interrupted (Ctrl-C), 141 stdout was closed early, 143 terminated.",
 )
-_MODULES = "inspecting running validation reporting comparing querying simulating learning converting compiling"
+_MODULES = "inspecting running reporting comparing learning simulating"
 for _module in _MODULES.split():
     importlib.import_module(f"{__package__}.{_module}")
 app.registered_commands = options.commands.registered_commands

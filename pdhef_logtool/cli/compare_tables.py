@@ -5,20 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from rich.console import Console
 from rich.text import Text
 
 from pdhef_logtool.cli.console import print_indented, table, three_lines
 from pdhef_logtool.cli.plan_tables import plan_line, render_plan
 from pdhef_logtool.evaluation.units import read_unit
-from pdhef_logtool.results.comparing import MAIN, ComparedFigure, Comparison
-from pdhef_logtool.results.comparison_words import history_table, interval_text, notes_of, percent, sentence
+from pdhef_logtool.results import comparing
+from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.junit import Case, cases_bytes, plan_cases
 from pdhef_logtool.storage.files import write_bytes
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 #: Number of drives at either end of a list.
 _MOST_DRIVES = 5
@@ -27,11 +24,13 @@ _MOST_DRIVES = 5
 def render_comparison(comparison: Comparison, console: Console) -> None:
     """Print a comparison: verdict, assumptions and next step, then their basis."""
     requirements = comparison.requirements
-    verdict = "; gate closed: ".join((sentence("verdict", comparison), *comparison.failures))
+    verdict = "; gate closed: ".join((comparing.sentence("verdict", comparison), *comparison.failures))
     result = verdict if requirements is None else Text.assemble(verdict, "; ", plan_line(requirements))
-    console.print(three_lines(result, sentence("assumed", comparison), sentence("next", comparison)))
+    console.print(
+        three_lines(result, comparing.sentence("assumed", comparison), comparing.sentence("next", comparison))
+    )
     if comparison.history:
-        heads, rows = history_table(comparison)
+        heads, rows = comparing.history_table(comparison)
         _print(rows, console, *heads, fold=4)
     console.print()
     console.print(Text.assemble(("A ", "bold"), comparison.a, ("  B ", "bold"), comparison.b), soft_wrap=True)
@@ -41,7 +40,7 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
         console.print("\nOther differences", style="bold")
         for line in comparison.differences:
             print_indented(line, console)
-    console.print(f"\n{sentence('changes', comparison)}")
+    console.print(f"\n{comparing.sentence('changes', comparison)}")
     if not comparison.equal:
         _print_figures(comparison, console)
         _print_drives(comparison.figures[0], console)
@@ -53,22 +52,19 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
 
 
 def _print(rows: Sequence[Sequence[str]], console: Console, *heads: str, fold: int = 1) -> None:
-    made = table(*heads, fold=fold)
-    for row in rows:
-        made.add_row(*row)
     console.print()
-    console.print(made)
+    console.print(table(*heads, rows=rows, fold=fold))
 
 
 def _print_figures(comparison: Comparison, console: Console) -> None:
     rows = []
     for row in comparison.figures:
-        may_be = "-" if row.limit is None else percent(row.limit)
+        may_be = "-" if row.limit is None else comparing.percent(row.limit)
         drives = str(row.change.drives) + (f" ({row.change.clusters})" if comparison.cluster else "")
-        median = percent(math.expm1(row.change.median))
-        rows.append([row.requirement.name, drives, median, interval_text(row), may_be, row.verdict])
+        median = comparing.percent(math.expm1(row.change.median))
+        rows.append([row.requirement.name, drives, median, comparing.interval_text(row), may_be, row.verdict])
     _print(rows, console, "figure", ">drives", ">median\nchange", ">95 %\ninterval", ">limit", "verdict")
-    for note in notes_of(comparison):
+    for note in comparing.notes_of(comparison):
         print_indented(note, console)
 
 
@@ -80,7 +76,7 @@ def _print_drives(figure: ComparedFigure, console: Console) -> None:
     rows = []
     for drive in changed:
         name = drive["drive"] + ("" if drive["drive"] == drive["drive_b"] else f" ({drive['drive_b']} in B)")
-        change = "-" if drive["change"] is None else percent(drive["change"])
+        change = "-" if drive["change"] is None else comparing.percent(drive["change"])
         rows.append([name, *(f"{drive[side] * factor:.3g}" for side in "ab"), change])
     if (more := len(rows) - 2 * _MOST_DRIVES) > 0:
         rows[_MOST_DRIVES:-_MOST_DRIVES] = [[f"… {more} more …", "", "", ""]]
@@ -92,7 +88,7 @@ def _print_others(others: Sequence[ComparedFigure], console: Console) -> None:
     rows = []
     for row in others:
         p = 1.0 if row.corrected_p is None else row.corrected_p
-        median, changed = percent(math.expm1(row.change.median)), "changed" if p < 0.05 else ""
+        median, changed = comparing.percent(math.expm1(row.change.median)), "changed" if p < 0.05 else ""
         rows.append([row.requirement.name, str(row.change.drives), median, f"{p:.2g}", changed])
     _print(rows, console, "other figures", ">drives", ">median", ">p (Holm)", "")
 
@@ -111,7 +107,9 @@ def write_comparison_junit(path: Path, comparison: Comparison) -> None:
 def _figure_case(row: ComparedFigure, comparison: Comparison) -> Case:
     name = row.requirement.name
     closed = any(line.startswith(f"{name}: ") for line in comparison.failures)
-    median = percent(math.expm1(row.change.median))
-    limit = "no limit" if row.limit is None else f"limit {percent(row.limit)}"
-    text = f"{row.verdict}: median {median} (95 %: {interval_text(row)}) of {row.change.drives} drives, {limit}"
-    return Case("compare", row.requirement.estimator or MAIN, name, row.verdict, closed, text, text)
+    median = comparing.percent(math.expm1(row.change.median))
+    limit = "no limit" if row.limit is None else f"limit {comparing.percent(row.limit)}"
+    text = (
+        f"{row.verdict}: median {median} (95 %: {comparing.interval_text(row)}) of {row.change.drives} drives, {limit}"
+    )
+    return Case("compare", row.requirement.estimator or comparing.MAIN, name, row.verdict, closed, text, text)

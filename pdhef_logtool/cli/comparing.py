@@ -1,4 +1,4 @@
-"""``pdhef compare`` and ``events``: differences between two runs, and events within one."""
+"""``pdhef compare``, ``events`` and ``query``: differences between runs, events within one, SQL on their tables."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.printable import printable
 
 #: Time around events: repeated crossings of a threshold are one event; a clip shows the time before and after.
 _PAD_S, _CLIP_PAD_S = 0.25, 5.0
@@ -94,3 +95,21 @@ def _seconds(text: str, option: str) -> float:
     if match is None or float(match[1]) > 1e6:
         raise UsageError(expected="a time such as 5s", got=text, where=option)
     return float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)
+
+
+@options.command()
+def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
+    """Ask about the drives of one or more runs, in SQL."""
+    from pdhef_logtool.results import querying
+
+    rows = querying.query(runs, sql)
+    if csv or console.as_json:
+        print(rows.write_csv() if csv else rows.write_json())  # noqa: T201
+        return
+
+    def text(value: object) -> str:
+        return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else printable(str(value))
+
+    heads = (f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items())
+    texts = (map(text, row) for row in rows.iter_rows())
+    console.stdout().print(console.table(*heads, rows=texts, fold=len(rows.columns)))

@@ -6,7 +6,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
 
@@ -56,8 +56,8 @@ def stdout() -> Console:
     )
 
 
-def table(*heads: str, fold: int = 0) -> Table:
-    """Return a table without a box; a head that begins with ``>`` marks a column of numbers.
+def table(*heads: str, rows: Iterable[Iterable[Any]] = (), fold: int = 0) -> Table:
+    """Return a table of rows without a box; a head that begins with ``>`` marks a column of numbers.
 
     ``fold``: number of columns from the left that wrap their text instead of truncating it.
     """
@@ -67,6 +67,8 @@ def table(*heads: str, fold: int = 0) -> Table:
     for number, head in enumerate(heads):
         side: Literal["left", "right"] = "right" if head.startswith(">") else "left"
         made.add_column(head.removeprefix(">"), justify=side, overflow="fold" if number < fold else "ellipsis")
+    for row in rows:
+        made.add_row(*row)
     return made
 
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from rich.console import Console
 
 from pdhef_logtool.cli.console import table, three_lines
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.records.printable import listed
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pdhef_logtool.results.events import FoundEvents
+from pdhef_logtool.results.events import FoundEvents
 
 #: Largest number of events in the output.
 _MOST_EVENTS = 50

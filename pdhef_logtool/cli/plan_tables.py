@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
+from rich.console import Console
 from rich.text import Text
 
 from pdhef_logtool.cli.console import print_indented, table
 from pdhef_logtool.evaluation.requirement_verdicts import joint_notes
 from pdhef_logtool.evaluation.validation_plan import shown
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
 

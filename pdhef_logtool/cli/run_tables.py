@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
+from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, three_lines
 from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
@@ -29,34 +30,15 @@ from pdhef_logtool.results.selected_estimate import (
     is_worse,
     result_of,
 )
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pdhef_logtool.evaluation.metrics.metric import Metric
-    from pdhef_logtool.runs.run_result import RunResult
+from pdhef_logtool.runs.run_result import RunResult
 
 _Report: TypeAlias = Mapping[str, Any]
 #: Signal, segment and metric.
 _Key: TypeAlias = tuple[str, str, str]
+#: Head of a column of the table of estimators, factor to the displayed unit, digits.
+_Column: TypeAlias = tuple[str, float, int]
 
-
-class _Column(NamedTuple):
-    """A column of the table of estimators: head, metric, factor to the displayed unit, digits."""
-
-    head: str
-    signal: str
-    segment: str
-    metric: str
-    factor: float
-    digits: int
-
-    @property
-    def key(self) -> _Key:
-        return self.signal, self.segment, self.metric
-
-
-_NIS_RATIO = _Column("\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2)
+_NIS_RATIO: _Key = ("state", "all", "nis_ratio")
 #: Columns of the narrowest terminal, and columns in the order of their omission, after all columns that are not listed.
 _KEPT: tuple[_Key, ...] = (("sideslip_rad", "all", "rmse"), ("sideslip_rad", "all", "coverage95"))
 _LEAVE_LAST: tuple[_Key, ...] = (
@@ -66,7 +48,7 @@ _LEAVE_LAST: tuple[_Key, ...] = (
     ("vy_m_s", "all", "rmse"),
     ("sideslip_rad", "all", "p95_abs"),
     ("ay_m_s2", "all", "rmse"),
-    _NIS_RATIO.key,
+    _NIS_RATIO,
     ("sideslip_rad", "all", "lag_s"),
     ("sideslip_rad", "linear", "rmse"),
     ("yaw_rate_rad_s", "all", "rmse"),
@@ -164,20 +146,18 @@ def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
     console.print(_fleet_head(summary))
     console.print()
     if summary["errors"]:
-        spread = table("sideslip by", ">drives", ">median °", ">p90 °", ">largest °")
-        for of in summary["errors"]:
-            figures = (cell(of[f"{name}_rad"], DEGREES, 3) for name in ("median", "p90", "max"))
-            spread.add_row(of["estimator"], str(of["drives"]), *figures)
+        keys, errors = ("median_rad", "p90_rad", "max_rad"), summary["errors"]
+        rows = ((of["estimator"], str(of["drives"]), *(cell(of[key], DEGREES, 3) for key in keys)) for of in errors)
         console.print(f"RMSE of sideslip over {summary['scored']} drives with an independent ground truth")
-        console.print(spread)
+        console.print(table("sideslip by", ">drives", ">median °", ">p90 °", ">largest °", rows=rows))
         console.print()
     if summary["worst"]:
         names = list(dict.fromkeys(n for d in summary["worst"] for n in d["errors_rad"] if n != d["main"]))[:3]
-        worst = table("worst drives", "by", ">RMSE °", *(f">{n} °" for n in names), fold=1)
-        for drive in summary["worst"]:
-            errors = (cell(drive["errors_rad"].get(n), DEGREES, 3) for n in (drive["main"], *names))
-            worst.add_row(drive["log"], drive["main"], *errors)
-        console.print(worst)
+        rows = (
+            (d["log"], d["main"], *(cell(d["errors_rad"].get(n), DEGREES, 3) for n in (d["main"], *names)))
+            for d in summary["worst"]
+        )
+        console.print(table("worst drives", "by", ">RMSE °", *(f">{n} °" for n in names), rows=rows, fold=1))
         console.print()
     for kind in summary["failed"]:
         console.print(Text.assemble((f"{kind['count']} failed: ", "bold"), kind["reason"]))
@@ -311,70 +291,52 @@ def _figures(report: _Report) -> dict[tuple[str, str, str, str], float | None]:
 
 def _table(report: _Report, console: Console) -> Table:
     """Return the table of the displayed estimators, with as many columns as fit the terminal."""
-    values = _figures(report)
+    values, truth = _figures(report), report["truth"]
     shown = [e for e in _shown(report) if any(name == e["name"] for name, *_ in values)]  # --keep metrics has less
-    names = [e["name"] for e in shown]
-    asked = _columns(truth=report["truth"]["available"])
-    columns = [c for c in asked if any(values.get((name, *c.key)) is not None for name in names)]
-    others = [c.key for c in columns if c.key not in (*_KEPT, *_LEAVE_LAST)] if report["truth"]["available"] else []
+    asked = _columns(truth=truth["available"], main=report["selected_estimate"] or "").items()
+    columns = [(k, c) for k, c in asked if any(values.get((e["name"], *k)) is not None for e in shown)]
+    others = [k for k, _ in columns if k not in (*_KEPT, *_LEAVE_LAST)] if truth["available"] else []
     for leave in (None, *others, *_LEAVE_LAST):
-        columns = [c for c in columns if c.key != leave]
-        made = _table_of(report, shown, columns, values)
+        columns = [(k, c) for k, c in columns if k != leave]
+        heads = (f">{head}" + (" †" if k[0] in truth["not_independent"] else "") for k, (head, *_) in columns)
+        made = table("\nestimator", *heads)
+        for column in made.columns:
+            column.no_wrap = True
+        for e in shown:
+            figures = (cell(values.get((e["name"], *k)), factor, digits) for k, (_, factor, digits) in columns)
+            made.add_row(e["name"] + ("" if e["causal"] else " *"), *figures)
         if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= console.width:
             break
     return made
 
 
-def _columns(*, truth: bool) -> list[_Column]:
+def _columns(*, truth: bool, main: str) -> dict[_Key, _Column]:
     """Return the columns of the table: columns of the metrics by signal, and ratios and differences of two."""
-    metrics = registered()
+    metrics, columns = registered(), dict[_Key, _Column]()
+
+    def add(name: str, signal: str, segment: str = "all", *, top: str = "", head: str = "", key: str = "") -> None:
+        unit, factor = read_unit(metrics[name].unit_of(signal))
+        label = metrics[name].head(signal)
+        if not top and not unit:  # in two lines, as the others
+            top, _, label = label.rpartition(" ")
+        columns[signal, segment, key or name] = head or f"{top}\n{label}", factor, metrics[name].digits
+
+    if not truth:
+        add("reference_rms", "sideslip_rad", head="sideslip: RMS\nfrom reference °")
+        add("disagreement_rms", "sideslip_rad", head=f"sideslip: RMS\nfrom {main} °", key="from_main")
+        add("d2", "vy_m_s", top="lateral kin.")
+        columns[_NIS_RATIO] = "innovations\nNIS/dof", 1.0, 2
     asked = [(signal, metric) for metric in metrics.values() for signal in metric.terminal]
     signals = [*dict.fromkeys(signal for signal, _ in asked)]
-    columns, topped = [], set[str]()
+    topped = {"state"}
     for signal, metric in sorted(asked, key=lambda a: (signals.index(a[0]), a[1].unit == "1")):  # shares last
-        top = "" if signal in topped or signal == "state" else LABELS[signal]
+        add(metric.name, signal, top="" if signal in topped else LABELS[signal])
         topped.add(signal)
-        columns.append(_column(metric, signal, "all", top))
     if truth:
-        rmse = metrics["rmse"]
-        columns += [_column(rmse, "sideslip_rad", segment, segment) for segment in ("linear", "nonlinear")]
-        return [*columns, _NIS_RATIO]
-    apart = _column(metrics["disagreement_rms"], "sideslip_rad", "all", "")
-    of_sensors = _column(metrics["d2"], "vy_m_s", "all", "lateral kin.")
-    of_reference = _column(metrics["reference_rms"], "sideslip_rad", "all", "")
-    return [
-        of_reference._replace(head="sideslip: RMS\nfrom reference °"),
-        apart._replace(head="sideslip: RMS\nfrom {main} °", metric="from_main"),
-        of_sensors,
-        _NIS_RATIO._replace(head=f"innovations{_NIS_RATIO.head}"),
-        *columns,
-    ]
-
-
-def _column(metric: Metric, signal: str, segment: str, top: str) -> _Column:
-    unit, factor = read_unit(metric.unit_of(signal))
-    label = metric.head(signal)
-    if not top and not unit:  # in two lines, as the others
-        top, _, label = label.rpartition(" ")
-    return _Column(f"{top}\n{label}", signal, segment, metric.name, factor, metric.digits)
-
-
-def _table_of(
-    report: _Report,
-    shown: Sequence[Mapping[str, Any]],
-    columns: Sequence[_Column],
-    values: Mapping[tuple[str, str, str, str], float | None],
-) -> Table:
-    dependent, main = report["truth"]["not_independent"], report["selected_estimate"] or ""
-    heads = [c.head.format(main=main) + (" †" if c.signal in dependent else "") for c in columns]
-    made = table("\nestimator", *(f">{head}" for head in heads))
-    for column in made.columns:
-        column.no_wrap = True
-    for estimator in shown:
-        name = estimator["name"]
-        figures = (cell(values.get((name, *c.key)), c.factor, c.digits) for c in columns)
-        made.add_row(name + ("" if estimator["causal"] else " *"), *figures)
-    return made
+        for segment in ("linear", "nonlinear"):
+            add("rmse", "sideslip_rad", segment, top=segment)
+        columns[_NIS_RATIO] = "\nNIS/dof", 1.0, 2
+    return columns
 
 
 def _joint_table(reports: Sequence[_Report]) -> Table:

@@ -1,4 +1,4 @@
-"""``pdhef run``, ``metrics`` and ``view``: estimate on logs, score recorded estimates, show the recordings."""
+"""``pdhef run``, ``metrics``, ``view`` and ``plan init``: estimate, score recorded estimates, show recordings."""
 
 from __future__ import annotations
 
@@ -25,10 +25,8 @@ def _list_estimators(show: bool) -> None:
     if show:
         from pdhef_logtool.estimators.table import all_specs
 
-        table = console.table("name", "description")
-        for spec in all_specs():
-            table.add_row(spec.name, spec.text)
-        console.stdout().print(table)
+        rows = ((spec.name, spec.text) for spec in all_specs())
+        console.stdout().print(console.table("name", "description", rows=rows))
         raise typer.Exit
 
 
@@ -110,8 +108,8 @@ def _finish(result: RunResult) -> NoReturn:
     from pdhef_logtool.cli.run_tables import render_fleet, render_run
 
     if result.is_fleet and result.output is not None:
+        from pdhef_logtool.results.fleet import summarise
         from pdhef_logtool.results.opened_run import open_run
-        from pdhef_logtool.results.summary import summarise
 
         summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
         console.show(summary, render_fleet)
@@ -189,3 +187,17 @@ def open_viewer(recordings: Sequence[Path | str], *, web: bool) -> int:
     """Open recordings or a catalog in one viewer, not reachable from the network, and return its exit code."""
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--new", *(["--web-viewer"] if web else [])]
     return subprocess.call([*command, *map(str, recordings)])  # noqa: S603 (our own interpreter)
+
+
+@options.command()
+def plan(action: str, *, output: Path) -> None:
+    """Write a validation plan: requirements for run, metrics and compare."""
+    from pdhef_logtool.evaluation.validation_plan import example_plan
+    from pdhef_logtool.storage.files import write_bytes
+
+    if action != "init":
+        raise UsageError(expected="init", got=action, where="pdhef plan", remedy="pdhef plan init -o plan.toml")
+    if output.exists():
+        raise UsageError(expected="a new file", got="one that exists", where=str(output), remedy="choose another name")
+    write_bytes(output, example_plan().encode())
+    console.say(f"{output} written; use it: pdhef run LOGS -o OUT --plan {output}")

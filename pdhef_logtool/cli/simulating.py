@@ -1,12 +1,18 @@
-"""``pdhef simulate MANOEUVRE`` and ``pdhef simulate suite``: drives of truthsim."""
+"""``pdhef simulate`` (drives of truthsim), ``convert`` (any log to MCAP) and ``compile`` (code of runs in advance)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
 
 from pdhef_logtool.cli import console, options
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
+
+if TYPE_CHECKING:
+    from pdhef_logtool.runs.config import RunConfig
 
 
 @options.command()
@@ -105,7 +111,55 @@ def _list_manoeuvres() -> None:
         rows = [{"name": name, **{f: getattr(m, f) for f in fields}} for name, m in MANOEUVRES.items()]
         console.print_json({"manoeuvres": rows})
         return
-    table = console.table("name", "km/h", "mu", "s", "what it is")
-    for name, m in MANOEUVRES.items():
-        table.add_row(name, f"{m.speed_km_h:g}", f"{m.friction:g}", f"{m.duration_s:g}", m.description)
-    console.stdout().print(table)
+    figures = ((n, *(f"{getattr(m, f):g}" for f in fields[1:]), m.description) for n, m in MANOEUVRES.items())
+    console.stdout().print(console.table("name", "km/h", "mu", "s", "what it is", rows=figures))
+
+
+@options.command()
+def convert(log: str, *, config: RunConfig, output: Path = Path("drive.mcap")) -> None:
+    """Convert a log of any format to MCAP."""
+    from pdhef_logtool.logs.conversion import convert_log
+    from pdhef_logtool.logs.discovery import one_place
+
+    reading = config.read_options
+    place = one_place(log, private_redirects=config.allow_private_redirects)
+    lost, messages = convert_log(place, output, reading.limits, reading.msgs, reading.tables)
+    for loss in lost:
+        console.warn(f"{loss.where}: {loss.what}" + ("" if loss.count is None else f" ({loss.count} times)"))
+    console.say(f"{messages} messages written to {output}")
+    raise typer.Exit(EXIT_PARTIAL if any(loss.severity == "lost" for loss in lost) else EXIT_OK)
+
+
+#: The receiver of the simulated car as a sensor.
+_GNSS_MAPPING = """fill_recognised = true
+
+[signals]
+gnss_latitude_deg = { topic = "/rtk/fix", field = "latitude" }
+gnss_longitude_deg = { topic = "/rtk/fix", field = "longitude" }
+"""
+
+
+@options.command()
+def compile_() -> None:
+    """Compile the filters in advance, so that the first run starts at once."""
+    import time
+    from pathlib import Path
+    from tempfile import TemporaryDirectory
+
+    from pdhef_logtool.compiled.sources import compiled_digest
+    from pdhef_logtool.estimators.table import ALL_ESTIMATORS
+    from pdhef_logtool.runs.config import RunConfig
+    from pdhef_logtool.runs.fleet import run_logs
+    from truthsim.drive import simulate_drive, write_drive
+
+    began_s = time.perf_counter()
+    saloon = RunConfig(car=Path("saloon"), estimators=(ALL_ESTIMATORS,), keep="metrics", reference="on")
+    with TemporaryDirectory() as folder:
+        log, mapping = Path(folder) / "drive.mcap", Path(folder) / "mapping.toml"
+        write_drive(simulate_drive("banked-road"), log)
+        mapping.write_text(_GNSS_MAPPING, encoding="utf-8")
+        sedan = RunConfig(keep="metrics", reference="on", mapping=mapping)
+        for config in (saloon, sedan):
+            run_logs([str(log)], Path(folder) / "out", config, report=False)
+    seconds = time.perf_counter() - began_s
+    console.say(f"all code of runs is compiled ({seconds:.0f} s, {compiled_digest()})")

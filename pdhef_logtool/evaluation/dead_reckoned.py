@@ -8,8 +8,6 @@ pose or a gap are excluded.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pdhef_logtool.records.geometry import dead_reckon
@@ -60,19 +58,12 @@ def lateral_errors(estimate: StateTrack, truth: StateTrack) -> FloatArray:
     return np.asarray(-np.sin(truth.yaw_rad[end]) * dx + np.cos(truth.yaw_rad[end]) * dy, dtype=np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class PathDrift:
-    """Distance in m of the end of a dead-reckoned path from the ground truth's, which is ``length_m`` long.
+def path_drift(estimate: StateTrack, truth: StateTrack) -> dict[str, float] | None:
+    """Return the drift of the path of an estimate [N], by its pose at :data:`_MOST_POINTS`; None without a path.
 
-    The paths are aligned by position and heading first (:func:`aligned_path`).
+    ``end_m``: distance of its end from the end of the ground truth's path, which is ``length_m`` long; the paths are
+    aligned by position and heading first (:func:`aligned_path`).
     """
-
-    end_m: float
-    length_m: float
-
-
-def path_drift(estimate: StateTrack, truth: StateTrack) -> PathDrift | None:
-    """Return the drift of the path of an estimate [N], by its pose at :data:`_MOST_POINTS`; None without a path."""
     count = min(len(truth), _MOST_POINTS)
     rows = np.unique(np.linspace(0, max(len(truth) - 1, 0), count).astype(np.int64))
     source, target = (np.stack([track.x_m[rows], track.y_m[rows]]) for track in (estimate, truth))
@@ -81,7 +72,7 @@ def path_drift(estimate: StateTrack, truth: StateTrack) -> PathDrift | None:
     length = float(np.hypot(*np.diff(target, axis=1)).sum())
     if not length > 0.0:
         return None
-    return PathDrift(float(np.hypot(*(aligned_path(source, target) - target)[:, -1])), length)
+    return {"end_m": float(np.hypot(*(aligned_path(source, target) - target)[:, -1])), "length_m": length}
 
 
 def aligned_path(source: FloatArray, target: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,20 +17,12 @@ from pdhef_logtool.records.tracks import StateTrack
 PLACES, _APART_S, _APART_SHARE, _SETTLED_S = 10, 1.0, 0.02, 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorPlace:
-    """A place of a large sideslip error: stamp in ns, angles in rad, and the track that it is an error against."""
-
-    stamp_ns: int
-    estimate_rad: float
-    error_rad: float
-    against: str
-
-
 def largest_errors(
     estimate: StateTrack, truth: StateTrack | None, others: Sequence[StateTrack], low_speed_m_s: float
-) -> list[ErrorPlace]:
-    """Return the largest sideslip errors of a track [N], the largest first.
+) -> list[dict[str, Any]]:
+    """Return the largest sideslip errors of a track [N], the largest first, as entries of report.json.
+
+    Each has the stamp in ns, angles in rad, and the track that it is an error against.
 
     The first ``_SETTLED_S`` do not count, where more follows. Without ground truth that scores it, the largest
     differences from the first of ``others`` that has a sideslip at its stamps.
@@ -46,9 +38,14 @@ def largest_errors(
         if len(scored):
             settled = int(np.searchsorted(estimate.stamps_ns, estimate.stamps_ns[scored[0]] + round(_SETTLED_S * 1e9)))
             error[: settled if settled <= scored[-1] else 0] = np.nan
-            stamps, beta = estimate.stamps_ns, estimate.sideslip_rad
+            stamps, beta, name = estimate.stamps_ns, estimate.sideslip_rad, reference.name
             return [
-                ErrorPlace(int(stamps[i]), float(beta[i]), float(error[i]), reference.name)
+                {
+                    "stamp_ns": int(stamps[i]),
+                    "estimate_rad": float(beta[i]),
+                    "error_rad": float(error[i]),
+                    "against": name,
+                }
                 for i in _largest_places(stamps, error)
             ]
     return []

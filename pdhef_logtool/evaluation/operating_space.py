@@ -7,8 +7,7 @@ that cells of a fleet can be added.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,37 +25,18 @@ AY_EDGES_M_S2 = tuple(float(i) for i in range(13))
 MAX_STEP_S = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """A cell of the grid with data of the drive.
-
-    ``speed`` and ``ay``: indices of the lower edges. ``scored``: number of stamps in the mean
-    squared sideslip error of the selected estimate, which is NaN without any.
-    """
-
-    speed: int
-    ay: int
-    seconds: float
-    scored: int
-    sideslip_mse_rad2: float
-
-
-@dataclass(frozen=True, slots=True)
-class OperatingSpace:
-    """Cells with data of a drive, in order, its highest speed and |a_y| (None: unknown), median friction, the grid."""
-
-    cells: Sequence[Cell]
-    speed_max_m_s: float | None
-    ay_max_m_s2: float | None
-    friction_median: float
-    speed_edges_m_s: Sequence[float] = SPEED_EDGES_M_S
-    ay_edges_m_s2: Sequence[float] = AY_EDGES_M_S2
+#: Entries of a cell with data.
+_CELL = ("speed", "ay", "seconds", "scored", "sideslip_mse_rad2")
 
 
 def operating_space(
     signals: Signals, truth: StateTrack | None, estimate: StateTrack | None, vehicle: VehicleParameters
-) -> OperatingSpace:
-    """Return the operating space of a drive.
+) -> dict[str, Any]:
+    """Return the operating space of a drive, as the entry of report.json.
+
+    ``cells`` with data in order, each with the indices of its lower edges (``speed``, ``ay``), the duration, and the
+    number of stamps in the mean squared sideslip error of the selected estimate, which is NaN without any; highest
+    speed and abs a_y (None: unknown), median friction, the grid.
 
     Parameters
     ----------
@@ -84,11 +64,12 @@ def operating_space(
     with np.errstate(invalid="ignore"):
         errors = squares / counts
     cells = [
-        Cell(*divmod(int(i), shape[1]), float(seconds[i]), int(counts[i]), float(errors[i]))
+        dict(zip(_CELL, (*divmod(int(i), shape[1]), *(c[i].item() for c in (seconds, counts, errors))), strict=True))
         for i in np.flatnonzero(seconds)
     ]
     friction = signals.friction[np.isfinite(signals.friction)]
     everywhere = np.where(np.isfinite(speed), speed, signals.speed_m_s)  # ground truth may end before the drive
     top_speed, top_ay = (float(np.nanmax(c)) if np.isfinite(c).any() else None for c in (everywhere, ay))
     usual = float(np.median(friction)) if friction.size else vehicle.assumed_friction
-    return OperatingSpace(cells, top_speed, top_ay, usual)
+    edges = {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2}
+    return {"cells": cells, "speed_max_m_s": top_speed, "ay_max_m_s2": top_ay, "friction_median": usual, **edges}

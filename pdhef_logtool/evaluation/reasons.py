@@ -6,7 +6,9 @@ seconds gives one interval, even if single samples change.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,21 +32,18 @@ class Interval:
     end_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class SensorFault:
-    """One kind of fault of one sensor over a drive.
+def sensor_fault(sensor: str, kind: str, intervals: Sequence[Interval]) -> dict[str, Any]:
+    """Return a fault of one sensor over a drive, as an entry of report.json.
 
-    Attributes
+    Parameters
     ----------
-    sensor : signal. kind : ``burst``, ``spike``, ``stuck``, ``dead``, ``missing``, ``jump`` (of its bias) or ``gain``.
-    count, seconds : of all intervals. intervals : up to :data:`LISTED_INTERVALS` of the longest, in order of time.
+    kind : ``burst``, ``spike``, ``stuck``, ``dead``, ``missing``, ``jump`` (of its bias) or ``gain``.
+    intervals : all; the entry has up to :data:`LISTED_INTERVALS` of the longest, in order of time.
     """
-
-    sensor: str
-    kind: str
-    count: int
-    seconds: float
-    intervals: tuple[Interval, ...]
+    seconds = sum(i.end_ns - i.start_ns for i in intervals) * 1e-9
+    longest = sorted(intervals, key=lambda i: (i.start_ns - i.end_ns, i.start_ns))[:LISTED_INTERVALS]
+    listed = sorted(longest, key=lambda i: i.start_ns)
+    return {"sensor": sensor, "kind": kind, "count": len(intervals), "seconds": seconds, "intervals": listed}
 
 
 def reason_intervals(track: StateTrack) -> dict[str, list[Interval]]:
@@ -59,18 +58,15 @@ def reason_intervals(track: StateTrack) -> dict[str, list[Interval]]:
     return intervals
 
 
-def sensor_faults(track: StateTrack) -> tuple[SensorFault, ...] | None:
+def sensor_faults(track: StateTrack) -> list[dict[str, Any]] | None:
     """Return the sensor faults that an estimator detected; None if the source provides no reasons."""
     if not len(track.reason) == len(track) > 0:
         return None
     faults = []
     for name, intervals in reason_intervals(track).items():
         kind, _, sensor = name.partition("_")
-        seconds = sum(i.end_ns - i.start_ns for i in intervals) * 1e-9
-        longest = sorted(intervals, key=lambda i: (i.start_ns - i.end_ns, i.start_ns))[:LISTED_INTERVALS]
-        listed = tuple(sorted(longest, key=lambda i: i.start_ns))
-        faults.append(SensorFault(_SENSORS[sensor], kind, len(intervals), seconds, listed))
-    return tuple(sorted(faults, key=lambda f: f.sensor))
+        faults.append(sensor_fault(_SENSORS[sensor], kind, intervals))
+    return sorted(faults, key=lambda f: str(f["sensor"]))
 
 
 def _runs(stamps_ns: IntArray) -> tuple[IntArray, IntArray]:

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive
 from pdhef_logtool.evaluation.smoothing import median_step_ns
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, raw_error, scorable, total_std, truth_speed
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import MEANS, POOLED, SQUARES, Requirement
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
 #: Errors are correlated over seconds (docs/method.md#evaluation).
 BLOCK_S = 10.0
 #: Largest number of blocks per requirement in a report; a longer drive has longer blocks.
 _MOST_BLOCKS = 60
-_Read = Callable[[str], StateTrack | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,45 +51,33 @@ class RequirementBlocks:
         return bool(self.std)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScoredDrive:
-    """Tracks of a drive at the stamps of ``truth``, which is ground truth or the estimated reference.
-
-    ``read`` returns a track by name. ``masks``: of the segments. ``not_independent``: signals without a verdict.
-    """
-
-    read: _Read
-    truth: StateTrack
-    masks: Mapping[str, BoolArray]
-    low_speed_m_s: float
-    not_independent: frozenset[str] = frozenset()
-    estimated: bool = False
-
-
 def requirement_blocks(
-    requirements: Sequence[Requirement], main: str | None, drive: ScoredDrive
+    requirements: Sequence[Requirement], main: str | None, drive: EvaluatedDrive, truth: StateTrack
 ) -> list[RequirementBlocks]:
     """Return the blocks of all requirements with a mean over stamps as the metric and with data in this drive.
 
-    ``main`` : the selected estimate, for requirements without an estimator.
+    ``main`` : the selected estimate, for requirements without an estimator. ``truth`` : ground truth of the drive, or
+    its estimated reference.
     """
     results: list[RequirementBlocks] = []
     for requirement in requirements:
         name = requirement.estimator or main
-        if any(b.of == requirement.measured for b in results) or name is None or not _has_blocks(requirement, drive):
+        if any(b.of == requirement.measured for b in results) or name is None:
+            continue
+        if not _has_blocks(requirement, drive, estimated=truth.name == REFERENCE):
             continue
         named = [name, *([requirement.baseline] if requirement.baseline != requirement.other_run else [])]
-        tracks = [drive.read(n) for n in named if n is not None]
-        if all(track is not None and len(track) == len(drive.truth) for track in tracks):
-            blocks = _blocks(requirement, [t for t in tracks if t is not None], drive)
+        tracks = [drive.tracks.get(n) for n in named if n is not None]
+        if all(track is not None and len(track) == len(truth) for track in tracks):
+            blocks = _blocks(requirement, [t for t in tracks if t is not None], truth, drive)
             if blocks is not None:
                 results.append(blocks)
     return results
 
 
-def _has_blocks(requirement: Requirement, drive: ScoredDrive) -> bool:
-    scored = requirement.signal in SCORED_SIGNALS and requirement.signal not in drive.not_independent
-    if drive.estimated:
+def _has_blocks(requirement: Requirement, drive: EvaluatedDrive, *, estimated: bool) -> bool:
+    scored = requirement.signal in SCORED_SIGNALS and requirement.signal not in drive.dependent
+    if estimated:
         return scored and (requirement.signal, requirement.metric) == ("sideslip_rad", "rmse")
     return (
         scored
@@ -99,19 +87,21 @@ def _has_blocks(requirement: Requirement, drive: ScoredDrive) -> bool:
     )
 
 
-def _blocks(requirement: Requirement, tracks: Sequence[StateTrack], drive: ScoredDrive) -> RequirementBlocks | None:
+def _blocks(
+    requirement: Requirement, tracks: Sequence[StateTrack], truth: StateTrack, drive: EvaluatedDrive
+) -> RequirementBlocks | None:
     """Return the summands of one requirement, summed over blocks of time."""
-    truth = drive.truth
+    estimated = truth.name == REFERENCE
     if not len(truth):
         return None
     since_ns = truth.stamps_ns - truth.stamps_ns[0]
     block_s = BLOCK_S * max(1, math.ceil(float(since_ns[-1]) * 1e-9 / (BLOCK_S * _MOST_BLOCKS)))
     step_s = median_step_ns(truth.stamps_ns) * 1e-9
-    columns = _summands(requirement, tracks, truth, drive)
+    columns = _summands(requirement, tracks, truth, drive.low_speed_m_s)
     used = np.isfinite(columns).all(axis=0) & drive.masks[requirement.segment]
     block = since_ns[used] // round(block_s * 1e9)
     way = np.nan_to_num(truth_speed(truth)[used]) * step_s
-    std = truth.sideslip_std_rad[used] ** 2 if drive.estimated else np.zeros(len(block))
+    std = truth.sideslip_std_rad[used] ** 2 if estimated else np.zeros(len(block))
     sums = np.stack([np.bincount(block, weights) for weights in (np.ones(len(block)), way, std, *columns[:, used])])
     numbers = np.flatnonzero(sums[0])
     kept = sums[:, numbers]
@@ -129,7 +119,7 @@ def _blocks(requirement: Requirement, tracks: Sequence[StateTrack], drive: Score
         _rounded(metres),
         values[0],
         values[1] if len(values) > 1 else (),
-        _rounded(np.sqrt(variance / counts)) if drive.estimated else (),
+        _rounded(np.sqrt(variance / counts)) if estimated else (),
     )
 
 
@@ -138,20 +128,19 @@ def _rounded(values: FloatArray) -> list[float]:
 
 
 def _summands(
-    requirement: Requirement, tracks: Sequence[StateTrack], truth: StateTrack, drive: ScoredDrive
+    requirement: Requirement, tracks: Sequence[StateTrack], truth: StateTrack, low_speed_m_s: float
 ) -> FloatArray:
     """Return the values [tracks, M] that the metric averages; NaN at stamps that are not scored."""
     signal, metric = requirement.signal, requirement.metric
-    at_truth = scorable(truth, signal, drive.low_speed_m_s)
-    if drive.estimated:
-        at_truth = truth.valid & (truth.vx_m_s > drive.low_speed_m_s)
+    at_truth, estimated = scorable(truth, signal, low_speed_m_s), truth.name == REFERENCE
+    if estimated:
+        at_truth = truth.valid & (truth.vx_m_s > low_speed_m_s)
     rows = []
     for track in tracks:
         error = raw_error(track, truth, signal)
         scored = used = track.valid & at_truth & np.isfinite(error)
-        if drive.estimated:
-            used = scored & (track.vx_m_s > drive.low_speed_m_s)
-            error = wrap_angle(error)
+        if estimated:
+            used, error = scored & (track.vx_m_s > low_speed_m_s), wrap_angle(error)
         if metric == "availability":
             value, used = scored.astype(np.float64), at_truth
         elif metric == "coverage95":

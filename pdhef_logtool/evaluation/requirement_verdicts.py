@@ -11,22 +11,8 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-from pdhef_logtool.evaluation.statistics import (
-    FACTORS,
-    LEAST_BLOCKS,
-    LEAST_DRIVES,
-    Bounded,
-    Factors,
-    Outcome,
-    decided,
-    gathered,
-    least_drives,
-    log_ratios,
-    paired_change,
-    pooled,
-    quantile,
-)
 from pdhef_logtool.evaluation.units import AY_NOTE
 from pdhef_logtool.evaluation.validation_plan import (
     AT_LEAST,
@@ -112,7 +98,7 @@ class RequirementVerdict:
     """
 
     requirement: Requirement
-    outcome: Outcome
+    outcome: statistics.Outcome
     value: float | None
     low: float | None
     high: float | None
@@ -201,39 +187,41 @@ def _ratios(drives: Sequence[DriveValue]) -> FloatArray:
         return np.where(values == others, 1.0, values / others)
 
 
-def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> Bounded:
+def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> statistics.Bounded:
     """Return the statistic of a requirement over drives, with bounds from drives or from blocks within them."""
-    count, factors = len(drives), {name: [d.factors.get(name) for d in drives] for name in FACTORS}
+    count, factors = len(drives), {name: [d.factors.get(name) for d in drives] for name in statistics.FACTORS}
     if requirement.statistic != POOLED:
         return _of_drives(requirement, _ratios(drives), factors)
-    if count >= LEAST_DRIVES and requirement.other_run is not None:
+    if count >= statistics.LEAST_DRIVES and requirement.other_run is not None:
         return _change(drives, requirement.confidence, factors)
     total = _pooled(requirement, drives, factors)
-    if count >= LEAST_DRIVES or not count:
+    if count >= statistics.LEAST_DRIVES or not count:
         return total
     return _from_blocks(requirement, total, [d.blocks for d in drives])
 
 
-def _of_drives(requirement: Requirement, values: FloatArray, factors: Factors) -> Bounded:
+def _of_drives(requirement: Requirement, values: FloatArray, factors: statistics.Factors) -> statistics.Bounded:
     """Return a quantile of the drives, or the worst drive, which has no confidence interval."""
     if requirement.quantile is not None:
-        return quantile(values, requirement.quantile, requirement.confidence, factors)
+        return statistics.quantile(values, requirement.quantile, requirement.confidence, factors)
     if not len(values):
-        return Bounded(math.nan, math.nan, math.nan, 0)
+        return statistics.Bounded(math.nan, math.nan, math.nan, 0)
     worst = np.min if requirement.metric in AT_LEAST else np.max
     largest = float(worst(np.abs(values)))
-    return Bounded(largest, largest, largest, len(values))
+    return statistics.Bounded(largest, largest, largest, len(values))
 
 
-def _from_blocks(requirement: Requirement, total: Bounded, blocks: Sequence[RequirementBlocks | None]) -> Bounded:
+def _from_blocks(
+    requirement: Requirement, total: statistics.Bounded, blocks: Sequence[RequirementBlocks | None]
+) -> statistics.Bounded:
     """Return the statistic ``total`` of few drives with bounds from the blocks of time within them."""
     present = [b for b in blocks if b is not None]
     if len(present) < len(blocks):
-        return Bounded(total.value, math.nan, math.nan, 0, basis="blocks")
+        return statistics.Bounded(total.value, math.nan, math.nan, 0, basis="blocks")
     bounded = _pooled(requirement, present, None)
-    low, high = (bounded.low, bounded.high) if bounded.units >= LEAST_BLOCKS else (math.nan, math.nan)
+    low, high = (bounded.low, bounded.high) if bounded.units >= statistics.LEAST_BLOCKS else (math.nan, math.nan)
     longest_s = max(b.block_s for b in present)
-    return Bounded(total.value, low, high, bounded.units, basis="blocks", block_s=longest_s)
+    return statistics.Bounded(total.value, low, high, bounded.units, basis="blocks", block_s=longest_s)
 
 
 def _column(units: Sequence[DriveValue | RequirementBlocks], key: str) -> FloatArray:
@@ -242,11 +230,11 @@ def _column(units: Sequence[DriveValue | RequirementBlocks], key: str) -> FloatA
 
 
 def _pooled(
-    requirement: Requirement, units: Sequence[DriveValue | RequirementBlocks], factors: Factors | None
-) -> Bounded:
+    requirement: Requirement, units: Sequence[DriveValue | RequirementBlocks], factors: statistics.Factors | None
+) -> statistics.Bounded:
     """Return the statistic over drives, or over the blocks of time within them."""
     metric = requirement.metric
-    bounded = pooled(
+    bounded = statistics.pooled(
         _column(units, "n"),
         _column(units, "value"),
         _column(units, "baseline") if requirement.baseline else None,
@@ -263,11 +251,13 @@ def _pooled(
     return bounded
 
 
-def _change(drives: Sequence[DriveValue], level: float, factors: Factors) -> Bounded:
+def _change(drives: Sequence[DriveValue], level: float, factors: statistics.Factors) -> statistics.Bounded:
     """Return the median of the drives' ratios to another run, which compares each drive with itself."""
-    change = paired_change(log_ratios(_column(drives, "baseline"), _column(drives, "value")), None, factors, level)
+    change = statistics.paired_change(
+        statistics.log_ratios(_column(drives, "baseline"), _column(drives, "value")), None, factors, level
+    )
     value, low, high = np.exp([change.median, change.low, change.high]).tolist()
-    return Bounded(value, low, high, change.drives, change.dependence)
+    return statistics.Bounded(value, low, high, change.drives, change.dependence)
 
 
 def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:
@@ -285,8 +275,8 @@ def _worst(requirement: Requirement, drives: Sequence[DriveValue]) -> str | None
 
 
 def _case(
-    requirement: Requirement, bounded: Bounded, exposure: Exposure, lacking: Sequence[_Lacking], sd: float
-) -> tuple[Outcome, str]:
+    requirement: Requirement, bounded: statistics.Bounded, exposure: Exposure, lacking: Sequence[_Lacking], sd: float
+) -> tuple[statistics.Outcome, str]:
     """Return the outcome, and the case that decides the sentences of ``requirement.txt``."""
     if not exposure.drives or not math.isfinite(bounded.value):
         return "INCONCLUSIVE", "missing"
@@ -305,26 +295,30 @@ def _case(
 @cache
 def _words() -> Any:
     """Return the sentences of ``requirement.txt`` as functions."""
-    limits: dict[str, Any] = {"LEAST_BLOCKS": LEAST_BLOCKS, "LEAST_DRIVES": LEAST_DRIVES, "MOST_TIMES": _MOST_TIMES}
+    limits: dict[str, Any] = {
+        "LEAST_BLOCKS": statistics.LEAST_BLOCKS,
+        "LEAST_DRIVES": statistics.LEAST_DRIVES,
+        "MOST_TIMES": _MOST_TIMES,
+    }
     limits |= {"REFERENCE_SDS": REFERENCE_SDS, "AY_NOTE": AY_NOTE, "POOLED": POOLED, "WORST_DRIVE": WORST_DRIVE}
     path = Path(__file__).parent / "templates" / "requirement.txt"
-    return template(path, **limits, shown=shown, least_drives=least_drives).module
+    return template(path, **limits, shown=shown, least_drives=statistics.least_drives).module
 
 
-def _without_bounds(requirement: Requirement, bounded: Bounded) -> bool:
+def _without_bounds(requirement: Requirement, bounded: statistics.Bounded) -> bool:
     """Return whether the bound that decides is missing, because there are too few units."""
     if requirement.quantile is not None and math.isinf(bounded.high):
         return bounded.low <= requirement.bound
     return not (math.isfinite(bounded.low) or math.isfinite(bounded.high))
 
 
-def _outcome(requirement: Requirement, bounded: Bounded) -> Outcome:
+def _outcome(requirement: Requirement, bounded: statistics.Bounded) -> statistics.Outcome:
     low, value, high, bound = bounded.low, bounded.value, bounded.high, requirement.bound
     if requirement.metric in AT_LEAST:
-        return decided(-high, -value, -low, -bound)
+        return statistics.decided(-high, -value, -low, -bound)
     # Another run as the baseline: a significant regression fails if it is larger than the accepted one.
     regression = requirement.other_run is not None and requirement.statistic == POOLED
-    return decided(low, value, high, bound, least=min(1.0, bound) if regression else bound)
+    return statistics.decided(low, value, high, bound, least=min(1.0, bound) if regression else bound)
 
 
 def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[DriveValue]) -> list[_Lacking]:
@@ -341,7 +335,7 @@ def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[Driv
     return [(has, needed, what) for has, needed, what in needs if needed > 0.0 and (has is None or has < needed)]
 
 
-def _times(requirement: Requirement, bounded: Bounded) -> float:
+def _times(requirement: Requirement, bounded: statistics.Bounded) -> float:
     """Return the factor on the amount of driving that gives a verdict if value and spread do not change, in tenths.
 
     The width of the interval is in proportion to the inverse square root of the amount, for positive values in the
@@ -362,13 +356,17 @@ def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
 
 def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
     """Return each note of the requirements once, with the ids of its requirements unless it applies to all."""
-    ids = gathered((note.rstrip("."), name) for name, of_requirement in notes.items() for note in of_requirement)
+    ids = statistics.gathered(
+        (note.rstrip("."), name) for name, of_requirement in notes.items() for note in of_requirement
+    )
     return [note if len(names) == len(notes) else f"{', '.join(names)}: {note}" for note, names in ids.items()]
 
 
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:
     """Return the next steps of a document: failed requirements, inconclusive ones, ``more``."""
     requirements = sorted((plan or {}).get("requirements") or (), key=lambda r: r["outcome"] != "FAIL")
-    ids = gathered((str(r["next"]), str(r["id"])) for r in requirements if r["next"] and r["outcome"] != "PASS")
+    ids = statistics.gathered(
+        (str(r["next"]), str(r["id"])) for r in requirements if r["next"] and r["outcome"] != "PASS"
+    )
     asked = [f"{', '.join(names)}: {text}" for text, names in ids.items()]
     return [*asked, *filter(None, more)]

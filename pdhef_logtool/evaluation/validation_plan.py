@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import LABELS, SIGNALS, read_unit
 from pdhef_logtool.records.errors import UsageError
@@ -365,3 +366,10 @@ def names_of(requirements: Sequence[Requirement]) -> frozenset[str]:
     """Return the estimators of the run that requirements use, as subject or baseline."""
     named = {r.estimator for r in requirements} | {r.baseline for r in requirements}
     return frozenset(name for name in named if name is not None and name != RUN and "/" not in name)
+
+
+def example_plan() -> str:
+    """Return the commented example of a plan.toml."""
+    segments = textwrap.fill(", ".join(SEGMENTS), 99, subsequent_indent="# ", break_on_hyphens=False)
+    text = (Path(__file__).parent / "plan_example.toml").read_text(encoding="utf-8")
+    return text.replace("SIGNALS", ", ".join(SIGNALS)).replace("SEGMENTS", segments)

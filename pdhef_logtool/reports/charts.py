@@ -8,10 +8,35 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from pdhef_logtool.estimators.table import all_specs
 from pdhef_logtool.records.printable import all_printable
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.reports.colours import PLAIN
 from pdhef_logtool.reports.encoding import Grid, encode
+from pdhef_logtool.results.plotted import colour_rgb
+from pdhef_logtool.results.sink import TRUTH
+
+INK = "#1a1a1a"
+#: Colours of faults, notes and normal events, distinguishable for the colour-blind.
+FAULT, NOTE, PLAIN = "#b2182b", "#7a5195", "#6b7785"
+#: Minimum contrast of lines on white according to WCAG 2.1.
+_LEAST_CONTRAST = 3.0
+
+
+def colour(name: str) -> str:
+    """Return the colour ``#rrggbb`` of an estimator or of the ground truth, which is the same on every page."""
+    if name == TRUTH:
+        return INK
+    rgb = colour_rgb(name, {s.name: s.colour for s in all_specs()})
+    while contrast(rgb) < _LEAST_CONTRAST:
+        rgb = (rgb[0] * 15 // 16, rgb[1] * 15 // 16, rgb[2] * 15 // 16)
+    return "#{:02x}{:02x}{:02x}".format(*rgb)
+
+
+def contrast(rgb: tuple[int, int, int]) -> float:
+    """Return the contrast to white by WCAG 2.1, 1 to 21."""
+    red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb))
+    return 1.05 / (0.2126 * red + 0.7152 * green + 0.0722 * blue + 0.05)
+
 
 #: Maximum number of intervals in a row of a strip; beyond, the intervals closest to each other are joined.
 _MOST_SPANS = 1500
@@ -213,10 +238,9 @@ class _Blocks:
         """Add a series and return its reference for the script."""
         key = (id(values), resolution)
         if key not in self._known:
-            made = encode(values, resolution)
             name = f"b{len(self.texts)}"
-            self.texts[name] = made.base64
-            self._known[key] = {"block": name, "low": made.low, "step": made.step, "count": made.count}
+            self.texts[name], scale = encode(values, resolution)
+            self._known[key] = {"block": name, **scale}
         return self._known[key]
 
     def entries(self, record: Any, resolution: float) -> dict[str, Any]:

@@ -7,11 +7,10 @@ import math
 import numpy as np
 
 from pdhef_logtool.evaluation.units import read_unit
-from pdhef_logtool.reports.charts import Charts, Interval, IntervalsFigure, against
-from pdhef_logtool.reports.colours import FAULT, PLAIN
+from pdhef_logtool.reports.charts import FAULT, PLAIN, Charts, Interval, IntervalsFigure, against
 from pdhef_logtool.reports.page import render
+from pdhef_logtool.results import comparing
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
-from pdhef_logtool.results.comparison_words import history_table, interval_text, notes_of, percent, sentence
 
 #: Maximum number of drives in the table, half of them from either end.
 _MOST_DRIVES = 200
@@ -22,7 +21,7 @@ _BLUE = "#0072b2"
 def comparison_page(comparison: Comparison) -> bytes:
     """Return the page of a comparison as a complete HTML file."""
     charts = Charts()
-    heads, history = history_table(comparison)
+    heads, history = comparing.history_table(comparison)
     first = None if comparison.equal else next(iter(comparison.figures), None)
     if history:
         _draw_history(comparison, charts)
@@ -32,17 +31,17 @@ def comparison_page(comparison: Comparison) -> bytes:
         "comparison.html",
         charts,
         comparison=comparison,
-        **{about: sentence(about, comparison) for about in ("paired", "verdict", "changes")},
+        **{about: comparing.sentence(about, comparison) for about in ("paired", "verdict", "changes")},
         kind=_KIND[comparison.verdict],
-        notes=notes_of(comparison),
+        notes=comparing.notes_of(comparison),
         unpaired=[line for line in comparison.unpaired if line not in comparison.failures],
         first=first,
         scale=read_unit(first.unit if first is not None else ""),
         half=_MOST_DRIVES // 2,
         heads=heads,
         history=history,
-        interval=interval_text,
-        percent=percent,
+        interval=comparing.interval_text,
+        percent=comparing.percent,
         expm1=math.expm1,
         zip=zip,
     )

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
 
+from pdhef_logtool.evaluation.metrics.handling import responses
+from pdhef_logtool.evaluation.metrics.metric import Metric, registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
-from pdhef_logtool.evaluation.units import AY_NOTE
+from pdhef_logtool.evaluation.units import AY_NOTE, LABELS, SCORED_SIGNALS, SIGNALS, read_unit
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import Roles, drive_figures
-from pdhef_logtool.reports.drive_tables import by_segment, definitions, disagreements, scores, whole_figures
 from pdhef_logtool.reports.page import render
+from pdhef_logtool.reports.pages import Page
 from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.selected_estimate import NAIVE
@@ -27,17 +28,7 @@ IN_PLANE = ("path", "ay_sideslip")
 _MOST_ROWS = 200
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DrivePage:
-    """The page of a drive: the HTML, its figures, the error of a file that could not be read, the key figures."""
-
-    html: bytes
-    charts: Charts
-    wrong: str = ""
-    key_figures: dict[str, Any] | None = None
-
-
-def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
+def drive_page(log: OpenedLog, back: str = "") -> Page:
     """Return the page of a log of a run; for a failed log, a page with the reason.
 
     ``back``: address of the page of the whole run, empty without one. Raises OutputError for a damaged report.json.
@@ -45,7 +36,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
     report = log.report()
     if report is None or not isinstance(report.get("log"), dict):
         cause, remedy = cause_and_remedy(log.outcome.removeprefix("failed: "))
-        return DrivePage(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
+        return Page(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
     figures, path, wrong = None, None, ""
     roles = roles_of(report)
     if roles is not None:
@@ -54,7 +45,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
             figures = None if path is None else drive_figures(path, report, roles)
         except OutputError as error:
             wrong = f"the figures cannot be drawn: {error}"
-    charts = Charts() if figures is None else figures.charts
+    charts = Charts() if figures is None else figures["charts"]
     texts, names = (report.get("answer") or {}).get("texts") or {}, () if roles is None else roles.names
     key_figures = whole_figures(report, (TRUTH, *names), manoeuvres=True)
     html = render(
@@ -83,7 +74,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         over_time=OVER_TIME,
         in_plane=IN_PLANE,
     )
-    return DrivePage(html, charts, wrong, key_figures)
+    return Page(html, charts, wrong, key_figures=key_figures)
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:
@@ -110,3 +101,92 @@ def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
     apart = [m["estimator"] for m in report["metrics"] if m["metric"] == "disagreement_rms" and m["value"] == 0.0]
     pairs = [n for pair in apart if main in (names := pair.split("~")) for n in names if n != main]
     return [*dict.fromkeys([*same, *pairs])]
+
+
+_Table = dict[str, Any]
+_BySignal: TypeAlias = dict[str, dict[str, dict[str, Mapping[str, Any]]]]
+
+
+def scores(report: Mapping[str, Any], roles: Roles) -> list[_Table]:
+    """Return the errors over the whole drive, one table per signal, the selected estimate first."""
+    causal, by_signal = {e["name"]: bool(e["causal"]) for e in report["estimators"]}, _by_signal(report)
+    tables = []
+    for signal in [s for s in LABELS if s in SCORED_SIGNALS]:
+        figures = by_signal.get(signal, {})
+        order = [n for n in roles.names if "rmse" in figures.get(n, {})]
+        shown = [m for m in registered().values() if m.of_truth and any(m.name in figures[n] for n in order)]
+        rows = [
+            {"name": n, "causal": causal[n], "values": [_read(figures[n], m.name) for m in shown]}
+            | {"n": figures[n]["rmse"]["n"]}
+            for n in order
+        ]
+        table: dict[str, Any] = {"name": LABELS[signal], "heads": [m.head() for m in shown], "rows": rows}
+        table["independent"] = signal not in report["truth"]["not_independent"]
+        tables += [table | {"unit": read_unit(figures[order[0]]["rmse"]["unit"])[0]}] if order else []
+    return tables
+
+
+def definitions(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return label, name and definition of each metric of a report."""
+    names = {m["metric"] for m in report["metrics"]}
+    return [(m.label, m.name, m.definition.replace("`", "")) for m in registered().values() if m.name in names]
+
+
+def by_segment(report: Mapping[str, Any], roles: Roles) -> list[_Table]:
+    """Return the RMSE of sideslip in rad by segment (``main``, ``rival``, None if unknown), the whole drive first."""
+    tables: dict[str, _Table] = {}
+    for m in report["metrics"]:
+        if (m["signal"], m["metric"]) == ("sideslip_rad", "rmse") and m["estimator"] in (roles.main, roles.rival):
+            row = tables.setdefault(m["segment"], {"segment": m["segment"], "main": None, "rival": None, "n": m["n"]})
+            row["main" if m["estimator"] == roles.main else "rival"] = m["value"]
+    return sorted(tables.values(), key=lambda row: (row["segment"] != "all", row["segment"]))
+
+
+def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres: bool) -> _Table | None:
+    """Return metrics that need no ground truth, of manoeuvres or the others, NIS per degree of freedom.
+
+    A table has heads, and rows of a name and its values; None without any value.
+    """
+    by_signal = _by_signal(report)
+
+    def value(name: str, signal: str, metric: Metric) -> float | None:
+        rows = by_signal.get(signal, {}).get(name, {})
+        figure, over = _read(rows, metric.name), _read(rows, "nis_dof") if metric.name == "nis" else 1.0
+        return figure / over if figure is not None and over else None
+
+    wanted = [m for m in registered().values() if (m.columns is responses) == manoeuvres]
+    wanted = [m for m in wanted if not m.of_truth and m.name != "nis_dof"]
+    columns = {(signal, m): [value(name, signal, m) for name in names] for m in wanted for signal in SIGNALS}
+    shown = {key: values for key, values in columns.items() if any(v is not None for v in values)}
+    heads = [f"{LABELS[s]}: {m.head(s)}" if len(m.brief) > 1 else m.head(s) for s, m in shown]
+    rows = [
+        (name, values)
+        for name, *values in zip(names, *shown.values(), strict=True)
+        if any(v is not None for v in values)
+    ]
+    return {"heads": heads, "rows": rows} if rows else None
+
+
+def disagreements(report: Mapping[str, Any], roles: Roles) -> dict[str, float]:
+    """Return the RMS sideslip difference in rad between each other estimator and the selected estimate."""
+    values = {}
+    for m in report["metrics"]:
+        first, _, second = m["estimator"].partition("~")
+        if (m["metric"], m["segment"]) == ("disagreement_rms", "all") and roles.main in (first, second):
+            values[second if first == roles.main else first] = m["value"]
+    return {name: float(value) for name, value in values.items() if value is not None}
+
+
+def _by_signal(report: Mapping[str, Any]) -> _BySignal:
+    """Return the rows of the whole drive by signal, estimator and metric."""
+    rows: _BySignal = {}
+    for m in report["metrics"]:
+        if m["segment"] == "all":
+            rows.setdefault(m["signal"], {}).setdefault(m["estimator"], {})[m["metric"]] = m
+    return rows
+
+
+def _read(rows: Mapping[str, Mapping[str, Any]], key: str) -> float | None:
+    """Return a figure in display units."""
+    row = rows.get(key)
+    return None if row is None or row["value"] is None else float(row["value"]) * read_unit(row["unit"])[1]

@@ -86,19 +86,10 @@ def _first(hit: BoolArray, begins: IntArray) -> IntArray:
     return places[np.searchsorted(places, begins)]
 
 
-@dataclass(frozen=True, slots=True)
-class Encoded:
-    """A series as text: value = low + step q, with q of 0 to LEVELS, or GAP for unknown values."""
+def encode(values: FloatArray, resolution: float = 0.0) -> tuple[str, dict[str, float]]:
+    """Return values [M] or [M, 2] (row by row) as text, and its scale; NaN and infinities are gaps.
 
-    low: float
-    step: float
-    count: int
-    base64: str
-
-
-def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
-    """Return values [M] or [M, 2] (row by row) as text; NaN and infinities are gaps.
-
+    A value is low + step q, with q of 0 to LEVELS, or GAP for unknown values; the scale also has their ``count``.
     ``resolution``: minimum quantisation step, so that invisible noise is not stored.
     """
     flat = np.ravel(values)
@@ -113,4 +104,5 @@ def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
     steps = np.diff(q, prepend=np.uint16(0)).view(np.int16)
     folded = ((steps << 1) ^ (steps >> 15)).view(np.uint16)
     planes = (folded & 0xFF).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()
-    return Encoded(low, step, len(flat), base64.b64encode(zlib.compress(planes, 7)).decode("ascii"))
+    scale = {"low": low, "step": step, "count": len(flat)}
+    return base64.b64encode(zlib.compress(planes, 7)).decode("ascii"), scale

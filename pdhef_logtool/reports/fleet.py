@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,10 @@ import numpy as np
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.reports.charts import BarsFigure, Charts, Interval, IntervalsFigure, against
-from pdhef_logtool.reports.colours import INK, colour
+from pdhef_logtool.reports.charts import INK, BarsFigure, Charts, Interval, IntervalsFigure, against, colour
 from pdhef_logtool.reports.page import render
-from pdhef_logtool.results.breakdown import LEAST_DRIVES
-from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
+from pdhef_logtool.reports.pages import Page
+from pdhef_logtool.results.fleet import ANSWER, JUDGED, LEAST_DRIVES, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 from pdhef_logtool.storage.documents import jsonable
 
@@ -33,16 +31,7 @@ _DRAWN = 5.0
 _SPEED_M_S, _AY_M_S2 = 40.0, 8.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FleetPage:
-    """The page of a run: the HTML, the figures in it, and the same as JSON-able values."""
-
-    html: bytes
-    charts: Charts
-    document: dict[str, Any]
-
-
-def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
+def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> Page:
     """Return the page of a run.
 
     Parameters
@@ -80,7 +69,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         "least": LEAST_DRIVES,
     }
     html = render("fleet.html", charts, fleet=fleet, pages=pages, run=run.document, **texts)
-    return FleetPage(html, charts, _document(fleet, texts))
+    return Page(html, charts, document=_document(fleet, texts))
 
 
 def _document(fleet: Fleet, texts: Mapping[str, Any]) -> dict[str, Any]:

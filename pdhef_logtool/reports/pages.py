@@ -7,16 +7,30 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError
+from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.results.opened_run import PAGE_FILE, REPORT_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.storage.files import write_bytes
 
-if TYPE_CHECKING:
-    from pdhef_logtool.reports.drive import DrivePage
-    from pdhef_logtool.reports.fleet import FleetPage
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Page:
+    """The HTML of a page, and its figures.
+
+    Attributes
+    ----------
+    wrong : error of a file that could not be read. document : the page of a run as JSON-able values.
+    key_figures : of the manoeuvres of a drive.
+    """
+
+    html: bytes
+    charts: Charts
+    wrong: str = ""
+    document: dict[str, Any] | None = None
+    key_figures: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,15 +122,14 @@ def remove_pages(run: OpenedRun) -> None:
             path.unlink(missing_ok=True)
 
 
-def _write(folder: Path, label: str, make: Callable[[], DrivePage | FleetPage]) -> WrittenPage:
+def _write(folder: Path, label: str, make: Callable[[], Page]) -> WrittenPage:
     try:
         page = make()
-        wrong = getattr(page, "wrong", "")
     except Exception as error:  # noqa: BLE001 (a defect of one report must not stop the other pages)
         shown = str(error) if isinstance(error, OutputError) else f"internal error, {type(error).__name__}: {error}"
         return WrittenPage(label, None, shown)
     path = folder / PAGE_FILE
     write_bytes(path, page.html)
-    if document := getattr(page, "document", None):
-        write_json(folder / REPORT_FILE, document)
-    return WrittenPage(label, path, wrong)
+    if page.document is not None:
+        write_json(folder / REPORT_FILE, page.document)
+    return WrittenPage(label, path, page.wrong)

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,17 +33,6 @@ _MOST_DRIVES = 20
 _FIGURES, _POSITIONS = ("worst", "sideslip", "error", "steer", "yaw_rate", "ay"), ("path",)
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _TIMEOUT_S = 180.0
-
-
-@dataclass(frozen=True, slots=True)
-class DriveSection:
-    """One drive of the document: its report, keys of its figures, and its key figures of manoeuvres."""
-
-    label: str
-    outcome: str
-    report: Mapping[str, Any] | None
-    figures: Sequence[str]
-    key_figures: dict[str, Any] | None = None
 
 
 def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
@@ -156,14 +145,15 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
     return -fails, -(figures.get(wanted) or 0.0)
 
 
-def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *, positions: bool) -> DriveSection:
+def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *, positions: bool) -> dict[str, Any]:
     """Return a drive of the document; add its figures, each with its own time, to ``charts``."""
+    drive: dict[str, Any] = {"label": log.label, "outcome": log.outcome, "report": report}
     if report is None:
-        return DriveSection(log.label, log.outcome, None, ())
+        return drive | {"figures": (), "key_figures": None}
     page, keys = drive_page(log), list[str]()
     for key in (*_FIGURES, *(_POSITIONS if positions else ())):
         if (figure := page.charts.figures.get(key)) is not None:
             keys.append(f"{key}-{len(charts.figures)}")
             figure = replace(figure, time=page.charts.time()) if isinstance(figure, TimeFigure) else figure
             charts.figures[keys[-1]] = figure
-    return DriveSection(log.label, log.outcome, report, keys, page.key_figures)
+    return drive | {"figures": keys, "key_figures": page.key_figures}

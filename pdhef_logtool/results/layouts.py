@@ -10,8 +10,7 @@ from typing import Any
 from pdhef_logtool.evaluation.dead_reckoned import pose_known
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.mcap_sink import LOG_TOPIC, MAP_FRAME, topic_of
-from pdhef_logtool.results.palette import colour_rgb
-from pdhef_logtool.results.plotted import ERRORS, STATES
+from pdhef_logtool.results.plotted import ERRORS, STATES, colour_rgb
 from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.results.selected_estimate import TEMPLATES
 from pdhef_logtool.results.sink import TRUTH

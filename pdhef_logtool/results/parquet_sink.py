@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
@@ -195,11 +194,3 @@ def reading(path: Path) -> Iterator[None]:
     except (OSError, ValueError, LookupError, pa.ArrowException) as error:
         got = f"one that cannot be read: {' '.join(str(error).split())[:200]}"
         raise OutputError(expected="a readable Parquet file", got=got, where=str(path), remedy=_AGAIN) from error
-
-
-def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
-    """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
-    schema = arrow_schema("metrics.parquet.json")
-    arrays = [arrow_array([getattr(r, f.name) for r in rows], f.type) for f in schema]
-    with parquet_writer(path, schema, checksums=False) as writer:
-        writer.write_table(pa.Table.from_arrays(arrays, schema=schema))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,3 +96,19 @@ def plotted_fields(track: StateTrack, truth: StateTrack | None, min_speed_m_s: f
         fields |= zip((plot.name, *plot.limits), drawn(track, plot, min_speed_m_s).T, strict=False)
     of_track = errors(track, None if truth is None or truth.name == track.name else truth, min_speed_m_s)
     return fields | {plot.error: of_track[plot.name] for plot in ERRORS}
+
+
+_TRUTH = 0x8A8A8A
+#: The sideslip reference.
+REFERENCE_COLOUR = 0x999933
+#: For other names, such as recorded estimates: Okabe and Ito (2008) without black and yellow.
+_OTHERS = (0xD55E00, 0x0072B2, 0xE69F00, 0x009E73, 0xCC79A7, 0x56B4E9)
+
+
+def colour_rgb(name: str, colours: Mapping[str, int]) -> tuple[int, int, int]:
+    """Return red, green, blue (0 to 255) of a track; ``colours`` are 0xRRGGBB by estimator.
+
+    A name that is not there always gets the same colour of the palette.
+    """
+    packed = {"truth": _TRUTH, **colours}.get(name, _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)])
+    return packed >> 16, packed >> 8 & 0xFF, packed & 0xFF

@@ -9,24 +9,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.units import LABELS
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.selected_estimate import TEMPLATES, MainFacts, answer_of
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("estimator", "signal", "segment", "metric", "value", "unit", "n")

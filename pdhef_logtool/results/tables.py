@@ -11,19 +11,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.opened_run import TABLES
 from pdhef_logtool.results.parquet_sink import parquet_writer, reading
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.results.run_report import LogOutcome
 
 #: Parts that are read before a row group of theirs is written.
 _PARTS_AT_ONCE = 256
@@ -143,9 +141,14 @@ def _verdicts(plan: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def write_part(path: Path, part: pa.Table) -> None:
-    """Write a part; raises OutputError."""
+    """Write a part, or another table; raises OutputError."""
     with parquet_writer(path, part.schema, checksums=False) as writer:
         writer.write_table(part)
+
+
+def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
+    """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
+    write_part(path, _table("metrics", rows))
 
 
 def read_part(path: Path) -> pa.Table:
@@ -192,5 +195,4 @@ def add_verdicts(folder: Path, plan: Mapping[str, Any]) -> None:
     path = folder / "verdicts.parquet"
     with reading(path), pq.ParquetFile(path) as file:
         of_drives = file.read()
-    with parquet_writer(path, of_drives.schema, checksums=False) as writer:
-        writer.write_table(pa.concat_tables([of_drives, _table("verdicts", _verdicts(plan))]))
+    write_part(path, pa.concat_tables([of_drives, _table("verdicts", _verdicts(plan))]))

@@ -90,11 +90,7 @@ class RunCars:
         if self.table is None:
             return [self.config.car]
         table = self.table
-        named = [
-            *table.logs.values(),
-            *table.folders.values(),
-            *(c for by in table.metadata.values() for c in by.values()),
-        ]
+        named = [car for of in (table.logs, table.folders, *table.metadata.values()) for car in of.values()]
         return list(dict.fromkeys(map(self._place, [*named, *filter(None, [table.default])])))
 
     def read(self, path: Path | None) -> Car:

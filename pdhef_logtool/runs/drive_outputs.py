@@ -31,11 +31,11 @@ from pdhef_logtool.results.opened_run import (
     TABLES_FOLDER,
     table_file,
 )
-from pdhef_logtool.results.palette import REFERENCE_COLOUR
-from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
+from pdhef_logtool.results.parquet_sink import write_estimates
+from pdhef_logtool.results.plotted import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
 from pdhef_logtool.results.sink import TRUTH, Event
-from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_tables
+from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_metrics, write_tables
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import file_sha256
@@ -46,12 +46,17 @@ if TYPE_CHECKING:
     from pdhef_logtool.results.mcap_sink import AnnotatedMcap
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
     from pdhef_logtool.results.selected_estimate import MainFacts
-    from pdhef_logtool.runs.estimating import Estimated
-    from pdhef_logtool.runs.preparing import PreparedDrive
+    from pdhef_logtool.runs.estimating import Estimated, PreparedDrive
 
 _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER = "annotated.mcap", "foxglove.json", "plotjuggler.xml"
 #: Files of an earlier run, deleted unless the new run writes them.
-STALE_FILES = (MODEL_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
+STALE_FILES = (
+    MODEL_FILE,
+    PAGE_FILE,
+    METRICS_FILE,
+    ESTIMATES_FILE,
+    RECORDING_FILE,
+)
 #: All files that a run writes into the folder of a log.
 LOG_FILES = (*STALE_FILES, _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER, REPORT_FILE)
 

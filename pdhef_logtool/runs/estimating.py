@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.drive.sensor_changes import SensorChange
 from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.estimators.algorithm import resolve
@@ -18,13 +19,85 @@ from pdhef_logtool.estimators.divergence import watched_track
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.plug_ins import package_of
-from pdhef_logtool.model.intervals import DriveIntervals, spread, widened
+from pdhef_logtool.estimators.table import Options, Skipped, runnable
+from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Manoeuvre, find_manoeuvres
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
+from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segment_masks
+from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.model.intervals import DriveIntervals, drive_intervals, spread, widened
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.readings import without_impossible_states
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.sink import TRUTH
+from pdhef_logtool.results.sink import TRUTH, Event
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.referencing import DriveReference, reference_of
+from pdhef_logtool.runs.selection import default_names
+
+_MAP_THEM = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedDrive:
+    """A drive, its model, and the estimators that run on it; ``failed``: reasons of those without a result, by name."""
+
+    drive: Drive
+    config: RunConfig
+    model: DriveModel
+    reference: DriveReference | None
+    estimators: Sequence[Estimator]
+    skipped: Sequence[Skipped]
+    intervals: DriveIntervals
+    failed: Mapping[str, str]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the estimators."""
+        return [e.name for e in self.estimators]
+
+    @property
+    def car(self) -> Car:
+        """The car of the model."""
+        return self.model.car
+
+
+def prepare(drive: Drive, config: RunConfig) -> PreparedDrive:
+    """Fit the model of the drive, make the reference, choose the estimators.
+
+    Raises EstimatorError if no requested estimator can run.
+    """
+    model = DriveModel.fit(drive)
+    car = model.car
+    estimators, skipped = choose(drive, config.estimators, car, gnss=config.gnss == "auto")
+    if not estimators:
+        raise EstimatorError(
+            expected="at least one estimator that can run",
+            got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
+            where=str(drive.path),
+            remedy=next((f"{reason} (or --waive it)" for reason in drive.plan.refused.values()), _MAP_THEM),
+        )
+    reference = reference_of(drive, model, config)
+    if reference is not None and reference.estimator is not None:
+        estimators = [*estimators, reference.estimator]
+    intervals, failed = drive_intervals(car, estimators), {s.name: s.reason for s in skipped if s.is_error}
+    return PreparedDrive(drive, config, model, reference, estimators, skipped, intervals, failed)
+
+
+def choose(
+    drive: Drive, names: Sequence[str] | None = None, car: Car | None = None, *, gnss: bool = True
+) -> tuple[list[Estimator], list[Skipped]]:
+    """Return the estimators that can run on a drive and a car, and the skipped ones with the reasons.
+
+    Parameters
+    ----------
+    names : of estimators, ``["all"]`` or ``["peers"]``; None: those that a run chooses. car : by default the drive's.
+    gnss : whether filters may use GNSS velocity.
+    """
+    car = drive.car if car is None else car
+    names = default_names(car, drive.available) if names is None else names
+    options = Options(drive.options.use_speed, gnss=gnss)
+    return runnable(names, car, drive.available, options, drive.plan.refused)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,3 +210,75 @@ def _first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
             i = int(posed[0])
             return float(truth.x_m[i]), float(truth.y_m[i]), float(truth.yaw_rad[i])
     return 0.0, 0.0, 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """The figures of one drive.
+
+    Attributes
+    ----------
+    drive : the scored tracks and signals. rows, events : figures, and events in order of time.
+    silent : why estimators have no valid row although the car moves. moves : whether it does.
+    """
+
+    drive: EvaluatedDrive
+    rows: list[MetricRow]
+    events: list[Event]
+    silent: dict[str, str]
+    moves: bool
+
+
+def evaluate(
+    drive: Drive, estimated: Estimated, model: DriveModel, dependent: Mapping[str, str] | None = None
+) -> Evaluation:
+    """Score the tracks of a drive; ``dependent`` : as in :class:`EvaluatedDrive`, by default from the drive's plan."""
+    signals, truth, vehicle = estimated.signals, estimated.truth, drive.car.vehicle
+    manoeuvres = find_manoeuvres(drive.recorded().signals, vehicle)
+    masks = segment_masks(signals, truth, vehicle, manoeuvres)
+    moving = moving_mask(signals, truth, vehicle)
+    tracks, slow, calibrated = estimated.tracks, vehicle.low_speed_blend_m_s, model.calibrated(signals)
+    dependent = drive.plan.dependent if dependent is None else dependent
+    scored = EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent)
+    events = _events(signals, masks, manoeuvres, [*tracks.values()])
+    moves = bool(moving.any())
+    silent = {
+        name: why_silent(signals, moving)
+        for name, track in tracks.items()
+        if moves and not (moving & track.valid & track.something_known).any()
+    }
+    return Evaluation(scored, evaluate_drive(scored), events, silent, moves)
+
+
+def why_silent(signals: Signals, moving: BoolArray) -> str:
+    """Return why an estimator has no valid row where the car moves (``moving`` [N])."""
+    read = [name for name in ALIGNED_SIGNALS if name in signals.available]
+    if lost := [name for name in read if not np.isfinite(getattr(signals, name)[moving]).any()]:
+        return f"no samples of {', '.join(lost)} while it does"
+    return "its signals are there, but the estimator marks none as valid"
+
+
+def _events(
+    stamped: Signals | StateTrack,
+    masks: Mapping[str, BoolArray],
+    manoeuvres: Sequence[Manoeuvre],
+    tracks: Sequence[StateTrack],
+) -> list[Event]:
+    """Return segments, manoeuvres with their peaks, and intervals in which an estimator reports divergence, in order.
+
+    The whole drive and ``linear`` are no events.
+    """
+    spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
+    return in_order([*spans, *manoeuvres, *divergences(tracks)])
+
+
+def divergences(tracks: Iterable[StateTrack]) -> Iterator[Event]:
+    """Yield the intervals in which an estimator reports divergence."""
+    for track in tracks:
+        for s in find_intervals(track, {"diverged": track.diverged}):
+            yield Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
+
+
+def in_order(events: Iterable[Event]) -> list[Event]:
+    """Return events in order of time."""
+    return sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))

@@ -19,9 +19,7 @@ from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.runs.estimating import Estimated, estimate_drive
-from pdhef_logtool.runs.preparing import choose
-from pdhef_logtool.runs.scoring import evaluate
+from pdhef_logtool.runs.estimating import Estimated, choose, estimate_drive, evaluate
 
 if TYPE_CHECKING:
     import polars as pl

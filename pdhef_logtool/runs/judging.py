@@ -5,30 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
-from pdhef_logtool.evaluation.operating_space import OperatingSpace
-from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, ScoredDrive, requirement_blocks
+from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, requirement_blocks
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan, default_plan, load_plan
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results import plan_verdicts
+from pdhef_logtool.results.plan_verdicts import JudgedDrive, PlanVerdicts
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import jsonable
-
-if TYPE_CHECKING:
-    from pdhef_logtool.results.plan_verdicts import JudgedDrive, PlanVerdicts
 
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
     """Return the plan of a file or the default plan; raises UsageError if it is wrong, or missing for ``junit``."""
     if file is not None:
-        from pdhef_logtool.results.plan_verdicts import other_runs
-
         plan = load_plan(file)
-        other_runs(plan, ())  # a missing one ends the command before the work
+        plan_verdicts.other_runs(plan, ())  # a missing one ends the command before the work
         return plan
     if junit is not None:
         raise UsageError(
@@ -45,12 +41,9 @@ def drive_blocks(
     ``main`` : the selected estimate, for requirements that name no estimator.
     """
     blocks: list[RequirementBlocks] = []
-    read, slow, dependent = drive.tracks.get, drive.low_speed_m_s, frozenset(drive.dependent)
-    for base in (drive.truth, read(REFERENCE)):
-        if base is not None:
-            scored = ScoredDrive(read, base, drive.masks, slow, dependent, estimated=base is not drive.truth)
-            left = [r for r in requirements if all(b.of != r.measured for b in blocks)]
-            blocks += requirement_blocks(left, main, scored)
+    for base in filter(None, (drive.truth, drive.tracks.get(REFERENCE))):
+        left = [r for r in requirements if all(b.of != r.measured for b in blocks)]
+        blocks += requirement_blocks(left, main, drive, base)
     return blocks
 
 
@@ -60,17 +53,16 @@ def judge_drive(
     main: str | None,
     rows: Sequence[MetricRow],
     blocks: Sequence[RequirementBlocks],
-    space: OperatingSpace,
+    space: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the entries of report.json on one drive: verdicts of a plan file, blocks of time, operating space."""
     stated = [{k: v for k, v in jsonable(block).items() if v != []} for block in blocks]
     entries = {"requirement_blocks": stated, "operating_space": jsonable(space)}
     if not plan.file:
         return {"plan": None, **entries}
-    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, in_space, plan_verdicts
-
     judged = JudgedDrive(drive.name, main, lambda: entries, {"car": drive.car.vehicle.name})
-    verdicts = plan_verdicts(plan, figures_of_rows(rows), [in_space(judged, entries)]).to_dict()["requirements"]
+    drives, figures = [plan_verdicts.in_space(judged, entries)], plan_verdicts.figures_of_rows(rows)
+    verdicts = plan_verdicts.plan_verdicts(plan, figures, drives).to_dict()["requirements"]
     return {"plan": {"file": plan.file, "requirements": verdicts}, **entries}
 
 
@@ -85,20 +77,18 @@ def judge(
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
     if not plan.file and len(done) < LEAST_DRIVES:
         return None
-    from pdhef_logtool.results import plan_verdicts as judging
-
-    drives: Sequence[JudgedDrive] = [judging.judged_drive(r.opened, partial(_report, r)) for r in done]
+    drives: Sequence[JudgedDrive] = [plan_verdicts.judged_drive(r.opened, partial(_report, r)) for r in done]
     if tables is None:
-        figures = judging.figures_of_rows(row for r in done for row in r.rows)
-        drives = [judging.in_space(d, _report(r) or {}) for d, r in zip(drives, done, strict=True)]
+        figures = plan_verdicts.figures_of_rows(row for r in done for row in r.rows)
+        drives = [plan_verdicts.in_space(d, _report(r) or {}) for d, r in zip(drives, done, strict=True)]
     else:
         import polars as pl
 
         metrics, *spaces = (pl.scan_parquet(tables / f"{x}.parquet") for x in ("metrics", "drives", "exposure"))
-        figures = judging.figures_of_file(metrics, plan, [d.main for d in drives])
-        drives = judging.in_spaces(drives, plan, *spaces)
-    against = judging.other_runs(plan, [r.opened for r in done])
-    return judging.plan_verdicts(plan, figures, drives, strict=strict, against=against)
+        figures = plan_verdicts.figures_of_file(metrics, plan, [d.main for d in drives])
+        drives = plan_verdicts.in_spaces(drives, plan, *spaces)
+    against = plan_verdicts.other_runs(plan, [r.opened for r in done])
+    return plan_verdicts.plan_verdicts(plan, figures, drives, strict=strict, against=against)
 
 
 @lru_cache(maxsize=LEAST_DRIVES)

@@ -6,9 +6,9 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,44 +18,65 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, one_log, read_drive
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
+from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS
 from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import check_mapping, mapping_of, merge_losses, read_signals
+from pdhef_logtool.mapping import (
+    SignalSource,
+    check_mapping,
+    clock_key,
+    fit_clocks,
+    mapping_of,
+    merge_losses,
+    read_signals,
+    resolve_mapping,
+)
+from pdhef_logtool.mapping.can_frames import with_can_signals
+from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, si_values
 from pdhef_logtool.mapping.choosing import mapping_for_recorder
-from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
+from pdhef_logtool.mapping.clocks import request_source, stamps_on_log_clock
+from pdhef_logtool.mapping.estimates import (
+    BASE_ORDER,
+    STDS,
+    CovarianceSource,
+    EstimateSource,
+    choose_estimates,
+    sources_of,
+)
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS, TRUTH_UNITS, WHEELS, FloatArray, IntArray, Loss, Signals
-from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.records.signals import (
+    ALIGNED_SIGNALS,
+    ESTIMATE_UNITS,
+    TRUTH_UNITS,
+    WHEELS,
+    BoolArray,
+    Channel,
+    FloatArray,
+    IntArray,
+    Loss,
+    Signals,
+)
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack, diagonal_covariance, make_track
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import estimator_entry
 from pdhef_logtool.results.tables import drive_part
+from pdhef_logtool.runs import drive_outputs, estimating
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.drive_outputs import (
-    check_places,
-    files_of,
-    log_place,
-    write_drive_tables,
-    write_run,
-    write_run_tables,
-)
-from pdhef_logtool.runs.drive_report import outcome_of, report_drive
-from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
-from pdhef_logtool.runs.estimating import Estimated, with_poses
 from pdhef_logtool.runs.judging import drive_blocks, judge, judge_drive, read_validation_plan, write_verdicts
-from pdhef_logtool.runs.preparing import PreparedDrive
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
+from pdhef_logtool.runs.run_drive import outcome_of, report_drive
 from pdhef_logtool.runs.run_result import LogResult, RunResult
-from pdhef_logtool.runs.scoring import Evaluation, divergences, evaluate, in_order
 from pdhef_logtool.storage.outputs import OutputFolder
 
 _RECORDED = "read from the log: not recorded whether it is causal, or what it was computed from"
@@ -96,15 +117,15 @@ def score_log(
         ) as log:
             mapping = mapping_for_recorder(log, mapping)
     plan = read_validation_plan(config.plan, junit)
-    check_places([log_input], output, config, mapping, junit)
+    drive_outputs.check_places([log_input], output, config, mapping, junit)
     with nullcontext() if output is None else OutputFolder(output, (LOGS,)) as outputs:
         drive, sources = _open(log_input, car, mapping, config, (estimates, truth, name), reporter)
         with drive:
             result = _score_drive(drive, sources, config, plan, outputs, reporter)
         verdicts = judge(plan, [result], config.strict)
         if output is not None:
-            write_run_tables(output, [result])
-            write_run(output, _config_document(config, drive, sources), [result], verdicts)
+            drive_outputs.write_run_tables(output, [result])
+            drive_outputs.write_run(output, _config_document(config, drive, sources), [result], verdicts)
         write_verdicts(junit, verdicts, [result])
     return RunResult(output, (result,), requirements=verdicts)
 
@@ -173,12 +194,12 @@ def _score_drive(
         drive.tell("no IMU in the mapping: segments come from the ground truth alone")
     model = DriveModel.of(drive)
     reference = _reference(drive, model, config)
-    run = PreparedDrive(drive, config, model, reference, [], [], drive_intervals(drive.car, []), {})
+    run = estimating.PreparedDrive(drive, config, model, reference, [], [], drive_intervals(drive.car, []), {})
     reporter.progress(drive.name, 0.8)
 
-    def at(stamps_ns: IntArray, tracks: Sequence[StateTrack]) -> Estimated:
+    def at(stamps_ns: IntArray, tracks: Sequence[StateTrack]) -> estimating.Estimated:
         of_reference = [] if reference is None or reference.estimator is None else [reference.estimator.at(stamps_ns)]
-        return with_poses(_drive_at(drive, truth, stamps_ns), [*tracks, *of_reference])
+        return estimating.with_poses(_drive_at(drive, truth, stamps_ns), [*tracks, *of_reference])
 
     tracks = [r.track for r in recorded]
     equal: dict[str, str] = {}
@@ -188,9 +209,11 @@ def _score_drive(
     stamps_ns = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
     whole, together = scored[0], at(stamps_ns, tracks)
     if selected is None:  # each has been scored at its own stamps; the drive is cut into segments at those of all
-        parts = evaluate(drive, at(stamps_ns, []), model)
+        parts = estimating.evaluate(drive, at(stamps_ns, []), model)
         rows = {(m.estimator, m.signal, m.segment, m.metric): m for s in scored for m in s.rows}
-        whole = replace(parts, rows=[*rows.values()], events=in_order([*parts.events, *divergences(tracks)]))
+        whole = replace(
+            parts, rows=[*rows.values()], events=estimating.in_order([*parts.events, *estimating.divergences(tracks)])
+        )
     blocks = []
     for track, s in zip(tracks, scored, strict=True):
         asked = [q for q in plan.requirements if q.estimator == track.name or (selected and q.estimator is None)]
@@ -202,10 +225,10 @@ def _score_drive(
     report = report_drive(run, together, whole, stated, losses, selected)
     folder, files = None, dict[str, str]()
     if outputs is not None:
-        with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
-            write_drive_tables(change, report, whole.rows, together.drawn)
+        with outputs.begin(drive_outputs.log_place(drive.name), stale=(PAGE_FILE,)) as change:
+            drive_outputs.write_drive_tables(change, report, whole.rows, together.drawn)
         folder = change.target
-        files = files_of(folder)
+        files = drive_outputs.files_of(folder)
     reporter.progress(drive.name, 1.0)
     outcome = outcome_of(drive, losses, files=files)
     part = drive_part(outcome, report, whole.rows, stated["plan"])
@@ -272,7 +295,9 @@ def _drive_at(drive: Drive, truth: TruthTrack | None, stamps_ns: IntArray) -> Wh
     return WholeDrive(drive.name, plan, drive.friction.fill(signals), true, drive.log.start_ns, recorded.changes)
 
 
-def _score(run: PreparedDrive, recorded: RecordedEstimate, estimated: Estimated, equal: dict[str, str]) -> Evaluation:
+def _score(
+    run: estimating.PreparedDrive, recorded: RecordedEstimate, estimated: estimating.Estimated, equal: dict[str, str]
+) -> estimating.Evaluation:
     """Score an estimate at its own stamps; add to ``equal`` the ground truth that equals it."""
     drive, track, truth = run.drive, recorded.track, estimated.truth
     same = {
@@ -281,7 +306,7 @@ def _score(run: PreparedDrive, recorded: RecordedEstimate, estimated: Estimated,
         if truth is not None and _same_column(getattr(track, signal), getattr(truth, signal))
     }
     equal |= same
-    scored = evaluate(drive, estimated, run.model, {**same, **drive.plan.dependent})
+    scored = estimating.evaluate(drive, estimated, run.model, {**same, **drive.plan.dependent})
     if not any(m.estimator == track.name and m.metric in ("rmse", "reference_rms") for m in scored.rows):
         drive.tell(f"{track.name}: nowhere are estimate and ground truth known together, so there are no errors")
     # A quantity that the estimate does not contain has no availability, and so no row.
@@ -303,3 +328,144 @@ def _nothing_to_score_against(got: str, where: str) -> MappingError:
 def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
     usable = np.isfinite(estimate) & np.isfinite(truth)
     return int(np.count_nonzero(usable)) >= 10 and share_equal(estimate[usable], truth[usable]) >= SAME_SHARE
+
+
+#: Steps of more than this number of median periods are not interpolated.
+GAP_PERIODS = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedEstimate:
+    """A recorded estimate on its own stamps.
+
+    ``channels`` are its quantities on their own stamps, NaN left out; ``claimed`` are the names of all that the
+    estimate consists of.
+    """
+
+    track: StateTrack
+    channels: Mapping[str, Channel]
+    claimed: frozenset[str]
+    notes: tuple[str, ...] = ()
+
+
+def read_estimate(
+    log: DriveLog, source: EstimateSource, start_ns: int, end_ns: int
+) -> tuple[RecordedEstimate, list[Loss]]:
+    """Read one recorded estimate with log time in [start, end) onto the stamps of its first quantity of BASE_ORDER.
+
+    NaN stays: it counts against the availability of the estimator and is not a loss.
+
+    Raises
+    ------
+    MappingError : The slice contains no message of it, or not one number.
+    """
+    log = with_can_signals(log, source.as_mapping())
+    mapping = resolve_mapping(log, source.as_mapping())
+    clocks = fit_clocks(log, mapping, start_ns, end_ns)
+    requests: dict[str, list[str]] = {}
+    for s in mapping.signals.values():
+        request_source(log, s, requests)
+    if source.covariance is not None:
+        requests[source.covariance.topic].append(source.covariance.field)
+    losses: list[Loss] = []
+    base = next(name for name in BASE_ORDER if name in mapping.signals)
+    columns = log.read(requests, start_ns, end_ns)
+    channels: dict[str, Channel] = {}
+    covariance = None
+    for name, s in mapping.signals.items():
+        topic = columns.get(s.read_topic)
+        if topic is None or len(topic) == 0:
+            channels[name] = Channel(
+                name, ESTIMATE_UNITS[name], s.label, *2 * (np.empty(0, dtype=np.int64),), np.empty(0)
+            )
+            continue
+        stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
+        stamps = stamps - np.int64(round(s.latency_s * 1e9))
+        kept = _in_order(stamps, topic.log_time_ns, usable)
+        values = _in_range(si_values(topic, s), s)[kept]
+        channels[name] = Channel(name, ESTIMATE_UNITS[name], s.label, stamps[kept], topic.log_time_ns[kept], values)
+        if name == base:
+            if not usable.all():
+                losses.append(dropped("bad-stamp", s.topic, topic.log_time_ns[~usable]))
+            if repeated := int(np.count_nonzero(usable)) - len(kept):
+                text = LOSS_TEXTS["duplicate-stamp"]
+                losses.append(Loss("duplicate-stamp", text, s.topic, count=repeated, severity="note"))
+            if source.covariance is not None:
+                covariance = _planar_covariance(topic, source.covariance)[kept]
+    if not any(np.isfinite(channel.values).any() for name, channel in channels.items() if name in BASE_ORDER):
+        raise MappingError(
+            expected="numbers in the recorded estimate",
+            got="none in the chosen slice",
+            where=f"{log.path} {', '.join(s.label for n, s in mapping.signals.items() if n in BASE_ORDER)}",
+            remedy="check topic, field and slice",
+        )
+    track, notes = _track(source.name, channels[base].stamps_ns, channels, covariance)
+    finite = {n: c.take(np.isfinite(c.values)) for n, c in channels.items() if n in BASE_ORDER}
+    return RecordedEstimate(track, finite, frozenset(channels), notes), losses
+
+
+def _in_range(values: FloatArray, source: SignalSource) -> FloatArray:
+    with np.errstate(invalid="ignore"):
+        outside = np.zeros(values.shape[0], dtype=np.bool_)
+        if source.valid_min is not None:
+            outside |= values < source.valid_min
+        if source.valid_max is not None:
+            outside |= values > source.valid_max
+    return np.where(outside | ~np.isfinite(values), np.nan, values)
+
+
+def _in_order(stamps_ns: IntArray, arrival_ns: IntArray, usable: BoolArray) -> IntArray:
+    """Return the places of usable samples in order of unique stamps; of equal stamps the first arrival."""
+    places = np.flatnonzero(usable)
+    order = places[np.lexsort((arrival_ns[places], stamps_ns[places]))]
+    return order[np.diff(stamps_ns[order], prepend=stamps_ns[order[:1]] - 1) > 0]
+
+
+def _planar_covariance(topic: Columns, source: CovarianceSource) -> FloatArray:
+    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN if unknown (all zero, or −1 first, as in ROS)."""
+    raw = np.asarray(topic.fields[source.field], dtype=np.float64)
+    n = raw.shape[0]
+    if raw.ndim != 2 or raw.shape[1] != source.size**2:
+        return np.full((n, 3, 3), np.nan)
+    places = np.array(source.planar)
+    planar = raw.reshape(n, source.size, source.size)[:, places[:, None], places]
+    unknown = (planar == 0.0).all(axis=(1, 2)) | (raw[:, 0] < 0.0)
+    return np.where(unknown[:, None, None], np.nan, planar)
+
+
+def _track(
+    name: str, stamps_ns: IntArray, channels: Mapping[str, Channel], covariance: FloatArray | None
+) -> tuple[StateTrack, tuple[str, ...]]:
+    notes: list[str] = []
+    columns: dict[str, FloatArray] = {}
+    for quantity, channel in channels.items():
+        same = np.array_equal(channel.stamps_ns, stamps_ns)
+        columns[quantity] = channel.values if same else _interpolated(channel, stamps_ns)
+        if not same and quantity in BASE_ORDER:
+            notes.append(f"{quantity} has other stamps than the estimate and is interpolated to them")
+    if "sideslip_rad" in columns:
+        beta = columns["sideslip_rad"]
+        columns["sideslip_rad"] = np.where(np.abs(beta) > np.pi, wrap_angle(beta), beta)
+        if "vx_m_s" in columns and "vy_m_s" not in columns:
+            columns["vy_m_s"] = columns["vx_m_s"] * np.tan(columns["sideslip_rad"])
+            notes.append("v_y is v_x times tan of the sideslip")
+    if covariance is None or not np.isfinite(covariance).any():
+        covariance = diagonal_covariance([columns.get(s, np.full(stamps_ns.shape[0], np.nan)) for s in STDS])
+    flags = {flag: columns[flag] >= 0.5 for flag in ("valid", "diverged") if flag in columns}
+    if covariance.shape[0] and "sideslip_std_rad" not in columns and {"vx_m_s", "vy_m_s"} <= columns.keys():
+        # Where only deviations are known the correlation of the two velocities counts as 0.
+        completed = np.where(np.eye(3, dtype=np.bool_), covariance, np.nan_to_num(covariance, nan=0.0))
+        columns["sideslip_std_rad"] = sideslip_std(columns["vx_m_s"], columns["vy_m_s"], completed)
+    state = {n: c for n, c in columns.items() if n not in (*STDS, "valid", "diverged")}
+    return make_track(name, stamps_ns, covariance=covariance, **state, **flags), tuple(notes)
+
+
+def _interpolated(channel: Channel, stamps_ns: IntArray) -> FloatArray:
+    finite = channel.take(np.isfinite(channel.values))
+    bracket = Bracket(finite.stamps_ns, stamps_ns, gap_ns(finite.stamps_ns))
+    return bracket.angle(finite.values) if channel.name == "sideslip_rad" else bracket.linear(finite.values)
+
+
+def gap_ns(stamps_ns: IntArray) -> int:
+    """Return the longest step of stamps [N] that is interpolated across."""
+    return round(GAP_PERIODS * float(np.median(np.diff(stamps_ns)))) if stamps_ns.shape[0] > 1 else 0

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_GATE, EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.results.opened_run import OpenedLog
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.object_store import Mirror
-
-if TYPE_CHECKING:
-    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 #: Largest number of logs that are reported one by one and keep all files.
 FEW_LOGS = 50

@@ -20,7 +20,7 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.table import runnable
-from pdhef_logtool.evaluation.metrics import MetricRow, score_track
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
 from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -173,13 +173,8 @@ def track_of(estimator: Estimator, car: Car, drive: ReadDrive) -> StateTrack:
 def figures_of(track: StateTrack, drive: ReadDrive) -> dict[str, float]:
     """Score a track; the figures of ``FIGURES`` that it has."""
     truth, plan = drive.truth, drive.whole.plan
-    rows = score_track(
-        track,
-        truth,
-        segment_masks(drive.signals, truth, plan.vehicle),
-        log=drive.scenario.name,
-        low_speed_m_s=plan.vehicle.low_speed_blend_m_s,
-    )
+    masks, slow = segment_masks(drive.signals, truth, plan.vehicle), plan.vehicle.low_speed_blend_m_s
+    rows = evaluate_drive(EvaluatedDrive(drive.scenario.name, {track.name: track}, truth, None, masks, slow))
     by_key: dict[tuple[str, str, str], MetricRow] = {(r.signal, r.segment, r.metric): r for r in rows}
     values = {
         name: factor * by_key[signal, segment, metric].value

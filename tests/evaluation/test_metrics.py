@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, position_error
-from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive, score_track
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
+from pdhef_logtool.evaluation.metrics.errors import lag_s
 from pdhef_logtool.evaluation.metrics.innovations import nees
-from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 T0 = 1_700_000_000_000_000_000
@@ -158,8 +158,8 @@ def test_the_constant_and_the_shift_of_ground_truth_are_taken_out_and_no_other_e
 
     def errors(estimate):
         moving = {"vx_m_s": np.full(t.size, 10.0)}
-        pair = (make_track(n, stamps, sideslip_rad=b, **moving) for n, b in (("a", estimate), ("truth", truth)))
-        rows = score_track(*pair, {"straight": mask}, log="x", low_speed_m_s=3.0)
+        a, of = (make_track(n, stamps, sideslip_rad=b, **moving) for n, b in (("a", estimate), ("truth", truth)))
+        rows = evaluate_drive(EvaluatedDrive("x", {"a": a}, of, None, {"straight": mask}, 3.0))
         found = {r.metric: r.value for r in rows if (r.signal, r.segment) == ("sideslip_rad", "all")}
         return found["rmse"], found["rmse_aligned"]
 

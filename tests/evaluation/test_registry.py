@@ -16,8 +16,8 @@ from mcap.reader import make_reader
 from pdhef_logtool.cli.compare_tables import render_comparison
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.evaluation import metrics
-from pdhef_logtool.evaluation.metrics import registry
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics import metric as registry
+from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run

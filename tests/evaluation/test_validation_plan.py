@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.evaluation.plan_example import EXAMPLE
-from pdhef_logtool.evaluation.validation_plan import default_plan, load_plan, plan_from_dict
+from pdhef_logtool.evaluation.validation_plan import default_plan, example_plan, load_plan, plan_from_dict
 from pdhef_logtool.records.errors import UsageError
 from tests.run_report import follows
 
@@ -22,8 +21,8 @@ def read(*tables: dict[str, Any]) -> Any:
 
 
 def test_the_example_is_valid_and_is_read(tmp_path: Path) -> None:
-    follows(tomllib.loads(EXAMPLE), "plan.schema.json")
-    (tmp_path / "plan.toml").write_text(EXAMPLE, encoding="utf-8")
+    follows(tomllib.loads(example_plan()), "plan.schema.json")
+    (tmp_path / "plan.toml").write_text(example_plan(), encoding="utf-8")
     plan = load_plan(tmp_path / "plan.toml")
     assert (plan.file, [r.id for r in plan.requirements]) == ("plan.toml", [f"SR-{i}" for i in range(1, 6)])
     assert plan.requirements[0].limit == pytest.approx(math.radians(0.5))

@@ -13,11 +13,10 @@ from pdhef_logtool.car.model import read_model
 from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.cli.learning_tables import render_learning
+from pdhef_logtool.cli.learning import render_learning
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.learning.drives import LearnSettings
-from pdhef_logtool.learning.learn import LearnResult, learn
-from pdhef_logtool.learning.teach import OpenedDrive, learn_from, open_drive
+from pdhef_logtool.learning.learn import LearnResult, OpenedDrive, learn, learn_from, open_drive
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.model.priors import REAR_STIFFNESS, TYRES, prior_of
 from pdhef_logtool.records.errors import EstimatorError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -128,10 +128,10 @@ def test_the_path_is_aligned_at_the_start_and_its_drift_is_stated(tmp_path):
     turned = np.cos(angle) * x - np.sin(angle) * y + 5.0, np.sin(angle) * x + np.cos(angle) * y
     longer = [x[0] + 1.02 * (x - x[0]), y[0] + 1.02 * (y - y[0])]
     tracks[1] = replace(tracks[1], x_m=turned[0], y_m=turned[1])
-    assert path_drift(tracks[1], tracks[0]).end_m == pytest.approx(0.0, abs=1e-6)  # an unknown heading is no drift
+    assert path_drift(tracks[1], tracks[0])["end_m"] == pytest.approx(0.0, abs=1e-6)  # an unknown heading is no drift
     tracks[1] = replace(tracks[1], x_m=longer[0], y_m=longer[1])
     made = path_drift(tracks[1], tracks[0])
-    page = drive_page(open_run(write_run(tmp_path, tracks, path_drift=asdict(made))).logs[0])
+    page = drive_page(open_run(write_run(tmp_path, tracks, path_drift=made)).logs[0])
     text = text_of(page.html)
     length = float(np.hypot(np.diff(x), np.diff(y)).sum())
     drift = float(re.search(r"Drift: ([\d.]+) m", text)[1])

@@ -10,11 +10,12 @@ from pdhef_logtool.reports.encoding import GAP, MOST_CELLS, encode, envelope, gr
 
 def decode(encoded):
     """Decode a text to values [M] like the page does; gaps are NaN."""
-    planes = np.frombuffer(zlib.decompress(base64.b64decode(encoded.base64)), dtype=np.uint8).astype(np.uint16)
-    folded = planes[: encoded.count] | planes[encoded.count :] << 8
+    text, scale = encoded
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8).astype(np.uint16)
+    folded = planes[: scale["count"]] | planes[scale["count"] :] << 8
     steps = (folded >> 1) ^ -(folded & 1)
     q = np.cumsum(steps, dtype=np.uint16)
-    return np.where(q == GAP, np.nan, encoded.low + encoded.step * q)
+    return np.where(q == GAP, np.nan, scale["low"] + scale["step"] * q)
 
 
 def stamps(n, step_ns=10_000_000, start=1_700_000_000_000_000_000):

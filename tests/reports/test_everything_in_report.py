@@ -14,7 +14,7 @@ import pytest
 from made_runs import drive_tracks, write_run
 from test_fleet_page import run_of
 
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pdhef_logtool.results.breakdown import Breakdown, breakdowns
+from pdhef_logtool.results.fleet import Breakdown, breakdowns
 
 
 def found(errors: list[float], days: list[int] | None = None, **keys: list[str]) -> tuple[Breakdown, ...]:

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.validation_plan import Requirement
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.results.comparing import Comparison, compare, compare_runs, figure
-from pdhef_logtool.results.comparison_words import notes_of, sentence
+from pdhef_logtool.results.comparing import Comparison, compare, compare_runs, figure, notes_of, sentence
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import jsonable
 from tests.results.made_run import digest, entry, row, write_run

@@ -14,7 +14,8 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, SHARE_COLUMNS
 from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.results.parquet_sink import list_estimators, read_track, write_estimates, write_metrics
+from pdhef_logtool.results.parquet_sink import list_estimators, read_track, write_estimates
+from pdhef_logtool.results.tables import write_metrics
 
 KINDS = {
     "int64": pl.Int64, "int32": pl.Int32, "double": pl.Float64, "bool": pl.Boolean, "string": pl.String,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.operating_space import Cell, OperatingSpace
-from pdhef_logtool.evaluation.reasons import Interval, SensorFault
+from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
+from pdhef_logtool.evaluation.reasons import Interval, sensor_fault
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.results.palette import colour_rgb
+from pdhef_logtool.results.plotted import colour_rgb
 from pdhef_logtool.results.run_report import (
     LogOutcome,
     build_run,
@@ -60,7 +60,9 @@ def test_report_follows_its_schema(tmp_path):
     assert [m["value"] for m in document["metrics"]] == [np.deg2rad(0.5), None]
     assert document["segments"] == [{"name": "nonlinear", "start_ns": 1, "end_ns": 2, "text": "|ay| above 0.5 g"}]
     assert document["losses"][0]["severity"] == "lost"
-    space = OperatingSpace([Cell(3, 2, 1.5, 0, float("nan"))], 12.3, 2.5, 0.9)
+    cell = {"speed": 3, "ay": 2, "seconds": 1.5, "scored": 0, "sideslip_mse_rad2": float("nan")}
+    space = {"cells": [cell], "speed_max_m_s": 12.3, "ay_max_m_s2": 2.5, "friction_median": 0.9}
+    space |= {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2}
     more = report(metadata={"vehicle": "a"}, operating_space=space, faults=None)
     follows({**more, "estimators": []})
     assert more["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None and more["faults"] is None
@@ -68,11 +70,8 @@ def test_report_follows_its_schema(tmp_path):
 
 def test_faults_are_in_words():
     spans = [Interval(int(a * 1e9), int(b * 1e9)) for a, b in ((1.2, 1.21), (3.45, 3.46), (7, 8), (9, 9.01))]
-    stuck, spike = (
-        SensorFault("yaw_rate_rad_s", "stuck", 1, 1.0, (spans[2],)),
-        SensorFault("ay_m_s2", "spike", 60, 1.0, tuple(spans)),
-    )
-    document = report(None, faults=[stuck, spike], estimators=[ran("phy-ukf", algorithm=None)])
+    stuck, spike = sensor_fault("yaw_rate_rad_s", "stuck", spans[2:3]), sensor_fault("ay_m_s2", "spike", spans)
+    document = report(None, faults=[stuck, {**spike, "count": 60}], estimators=[ran("phy-ukf", algorithm=None)])
     follows(document)
     words = "yaw rate stuck 7.0-8.0 s; a_y spike 1.20 s, 3.45 s, 7.0-8.0 s and 57 more"
     assert f"- {words}" in report_markdown(document).splitlines()

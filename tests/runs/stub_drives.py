@@ -14,8 +14,8 @@ from pdhef_logtool.results.run_report import LogOutcome, write_json
 from pdhef_logtool.results.tables import drive_part, write_part
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.drive_outputs import files_of
-from pdhef_logtool.runs.drive_report import car_entry
 from pdhef_logtool.runs.journal import digest_of, states_of
+from pdhef_logtool.runs.run_drive import car_entry
 from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.storage.files import PendingFile
 from pdhef_logtool.workers.supervisor import Tell

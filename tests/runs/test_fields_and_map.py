@@ -23,12 +23,12 @@ from tests.command_line import rendered
 def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
     found = fields_of_log(sample_logs_dir / "dlc.mcap", "/imu/data")
     (topic,) = found.topics
-    paths = [f.path for f in topic.fields]
+    paths = [f["path"] for f in topic["fields"]]
     assert "angular_velocity.z" in paths
     assert sum("covariance" in p for p in paths) == 3
-    gravity = next(f for f in topic.fields if f.path == "linear_acceleration.z")
-    assert gravity.type == "float64"
-    assert gravity.minimum <= gravity.mean <= gravity.maximum
+    gravity = next(f for f in topic["fields"] if f["path"] == "linear_acceleration.z")
+    assert gravity["type"] == "float64"
+    assert gravity["minimum"] <= gravity["mean"] <= gravity["maximum"]
     assert found.whole
     text = rendered(render_fields, found)
     assert max(map(len, text.splitlines()[1:])) <= 80

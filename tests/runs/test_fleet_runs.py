@@ -16,9 +16,9 @@ import pytest
 
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.results.fleet import summarise
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
 from pdhef_logtool.results.run_report import LogOutcome
-from pdhef_logtool.results.summary import summarise
 from pdhef_logtool.runs import fleet
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import Schedule, run_logs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.runs.reference_audit import audit_truth
+from pdhef_logtool.runs.referencing import audit_truth
 
 N, RATE_HZ = 6000, 100
 STAMPS = np.arange(N, dtype=np.int64) * (1_000_000_000 // RATE_HZ)

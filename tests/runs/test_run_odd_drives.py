@@ -15,11 +15,11 @@ from reference_car import signals_at
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.runs import preparing
+from pdhef_logtool.runs import estimating
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimating import why_silent
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
-from pdhef_logtool.runs.scoring import why_silent
 from studies.torture.hours import Drive, read_samples, write_samples
 from tests.command_line import called
 
@@ -49,7 +49,7 @@ def silenced(monkeypatch: pytest.MonkeyPatch) -> None:
         ready, skipped = table.runnable(*arguments)
         return [_Silent() if e.name == "phy-ukf" else e for e in ready], skipped
 
-    monkeypatch.setattr(preparing, "runnable", runnable)
+    monkeypatch.setattr(estimating, "runnable", runnable)
 
 
 def _run(change: Callable[[Drive], Drive], folder: Path, sample_logs_dir: Path, *estimators: str) -> RunResult:
@@ -86,7 +86,7 @@ def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sa
 def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
     tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preparing, "default_names", lambda _car, _available: ())  # physics has valid rows
+    monkeypatch.setattr(estimating, "default_names", lambda _car, _available: ())  # physics has valid rows
     write_samples(tmp_path / "odd.mcap", [read_samples(sample_logs_dir / "step.mcap")])
     words = ("run", tmp_path / "odd.mcap", "-o", tmp_path / "out", "-e", "phy-ukf", "--car", "saloon")
     done = called(*words, "--network", "none", "--keep", "estimates", "--no-report", "--json")

@@ -1,7 +1,7 @@
 """Metrics: formulas over columns of a drive. Files, terminal, pages, plans and documentation use these entries.
 
 To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`; the words of our own are in
-``metrics.toml``) and add its name to ``MODULES`` of :mod:`~.registry`. Example, ``interval_width.py``::
+``metrics.toml``) and add its name to ``MODULES`` of :mod:`~.metric`. Example, ``interval_width.py``::
 
     from pdhef_logtool.evaluation.metrics.errors import errors_of_drive
     from pdhef_logtool.evaluation.metrics.metric import Metric
@@ -22,8 +22,7 @@ To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`
     )
 """
 
-from pdhef_logtool.evaluation.metrics.metric import ALL, EvaluatedDrive, MetricRow
-from pdhef_logtool.evaluation.metrics.registry import evaluate_drive, score_track
+from pdhef_logtool.evaluation.metrics.metric import ALL, EvaluatedDrive, MetricRow, evaluate_drive
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, signal_error
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 
@@ -34,6 +33,5 @@ __all__ = [
     "EvaluatedDrive",
     "MetricRow",
     "evaluate_drive",
-    "score_track",
     "signal_error",
 ]

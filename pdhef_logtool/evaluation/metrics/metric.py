@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import SIGNALS, read_unit
+from pdhef_logtool.records.entries import load_entries
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -223,3 +224,26 @@ def _rows(
         if value is not None:
             unit, independent = metric.unit_of(signal), not (metric.of_truth and signal in drive.dependent)
             yield MetricRow(drive.log, columns.estimator, signal, segment, metric.name, value, unit, n, independent)
+
+
+#: Modules of this package that export ``METRICS``. Add the name of a new one here.
+MODULES = (
+    "errors",
+    "innovations",
+    "lateral_consistency",
+    "yaw_consistency",
+    "reference",
+    "sensors",
+    "independence",
+    "handling",
+)
+
+
+def registered() -> Mapping[str, Metric]:
+    """Return the metrics by name; their files are imported at the first call."""
+    return load_entries("pdhef_logtool.evaluation.metrics", MODULES, "METRICS")
+
+
+def evaluate_drive(drive: EvaluatedDrive, names: Collection[str] | None = None) -> list[MetricRow]:
+    """Return the values of all metrics, or of the metrics with these names."""
+    return figures(drive, [m for m in registered().values() if names is None or m.name in names])

@@ -42,7 +42,7 @@ from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.reporting import FleetProgress
+from pdhef_logtool.runs.fleet import FleetProgress
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
@@ -149,12 +149,10 @@ class _Job:
         """Name of the drive in the dataset."""
         return self.settings.name_of(self.log_input.stem)
 
-    def target(self, split: str) -> Path:
-        """Return the path of the drive in the dataset."""
+    def identity(self, split: str) -> dict[str, str]:
+        """Return the entries of the drive that determine its path in the dataset."""
         sha, vehicle = self.physics
-        return dataset.drive_file(
-            self.output, {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha}
-        )
+        return {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha}
 
     @property
     def physics(self) -> tuple[str, VehicleParameters]:
@@ -357,7 +355,8 @@ def _failure(job: _Job, reason: str) -> DriveResult:
 def _extract(job: _Job, progress: Progress) -> DriveResult:
     settings, source = job.settings, identity_of(job.log_input)
     split, split_from = choose_split(source, chosen=settings.split, listed=job.listed_split)
-    fingerprint, target = _fingerprint(job, split), job.target(split)
+    fingerprint, identity = _fingerprint(job, split), job.identity(split)
+    target = dataset.drive_file(job.output, identity)
     if job.resume and (kept := _kept(job, target, source, split, fingerprint)) is not None:
         return kept
     with read_drive(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
@@ -377,14 +376,11 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
             rows = replace(rows, chosen=condition.is_true(columns))
         progress(job.log_input.stem, 1.0)
         entry = {
-            "name": job.name,
+            **identity,
             "log": job.log_input.stem,
             "source": {"file": job.log_input.path.name, "sha256": source},
             "signals_sha256": drive.signals_sha256,
-            "split": split,
             "split_from": split_from,
-            "car": job.physics[1].name,
-            "vehicle_sha256": job.physics[0],
             "settings_sha256": fingerprint,
             "mapping_sha256": drive.mapping.sha256,
             "calibration": calibration,

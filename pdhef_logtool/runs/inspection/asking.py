@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 from pdhef_logtool.mapping import Mapping, SignalSource
@@ -31,18 +31,23 @@ def ask_mapping(inspection: Inspection, ask: Callable[[str], str], tell: Callabl
     ----------
     ask : prints a question and returns the line that is answered. tell : prints a line.
     """
-    mapping = inspection.mapping
+    mapping, topics = inspection.mapping, {t.name for t in inspection.topics}
     tell(HELP)
     for section, title, names in QUESTIONS:
-        sources = dict(mapping.signals if section == "signals" else mapping.truth)
+        sources = dict(getattr(mapping, section))
         taken = next((sources[n] for n in names if n in sources), None)
         others = [c for c in inspection.candidates if c.section == section and c.source.name in names and not c.taken]
         if section == "truth" and taken is None and not others:
             continue
-        topics = frozenset(t.name for t in inspection.topics)
-        answer = _answer(title, names, taken, others, topics, ask, tell)
-        for name in names:
-            sources.pop(name, None)
+        tell("")
+        tell(title)
+        if taken is not None:
+            tell(f"  * {taken.label} as {taken.name}, scale {taken.scale}")
+        for number, candidate in enumerate(others, 1):
+            tell(f"  {number} {candidate.source.name}: {candidate}")
+        while isinstance(answer := _answered(ask("? ").split(), names, taken, others, topics), str):
+            tell(answer)
+        sources = {name: source for name, source in sources.items() if name not in names}
         if answer is not None:
             sources[answer.name] = answer
         mapping = replace(mapping, signals=sources) if section == "signals" else replace(mapping, truth=sources)
@@ -50,38 +55,26 @@ def ask_mapping(inspection: Inspection, ask: Callable[[str], str], tell: Callabl
     return replace(mapping, checks=())
 
 
-def _answer(
-    title: str,
-    names: tuple[str, ...],
+def _answered(
+    words: Sequence[str],
+    names: Sequence[str],
     taken: SignalSource | None,
     others: Sequence[Candidate],
-    topics: frozenset[str],
-    ask: Callable[[str], str],
-    tell: Callable[[str], None],
-) -> SignalSource | None:
-    tell("")
-    tell(title)
-    if taken is not None:
-        tell(f"  * {taken.label} as {taken.name}, scale {taken.scale}")
-    for number, candidate in enumerate(others, 1):
-        tell(f"  {number} {candidate.source.name}: {candidate}")
-    while True:
-        text = ask("? ").strip()
-        if not text:
-            return taken
-        if text == "-":
-            return None
-        if text.isdigit() and 1 <= int(text) <= len(others):
-            return others[int(text) - 1].source
-        words = text.split()
-        if len(words) in (2, 3) and words[0] not in topics:
-            tell(f"no topic {words[0]}; pdhef inspect lists them")
-            continue
-        if len(words) in (2, 3) and _is_number(words[2:]):
-            scale = float(words[2]) if len(words) == 3 else 1.0
-            name = names[0] if len(names) == 1 or taken is None else taken.name
-            return SignalSource(name, words[0], words[1], scale=scale)
-        tell(HELP)
+    topics: Collection[str],
+) -> SignalSource | str | None:
+    """Return the source that an answer chooses, or a text if it is not understood."""
+    if not words:
+        return taken
+    if len(words) == 1:
+        number = int(words[0]) if words[0].isdigit() else 0
+        return None if words[0] == "-" else others[number - 1].source if 1 <= number <= len(others) else HELP
+    if len(words) <= 3 and words[0] not in topics:
+        return f"no topic {words[0]}; pdhef inspect lists them"
+    if len(words) <= 3 and _is_number(words[2:]):
+        scale = float(words[2]) if len(words) == 3 else 1.0
+        name = names[0] if len(names) == 1 or taken is None else taken.name
+        return SignalSource(name, words[0], words[1], scale=scale)
+    return HELP
 
 
 def _is_number(words: Sequence[str]) -> bool:

@@ -21,45 +21,26 @@ from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.runs.inspection.rendering import table_of
-from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed
-from pdhef_logtool.runs.inspection.step_statistics import number_text
+from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed, number_text
 from pdhef_logtool.storage.documents import jsonable
 
 #: Arrays inside of arrays, or of structs.
 INNER_ARRAY = re.compile(r"\[\].")
 #: Fields of one topic that are read.
 MOST_FIELDS = 2000
-
-
-@dataclass(frozen=True, slots=True)
-class FieldReport:
-    """One field: float64 statistics in raw units over the read part, NaN without a finite value."""
-
-    path: str
-    type: str
-    minimum: float
-    mean: float
-    maximum: float
-
-
-@dataclass(frozen=True, slots=True)
-class TopicFields:
-    """The fields of a topic; ``reason``: why it has no fields."""
-
-    name: str
-    type: str
-    messages: int
-    rate_hz: float
-    fields: tuple[FieldReport, ...]
-    reason: str = ""
+_STATISTICS = ("minimum", "mean", "maximum")
 
 
 @dataclass(frozen=True, slots=True)
 class FieldsOfLog:
-    """Fields by topic over ``seconds`` of the log; ``whole`` if that is all of it."""
+    """Fields by topic over ``seconds`` of the log; ``whole`` if that is all of it.
+
+    A topic has ``fields``, or the ``reason`` why not; a field has statistics in raw units over the read part, NaN
+    without a finite value.
+    """
 
     path: str
-    topics: tuple[TopicFields, ...]
+    topics: tuple[dict[str, Any], ...]
     seconds: float
     whole: bool
 
@@ -91,7 +72,7 @@ def fields_of_log(
         return FieldsOfLog(str(path), reports, seconds, log.end_ns - log.start_ns <= seconds * 1e9 + 1)
 
 
-def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> TopicFields:
+def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> dict[str, Any]:
     lines = [line for line in collapsed(log.fields(topic.name)) if not any(map(INNER_ARRAY.search, line[2]))]
     lines = lines[:MOST_FIELDS]
     paths = {p.removesuffix("[]") for _, _, every in lines for p in every}
@@ -108,8 +89,8 @@ def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> TopicField
     if not (reports and topic.messages):
         reason = log.unreadable(topic.name) or "no numeric fields" if topic.messages else "no messages"
     rate_hz = max((sample.rate_hz for sample in samples.values()), default=float("nan"))
-    name = topic.type_name.replace("/msg/", "/")
-    return TopicFields(topic.name, name, topic.messages, rate_hz, tuple(reports), reason)
+    facts = {"name": topic.name, "type": topic.type_name.replace("/msg/", "/"), "messages": topic.messages}
+    return {**facts, "rate_hz": rate_hz, "fields": reports, "reason": reason}
 
 
 def _values_by_path(samples: Mapping[tuple[str, str], Seen], paths: set[str]) -> dict[str, list[FloatArray]]:
@@ -121,13 +102,12 @@ def _values_by_path(samples: Mapping[tuple[str, str], Seen], paths: set[str]) ->
     return values
 
 
-def _report(path: str, kind: str, values: Sequence[FloatArray]) -> FieldReport:
+def _report(path: str, kind: str, values: Sequence[FloatArray]) -> dict[str, Any]:
     every = np.concatenate([np.empty(0), *values])
     every = every[np.isfinite(every)]
-    if every.shape[0] == 0:
-        return FieldReport(path, kind, float("nan"), float("nan"), float("nan"))
     with np.errstate(over="ignore"):
-        return FieldReport(path, kind, float(every.min()), float(every.mean()), float(every.max()))
+        figures = (float(f(every)) if every.size else np.nan for f in (np.min, np.mean, np.max))
+        return {"path": path, "type": kind, **dict(zip(_STATISTICS, figures, strict=True))}
 
 
 def render_fields(report: FieldsOfLog, console: Console) -> None:
@@ -136,11 +116,10 @@ def render_fields(report: FieldsOfLog, console: Console) -> None:
     part = "all" if report.whole else "pieces"
     console.print(f"Values over {part} of the log, {report.seconds:.0f} s, in recorded units.")
     for topic in report.topics:
-        title = f"{topic.name} ({topic.type}), {number_text(topic.rate_hz)} Hz"
-        rows = [
-            (Text(row.path), row.type, *map(number_text, (row.minimum, row.mean, row.maximum))) for row in topic.fields
-        ]
-        if topic.fields and not topic.reason:
+        title, fields = f"{topic['name']} ({topic['type']})", topic["fields"]
+        if fields and not topic["reason"]:
+            rows = [(Text(f["path"]), f["type"], *(number_text(f[k]) for k in _STATISTICS)) for f in fields]
+            title = f"{title}, {number_text(topic['rate_hz'])} Hz"
             console.print(table_of(title, ("field", "type", "min", "mean", "max"), rows, words=2))
         else:
-            console.print(Text(f"{topic.name} ({topic.type}): {topic.reason}"))
+            console.print(Text(f"{title}: {topic['reason']}"))

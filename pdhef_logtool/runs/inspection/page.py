@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from markupsafe import Markup
 
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.evidence import Pieces, Seen
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, FloatArray
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.runs.inspection.rendering import findings_of
-from pdhef_logtool.runs.inspection.report import Inspection, mapping_text
-from pdhef_logtool.runs.inspection.step_statistics import number_text
+from pdhef_logtool.runs.inspection.report import Inspection, mapping_text, number_text
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import check_no_input
 
@@ -31,18 +28,8 @@ _HEIGHT = 60
 _PARTS, _ALTERNATIVES = 100, 6
 
 
-@dataclass(frozen=True, slots=True)
-class _Card:
-    """A field with its picture, range and rate, the candidate that it was, and the checks that it does not pass."""
-
-    source: SignalSource
-    candidate: Candidate | None
-    picture: Markup
-    low: float
-    high: float
-    rate_hz: float
-    taken: bool = False
-    checks: Sequence[Check] = ()
+#: A field with its picture, range and rate, the candidate that it was, and the checks that it does not pass.
+_Card: TypeAlias = dict[str, Any]
 
 
 def inspection_page(inspection: Inspection, log: DriveLog) -> bytes:
@@ -79,15 +66,16 @@ def _cards(inspection: Inspection, section: str, samples: Mapping[tuple[str, str
         chosen = next((c for c in candidates if c.taken and c.source.name == name), None)
         bad = [c for c in inspection.checks if c.subject == f"{prefix}{name}" and c.verdict != "passed"]
         picture, low, high = sparkline(_cells(source, samples)), report.minimum, report.maximum
-        cards[name] = [_Card(source, chosen, picture, low, high, report.rate_hz, taken=True, checks=bad)]
+        shown = {"source": source, "candidate": chosen, "picture": picture, "low": low, "high": high}
+        cards[name] = [{**shown, "rate_hz": report.rate_hz, "taken": True, "checks": bad}]
     for candidate in candidates:
         source, cells = candidate.source, _cells(candidate.source, samples)
-        others = sum(not card.taken for card in cards.get(source.name, ()))
+        others = sum(not card["taken"] for card in cards.get(source.name, ()))
         if not candidate.taken and cells.size and others < _ALTERNATIVES:
             low, high = float(np.nanmin(cells, initial=np.inf)), float(np.nanmax(cells, initial=-np.inf))
             rate_hz = samples[source.topic, source.paths[0]].rate_hz
-            card = _Card(source, candidate, sparkline(cells), low, high, rate_hz)
-            cards.setdefault(source.name, []).append(card)
+            shown = {"source": source, "candidate": candidate, "picture": sparkline(cells), "low": low, "high": high}
+            cards.setdefault(source.name, []).append({**shown, "rate_hz": rate_hz, "taken": False, "checks": ()})
     return cards
 
 

@@ -15,8 +15,7 @@ from rich.text import Text
 from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
-from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport
-from pdhef_logtool.runs.inspection.step_statistics import number_text
+from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport, number_text
 
 #: Candidates of a signal that are shown beside the one that was taken.
 CANDIDATES_SHOWN = 2

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Mapping as MappingABC
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -45,10 +46,94 @@ from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
-from pdhef_logtool.runs.inspection.step_statistics import Steps, number_text
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, IntArray, Loss
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.files import write_bytes
+
+#: A gap is more than this many median steps, and more than ``MIN_GAP_S``.
+GAP_PERIODS = 5.0
+MIN_GAP_S = 0.1
+#: If the median step differs from the mean step by more, messages come in bursts.
+BURST = 0.75
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Steps between ascending times.
+
+    Attributes
+    ----------
+    count : number of times. steps_s : float64 [N]. starts_ns : int64 [N], start of each step.
+    """
+
+    count: int
+    steps_s: FloatArray
+    starts_ns: IntArray
+
+    @classmethod
+    def of(cls, parts: Sequence[IntArray]) -> Steps:
+        """Return the steps within each part, int64 [K] ascending; a step from one part to the next is left out."""
+        steps = [np.diff(part) * 1e-9 for part in parts]
+        starts = [part[:-1] for part in parts]
+        return cls(sum(map(len, parts)), np.concatenate([np.empty(0), *steps]), np.concatenate([_NONE, *starts]))
+
+    @cached_property
+    def median_s(self) -> float:
+        """Median step; NaN without a step."""
+        return float(np.median(self.steps_s)) if self.steps_s.shape[0] else float("nan")
+
+    @property
+    def rate_hz(self) -> float:
+        """Rate by the median step; for bursts, by the mean of the steps that are no gaps."""
+        steps = self.steps_s
+        if not steps.shape[0]:
+            return float("nan")
+        # The step that half of the time is spent in, without the longest 1 %: of bursts, that from one to the next.
+        usual = np.sort(steps)[: max(1, len(steps) - max(1, len(steps) // 100))]
+        half = usual[np.searchsorted(np.cumsum(usual), 0.5 * usual.sum())]
+        limit = max(MIN_GAP_S, GAP_PERIODS * float(half))
+        mean, median = float(steps[steps <= limit].mean()), self.median_s
+        step = median if BURST * mean <= median <= mean / BURST else mean
+        return 1.0 / step if step > 0.0 else float("nan")
+
+    @property
+    def jitter_p95_s(self) -> float:
+        """95th percentile of |step − median|; NaN without a step."""
+        steps = self.steps_s
+        return float(np.quantile(np.abs(steps - self.median_s), 0.95)) if steps.shape[0] else float("nan")
+
+    def longest(self, since_ns: int, above_s: float = MIN_GAP_S) -> dict[str, float]:
+        """Return the longest step above a limit and its start since a stamp, both in s; NaN without one."""
+        i = int(np.argmax(self.steps_s)) if self.steps_s.shape[0] else 0
+        gap = math.nan, math.nan
+        if (self.steps_s[i : i + 1] > above_s).any():
+            gap = float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * 1e-9
+        return dict(zip(("largest_gap_s", "largest_gap_at_s"), gap, strict=True))
+
+    @property
+    def gap_limit_s(self) -> float:
+        """Steps above this limit are gaps."""
+        return max(MIN_GAP_S, GAP_PERIODS * self.median_s)
+
+    @property
+    def gaps(self) -> int:
+        """Number of gaps."""
+        return int(np.count_nonzero(self.steps_s > self.gap_limit_s))
+
+
+_NONE = np.empty(0, dtype=np.int64)
+
+
+def number_text(value: float) -> str:
+    """Return a number in few digits, a dash without one."""
+    if not math.isfinite(value):
+        return "-"
+    if value == 0.0:
+        return "0"
+    if 100.0 <= abs(value) < 1e5:
+        return f"{value:.0f}"
+    return f"{value:.3g}" if 1e-4 <= abs(value) < 1e4 else f"{value:.1e}"
+
 
 WINDOW_NS = 600_000_000_000
 #: Of a larger log with a sound index values are looked at in a part: its first ten minutes, and windows over the rest.
@@ -70,6 +155,14 @@ _IN_DOCUMENT = (
     "truth", "truth_quality", "missing", "ambiguities", "notes", "checks", "proposals", "lost", "candidates",
     "estimators",
 )  # fmt: skip
+
+
+_FIGURES: dict[str, Callable[[FloatArray], Any]] = {
+    "mean": np.mean,
+    "std": np.std,
+    "minimum": np.min,
+    "maximum": np.max,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +432,6 @@ def _topic_reports(
 
 
 def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log: DriveLog) -> TopicReport:
-    gap_s, gap_at_s = steps.longest(log.start_ns)
     log_s = (log.end_ns - log.start_ns) * 1e-9
     numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
     delays = np.concatenate([np.empty(0), *((c.log_time_ns - c.publish_time_ns) * 1e-9 for c in stamps)])
@@ -351,8 +443,7 @@ def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log
         messages=topic.messages,
         rate_hz=steps.rate_hz if steps.count else topic.messages / log_s if log_s > 0.0 else math.nan,
         jitter_p95_s=steps.jitter_p95_s,
-        largest_gap_s=gap_s,
-        largest_gap_at_s=gap_at_s,
+        **steps.longest(log.start_ns),
         delay_median_s=median,
         delay_p95_s=late,
         fields=numbers[:MAX_LISTED_FIELDS],
@@ -371,7 +462,6 @@ def _signal_report(
     steps = Steps.of([c.stamps_ns for c in channels])
     lengths = (c.values if c.values.ndim == 1 else np.linalg.norm(c.values, axis=1) for c in channels)
     values = np.concatenate([np.empty(0), *lengths])
-    gap_s, gap_at_s = steps.longest(log.start_ns, steps.gap_limit_s)
     places = {f"{source.name} ({source.label})"}
     if section == "truth" and quality is not None:
         places.add(f"{source.name} ({quality.describe()})")
@@ -379,9 +469,7 @@ def _signal_report(
     # Messages that were sorted back are used.
     dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.read_topic and x.kind in TOPIC_DROPS}
     with np.errstate(over="ignore", invalid="ignore"):  # values that are no measurements
-        mean, std, minimum, maximum = (
-            float(f(values)) if values.size else math.nan for f in (np.mean, np.std, np.min, np.max)
-        )
+        figures = {name: float(f(values)) if values.size else math.nan for name, f in _FIGURES.items()}
     return SignalReport(
         name=source.name,
         unit=(SIGNAL_UNITS if section == "signals" else TRUTH_UNITS)[source.name],
@@ -390,13 +478,9 @@ def _signal_report(
         samples=steps.count,
         rate_hz=steps.rate_hz,
         latency_s=clock.median_delay_s + source.latency_s,
-        mean=mean,
-        std=std,
-        minimum=minimum,
-        maximum=maximum,
+        **figures,
         gaps=steps.gaps,
-        largest_gap_s=gap_s,
-        largest_gap_at_s=gap_at_s,
+        **steps.longest(log.start_ns, steps.gap_limit_s),
         dropped=dropped,
     )
 
