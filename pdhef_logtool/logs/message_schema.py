@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -98,13 +98,14 @@ class Unknown:
 Node: TypeAlias = Scalar | Struct | Array | Unknown
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class MessageSchema:
     """A message type: its tree and its decoder.
 
     ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
     ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
-    of an installed ROS that it was read from, if the log contains no definition.
+    of an installed ROS that it was read from, if the log contains no definition. ``units`` of fields are those that its
+    text states.
     """
 
     type_name: str
@@ -114,6 +115,12 @@ class MessageSchema:
     message_class: Any = None
     limits: ResourceLimits = DEFAULT_LIMITS
     borrowed: tuple[Path, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @functools.cached_property
+    def fields(self) -> tuple[FieldInfo, ...]:
+        """The scalar leaves of the tree, times as one leaf."""
+        return tuple(replace(f, unit=self.units.get(f.path.partition("[")[0], "")) for f in leaves(self.root))
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +271,8 @@ def ros_schema(
                 borrowed = tuple(file for file in files if file is not None)
                 store.register(types)
             root = _ros_root(store.fielddefs, type_name, limits)
-    return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed)
+    units = stated_units(text) if encoding == "ros2msg" else {}
+    return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed, units=units)
 
 
 def _idl_types(text: str) -> Any:
@@ -446,9 +454,9 @@ def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
 _STATED_UNIT = re.compile(r"^\s*[\w/\[\]<=]+\s+(\w+)\s*#\s*\[([^\[\]\s]{1,12})\]\s*$", re.MULTILINE)
 
 
-def stated_units(definition: bytes) -> dict[str, str]:
+def stated_units(definition: str) -> dict[str, str]:
     """Return the units by field that comments of a ROS 2 message's own fields give: ``float64 speed  # [km/h]``."""
-    main_type = definition.decode(errors="replace").partition("\n===")[0]
+    main_type = definition.partition("\n===")[0]
     return {match[1]: match[2] for match in _STATED_UNIT.finditer(main_type)}
 
 
@@ -485,8 +493,9 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             return Selection(path, "dynamic", (steps,))
         node = _part(node, step)
     if node is None:
-        paths = [leaf.path for leaf in leaves(schema.root)]
-        raise nearest(path, paths, f"a field of {schema.type_name or 'the message'}", topic)
+        raise nearest(
+            path, [leaf.path for leaf in schema.fields], f"a field of {schema.type_name or 'the message'}", topic
+        )
     if ending:
         # Records of ROS messages are read without their texts.
         is_text = isinstance(node, Unknown) or (isinstance(node, Scalar) and node.kind == "string")
@@ -542,7 +551,7 @@ def nearest(name: str, names: Sequence[str], expected: str, where: object) -> Ma
 
 
 def _no_number(schema: MessageSchema, topic: str, path: str, what: str) -> MappingError:
-    below = [leaf.path for leaf in leaves(schema.root) if leaf.path.startswith(path) and leaf.kind != "string"][:3]
+    below = [leaf.path for leaf in schema.fields if leaf.path.startswith(path) and leaf.kind != "string"][:3]
     return MappingError(
         expected="a number, a time, a vector or an array of numbers",
         got=f"{path!r}, which is {what}",
