@@ -416,8 +416,13 @@ def json_schema_of_message(type_name: str, message: bytes, limits: ResourceLimit
     what = "the first message"
     with parsing(what):
         limits.check("schema_bytes", len(message), what)
-        root = _example_node(json.loads(message), Unfolding(limits, what), 0)
+        root = node_of_value(json.loads(message), limits)
     return MessageSchema(type_name, "json", root, limits=limits)
+
+
+def node_of_value(value: object, limits: ResourceLimits) -> Node:
+    """Return the tree of a JSON value; raises LimitError."""
+    return _example_node(value, Unfolding(limits, "a JSON value"), 0)
 
 
 def _example_node(value: object, unfolding: Unfolding, depth: int) -> Node:
@@ -507,6 +512,11 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
                 remedy=f"drop the ending {ending}",
             )
         return Selection(path, "array", (steps,), None, TEXT_ENDINGS[ending])
+    return select(schema, topic, path, node, steps)
+
+
+def select(schema: MessageSchema, topic: str, path: str, node: Node, steps: tuple[Step, ...]) -> Selection:
+    """Return how the node at some steps becomes a column; raises MappingError for one that is no number."""
     if isinstance(node, Unknown):
         return Selection(path, "dynamic", (steps,))
     if isinstance(node, Scalar):
@@ -514,7 +524,13 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             raise _no_number(schema, topic, path, "a text")
         return Selection(path, "scalar", (steps,))
     if isinstance(node, Array):
-        return _select_array(node, schema, topic, path, steps)
+        if isinstance(node.item, Unknown):
+            return Selection(path, "dynamic", (steps,))
+        if not isinstance(node.item, Scalar) or node.item.kind == "string":
+            raise _no_number(schema, topic, path, "an array of structs or texts")
+        if node.length is not None and node.length > schema.limits.array_width:
+            raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
+        return Selection(path, "array", (steps,), node.length)
     if node.time:
         return Selection(path, "time", tuple((*steps, part) for part in node.time))
     if node.vector:
@@ -528,16 +544,6 @@ def _part(node: Node | None, step: Step) -> Node | None:
         return node.members.get(step)
     is_element = isinstance(node, Array) and isinstance(step, int) and (node.length is None or step < node.length)
     return node.item if isinstance(node, Array) and is_element else None
-
-
-def _select_array(node: Array, schema: MessageSchema, topic: str, path: str, steps: tuple[Step, ...]) -> Selection:
-    if isinstance(node.item, Unknown):
-        return Selection(path, "dynamic", (steps,))
-    if not isinstance(node.item, Scalar) or node.item.kind == "string":
-        raise _no_number(schema, topic, path, "an array of structs or texts")
-    if node.length is not None and node.length > schema.limits.array_width:
-        raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
-    return Selection(path, "array", (steps,), node.length)
 
 
 def nearest(name: str, names: Sequence[str], expected: str, where: object) -> MappingError:
@@ -573,12 +579,17 @@ def bytes_of_text(value: object, encoding: str) -> list[int] | None:
         return None
 
 
+@functools.lru_cache(maxsize=4096)
+def _can_be_absent(descriptor: Any, name: str) -> bool:
+    """Return whether a protobuf field can be absent; a default that the type declares (proto2) replaces such a value."""
+    field = descriptor.fields_by_name.get(name)
+    return field is not None and field.has_presence and not field.has_default_value
+
+
 def value_at(message: object, steps: Sequence[Step]) -> object:
     """Follow steps through attributes, mappings and sequences; None where the message lacks one."""
     value: Any = message
     for step in steps:
-        if value is None:
-            return None
         if isinstance(step, int):
             try:
                 value = value[step]
@@ -587,5 +598,7 @@ def value_at(message: object, steps: Sequence[Step]) -> object:
         elif isinstance(value, dict):
             value = value.get(step)
         else:
-            value = getattr(value, step, None)
+            descriptor = getattr(value, "DESCRIPTOR", None)
+            is_absent = descriptor is not None and _can_be_absent(descriptor, step) and not value.HasField(step)
+            value = None if is_absent else getattr(value, step, None)
     return value
