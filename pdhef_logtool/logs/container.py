@@ -268,8 +268,7 @@ class Container(ABC):
         self.size = size
         self.cut = False
         self._closing = ExitStack()
-        self._losses: dict[str, int] = {}  # how many of a kind
-        self._folded: dict[str, int] = {}  # index in ``lost`` of the loss that sums up further ones
+        self._losses: Counter[str] = Counter()  # how many of a kind
 
     @classmethod
     def open(cls, file: LogFile) -> Self:
@@ -338,18 +337,14 @@ class Container(ABC):
         self, kind: str, what: str, start_ns: int | None = None, end_ns: int | None = None, count: int | None = None
     ) -> None:
         """Record damage of this file; the 21st and later losses of a kind are merged."""
-        n = self._losses[kind] = self._losses.get(kind, 0) + 1
-        more = n - _LOSSES_OF_A_KIND
-        if more <= 0:
-            self.lost.append(Loss(kind, what, str(self.path), start_ns, end_ns, count))
-        elif more == 1:
-            self._folded[kind] = len(self.lost)
-            self.lost.append(Loss(kind, f"more of this kind: {what}", str(self.path), start_ns, end_ns, count))
-        else:
-            old = self.lost[self._folded[kind]]
-            total = None if old.count is None or count is None else old.count + count
-            text = f"{more} more of this kind, the last: {what}"
-            self.lost[self._folded[kind]] = Loss(kind, text, str(self.path), old.start_ns, end_ns, total)
+        self._losses[kind] += 1
+        more = self._losses[kind] - _LOSSES_OF_A_KIND
+        if more > 0:
+            what = f"{more} more of this kind, the last: {what}"
+        if more > 1:
+            old = self.lost.pop(max(i for i, loss in enumerate(self.lost) if loss.kind == kind))
+            start_ns, count = old.start_ns, None if old.count is None or count is None else old.count + count
+        self.lost.append(Loss(kind, what, str(self.path), start_ns, end_ns, count))
 
     def drop_undeclared(self, called: str) -> None:
         """Remove the messages of undeclared channels from the spans' counts, with a loss per span."""

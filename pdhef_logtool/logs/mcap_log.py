@@ -112,7 +112,7 @@ class McapContainer(FileContainer):
         indexed = self._indexed_places()
         self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
         places, n = [*sorted(indexed), size], 0
-        header_seen = False
+        self.position = self._read_header()
         for offset in self._places():
             if offset in indexed:
                 self.position = self._add_indexed(*indexed[offset])
@@ -120,26 +120,17 @@ class McapContainer(FileContainer):
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self._closed = True
                 return
-            opcode, length = RECORD.unpack(source.read(offset, RECORD.size)) if offset + RECORD.size <= size else (0, 0)
-            end = offset + RECORD.size + length
+            opcode, end = self._record_head(offset)
             while places[n] <= offset:
                 n += 1
             if end > places[n] or opcode == 0:
-                if not header_seen:
-                    raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
                 resume = places[n] if places[n] < size else self._next_chunk(offset)
                 if resume is None:
                     self.lose_end(offset)
                     return
                 what = f"bytes {offset} to {resume} contain no readable record; reading resumes at the next chunk"
                 self.lose("bad-record", what, self.last_ns())
-                self.position = resume
-                continue
-            if not header_seen:
-                if opcode != _OP_HEADER:
-                    raise self.no_log("a header record after the magic bytes", "none")
-                self._read_header(offset, length)
-                header_seen = True
+                end = resume
             elif opcode == _OP_MESSAGE:
                 end = self._messages(offset)
             else:
@@ -148,8 +139,13 @@ class McapContainer(FileContainer):
                 except Exception as error:  # noqa: BLE001 (the next record is read in any case)
                     self.lose_record(offset, error)
             self.position = end
-        if not header_seen:
-            raise self.no_log("a header record after the magic bytes", "none")
+
+    def _record_head(self, offset: int) -> tuple[int, int]:
+        """Return opcode and end of the record at a byte; opcode 0 without a complete head."""
+        if offset + RECORD.size > self.source.size:
+            return 0, offset
+        opcode, length = RECORD.unpack(self.source.read(offset, RECORD.size))
+        return opcode, offset + RECORD.size + length
 
     def _indexed_places(self) -> dict[int, tuple[Extent, Span | None]]:
         """Return by their places the chunks, and attachments that are not read, that a sound summary describes.
@@ -207,13 +203,20 @@ class McapContainer(FileContainer):
         )
         self.lose("bad-record", what)
 
-    def _read_header(self, offset: int, length: int) -> None:
-        self.meter.limits.check("metadata_bytes", length, "the header record")
+    def _read_header(self) -> int:
+        """Read the header record, which is the first one; return its end."""
+        start = self.position
+        opcode, end = self._record_head(start)
+        if opcode == 0 or end > self.source.size:
+            raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
+        if opcode != _OP_HEADER:
+            raise self.no_log("a header record after the magic bytes", "none")
         try:
-            self.profile = _parsed(Header, self.source.read(offset + RECORD.size, length)).profile
+            self.profile = _parsed(Header, self._payload(start, end)).profile
         except (struct.error, UnicodeDecodeError, McapError) as error:
             got = "a malformed one, or a draft of the format before 1.0"
             raise self.no_log("a header record with profile and library", got) from error
+        return end
 
     def _next_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that a damaged summary names, or None."""

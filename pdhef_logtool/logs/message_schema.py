@@ -581,7 +581,7 @@ def bytes_of_text(value: object, encoding: str) -> list[int] | None:
 
 @functools.lru_cache(maxsize=4096)
 def _can_be_absent(descriptor: Any, name: str) -> bool:
-    """Return whether a protobuf field can be absent; a default that its type declares (proto2) replaces such a value."""
+    """Return whether a protobuf field can be absent. A default that its type declares (proto2) replaces its value."""
     field = descriptor.fields_by_name.get(name)
     return field is not None and field.has_presence and not field.has_default_value
 

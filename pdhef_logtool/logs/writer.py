@@ -77,7 +77,7 @@ class TopicBatch:
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
-    """A message as ready bytes on a channel of :meth:`McapLogWriter.add_raw_channel`."""
+    """A message as ready bytes on a channel of :meth:`McapLogWriter.add_channel`."""
 
     channel: int
     log_time_ns: int
@@ -187,20 +187,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._channels[channel.id] = channel
         self._emit_record(channel)
         return channel.id
-
-    def add_raw_channel(
-        self,
-        topic: str,
-        *,
-        schema_name: str,
-        schema_encoding: str,
-        schema_data: bytes,
-        message_encoding: str,
-        metadata: Mapping[str, str],
-    ) -> int:
-        """Add a channel for :class:`RawMessage`, as :meth:`add_channel`."""
-        schema = schema_name, schema_encoding, schema_data
-        return self.add_channel(ChannelRecord(-1, topic, message_encoding, *schema, metadata))
 
     def has_ids_of(self, channel_id: int, record: ChannelRecord) -> bool:
         """Return whether a channel has the ids of a record, which a :class:`RawChunk` of its file needs."""
