@@ -292,7 +292,7 @@ class McapContainer(FileContainer):
             place = end
         if not places:
             self.lose_record(offset, SpanDamageError("a message record is too short"))
-            return offset + RECORD.size + int(RECORD.unpack(self.source.read(offset, RECORD.size))[1])
+            return self._record_head(offset)[1]
         heads = _heads(block, np.array(places, dtype=np.int64))
         times, counts = _held_times(heads["log"]), Counter(heads["channel"].tolist())
         ordered = bool((times[1:] >= times[:-1]).all())
@@ -307,10 +307,10 @@ class McapContainer(FileContainer):
         """
         index_end, size = end, self.source.size
         while index_end + INDEX_RECORD.size <= size:
-            opcode, length = RECORD.unpack(self.source.read(index_end, RECORD.size))
-            if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or index_end + RECORD.size + length > size:
+            opcode, following = self._record_head(index_end)
+            if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or following > size:
                 break  # one wrong bit makes an index a private record
-            index_end += RECORD.size + length
+            index_end = following
         extent = Extent(start, end, index_end)
         first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
         claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, {})
