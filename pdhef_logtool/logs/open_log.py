@@ -268,9 +268,6 @@ def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
                     raise LogError(
                         expected="a file of messages", got=f"a log of kind {container.kind}", where=str(file)
                     )
-            except LogError as error:
-                lost.append(Loss("bad-file", f"expected {error.expected}, got {error.got}", str(file)))
-                continue
             except Exception as error:  # noqa: BLE001 (one file of several)
                 lost.append(Loss("bad-file", describe_damage(error)[1], str(file)))
                 continue
