@@ -23,8 +23,8 @@ import numpy as np
 
 from benchmarks.measuring import CACHE
 from pdhef_logtool.logs.container import ChannelRecord
+from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.encoding import CdrEncoder
-from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import FloatArray, IntArray

@@ -189,11 +189,11 @@ class ColumnarLog(DriveLog):
 
     def attachments(self) -> Iterator[Attachment]:
         """Yield the files that the log contains."""
-        return (attachment for container in self.containers for attachment in container.attachments())
+        return (attachment for container in self.containers for attachment in container.records(Attachment))
 
     def metadata_records(self) -> Iterator[Metadata]:
         """Yield the metadata records."""
-        return (record for container in self.containers for record in container.metadata_records())
+        return (record for container in self.containers for record in container.records(Metadata))
 
     @property
     def is_remote(self) -> bool:

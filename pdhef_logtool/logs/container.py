@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from mcap.records import Attachment, Metadata
@@ -22,7 +22,7 @@ from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
-    from pdhef_logtool.logs.log_file import LogFile
+    from pdhef_logtool.logs.table_file import LogFile
 
 # First bytes of the files of each format.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -32,6 +32,7 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 #: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
 UNVERIFIED = "unverified"
+RecordT = TypeVar("RecordT", Attachment, Metadata)
 _LOSSES_OF_A_KIND = 20  # of one file; further ones become one loss
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
@@ -309,12 +310,9 @@ class Container(ABC):
         del span, block, kept
         return None
 
-    def attachments(self) -> Iterator[Attachment]:
-        """Read the attachments; a damaged one is among the losses and left out."""
-        yield from ()
-
-    def metadata_records(self) -> Iterator[Metadata]:
-        """Read the metadata records; a damaged one is among the losses and left out."""
+    def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
+        """Read the attachments or metadata records; a damaged one is among the losses and left out."""
+        del kind
         yield from ()
 
     def prefetch(self, spans: Iterable[Span]) -> None:

@@ -36,6 +36,7 @@ from pdhef_logtool.logs.container import (
     ChannelRecord,
     FileContainer,
     RawChunk,
+    RecordT,
     Span,
     SpanDamageError,
     Wanted,
@@ -93,8 +94,7 @@ class McapContainer(FileContainer):
         self._wanted = wanted
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
-        self._attachment_at: list[tuple[int, int]] = []
-        self._metadata_at: list[tuple[int, int]] = []
+        self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
         self._unread: dict[
             int, int
         ] = {}  # chunks and attachments of a remote file that are not wanted, from start to end
@@ -177,7 +177,7 @@ class McapContainer(FileContainer):
     def _add_indexed(self, extent: Extent, span: Span | None) -> int:
         """Add a chunk, or an attachment, by its entry in the summary; return the start of the next record."""
         if span is None:
-            self._attachment_at.append((extent.start, extent.end))
+            self._records_at[Attachment].append((extent.start, extent.end))
             return extent.end
         ordered = self.source.is_remote
         if not ordered:
@@ -238,7 +238,7 @@ class McapContainer(FileContainer):
             self._data_end = (start, end)
         elif opcode == Opcode.METADATA:
             _parsed(Metadata, self._payload(start, end))
-            self._metadata_at.append((start, end))
+            self._records_at[Metadata].append((start, end))
         elif opcode == Opcode.STATISTICS and self._data_end:
             self._statistics = _parsed(Statistics, self._payload(start, end))
         elif opcode == Opcode.FOOTER and self._data_end:
@@ -520,18 +520,11 @@ class McapContainer(FileContainer):
             return {id_: _held_times(times) for id_, times in indexes}
         return super().times(span)
 
-    def attachments(self) -> Iterator[Attachment]:
-        """Read the attachments; a damaged one is among the losses and left out."""
-        yield from self._sound_records(self._attachment_at, Attachment)
-
-    def metadata_records(self) -> Iterator[Metadata]:
-        """Read the metadata records; a damaged one is among the losses and left out."""
-        yield from self._sound_records(self._metadata_at, Metadata)
-
-    def _sound_records(self, extents: Iterable[tuple[int, int]], kind: Any) -> Iterator[Any]:
-        for start, end in extents:
+    def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
+        """See :class:`~pdhef_logtool.logs.container.Container`."""
+        for start, end in self._records_at[kind]:
             try:
-                record = _parsed(kind, self.source.read(start + RECORD.size, end - start - RECORD.size))
+                record: RecordT = _parsed(kind, self.source.read(start + RECORD.size, end - start - RECORD.size))
             except Exception as error:  # noqa: BLE001 (the boundary)
                 self.lose_record(start, error)
                 continue
@@ -551,7 +544,7 @@ class McapContainer(FileContainer):
         if crc and self._crc(start, crc_at) != crc:
             self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
             return
-        self._attachment_at.append((start - RECORD.size, end))
+        self._records_at[Attachment].append((start - RECORD.size, end))
 
 
 def _parsed(kind: Any, payload: bytes) -> Any:

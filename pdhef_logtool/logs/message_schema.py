@@ -14,9 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from pdhef_logtool.logs.definitions import SHIPPED, Definitions
+from pdhef_logtool.logs.definitions import SHIPPED, Definitions, referenced, with_contained_types
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
-from pdhef_logtool.logs.schema_files import referenced, with_contained_types
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
 if TYPE_CHECKING:

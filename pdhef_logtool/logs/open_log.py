@@ -24,10 +24,9 @@ from pdhef_logtool.logs.formats import (
     what_is_a_log,
     without_general,
 )
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
-from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
+from pdhef_logtool.logs.table_file import NO_SETTINGS, LogFile, TableSettings
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.storage.documents import read_text

@@ -38,10 +38,10 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, ChannelRecord, RawChunk
+from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.mcap_index import RECORD
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
-from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import LIBRARY

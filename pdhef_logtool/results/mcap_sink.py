@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.evaluation.dead_reckoned import pose_known
 from pdhef_logtool.logs.container import ChannelRecord, RawChunk
+from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.errors import OutputError
