@@ -35,7 +35,7 @@ from pdhef_logtool.logs.message_schema import (
     node_of_value,
     ros_schema,
     select,
-    value_at,
+    values_at,
 )
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
 from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout, layout_of_message
@@ -45,6 +45,8 @@ from pdhef_logtool.records.signals import IntArray
 #: Value of a time column if the message has no time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
 _MOST_SECONDS = 9e9
+#: Messages that are decoded singly at the same time.
+_BYTES_AT_ONCE = 4 << 20
 _LAYOUTS_PER_CHANNEL = 8
 #: An array has as many columns as its longest value: at most this many cells, or columns if there are many values.
 _CELLS = 1 << 26
@@ -175,20 +177,27 @@ class ChannelDecoder:
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self.single_decoder()
-        values: dict[str, list[list[Any]]] = {s.path: [] for s in self.selections}
+        found: dict[str, list[list[Any]]] = {s.path: [[] for _ in s.components] for s in self.selections}
         most = min(self.schema.limits.array_width, _most_columns(len(rows)))
-        for row in rows.tolist():
-            message = decode(block.message(row))
-            if message is None:
-                self.undecodable.append(row)
+        batch = np.cumsum(block.length[rows]) // _BYTES_AT_ONCE
+        for its in np.split(rows, np.flatnonzero(np.diff(batch)) + 1):
+            messages = [decode(block.message(row)) for row in its.tolist()]
+            self.undecodable += [row for row, message in zip(its.tolist(), messages, strict=True) if message is None]
             for s in self.selections:
-                first, *others = (value_at(message, steps) for steps in s.components)
-                first = bytes_of_text(first, s.text) if s.text else first
-                if isinstance(first, Sized) and not isinstance(first, str) and len(first) > most:
-                    self.undecodable.append(row)
-                    first = None
-                values[s.path].append([_numbers(first) if s.shape == "array" else first, *others])
-        return {s.path: self._single_column(s, values[s.path]) for s in self.selections}
+                parts = [values_at(messages, steps) for steps in s.components]
+                if s.shape in ("array", "dynamic"):
+                    parts = [[self._bounded(s, *item, most) for item in zip(its.tolist(), parts[0], strict=True)]]
+                for values, more in zip(found[s.path], parts, strict=True):
+                    values += more
+        return {s.path: self._single_column(s, found[s.path]) for s in self.selections}
+
+    def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> Any:
+        """Return the elements of an array, or the value of a place that the schema leaves open; none if too wide."""
+        value = bytes_of_text(value, selection.text) if selection.text else value
+        if isinstance(value, Sized) and not isinstance(value, str) and len(value) > most:
+            self.undecodable.append(row)
+            value = None
+        return _numbers(value) if selection.shape == "array" else value
 
     def single_decoder(self) -> Callable[[bytes], object]:
         """Return a decoder of one message; it returns None if the payload does not fit the type or is too large."""
@@ -200,14 +209,14 @@ class ChannelDecoder:
         function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
         return _tolerant(bind(function, typename=schema.type_name), schema)
 
-    def _single_column(self, selection: Selection, values: Sequence[Sequence[Any]]) -> NDArray[Any]:
+    def _single_column(self, selection: Selection, parts: Sequence[Sequence[Any]]) -> NDArray[Any]:
         if selection.shape == "dynamic":
-            selection = self._as_found(selection, [value for (value,) in values])
-            values = [[value_at(value, steps) for steps in selection.components] for (value,) in values]
+            selection = self._as_found(selection, parts[0])
+            parts = [values_at(parts[0], steps) for steps in selection.components]
         if selection.shape == "array":
-            return _padded([_numbers(value) for (value,) in values], selection.length)
-        parts = [np.array([_number(value) for value in part], np.float64) for part in zip(*values, strict=True)]
-        return _column(selection, parts, len(values))
+            return _padded([_numbers(value) for value in parts[0]], selection.length)
+        columns = [np.array([_number(value) for value in part], np.float64) for part in parts]
+        return _column(selection, columns, len(parts[0]))
 
     def _as_found(self, selection: Selection, values: Sequence[object]) -> Selection:
         """Return the selection inside of a place, by the first value that is there."""

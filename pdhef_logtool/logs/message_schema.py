@@ -578,13 +578,6 @@ def bytes_of_text(value: object, encoding: str) -> list[int] | None:
         return None
 
 
-@functools.lru_cache(maxsize=4096)
-def _can_be_absent(descriptor: Any, name: str) -> bool:
-    """Return whether a protobuf field can be absent. A default that its type declares (proto2) replaces its value."""
-    field = descriptor.fields_by_name.get(name)
-    return field is not None and field.has_presence and not field.has_default_value
-
-
 def value_at(message: object, steps: Sequence[Step]) -> object:
     """Follow steps through attributes, mappings and sequences; None where the message lacks one."""
     value: Any = message
@@ -594,10 +587,24 @@ def value_at(message: object, steps: Sequence[Step]) -> object:
                 value = value[step]
             except (IndexError, KeyError, TypeError):
                 return None
-        elif isinstance(value, dict):
-            value = value.get(step)
         else:
-            descriptor = getattr(value, "DESCRIPTOR", None)
-            is_absent = descriptor is not None and _can_be_absent(descriptor, step) and not value.HasField(step)
-            value = None if is_absent else getattr(value, step, None)
+            value = value.get(step) if isinstance(value, dict) else getattr(value, step, None)
     return value
+
+
+def values_at(values: Sequence[Any], steps: Sequence[Step]) -> Sequence[Any]:
+    """Follow steps through messages or values of one type, as :func:`value_at` does through one of them.
+
+    Absent fields of protobuf messages are None. A default that the type declares (proto2) replaces an absent value.
+    """
+    for step in steps:
+        kind: Any = type(next((value for value in values if value is not None), None))
+        if isinstance(step, int) or not hasattr(kind, "DESCRIPTOR"):
+            values = [value_at(value, (step,)) for value in values]
+            continue
+        field = kind.DESCRIPTOR.fields_by_name[step]
+        if field.has_presence and not field.has_default_value:
+            values = [getattr(v, step) if v is not None and v.HasField(step) else None for v in values]
+        else:
+            values = [None if v is None else getattr(v, step) for v in values]
+    return values
