@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measuring import CACHE
+from pdhef_logtool.logs.container import ChannelRecord
+from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.encoding import CdrEncoder
-from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import FloatArray, IntArray
@@ -167,14 +168,8 @@ def _window(rng: np.random.Generator, begin_s: int, length_s: int) -> list[Topic
 
 
 def _add_image_channel(writer: McapLogWriter) -> int:
-    return writer.add_raw_channel(
-        "/image",
-        schema_name=_IMAGE,
-        schema_encoding="ros2msg",
-        schema_data=message_definition(_IMAGE).encode(),
-        message_encoding="cdr",
-        metadata={},
-    )
+    definition = message_definition(_IMAGE).encode()
+    return writer.add_channel(ChannelRecord(-1, "/image", "cdr", _IMAGE, "ros2msg", definition))
 
 
 def _images(rng: np.random.Generator, channel: int, begin_s: int, length_s: int) -> Iterator[RawMessage]:

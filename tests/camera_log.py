@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
+from pdhef_logtool.logs.container import ChannelRecord
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 
 _SLICE_NS = 20_000_000_000
@@ -27,8 +28,7 @@ def write_apart(path: Path, chunks: Iterable[list[Message]]) -> None:
         for chunk in chunks:
             for topic, (name, encoding, text), *_ in chunk:
                 if topic not in ids:
-                    about = {"schema_name": name, "schema_encoding": encoding, "message_encoding": "cdr"}
-                    ids[topic] = writer.add_raw_channel(topic, schema_data=text, metadata={}, **about)
+                    ids[topic] = writer.add_channel(ChannelRecord(-1, topic, "cdr", name, encoding, text))
             writer.write([], [RawMessage(ids[topic], at, at, 0, data) for topic, _, at, data in chunk])
 
 

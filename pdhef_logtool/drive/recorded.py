@@ -83,7 +83,6 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
     """Read the slice of a plan once, align it and derive the ground truth; ``unchanged`` sensors are not corrected."""
     from pdhef_logtool.drive.sensor_faults import without_faults  # loads the compiler
 
-    log.keep_no_more()
     part = read_signals(log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
     channels = [*part.signals.values(), *part.truth.values()]
     aligned, late_counts = align(part.signals, plan.alignment)

@@ -85,17 +85,13 @@ class ByteSource(ABC):
 
     def read(self, offset: int, size: int) -> bytes:
         """Return exactly these bytes; raises :class:`CutError` where the file has less."""
-        start, block = self._block
-        position = offset - start
-        if position >= 0 and position + size <= len(block):
-            return block[position : position + size]
-        if size > _LARGE_READ_BYTES:
-            if offset + size > self.size:  # a claim must not be allocated
-                raise CutError(f"the file has no {size} bytes at byte {offset}")
-            data = self.fetch(offset, size)
-        else:
+        if size <= _LARGE_READ_BYTES:
             block, position = self.ahead(offset, size)
-            data = block[position : position + size]
+        elif offset + size > self.size:  # a claim must not be allocated
+            raise CutError(f"the file has no {size} bytes at byte {offset}")
+        else:
+            block, position = self.fetch(offset, size), 0
+        data = block[position : position + size]
         if len(data) < size:
             raise CutError(f"the file ends at byte {offset + len(data)}, before byte {offset + size}")
         return data

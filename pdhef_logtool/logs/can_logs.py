@@ -10,8 +10,10 @@ import re
 import struct
 import zlib
 from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from mmap import ACCESS_READ, mmap
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,77 +247,63 @@ _FRAME_SHAPE = re.compile(rb"\d+\s+(?:\S+\s+[rt]x\s|errorframe)|canfd\s", re.I)
 _STEP_NS = 10**9
 
 
+#: A frame: time in ns, data, and the numbers of ``_PARTS``.
+_Frame: TypeAlias = tuple[int, bytes, tuple[int, ...]]
+
+
 class _TextLog:
-    """Reader of a text log with one frame per line."""
+    """The frames of a log with one frame per line.
 
-    kind = ""
+    ``read`` returns None for a line without a frame, and raises ValueError for a frame that cannot be read.
+    """
 
-    def __init__(self, file: TableFile) -> None:
-        self._file = file
-        self._stamps, self._numbers, self._data = array("q"), bytearray(), bytearray()
-        self._losses: list[Loss] = []
-
-    def _read(self, line: bytes) -> bool:
-        """Read a line; return False for a frame that cannot be read."""
-        raise NotImplementedError
-
-    def _add(self, stamp_ns: int, data: bytes, *parts: int) -> bool:
-        """Add a frame with its parts in their order; return False if the line is no frame."""
-        if parts[0] > ID_BITS:
-            return False
-        row = _ROW.pack(*parts)
-        self._stamps.append(stamp_ns)
-        self._numbers += row
-        self._data += data
-        return True
-
-    def tables(self) -> Tables:
-        """Read the file."""
-        unreadable, first = 0, ""
-        for number, line in enumerate(self._file.stream, 1):
+    def __init__(self, file: TableFile, read: Callable[[bytes], _Frame | None]) -> None:
+        self.file, stamps, numbers, data = file, array("q"), bytearray(), bytearray()
+        self.losses: list[Loss] = []
+        unreadable = array("q")
+        first = ""
+        for number, line in enumerate(file.stream, 1):
             try:
-                is_read = self._read(line)
+                if (frame := read(line)) is None:
+                    continue
+                stamp_ns, content, parts = frame
+                row = _ROW.pack(*parts)
+                stamps.append(stamp_ns)
             except (ValueError, OverflowError, struct.error):
-                is_read = False
-            if not is_read:
                 first = first or f"line {number}, {line[:60].decode('ascii', 'replace').strip()!r}"
-                unreadable += 1
+                unreadable.append(number)
+            else:
+                numbers += row
+                data += content
         if unreadable:
-            what = f"{unreadable} lines of frames cannot be read, the first: {first}"
-            self._losses.append(Loss("bad-row", what, self._file.name, count=unreadable))
-        numbers = np.frombuffer(self._numbers, np.int32).reshape(-1, len(_PARTS))
-        stamps = self._times(np.frombuffer(self._stamps, np.int64))
+            what = f"{len(unreadable)} lines of frames cannot be read, the first: {first}"
+            self.losses.append(Loss("bad-row", what, file.name, count=len(unreadable)))
+        self.stamps = np.frombuffer(stamps, np.int64)
+        self.numbers = np.frombuffer(numbers, np.int32).reshape(-1, len(_PARTS))
+        self._data = np.frombuffer(data, np.uint8)
+
+    def tables(self, kind: str) -> Tables:
+        """Return the frames, without those of times that were recorded before."""
         # Buses are written with small delays; after a larger step back, times that were recorded before are left out.
-        latest = np.maximum.accumulate(stamps)
-        rows, lost = ascending_rows(np.where(latest - stamps < _STEP_NS, latest, stamps), self._file.name)
-        used = np.isin(np.arange(len(stamps)), rows)
-        data = np.frombuffer(self._data, np.uint8)[np.repeat(used, numbers[:, 1])]
-        return _tables(
-            self.kind, self._file, stamps[used], self._bus_numbers(numbers[used]), data, [*self._losses, *lost]
-        )
-
-    def _times(self, stamps: IntArray) -> IntArray:
-        """Return the times [N] of frames."""
-        return stamps
-
-    def _bus_numbers(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the numbers [N, 6] of frames, completed by the bus numbers."""
-        return numbers
+        latest = np.maximum.accumulate(self.stamps)
+        in_order = np.where(latest - self.stamps < _STEP_NS, latest, self.stamps)
+        rows, lost = ascending_rows(in_order, self.file.name)
+        used = np.isin(np.arange(len(in_order)), rows)
+        data = self._data[np.repeat(used, self.numbers[:, 1])]
+        losses = [*self.losses, *lost]
+        return _tables(kind, self.file, self.stamps[used], self.numbers[used], data, losses)
 
 
 def open_asc(file: TableFile) -> Tables:
     """Read an ASC file; raises LogError if it has no frames."""
-    return _Asc(file).tables()
+    return _TextLog(file, _Asc().read).tables("asc")
 
 
-class _Asc(_TextLog):
-    """Reader of an ASC file."""
+class _Asc:
+    """Reader of the lines of an ASC file."""
 
-    kind = "asc"
-
-    def __init__(self, file: TableFile) -> None:
-        super().__init__(file)
-        self._base, self._is_relative = 16, False
+    def __init__(self) -> None:
+        self._base, self._is_relative, self._is_empty = 16, False, True
         self._begins_ns: int | None = None
         self._start_ns = self._now_ns = 0
 
@@ -333,11 +321,12 @@ class _Asc(_TextLog):
                 self._begins_ns = _start_ns(int(year), _MONTHS.get(month.lower()[:3], 0), int(day), *time)
             self._begins_ns = self._begins_ns or 0
 
-    def _read(self, line: bytes) -> bool:
+    def read(self, line: bytes) -> _Frame | None:
+        """Read a line."""
         event = _EVENT.match(line)
         if event is None:
             self._read_head(line.decode("ascii", "ignore"))
-            return True
+            return None
         time_ns, text = round(float(event[1]) * 1e9), event[2].rstrip()
         if self._begins_ns is None and not self._is_relative and time_ns < self._now_ns - _STEP_NS:
             self._begins_ns = 0
@@ -346,21 +335,25 @@ class _Asc(_TextLog):
         self._now_ns = self._now_ns + time_ns if self._is_relative else time_ns
         match = _CLASSIC.match(text) or _FD_FRAME.match(text)
         if match is None:
-            return _FRAME_SHAPE.match(text) is None
+            if _FRAME_SHAPE.match(text):
+                raise ValueError(text)
+            return None
         bus, is_error, identifier, extended, remote, length, content = match.groups()
         base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
         count = min(int(length or b"0", base), most)
         data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
-        if len(data) < count:
-            return False
-        number, flags = int(identifier or b"0", self._base), (bool(is_error), bool(remote))
-        return self._add(self._start_ns + self._now_ns, data, number, count, bool(extended), int(bus) - 1, *flags)
+        number = int(identifier or b"0", self._base)
+        if len(data) < count or number > ID_BITS:
+            raise ValueError(text)
+        self._is_empty = False
+        parts = number, count, bool(extended), int(bus) - 1, bool(is_error), bool(remote)
+        return self._start_ns + self._now_ns, data, parts
 
     def _begin(self, begins_ns: int, time_ns: int) -> None:
         """Begin a measurement with its first event. If the times continue, they have the same origin as before."""
         self._begins_ns = None
         goes_on = not begins_ns if self._is_relative else time_ns >= self._now_ns
-        if not self._stamps or not goes_on:
+        if self._is_empty or not goes_on:
             self._start_ns, self._now_ns = begins_ns, 0
 
 
@@ -375,45 +368,35 @@ _ERROR_FLAG, _DIFFERENCES = CONSTANTS["candump"]["error_flag"], CONSTANTS["candu
 
 def open_candump(file: TableFile) -> Tables:
     """Read a log of ``candump`` (can-utils); raises LogError if it has no frames with times."""
-    return _Candump(file).tables()
-
-
-class _Candump(_TextLog):
-    """Reader of a log of ``candump``."""
-
-    kind = "candump"
-
-    def __init__(self, file: TableFile) -> None:
-        super().__init__(file)
-        self._interfaces: dict[bytes, int] = {}
-
-    def _read(self, line: bytes) -> bool:
-        match = _CANDUMP.match(line)
-        if match is None:
-            return not line.strip()
-        time, interface, identifier, remote, data, count, remote_too, listed = match.groups()
-        whole, _, fraction = time.partition(b".")
-        stamp_ns = int(whole) * 10**9 if whole.isdigit() else int(np.datetime64(whole.decode(), "ns").astype(np.int64))
-        is_remote = bool(remote or remote_too)
-        content = b"" if is_remote else bytes.fromhex((listed if data is None else data.replace(b".", b"")).decode())
-        number, bus = int(identifier, 16), self._interfaces.setdefault(interface, len(self._interfaces))
-        if len(content) > _MOST_BYTES or (count and not is_remote and len(content) != int(count)):
-            return False
-        flags = len(identifier) > 3, bus, bool(number & _ERROR_FLAG), is_remote
-        stamp_ns += int(fraction.ljust(9, b"0"))
-        return self._add(stamp_ns, content, number & ~_ERROR_FLAG, len(content), *flags)
-
-    def _times(self, stamps: IntArray) -> IntArray:
-        if not len(stamps) or np.mean(np.diff(stamps, prepend=stamps[0]) < 0) < _DIFFERENCES:
-            return stamps
+    interfaces: dict[bytes, int] = {}
+    log = _TextLog(file, partial(_candump_frame, interfaces=interfaces))
+    if len(log.stamps) and np.mean(np.diff(log.stamps, prepend=log.stamps[0]) < 0) >= _DIFFERENCES:
         what = "times are differences between frames, and are summed"
-        self._losses.append(Loss("clock", what, self._file.name, severity="note"))
-        return np.cumsum(stamps)
+        log.losses.append(Loss("clock", what, file.name, severity="note"))
+        log.stamps = np.cumsum(log.stamps)
+    # The number at the end of each interface, or its place among all if two have the same.
+    buses = [int(end[0]) if (end := re.findall(rb"\d{1,4}$", name)) else -1 for name in interfaces]
+    if len(set(buses)) < len(buses):
+        buses = [sorted(interfaces).index(name) for name in interfaces]
+    bus = _PARTS.index("bus")
+    log.numbers[:, bus] = np.array(buses, np.int32)[log.numbers[:, bus]]
+    return log.tables("candump")
 
-    def _bus_numbers(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return numbers with the number at the end of each interface, or its place among all if two have the same."""
-        ends = [int(end[0]) if (end := re.findall(rb"\d{1,4}$", name)) else -1 for name in self._interfaces]
-        if len(set(ends)) < len(ends):
-            ends = [sorted(self._interfaces).index(name) for name in self._interfaces]
-        numbers[:, _PARTS.index("bus")] = np.array(ends, np.int32)[numbers[:, _PARTS.index("bus")]]
-        return numbers
+
+def _candump_frame(line: bytes, interfaces: dict[bytes, int]) -> _Frame | None:
+    match = _CANDUMP.match(line)
+    if match is None:
+        if line.strip():
+            raise ValueError(line)
+        return None
+    time, interface, identifier, remote, data, count, remote_too, listed = match.groups()
+    whole, _, fraction = time.partition(b".")
+    stamp_ns = int(whole) * 10**9 if whole.isdigit() else int(np.datetime64(whole.decode(), "ns").astype(np.int64))
+    is_remote = bool(remote or remote_too)
+    content = b"" if is_remote else bytes.fromhex((listed if data is None else data.replace(b".", b"")).decode())
+    number, bus = int(identifier, 16), interfaces.setdefault(interface, len(interfaces))
+    is_error, number = bool(number & _ERROR_FLAG), number & ~_ERROR_FLAG
+    if len(content) > _MOST_BYTES or (count and not is_remote and len(content) != int(count)) or number > ID_BITS:
+        raise ValueError(line)
+    parts = number, len(content), len(identifier) > 3, bus, is_error, is_remote
+    return stamp_ns + int(fraction.ljust(9, b"0")), content, parts

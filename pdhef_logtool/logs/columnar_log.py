@@ -7,8 +7,9 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
 
@@ -33,10 +34,8 @@ from pdhef_logtool.logs.message_schema import (
     NoSchemaError,
     SchemaError,
     Selection,
-    leaves,
     nearest,
     resolve,
-    stated_units,
 )
 from pdhef_logtool.logs.recording_span import RecordingSpan, survey
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -48,8 +47,6 @@ from pdhef_logtool.storage.files import scratch_folder, write_bytes
 #: Loaded spans are kept up to this size, without payloads above ``_LARGE_BYTES`` (images, point clouds): the samples
 #: that recognition reads, and all of a short log, are decompressed once.
 _KEPT_BYTES, _LARGE_BYTES = 16 << 20, 16 << 10
-#: Columns of expected fields are kept up to this size.
-_COLUMN_BYTES = 64 << 20
 #: What of a span is lost: all of it.
 _ALL = ""
 #: A message in the text of a DBC file.
@@ -86,26 +83,19 @@ class ColumnarLog(DriveLog):
         self._custom = custom
         self.distro = distro
         self.definitions = SHIPPED  # of types that the log does not define; set before anything is read
-        # Messages that do not decode, by container, channel and span: a repeated read must not count them again.
-        self._undecodable: dict[tuple[int, int, int], IntArray] = {}
-        self._by_topic: dict[str, list[tuple[int, ChannelRecord]]] = {}
+        self._channels: dict[tuple[int, int], _Channel] = {}
+        self._by_topic: dict[str, list[_Channel]] = {}
         for c, container in enumerate(self.containers):
-            for channel in container.channels.values():
-                self._by_topic.setdefault(channel.topic, []).append((c, channel))
+            for record in container.channels.values():
+                channel = self._channels[c, record.id] = _Channel(c, record)
+                self._by_topic.setdefault(record.topic, []).append(channel)
         self._seen: set[tuple[int, int, frozenset[int] | None]] = set()  # what was loaded before
         self._late: dict[int, dict[int, Span]] = {}  # spans for which no time was left, by container
         self._found: dict[tuple[int, int, object], Loss] = {}  # in a container and span: of all of it, or of what
-        self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
-        self._fields: dict[tuple[int, int], tuple[FieldInfo, ...]] = {}
-        self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
-        self._asked: set[tuple[int, int]] = set()  # channels that were requested or listed
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
         self._kept_bytes = 0
-        self._expected: dict[str, _Plan] = {}  # by topic
-        self._columns: dict[tuple[int, int], dict[int, Columns]] = {}  # of expected topics, by span and channel
-        self._column_bytes = 0
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
     @property
@@ -118,7 +108,7 @@ class ColumnarLog(DriveLog):
                 if (c, span.index, _ALL) not in self._found:
                     for id_, n in span.counts.items():
                         counts[names[id_]] += n
-        firsts = ((name, channels[0][1]) for name, channels in sorted(self._by_topic.items()))
+        firsts = ((name, channels[0].record) for name, channels in sorted(self._by_topic.items()))
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
     @cached_property
@@ -142,32 +132,14 @@ class ColumnarLog(DriveLog):
     def lost(self) -> tuple[Loss, ...]:
         """Losses so far."""
         losses = [*self._opened_lost, *self.recording_span.losses]
-        undecodable: Counter[tuple[int, int]] = Counter()
-        for (c, channel, _), rows in self._undecodable.items():
-            undecodable[c, channel] += len(rows)
         for c, container in enumerate(self.containers):
             losses.extend(container.lost)
             losses.extend(loss for (of, _, _), loss in self._found.items() if of == c)
             if c in self._late:
                 losses.append(_out_of_time(container, list(self._late[c].values())))
-            for of, channel in sorted(self._asked):
-                if of == c:
-                    losses.extend(self._channel_losses(c, container.channels[channel], undecodable[c, channel]))
+            for id_ in sorted(container.channels):
+                losses.extend(self._channels[c, id_].losses())
         return tuple(losses)
-
-    def _channel_losses(self, c: int, channel: ChannelRecord, undecodable: int) -> Iterator[Loss]:
-        """Yield the losses and notes of the messages of one channel."""
-        schema = self._schemas.get((c, channel.id))
-        if undecodable:
-            what = f"{undecodable} messages do not fit the type of their topic"
-            yield Loss("undecodable", what, channel.topic, count=undecodable)
-        if isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
-            yield Loss("bad-schema", f"its messages cannot be decoded: {schema}", channel.topic)
-        if isinstance(schema, MessageSchema) and schema.borrowed:
-            files = ", ".join(map(str, schema.borrowed))
-            what = f"read by {files} of this machine, as the log does not define its type: correct only if they match"
-            what += " the recorded version"
-            yield Loss("borrowed-definition", what, channel.topic, severity="note")
 
     @property
     def messages(self) -> ColumnarLog | None:
@@ -217,11 +189,11 @@ class ColumnarLog(DriveLog):
 
     def attachments(self) -> Iterator[Attachment]:
         """Yield the files that the log contains."""
-        return (attachment for container in self.containers for attachment in container.attachments())
+        return (attachment for container in self.containers for attachment in container.records(Attachment))
 
     def metadata_records(self) -> Iterator[Metadata]:
         """Yield the metadata records."""
-        return (record for container in self.containers for record in container.metadata_records())
+        return (record for container in self.containers for record in container.records(Metadata))
 
     @property
     def is_remote(self) -> bool:
@@ -265,23 +237,18 @@ class ColumnarLog(DriveLog):
 
         With ``quiet`` a schema that does not parse is not reported as a loss.
         """
-        for c, channel in self._by_topic.get(topic, ()):
-            if not quiet:
-                self._asked.add((c, channel.id))
-            schema = self.schema_of(c, channel)
+        for channel in self._by_topic.get(topic, ()):
+            channel.asked |= not quiet
+            schema = self._schema(channel)
             if isinstance(schema, MessageSchema):
-                if (c, channel.id) not in self._fields:
-                    units = stated_units(channel.schema_data) if channel.schema_encoding == "ros2msg" else {}
-                    of_units = (replace(f, unit=units.get(f.path.partition("[")[0], "")) for f in leaves(schema.root))
-                    self._fields[c, channel.id] = tuple(of_units) if units else tuple(leaves(schema.root))
-                return self._fields[c, channel.id]
+                return schema.fields
         return ()
 
     def unreadable(self, topic: str) -> str:
         """Return why a topic has no readable fields, for example a missing definition; empty if it has some."""
         reasons = []
-        for c, channel in self._by_topic.get(topic, ()):
-            schema = self.schema_of(c, channel)
+        for channel in self._by_topic.get(topic, ()):
+            schema = self._schema(channel)
             if isinstance(schema, MessageSchema):
                 return ""
             if isinstance(schema, MissingDefinitionError):
@@ -294,55 +261,44 @@ class ColumnarLog(DriveLog):
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic, decoded; messages that do not decode are left out."""
         messages: list[object] = []
-        for c, channel in self._by_topic.get(topic, ()):
-            schema = self.schema_of(c, channel)
+        for channel in self._by_topic.get(topic, ()):
+            schema = self._schema(channel)
             if not isinstance(schema, MessageSchema):
                 continue
             decode = ChannelDecoder(schema, ()).single_decoder()
-            with self.containers[c].meter.running():
-                for span in (s for s in self.containers[c].spans if channel.id in s.counts):
-                    block = self.load(c, span, frozenset({channel.id})) if len(messages) < most else None
-                    if block is None:
-                        continue
-                    rows = block.rows.get(channel.id, np.empty(0, np.int64))
-                    messages += [decode(block.message(row)) for row in rows[: most - len(messages)]]
+            with self.containers[channel.c].meter.running():
+                payloads = self._payloads(channel)
+                messages += [decode(payload) for payload in islice(payloads, most - len(messages))]
         return [message for message in messages if message is not None]
+
+    def _payloads(self, channel: _Channel) -> Iterator[bytes]:
+        """Yield the messages of a channel, undecoded."""
+        id_ = channel.record.id
+        for span in self.containers[channel.c].spans:
+            block = self.load(channel.c, span, frozenset({id_})) if id_ in span.counts else None
+            if block is not None:
+                yield from map(block.message, block.rows.get(id_, ()))
 
     def _read(
         self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
     ) -> dict[str, Columns]:
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
-        self.expect({topic: paths for topic, paths in requests.items() if topic in self._expected})
         if not quiet:
-            self._asked |= {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
+            for channel in (channel for topic in requests for channel in self._by_topic[topic]):
+                channel.asked = True
         plans |= {topic: _Plan((), {}) for topic in stamps if topic not in plans}
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
-        request = _Request(plans, self._expected if self._column_bytes < _COLUMN_BYTES else {}, window_ns)
         for c, container in enumerate(self.containers):
             spans = tuple(self._to_read(plans, container, *window_ns))
             container.prefetch(spans)
             with container.meter.running():
-                for span in spans:
-                    self._collect_span(request, c, span, parts)
+                for columns in (columns for span in spans for columns in self._read_span(plans, c, span, window_ns)):
+                    parts[columns.topic].append(columns)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
-
-    def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
-        """See :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
-        for topic, paths in requests.items():
-            before = self._expected[topic].paths if topic in self._expected else ()
-            if topic not in self._expected or not set(paths) <= set(before):
-                self._expected[topic] = self._plan(topic, tuple(dict.fromkeys([*before, *paths])))
-
-    def keep_no_more(self) -> None:
-        """See :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
-        self._kept.clear()
-        self._kept_bytes = _KEPT_BYTES
-        self._expected = {}
 
     def close(self) -> None:
         """Release the files."""
         self._kept.clear()
-        self._columns.clear()
         for container in self.containers:
             container.close()
         if self._extracted is not None:
@@ -420,59 +376,39 @@ class ColumnarLog(DriveLog):
                 loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
                 self._found[c, span.index, (kind, want)] = loss
 
-    def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
-        """Return the schema of a channel of the c-th container, or the reason why it is unknown."""
-        key = (c, channel.id)
-        if key not in self._schemas:
-            self._schemas[key] = self._parse_schema(c, channel)
-        return self._schemas[key]
-
-    def _parse_schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
-        """Parse a schema once, within the log's time; one that does not parse is a loss of its topic.
+    def _schema(self, channel: _Channel) -> MessageSchema | SchemaError:
+        """Return the schema of a channel, or the reason why it is unknown. It is parsed once, within the log's time.
 
         All schemas together get the part of the time limit that does not depend on the size of the log.
         """
-        example = self._example(c, channel)
-        names = (channel.encoding, channel.schema_encoding, channel.schema_name, channel.type_name)
-        definition = (*names, channel.schema_data, example)
-        meter = self.containers[c].meter
+        if channel.schema is not None:
+            return channel.schema
+        record, meter = channel.record, self.containers[channel.c].meter
+        is_in_message = record.encoding == "json" and not record.schema_data.strip()
+        example = next(self._payloads(channel), None) if is_in_message else None
         started = time.process_time()
         try:
             meter.check()
             meter.limits.check("seconds", self._schemas_s, "the time for all schemas")
             with meter.running():
-                if definition not in self._parsed:
-                    self._parsed[definition] = channel_schema(
-                        channel, self.distro, example, meter.limits, self.definitions
-                    )
-                return self._parsed[definition]
+                channel.schema = channel_schema(record, self.distro, example, meter.limits, self.definitions)
         except SchemaError as error:
-            return self._parsed.setdefault(definition, error)
+            channel.schema = error
         except LimitError as error:  # of time
-            return SchemaError(describe_damage(error)[1])
+            channel.schema = SchemaError(describe_damage(error)[1])
         finally:
             self._schemas_s += time.process_time() - started
-
-    def _example(self, c: int, channel: ChannelRecord) -> bytes | None:
-        """Return a channel's first message if its schema has to be taken from it."""
-        if channel.encoding != "json" or channel.schema_data.strip():
-            return None
-        for span in self.containers[c].spans:
-            if channel.id in span.counts:
-                block = self.load(c, span, frozenset({channel.id}))
-                if block is not None and channel.id in block.rows:
-                    return block.message(block.rows[channel.id][0])
-        return None
+        return channel.schema
 
     def _plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:
         if (topic, paths) in self._plans:
             return self._plans[topic, paths]
-        decoders: dict[tuple[int, int], ChannelDecoder] = {}
+        decoders: dict[_Channel, ChannelDecoder] = {}
         problems: list[MappingError] = []
         if topic not in self._by_topic:
             raise nearest(topic, sorted(self._by_topic), "a topic of the log", self.path)
-        for c, channel in self._by_topic[topic] if paths else ():
-            schema = self.schema_of(c, channel)
+        for channel in self._by_topic[topic] if paths else ():
+            schema = self._schema(channel)
             if isinstance(schema, SchemaError):
                 problems.append(
                     MappingError(
@@ -485,7 +421,7 @@ class ColumnarLog(DriveLog):
                 continue
             try:
                 selections = tuple(resolve(schema, topic, path) for path in paths)
-                decoders[(c, channel.id)] = ChannelDecoder(schema, selections)
+                decoders[channel] = ChannelDecoder(schema, selections)
             except MappingError as error:
                 problems.append(error)
         if paths and not decoders:
@@ -505,28 +441,15 @@ class ColumnarLog(DriveLog):
             if not ids.isdisjoint(span.counts) and span.overlaps(start_ns, end_ns):
                 yield span
 
-    def _collect_span(self, request: _Request, c: int, span: Span, parts: Mapping[str, list[Columns]]) -> None:
-        """Add the columns of the requested topics in a span; if it is opened, keep columns of expected topics too."""
-        channels, plans, expected = self.containers[c].channels, request.plans, request.expected
-        requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
-        stored = self._columns.get((c, span.index), {})
-        if not all(id_ in stored and plans[channels[id_].topic].is_in(stored[id_]) for id_ in requested):
-            later = frozenset(id_ for id_ in span.counts if channels[id_].topic in expected and id_ not in stored)
-            payloads = frozenset(id_ for id_ in requested | later if request.used[channels[id_].topic].selections)
-            block = self.load(c, span, requested | later, payloads)
-            if block is None:
-                return
-            stored = stored | self._decode_span(request, c, span, block)
-        for _, columns in sorted(stored.items()):
-            if columns.topic in plans:
-                keep = in_window(columns.log_time_ns, *request.window_ns)
-                parts[columns.topic].append(columns if keep is None else columns.rows(keep))
-
-    def _decode_span(self, request: _Request, c: int, span: Span, block: Block) -> dict[int, Columns]:
-        """Return the columns of a block by channel, within the window or of an expected topic; keep the latter."""
-        channels, plans, expected = self.containers[c].channels, request.used, request.expected
-        decoded: dict[int, Columns] = {}
-        keep = in_window(block.log_time_ns, *request.window_ns)
+    def _read_span(self, plans: Mapping[str, _Plan], c: int, span: Span, window_ns: Window) -> Iterator[Columns]:
+        """Yield the columns of the requested topics in a span, by channel."""
+        channels = self.containers[c].channels
+        wanted = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
+        payloads = frozenset(id_ for id_ in wanted if plans[channels[id_].topic].selections)
+        block = self.load(c, span, wanted, payloads)
+        if block is None:
+            return
+        keep = in_window(block.log_time_ns, *window_ns)
         # By the channels of the block: the counts of the span can be from a wrong index.
         for id_, rows in block.rows.items():
             topic = channels[id_].topic if id_ in channels else ""
@@ -535,23 +458,14 @@ class ColumnarLog(DriveLog):
             if self.recording_span.left_out:
                 unused = self.recording_span.unused(topic, c, span, block.log_time_ns[rows])
                 rows = rows if unused is None else rows[~unused]
-            if topic not in expected and keep is not None:
-                rows = rows[keep[rows]]
-            columns = self._decode(topic, plans[topic], c, span, id_, block, rows) if rows.size else None
+            rows = rows if keep is None else rows[keep[rows]]
+            columns = self._decode(plans[topic], self._channels[c, id_], span, block, rows) if rows.size else None
             if columns is not None:
-                decoded[id_] = columns
-            elif topic in expected:
-                decoded[id_] = _join(topic, plans[topic], ())
-        kept = {id_: columns for id_, columns in decoded.items() if columns.topic in expected}
-        self._columns.setdefault((c, span.index), {}).update(kept)
-        self._column_bytes += sum(columns.nbytes for columns in kept.values())
-        return decoded
+                yield columns
 
-    def _decode(
-        self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray
-    ) -> Columns | None:
+    def _decode(self, plan: _Plan, channel: _Channel, span: Span, block: Block, rows: IntArray) -> Columns | None:
         """Decode some messages of a channel. Any error of a decoder is a loss of these messages."""
-        decoder = plan.decoders.get((c, id_))
+        decoder, id_, topic = plan.decoders.get(channel), channel.record.id, channel.record.topic
         try:
             if decoder is None:
                 fields = {s.path: missing_column(s, len(rows)) for s in plan.selections}
@@ -561,15 +475,42 @@ class ColumnarLog(DriveLog):
             kind, text = describe_damage(error)
             kind = "undecodable" if kind == "bad-chunk" else kind
             what = f"{len(rows)} messages cannot be decoded: {text}"
-            self._found[c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
+            self._found[channel.c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
             return None
         if decoder is not None and decoder.undecodable:
-            key = (c, id_, span.index)
-            seen = self._undecodable.get(key, np.empty(0, dtype=np.int64))
+            seen = channel.undecodable.get(span.index, np.empty(0, dtype=np.int64))
             # Count by position in the channel: the other channels of a block depend on the request.
             places = np.searchsorted(block.rows[id_], decoder.undecodable)
-            self._undecodable[key] = np.union1d(seen, places.astype(np.int64))
+            channel.undecodable[span.index] = np.union1d(seen, places.astype(np.int64))
         return Columns(topic, block.log_time_ns[rows], block.publish_time_ns[rows], fields)
+
+
+@dataclass(slots=True, eq=False)
+class _Channel:
+    """A channel of the c-th container, with what is known of its messages.
+
+    ``asked``: whether it was requested or listed. ``undecodable``: messages that do not decode, by span, as a repeated
+    read must not count them again.
+    """
+
+    c: int
+    record: ChannelRecord
+    schema: MessageSchema | SchemaError | None = None
+    asked: bool = False
+    undecodable: dict[int, IntArray] = field(default_factory=dict)
+
+    def losses(self) -> Iterator[Loss]:
+        """Yield the losses and notes of its messages; none before it is asked for."""
+        topic, schema = self.record.topic, self.schema if self.asked else None
+        if self.asked and (undecodable := sum(map(len, self.undecodable.values()))):
+            what = f"{undecodable} messages do not fit the type of their topic"
+            yield Loss("undecodable", what, topic, count=undecodable)
+        if isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
+            yield Loss("bad-schema", f"its messages cannot be decoded: {schema}", topic)
+        if isinstance(schema, MessageSchema) and schema.borrowed:
+            files = ", ".join(map(str, schema.borrowed))
+            what = f"read by {files} of this machine, as the log does not define its type: correct only if they match"
+            yield Loss("borrowed-definition", f"{what} the recorded version", topic, severity="note")
 
 
 @dataclass(frozen=True, slots=True)
@@ -577,24 +518,7 @@ class _Plan:
     """How a topic is read: the resolved paths and a decoder per channel."""
 
     selections: tuple[Selection, ...]
-    decoders: Mapping[tuple[int, int], ChannelDecoder]
-
-    @property
-    def paths(self) -> tuple[str, ...]:
-        """The paths that are read."""
-        return tuple(selection.path for selection in self.selections)
-
-    def is_in(self, columns: Columns) -> bool:
-        """Return whether columns have all paths of this plan."""
-        return columns.fields.keys() >= set(self.paths)
-
-
-class _Request:
-    """One read: how the requested and the expected topics are read, by topic, and the window."""
-
-    def __init__(self, plans: Mapping[str, _Plan], expected: Mapping[str, _Plan], window_ns: Window) -> None:
-        self.plans, self.expected, self.window_ns = plans, expected, window_ns
-        self.used = {**plans, **expected}
+    decoders: Mapping[_Channel, ChannelDecoder]
 
 
 def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:

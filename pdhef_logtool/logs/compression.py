@@ -73,11 +73,10 @@ def decompress_message(stored: _Bytes, limits: ResourceLimits) -> bytes:
 
     try:
         size = zstandard.frame_content_size(stored)
-        limit = limits.chunk_bytes if size < 0 else size
-        if size > 0:
-            limits.check_unpacked(size, memoryview(stored).nbytes, "a compressed message")
-        return _zstd_decompressor().decompress(stored, max_output_size=limit)
-    except (zstandard.ZstdError, OverflowError, MemoryError) as error:
+        if size >= 0:
+            return decompress("zstd", stored, size, limits)
+        return _zstd_decompressor().decompress(stored, max_output_size=limits.chunk_bytes)
+    except (zstandard.ZstdError, SpanDamageError, OverflowError, MemoryError) as error:
         raise SpanDamageError(f"a compressed message is damaged: {error}") from error
 
 

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from mcap.records import Attachment, Metadata
@@ -22,7 +22,7 @@ from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
-    from pdhef_logtool.logs.log_file import LogFile
+    from pdhef_logtool.logs.table_file import LogFile
 
 # First bytes of the files of each format.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -32,6 +32,7 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 #: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
 UNVERIFIED = "unverified"
+RecordT = TypeVar("RecordT", Attachment, Metadata)
 _LOSSES_OF_A_KIND = 20  # of one file; further ones become one loss
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
@@ -268,8 +269,7 @@ class Container(ABC):
         self.size = size
         self.cut = False
         self._closing = ExitStack()
-        self._losses: dict[str, int] = {}  # how many of a kind
-        self._folded: dict[str, int] = {}  # index in ``lost`` of the loss that sums up further ones
+        self._losses: Counter[str] = Counter()  # how many of a kind
 
     @classmethod
     def open(cls, file: LogFile) -> Self:
@@ -310,12 +310,9 @@ class Container(ABC):
         del span, block, kept
         return None
 
-    def attachments(self) -> Iterator[Attachment]:
-        """Read the attachments; a damaged one is among the losses and left out."""
-        yield from ()
-
-    def metadata_records(self) -> Iterator[Metadata]:
-        """Read the metadata records; a damaged one is among the losses and left out."""
+    def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
+        """Read the attachments or metadata records; a damaged one is among the losses and left out."""
+        del kind
         yield from ()
 
     def prefetch(self, spans: Iterable[Span]) -> None:
@@ -338,18 +335,14 @@ class Container(ABC):
         self, kind: str, what: str, start_ns: int | None = None, end_ns: int | None = None, count: int | None = None
     ) -> None:
         """Record damage of this file; the 21st and later losses of a kind are merged."""
-        n = self._losses[kind] = self._losses.get(kind, 0) + 1
-        more = n - _LOSSES_OF_A_KIND
-        if more <= 0:
-            self.lost.append(Loss(kind, what, str(self.path), start_ns, end_ns, count))
-        elif more == 1:
-            self._folded[kind] = len(self.lost)
-            self.lost.append(Loss(kind, f"more of this kind: {what}", str(self.path), start_ns, end_ns, count))
-        else:
-            old = self.lost[self._folded[kind]]
-            total = None if old.count is None or count is None else old.count + count
-            text = f"{more} more of this kind, the last: {what}"
-            self.lost[self._folded[kind]] = Loss(kind, text, str(self.path), old.start_ns, end_ns, total)
+        self._losses[kind] += 1
+        more = self._losses[kind] - _LOSSES_OF_A_KIND
+        if more > 0:
+            what = f"{more} more of this kind, the last: {what}"
+        if more > 1:
+            old = self.lost.pop(max(i for i, loss in enumerate(self.lost) if loss.kind == kind))
+            start_ns, count = old.start_ns, None if old.count is None or count is None else old.count + count
+        self.lost.append(Loss(kind, what, str(self.path), start_ns, end_ns, count))
 
     def drop_undeclared(self, called: str) -> None:
         """Remove the messages of undeclared channels from the spans' counts, with a loss per span."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Sized
 from dataclasses import dataclass, field
 from functools import partial as bind
 from typing import Any, TypeAlias
@@ -22,28 +22,31 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions
 from pdhef_logtool.logs.message_schema import (
-    TIME_MEMBERS,
-    VECTOR_ORDERS,
     Array,
     MessageSchema,
     Node,
     NoSchemaError,
     Scalar,
     Selection,
-    Step,
     Struct,
     bytes_of_text,
     json_schema,
     json_schema_of_message,
+    node_of_value,
     ros_schema,
-    value_at,
+    select,
+    values_at,
 )
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
 from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout, layout_of_message
+from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray
 
 #: Value of a time column if the message has no time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
+_MOST_SECONDS = 9e9
+#: Messages that are decoded singly at the same time.
+_BYTES_AT_ONCE = 4 << 20
 _LAYOUTS_PER_CHANNEL = 8
 #: An array has as many columns as its longest value: at most this many cells, or columns if there are many values.
 _CELLS = 1 << 26
@@ -109,7 +112,7 @@ class ChannelDecoder:
     selections: tuple[Selection, ...]
     undecodable: list[int] = field(default_factory=list)
     _layouts: list[LayoutReader] = field(default_factory=list)
-    _columns_of: dict[str, tuple[str, int]] = field(default_factory=dict)
+    _by_value: dict[str, Selection] = field(default_factory=dict)  # of places that the schema leaves open
 
     def columns(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         """Decode the messages ``rows`` of a block: float64 [N] or [N, k], or int64 nanoseconds [N], by path."""
@@ -168,36 +171,33 @@ class ChannelDecoder:
         read = candidates if fits is None else candidates[fits]
         if not read.size:
             return left
-        partial.append((read, {s.path: _record_column(layout, records, s) for s in self.selections}))
+        leaves = {s.path: [layout.values(records, steps) for steps in s.components] for s in self.selections}
+        partial.append((read, {s.path: _column(s, leaves[s.path], len(records)) for s in self.selections}))
         return left[:0] if len(read) == len(left) else np.setdiff1d(left, read, assume_unique=True)
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self.single_decoder()
-        getters = [(s.path, self._getter(s)) for s in self.selections]
-        values: dict[str, list[object]] = {s.path: [] for s in self.selections}
+        found: dict[str, list[list[Any]]] = {s.path: [[] for _ in s.components] for s in self.selections}
         most = min(self.schema.limits.array_width, _most_columns(len(rows)))
-        for row, start, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
-            message = decode(bytes(block.buffer[start : start + n]))
-            if message is None:
-                self.undecodable.append(row)
-            for path, get in getters:
-                value = get(message)
-                if isinstance(value, (list, np.ndarray)) and len(value) > most:
-                    self.undecodable.append(row)
-                    value = None
-                values[path].append(value)
-        return {s.path: self._single_column(s, values[s.path]) for s in self.selections}
+        batch = np.cumsum(block.length[rows]) // _BYTES_AT_ONCE
+        for its in np.split(rows, np.flatnonzero(np.diff(batch)) + 1):
+            messages = [decode(block.message(row)) for row in its.tolist()]
+            self.undecodable += [row for row, message in zip(its.tolist(), messages, strict=True) if message is None]
+            for s in self.selections:
+                parts = [values_at(messages, steps) for steps in s.components]
+                if s.shape in ("array", "dynamic"):
+                    parts = [[self._bounded(s, *item, most) for item in zip(its.tolist(), parts[0], strict=True)]]
+                for values, more in zip(found[s.path], parts, strict=True):
+                    values += more
+        return {s.path: self._single_column(s, found[s.path]) for s in self.selections}
 
-    def _getter(self, selection: Selection) -> Callable[[object], object]:
-        if self.schema.wire == "protobuf":
-            from pdhef_logtool.logs.protobuf_schema import compile_getter
-
-            plain = compile_getter(self.schema, selection)
-        else:
-            plain = bind(_single_value, selection=selection)
-        if not selection.text:
-            return plain
-        return lambda message: bytes_of_text(plain(message), selection.text)
+    def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> Any:
+        """Return the elements of an array, or the value of a place that the schema leaves open; none if too wide."""
+        value = bytes_of_text(value, selection.text) if selection.text else value
+        if isinstance(value, Sized) and not isinstance(value, str) and len(value) > most:
+            self.undecodable.append(row)
+            value = None
+        return _numbers(value) if selection.shape == "array" else value
 
     def single_decoder(self) -> Callable[[bytes], object]:
         """Return a decoder of one message; it returns None if the payload does not fit the type or is too large."""
@@ -209,16 +209,27 @@ class ChannelDecoder:
         function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
         return _tolerant(bind(function, typename=schema.type_name), schema)
 
-    def _single_column(self, selection: Selection, values: list[object]) -> NDArray[Any]:
+    def _single_column(self, selection: Selection, parts: Sequence[Sequence[Any]]) -> NDArray[Any]:
         if selection.shape == "dynamic":
-            shape, width = self._columns_of.get(selection.path, ("", 0))
-            if not shape:
-                shape, width = _shape_of_values(values)
-                if shape:
-                    self._columns_of[selection.path] = (shape, width)
-            return _column(shape or "scalar", values, width or None)
-        width_known = selection.length if selection.shape == "array" else len(selection.components)
-        return _column(selection.shape, values, width_known)
+            selection = self._as_found(selection, parts[0])
+            parts = [values_at(parts[0], steps) for steps in selection.components]
+        if selection.shape == "array":
+            return _padded([_numbers(value) for value in parts[0]], selection.length)
+        columns = [np.array([_number(value) for value in part], np.float64) for part in parts]
+        return _column(selection, columns, len(parts[0]))
+
+    def _as_found(self, selection: Selection, values: Sequence[object]) -> Selection:
+        """Return the selection inside of a place, by the first value that is there."""
+        path = selection.path
+        if path not in self._by_value:
+            first = next((value for value in values if value not in (None, [], {})), None)
+            if first is None:
+                return Selection(path, "scalar", ((),))
+            try:
+                self._by_value[path] = select(self.schema, "", path, node_of_value(first, self.schema.limits), ())
+            except MappingError:
+                self._by_value[path] = Selection(path, "scalar", ((),))
+        return self._by_value[path]
 
 
 def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Callable[[bytes], object]:
@@ -291,29 +302,20 @@ def missing_column(selection: Selection, n: int) -> NDArray[Any]:
     return np.full(n if width is None else (n, width), np.nan)
 
 
-def _record_column(layout: LayoutReader, records: NDArray[Any], selection: Selection) -> NDArray[Any]:
-    values, n = [layout.values(records, steps) for steps in selection.components], len(records)
-    if selection.shape == "vector":
-        return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in values])
-    columns = [f for f in values if f is not None]
-    if len(columns) < len(values):
+def _column(selection: Selection, parts: Sequence[NDArray[Any] | None], n: int) -> NDArray[Any]:
+    """Return a column of N messages from its components, None for one that they lack."""
+    if all(part is None for part in parts):
         return missing_column(selection, n)
-    if selection.shape == "time":
-        return columns[0].astype(np.int64) * 1_000_000_000 + columns[1].astype(np.int64)
-    return columns[0].astype(np.float64)
-
-
-def _single_value(message: object, selection: Selection) -> object:
-    if len(selection.components) == 1:
-        return value_at(message, selection.components[0])
-    return tuple(value_at(message, steps) for steps in selection.components)
-
-
-def _time_ns(seconds: object, nanoseconds: object) -> int:
-    if not isinstance(seconds, (int, np.integer)) or not isinstance(nanoseconds, (int, np.integer)):
-        return NO_TIME_NS
-    total = int(seconds) * 1_000_000_000 + int(nanoseconds)
-    return total if abs(total) < 2**63 else NO_TIME_NS
+    given = [np.full(n, np.nan) if part is None else part for part in parts]
+    if selection.shape == "vector":
+        return np.column_stack([part.astype(np.float64) for part in given])
+    if selection.shape != "time":
+        return given[0].astype(np.float64)
+    seconds, nanoseconds = given
+    known = (np.abs(seconds) < _MOST_SECONDS) & (np.abs(nanoseconds) < _MOST_SECONDS)
+    with np.errstate(invalid="ignore"):
+        total = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+    return np.where(known, total, NO_TIME_NS)
 
 
 def _number(value: object) -> float:
@@ -325,48 +327,18 @@ def _number(value: object) -> float:
     return math.nan
 
 
-def _shape_of_values(values: Sequence[object]) -> tuple[str, int]:
-    """Return kind and width of a field by its first value, if the schema leaves its type open."""
-    value = next((value for value in values if value is not None), None)
-    if isinstance(value, (list, tuple)):
-        return "array", 0
-    names = frozenset(value) if isinstance(value, dict) else frozenset()
-    if any(names == set(pair) for pair in TIME_MEMBERS):
-        return "time", 0
-    if names in VECTOR_ORDERS:
-        return "vector", len(VECTOR_ORDERS[names])
-    return "" if value is None else "scalar", 0
+def _numbers(value: object) -> NDArray[Any]:
+    """Return the elements of an array, none of anything else."""
+    if isinstance(value, np.ndarray):
+        return value
+    elements = value if isinstance(value, Iterable) and not isinstance(value, str) else ()
+    return np.array([_number(element) for element in elements], np.float64)
 
 
-def _column(shape: str, values: Sequence[object], width: int | None) -> NDArray[Any]:
-    if shape == "scalar":
-        return np.array([_number(v) for v in values], dtype=np.float64)
-    if shape == "time":
-        return np.array([_time_ns(*_time_parts(v)) for v in values], dtype=np.int64)
-    rows = [_row(v) for v in values]
-    k = width if width is not None else max((len(r) for r in rows), default=0)
+def _padded(rows: Sequence[NDArray[Any]], width: int | None) -> NDArray[np.float64]:
+    """Return arrays as [N, k], filled up with NaN; k is the width of a fixed array, or that of the longest one."""
+    k = max(map(len, rows), default=0) if width is None else width
     filled = np.full((len(rows), k), np.nan)
     for i, row in enumerate(rows):
-        n = min(len(row), k)
-        filled[i, :n] = row[:n]
+        filled[i, : len(row)] = row[:k]
     return filled
-
-
-def _time_parts(value: object) -> tuple[object, object]:
-    if isinstance(value, dict):
-        pair = next((p for p in TIME_MEMBERS if set(value) == set(p)), None)
-        return (value[pair[0]], value[pair[1]]) if pair else (None, None)
-    if isinstance(value, tuple) and len(value) == 2:
-        return value[0], value[1]
-    return None, None
-
-
-def _row(value: object) -> Sequence[float]:
-    if isinstance(value, np.ndarray):
-        return [float(v) for v in value]
-    if isinstance(value, dict):
-        order: Sequence[Step] = VECTOR_ORDERS.get(frozenset(value), ())
-        return [_number(value[name]) for name in order]
-    if isinstance(value, (list, tuple)):
-        return [_number(v) for v in value]
-    return []

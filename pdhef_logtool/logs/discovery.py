@@ -8,7 +8,7 @@ import os
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, takewhile
 from pathlib import Path
@@ -294,17 +294,15 @@ def _with_stems(paths: list[LogPlace]) -> list[LogInput]:
     relative = [p[n:] for p in parts]
     names = ["__".join([*r[:-1], _bare_name(r[-1])]) for r in relative]
     counts = Counter(map(as_taken, names))
-    taken: set[str] = set()
-    stems: dict[int, str] = {}
     # Names that stay as they are come first, so that no other name can take theirs.
-    for i in sorted(range(len(names)), key=lambda i: not _stays(names[i], counts)):
-        stems[i] = names[i]
-        if not _stays(names[i], counts):
-            place = paths[i]
-            origin = place.identity if isinstance(place, RemotePlace) else "/".join(relative[i])
-            stems[i] = _with_digits(names[i], origin, taken)
-        taken.add(as_taken(stems[i]))
-    return [LogInput(p, stems[i]) for i, p in enumerate(paths)]
+    staying = {name for name in names if counts[as_taken(name)] == 1 and _portable(name) == name}
+    taken = {as_taken(name) for name in staying}
+    logs = []
+    for place, name, parts_below in zip(paths, names, relative, strict=True):
+        origin = place.identity if isinstance(place, RemotePlace) else "/".join(parts_below)
+        logs.append(LogInput(place, name if name in staying else _with_digits(name, origin, taken)))
+        taken.add(as_taken(logs[-1].stem))
+    return logs
 
 
 def _with_digits(name: str, origin: str, taken: Container[str]) -> str:
@@ -312,10 +310,6 @@ def _with_digits(name: str, origin: str, taken: Container[str]) -> str:
     digits = hashlib.sha256(os.fsencode(origin)).hexdigest()
     made = (_portable(name, digits[:n]) for n in range(8, len(digits) + 1))
     return next(stem for stem in made if as_taken(stem) not in taken)
-
-
-def _stays(name: str, counts: Mapping[str, int]) -> bool:
-    return counts[as_taken(name)] == 1 and _portable(name) == name
 
 
 def as_taken(name: str) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.columnar_log import ColumnarLog
@@ -57,16 +57,6 @@ class Columns:
     def __len__(self) -> int:
         """Return the number of messages."""
         return int(self.log_time_ns.shape[0])
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the columns."""
-        return sum(c.nbytes for c in (self.log_time_ns, self.publish_time_ns, *self.fields.values()))
-
-    def rows(self, keep: BoolArray) -> Columns:
-        """Return the messages at which a mask [N] is true."""
-        fields = {path: column[keep] for path, column in self.fields.items()}
-        return Columns(self.topic, self.log_time_ns[keep], self.publish_time_ns[keep], fields)
 
 
 class DriveLog(ABC):
@@ -129,18 +119,6 @@ class DriveLog(ABC):
         self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
     ) -> dict[str, Columns]:
         """Read as :meth:`read`."""
-
-    def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
-        """Announce the fields that later reads request, so that one pass over the file can serve them.
-
-        Raises
-        ------
-        MappingError : as for :meth:`read`.
-        """
-        del requests
-
-    def keep_no_more(self) -> None:  # noqa: B027 (most logs keep nothing)
-        """Announce the last long read: its columns are not kept for later reads."""
 
     @abstractmethod
     def close(self) -> None:

@@ -21,7 +21,7 @@ from pdhef_logtool.logs.message_schema import (
     resolve,
     ros_schema,
 )
-from pdhef_logtool.logs.wire_layout import NoLayoutError, Steps, WireLayout, build_layout, leaf_at
+from pdhef_logtool.logs.wire_layout import NoLayoutError, Steps, WireLayout, leaf_at
 from pdhef_logtool.records.errors import MappingError
 
 
@@ -56,9 +56,8 @@ class CdrEncoder:
                 self._texts[self._text_steps(path)] = value.encode()
             else:
                 self._numbers[path] = np.asarray(value, dtype=np.float64)
-                self._select(path)
         self._layouts: dict[tuple[tuple[Steps, int], ...], tuple[WireLayout, bytes]] = {}
-        self._layout({path: value.size for path, value in self._numbers.items()})
+        self.encode(1, {})  # the constants must fit the definition
 
     def encode(self, n: int, fields: Mapping[str, NDArray[Any]], head: int = 0) -> NDArray[np.uint8]:
         """Return N messages as uint8 [N, head + size].
@@ -74,14 +73,12 @@ class CdrEncoder:
         ------
         MappingError : a path is not in the type, or a column does not fit it.
         """
-        columns = {path: np.asarray(values) for path, values in fields.items()}
+        columns = {path: np.broadcast_to(value, (n, *value.shape)) for path, value in self._numbers.items()}
+        columns |= {path: np.asarray(values) for path, values in fields.items()}
         for path, values in columns.items():
             if values.shape[:1] != (n,) or values.ndim > 2:
                 raise self._misfit(path, f"{n} rows", f"shape {values.shape}")
-            self._select(path)
-        widths = {path: value.size for path, value in self._numbers.items()}
-        widths.update({path: v.shape[1] for path, v in columns.items() if v.ndim == 2})
-        layout, template = self._layout(widths)
+        layout, template = self._layout({path: v.shape[1] for path, v in columns.items() if v.ndim == 2})
         rows = np.empty((n, head + layout.size), dtype=np.uint8)
         rows[:, head:] = np.frombuffer(template, dtype=np.uint8)
         for path, values in columns.items():
@@ -109,7 +106,7 @@ class CdrEncoder:
         """Return the layout for these array widths and a message with only the constants."""
         lengths: dict[Steps, int] = {}
         for path, width in widths.items():
-            selection = self._selections[path]
+            selection = self._select(path)
             if selection.shape == "array" and selection.length is None:
                 lengths[selection.components[0]] = width
         key = tuple(sorted(lengths.items(), key=repr))
@@ -121,7 +118,7 @@ class CdrEncoder:
                 return len(self._texts.get(place, b"")) + 1 if is_text else lengths.get(place, 0)
 
             try:
-                layout = build_layout(self.schema.root, "cdr", length_of)
+                layout = WireLayout(self.schema.root, "cdr", length_of)
             except NoLayoutError as error:
                 raise MappingError(expected="a type with a fixed layout", got=str(error), where=self.topic) from error
             self._layouts[key] = (layout, self._template(layout))
@@ -135,11 +132,7 @@ class CdrEncoder:
         for steps, (offset, _) in layout.texts.items():
             text = self._texts.get(steps, b"")
             message[offset : offset + len(text)] = text
-        row = np.frombuffer(bytes(message), dtype=np.uint8).reshape(1, -1).copy()
-        for path, value in self._numbers.items():
-            column = value.reshape(1) if value.ndim == 0 else value.reshape(1, -1)
-            self._put(layout, row, path, column)
-        return row.tobytes()
+        return bytes(message)
 
     def _put(self, layout: WireLayout, rows: NDArray[np.uint8], path: str, values: NDArray[Any]) -> None:
         selection = self._select(path)

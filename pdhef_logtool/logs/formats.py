@@ -21,7 +21,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC, Container
-from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.table_file import LogFile
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.drive_log import DriveLog

@@ -277,7 +277,7 @@ def _mat_tables(
             continue
         is_own = clocks.get((struct_, length)) is clock
         if is_own:
-            losses += clock_notes(clock, f"{where}, {sheet.name}")
+            losses += clock_notes(clock.notes, f"{where}, {sheet.name}")
         signals = {n: v for n, v in sheet.columns.items() if not is_own or n not in clock.columns}
         rows += [(Sheet(sheet.name, signals, sheet.units), clock.stamps_ns)] if signals else []
     for name, (sheet, stamps) in zip(unique(sheet.name for sheet, _ in rows), rows, strict=True):

@@ -36,6 +36,7 @@ from pdhef_logtool.logs.container import (
     ChannelRecord,
     FileContainer,
     RawChunk,
+    RecordT,
     Span,
     SpanDamageError,
     Wanted,
@@ -93,8 +94,7 @@ class McapContainer(FileContainer):
         self._wanted = wanted
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
-        self._attachment_at: list[tuple[int, int]] = []
-        self._metadata_at: list[tuple[int, int]] = []
+        self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
         self._unread: dict[
             int, int
         ] = {}  # chunks and attachments of a remote file that are not wanted, from start to end
@@ -112,7 +112,7 @@ class McapContainer(FileContainer):
         indexed = self._indexed_places()
         self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
         places, n = [*sorted(indexed), size], 0
-        header_seen = False
+        self.position = self._read_header()
         for offset in self._places():
             if offset in indexed:
                 self.position = self._add_indexed(*indexed[offset])
@@ -120,26 +120,17 @@ class McapContainer(FileContainer):
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self._closed = True
                 return
-            opcode, length = RECORD.unpack(source.read(offset, RECORD.size)) if offset + RECORD.size <= size else (0, 0)
-            end = offset + RECORD.size + length
+            opcode, end = self._record_head(offset)
             while places[n] <= offset:
                 n += 1
             if end > places[n] or opcode == 0:
-                if not header_seen:
-                    raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
                 resume = places[n] if places[n] < size else self._next_chunk(offset)
                 if resume is None:
                     self.lose_end(offset)
                     return
                 what = f"bytes {offset} to {resume} contain no readable record; reading resumes at the next chunk"
                 self.lose("bad-record", what, self.last_ns())
-                self.position = resume
-                continue
-            if not header_seen:
-                if opcode != _OP_HEADER:
-                    raise self.no_log("a header record after the magic bytes", "none")
-                self._read_header(offset, length)
-                header_seen = True
+                end = resume
             elif opcode == _OP_MESSAGE:
                 end = self._messages(offset)
             else:
@@ -148,8 +139,13 @@ class McapContainer(FileContainer):
                 except Exception as error:  # noqa: BLE001 (the next record is read in any case)
                     self.lose_record(offset, error)
             self.position = end
-        if not header_seen:
-            raise self.no_log("a header record after the magic bytes", "none")
+
+    def _record_head(self, offset: int) -> tuple[int, int]:
+        """Return opcode and end of the record at a byte; opcode 0 without a complete head."""
+        if offset + RECORD.size > self.source.size:
+            return 0, offset
+        opcode, length = RECORD.unpack(self.source.read(offset, RECORD.size))
+        return opcode, offset + RECORD.size + length
 
     def _indexed_places(self) -> dict[int, tuple[Extent, Span | None]]:
         """Return by their places the chunks, and attachments that are not read, that a sound summary describes.
@@ -181,7 +177,7 @@ class McapContainer(FileContainer):
     def _add_indexed(self, extent: Extent, span: Span | None) -> int:
         """Add a chunk, or an attachment, by its entry in the summary; return the start of the next record."""
         if span is None:
-            self._attachment_at.append((extent.start, extent.end))
+            self._records_at[Attachment].append((extent.start, extent.end))
             return extent.end
         ordered = self.source.is_remote
         if not ordered:
@@ -207,13 +203,20 @@ class McapContainer(FileContainer):
         )
         self.lose("bad-record", what)
 
-    def _read_header(self, offset: int, length: int) -> None:
-        self.meter.limits.check("metadata_bytes", length, "the header record")
+    def _read_header(self) -> int:
+        """Read the header record, which is the first one; return its end."""
+        start = self.position
+        opcode, end = self._record_head(start)
+        if opcode == 0 or end > self.source.size:
+            raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
+        if opcode != _OP_HEADER:
+            raise self.no_log("a header record after the magic bytes", "none")
         try:
-            self.profile = _parsed(Header, self.source.read(offset + RECORD.size, length)).profile
+            self.profile = _parsed(Header, self._payload(start, end)).profile
         except (struct.error, UnicodeDecodeError, McapError) as error:
             got = "a malformed one, or a draft of the format before 1.0"
             raise self.no_log("a header record with profile and library", got) from error
+        return end
 
     def _next_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that a damaged summary names, or None."""
@@ -235,7 +238,7 @@ class McapContainer(FileContainer):
             self._data_end = (start, end)
         elif opcode == Opcode.METADATA:
             _parsed(Metadata, self._payload(start, end))
-            self._metadata_at.append((start, end))
+            self._records_at[Metadata].append((start, end))
         elif opcode == Opcode.STATISTICS and self._data_end:
             self._statistics = _parsed(Statistics, self._payload(start, end))
         elif opcode == Opcode.FOOTER and self._data_end:
@@ -289,7 +292,7 @@ class McapContainer(FileContainer):
             place = end
         if not places:
             self.lose_record(offset, SpanDamageError("a message record is too short"))
-            return offset + RECORD.size + int(RECORD.unpack(self.source.read(offset, RECORD.size))[1])
+            return self._record_head(offset)[1]
         heads = _heads(block, np.array(places, dtype=np.int64))
         times, counts = _held_times(heads["log"]), Counter(heads["channel"].tolist())
         ordered = bool((times[1:] >= times[:-1]).all())
@@ -304,10 +307,10 @@ class McapContainer(FileContainer):
         """
         index_end, size = end, self.source.size
         while index_end + INDEX_RECORD.size <= size:
-            opcode, length = RECORD.unpack(self.source.read(index_end, RECORD.size))
-            if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or index_end + RECORD.size + length > size:
+            opcode, following = self._record_head(index_end)
+            if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or following > size:
                 break  # one wrong bit makes an index a private record
-            index_end += RECORD.size + length
+            index_end = following
         extent = Extent(start, end, index_end)
         first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
         claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, {})
@@ -517,18 +520,11 @@ class McapContainer(FileContainer):
             return {id_: _held_times(times) for id_, times in indexes}
         return super().times(span)
 
-    def attachments(self) -> Iterator[Attachment]:
-        """Read the attachments; a damaged one is among the losses and left out."""
-        yield from self._sound_records(self._attachment_at, Attachment)
-
-    def metadata_records(self) -> Iterator[Metadata]:
-        """Read the metadata records; a damaged one is among the losses and left out."""
-        yield from self._sound_records(self._metadata_at, Metadata)
-
-    def _sound_records(self, extents: Iterable[tuple[int, int]], kind: Any) -> Iterator[Any]:
-        for start, end in extents:
+    def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
+        """See :class:`~pdhef_logtool.logs.container.Container`."""
+        for start, end in self._records_at[kind]:
             try:
-                record = _parsed(kind, self.source.read(start + RECORD.size, end - start - RECORD.size))
+                record: RecordT = _parsed(kind, self.source.read(start + RECORD.size, end - start - RECORD.size))
             except Exception as error:  # noqa: BLE001 (the boundary)
                 self.lose_record(start, error)
                 continue
@@ -548,7 +544,7 @@ class McapContainer(FileContainer):
         if crc and self._crc(start, crc_at) != crc:
             self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
             return
-        self._attachment_at.append((start - RECORD.size, end))
+        self._records_at[Attachment].append((start - RECORD.size, end))
 
 
 def _parsed(kind: Any, payload: bytes) -> Any:

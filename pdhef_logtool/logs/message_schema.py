@@ -10,13 +10,12 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from pdhef_logtool.logs.definitions import SHIPPED, Definitions
+from pdhef_logtool.logs.definitions import SHIPPED, Definitions, referenced, with_contained_types
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
-from pdhef_logtool.logs.schema_files import referenced, with_contained_types
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
 if TYPE_CHECKING:
@@ -98,13 +97,14 @@ class Unknown:
 Node: TypeAlias = Scalar | Struct | Array | Unknown
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class MessageSchema:
     """A message type: its tree and its decoder.
 
     ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
     ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
-    of an installed ROS that it was read from, if the log contains no definition.
+    of an installed ROS that it was read from, if the log contains no definition. ``units`` of fields are those that its
+    text states.
     """
 
     type_name: str
@@ -114,6 +114,12 @@ class MessageSchema:
     message_class: Any = None
     limits: ResourceLimits = DEFAULT_LIMITS
     borrowed: tuple[Path, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    @functools.cached_property
+    def fields(self) -> tuple[FieldInfo, ...]:
+        """The scalar leaves of the tree, times as one leaf."""
+        return tuple(replace(f, unit=self.units.get(f.path.partition("[")[0], "")) for f in leaves(self.root))
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +270,8 @@ def ros_schema(
                 borrowed = tuple(file for file in files if file is not None)
                 store.register(types)
             root = _ros_root(store.fielddefs, type_name, limits)
-    return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed)
+    units = stated_units(text) if encoding == "ros2msg" else {}
+    return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed, units=units)
 
 
 def _idl_types(text: str) -> Any:
@@ -408,8 +415,13 @@ def json_schema_of_message(type_name: str, message: bytes, limits: ResourceLimit
     what = "the first message"
     with parsing(what):
         limits.check("schema_bytes", len(message), what)
-        root = _example_node(json.loads(message), Unfolding(limits, what), 0)
+        root = node_of_value(json.loads(message), limits)
     return MessageSchema(type_name, "json", root, limits=limits)
+
+
+def node_of_value(value: object, limits: ResourceLimits) -> Node:
+    """Return the tree of a JSON value; raises LimitError."""
+    return _example_node(value, Unfolding(limits, "a JSON value"), 0)
 
 
 def _example_node(value: object, unfolding: Unfolding, depth: int) -> Node:
@@ -446,9 +458,9 @@ def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
 _STATED_UNIT = re.compile(r"^\s*[\w/\[\]<=]+\s+(\w+)\s*#\s*\[([^\[\]\s]{1,12})\]\s*$", re.MULTILINE)
 
 
-def stated_units(definition: bytes) -> dict[str, str]:
+def stated_units(definition: str) -> dict[str, str]:
     """Return the units by field that comments of a ROS 2 message's own fields give: ``float64 speed  # [km/h]``."""
-    main_type = definition.decode(errors="replace").partition("\n===")[0]
+    main_type = definition.partition("\n===")[0]
     return {match[1]: match[2] for match in _STATED_UNIT.finditer(main_type)}
 
 
@@ -485,8 +497,9 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             return Selection(path, "dynamic", (steps,))
         node = _part(node, step)
     if node is None:
-        paths = [leaf.path for leaf in leaves(schema.root)]
-        raise nearest(path, paths, f"a field of {schema.type_name or 'the message'}", topic)
+        raise nearest(
+            path, [leaf.path for leaf in schema.fields], f"a field of {schema.type_name or 'the message'}", topic
+        )
     if ending:
         # Records of ROS messages are read without their texts.
         is_text = isinstance(node, Unknown) or (isinstance(node, Scalar) and node.kind == "string")
@@ -498,6 +511,11 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
                 remedy=f"drop the ending {ending}",
             )
         return Selection(path, "array", (steps,), None, TEXT_ENDINGS[ending])
+    return select(schema, topic, path, node, steps)
+
+
+def select(schema: MessageSchema, topic: str, path: str, node: Node, steps: tuple[Step, ...]) -> Selection:
+    """Return how the node at some steps becomes a column; raises MappingError for one that is no number."""
     if isinstance(node, Unknown):
         return Selection(path, "dynamic", (steps,))
     if isinstance(node, Scalar):
@@ -505,7 +523,13 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             raise _no_number(schema, topic, path, "a text")
         return Selection(path, "scalar", (steps,))
     if isinstance(node, Array):
-        return _select_array(node, schema, topic, path, steps)
+        if isinstance(node.item, Unknown):
+            return Selection(path, "dynamic", (steps,))
+        if not isinstance(node.item, Scalar) or node.item.kind == "string":
+            raise _no_number(schema, topic, path, "an array of structs or texts")
+        if node.length is not None and node.length > schema.limits.array_width:
+            raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
+        return Selection(path, "array", (steps,), node.length)
     if node.time:
         return Selection(path, "time", tuple((*steps, part) for part in node.time))
     if node.vector:
@@ -521,16 +545,6 @@ def _part(node: Node | None, step: Step) -> Node | None:
     return node.item if isinstance(node, Array) and is_element else None
 
 
-def _select_array(node: Array, schema: MessageSchema, topic: str, path: str, steps: tuple[Step, ...]) -> Selection:
-    if isinstance(node.item, Unknown):
-        return Selection(path, "dynamic", (steps,))
-    if not isinstance(node.item, Scalar) or node.item.kind == "string":
-        raise _no_number(schema, topic, path, "an array of structs or texts")
-    if node.length is not None and node.length > schema.limits.array_width:
-        raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
-    return Selection(path, "array", (steps,), node.length)
-
-
 def nearest(name: str, names: Sequence[str], expected: str, where: object) -> MappingError:
     """Return the error for a topic or field that is not among these names."""
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
@@ -542,7 +556,7 @@ def nearest(name: str, names: Sequence[str], expected: str, where: object) -> Ma
 
 
 def _no_number(schema: MessageSchema, topic: str, path: str, what: str) -> MappingError:
-    below = [leaf.path for leaf in leaves(schema.root) if leaf.path.startswith(path) and leaf.kind != "string"][:3]
+    below = [leaf.path for leaf in schema.fields if leaf.path.startswith(path) and leaf.kind != "string"][:3]
     return MappingError(
         expected="a number, a time, a vector or an array of numbers",
         got=f"{path!r}, which is {what}",
@@ -568,15 +582,29 @@ def value_at(message: object, steps: Sequence[Step]) -> object:
     """Follow steps through attributes, mappings and sequences; None where the message lacks one."""
     value: Any = message
     for step in steps:
-        if value is None:
-            return None
         if isinstance(step, int):
             try:
                 value = value[step]
             except (IndexError, KeyError, TypeError):
                 return None
-        elif isinstance(value, dict):
-            value = value.get(step)
         else:
-            value = getattr(value, step, None)
+            value = value.get(step) if isinstance(value, dict) else getattr(value, step, None)
     return value
+
+
+def values_at(values: Sequence[Any], steps: Sequence[Step]) -> Sequence[Any]:
+    """Follow steps through messages or values of one type, as :func:`value_at` does through one of them.
+
+    Absent fields of protobuf messages are None. A default that the type declares (proto2) replaces an absent value.
+    """
+    for step in steps:
+        kind: Any = type(next((value for value in values if value is not None), None))
+        if isinstance(step, int) or not hasattr(kind, "DESCRIPTOR"):
+            values = [value_at(value, (step,)) for value in values]
+            continue
+        field = kind.DESCRIPTOR.fields_by_name[step]
+        if field.has_presence and not field.has_default_value:
+            values = [getattr(v, step) if v is not None and v.HasField(step) else None for v in values]
+        else:
+            values = [None if v is None else getattr(v, step) for v in values]
+    return values

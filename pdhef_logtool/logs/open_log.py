@@ -24,10 +24,9 @@ from pdhef_logtool.logs.formats import (
     what_is_a_log,
     without_general,
 )
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
-from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
+from pdhef_logtool.logs.table_file import NO_SETTINGS, LogFile, TableSettings
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.storage.documents import read_text
@@ -268,9 +267,6 @@ def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
                     raise LogError(
                         expected="a file of messages", got=f"a log of kind {container.kind}", where=str(file)
                     )
-            except LogError as error:
-                lost.append(Loss("bad-file", f"expected {error.expected}, got {error.got}", str(file)))
-                continue
             except Exception as error:  # noqa: BLE001 (one file of several)
                 lost.append(Loss("bad-file", describe_damage(error)[1], str(file)))
                 continue

@@ -1,4 +1,4 @@
-"""Protobuf message types from the descriptors that a log carries, and accessors compiled from dotted paths.
+"""Protobuf message types from the descriptors that a log carries.
 
 Two cases of a missing value differ, as in the language: a plain scalar of proto3 that is not on the wire
 is its default (0), whereas an absent sub-message, an unset ``optional`` and the members of a ``oneof`` that are not the
@@ -7,7 +7,6 @@ set one are absent (NaN). Maps and types that contain themselves have no place a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import lru_cache
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
@@ -18,8 +17,6 @@ from pdhef_logtool.logs.message_schema import (
     Node,
     Scalar,
     SchemaError,
-    Selection,
-    Step,
     Struct,
     Unfolding,
     parsing,
@@ -125,46 +122,6 @@ def _field_node(field: Any, inside: tuple[str, ...], unfolding: Unfolding) -> No
     else:
         node = Scalar("bool" if field.type == FieldDescriptor.TYPE_BOOL else "number")
     return Array(node, None) if _is_repeated(field) else node
-
-
-def compile_getter(schema: MessageSchema, selection: Selection) -> Callable[[Any], object]:
-    """Turn a resolved path into a function of a message: one value, or a tuple of them for several components.
-
-    The function returns None for absent fields and for None.
-    """
-    getters = [_compile_steps(schema.message_class.DESCRIPTOR, steps) for steps in selection.components]
-    return getters[0] if len(getters) == 1 else lambda message: tuple(get(message) for get in getters)
-
-
-def _compile_steps(descriptor: Any, steps: Sequence[Step]) -> Callable[[Any], object]:
-    """Compile steps from a message of one type."""
-    plan: list[tuple[Step, bool]] = []  # and whether it can be absent
-    field: Any = None
-    for step in steps:
-        if isinstance(step, str):
-            field = descriptor.fields_by_name[step]
-            descriptor = field.message_type
-        # A default that the type declares (proto2) replaces an absent value.
-        plan.append((step, isinstance(step, str) and field.has_presence and not field.has_default_value))
-    whole = field is not None and isinstance(steps[-1], str) and _is_array(field)
-
-    def get(message: Any) -> object:
-        for step, can_be_absent in plan:
-            if message is None or (can_be_absent and not message.HasField(step)):
-                return None
-            if isinstance(step, str):
-                message = getattr(message, step)
-            else:
-                message = message[step] if step < len(message) else None
-        return list(message) if whole and message is not None else message
-
-    return get
-
-
-def _is_array(field: Any) -> bool:
-    from google.protobuf.descriptor import FieldDescriptor
-
-    return _is_repeated(field) or bool(field.type == FieldDescriptor.TYPE_BYTES)
 
 
 def _is_repeated(field: Any) -> bool:

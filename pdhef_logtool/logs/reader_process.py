@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from io import BytesIO
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -29,10 +30,9 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.resource_limits import RAISE_LIMIT, LimitError, ResourceLimits
-from pdhef_logtool.logs.table_file import TableFile, Tables, TableSettings
+from pdhef_logtool.logs.resource_limits import RAISE_LIMIT, LimitError
+from pdhef_logtool.logs.table_file import LogFile, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError, PdhefError, UsageError, WorkerError
 from pdhef_logtool.records.signals import Loss
@@ -62,12 +62,12 @@ def open_tables(file: LogFile, reader: str, libraries: Sequence[str] = ()) -> Ta
     LogError : the reader cannot read the file, dies of it, or exceeds a limit.
     """
     size = file.path.stat().st_size
+    opened = TableFile(BytesIO(), size, str(file.place), file.meter.limits, file.settings)
     with file.meter.running(size):
         if not can_fork():
             stream = file.path.open("rb")
-            opened = TableFile(stream, size, str(file.place), file.meter.limits, file.settings)
-            return log_of_tables(file, pkgutil.resolve_name(reader)(opened), stream.close)
-        session = _Session(file, size, reader, libraries)
+            return log_of_tables(file, pkgutil.resolve_name(reader)(replace(opened, stream=stream)), stream.close)
+        session = _Session(file.path, opened, reader, libraries)
         try:
             return log_of_tables(file, session.open(), session.close)
         except BaseException:
@@ -89,11 +89,10 @@ def log_of_tables(file: LogFile, tables: Tables, close: Callable[[], object]) ->
 class _Session:
     """Requests to the reader of one file."""
 
-    def __init__(self, file: LogFile, size: int, reader: str, libraries: Sequence[str]) -> None:
-        self._file, self._size, self._reader, self._libraries = file, size, reader, libraries
-        self._where, limits = str(file.place), file.meter.limits
-        self._seconds = limits.seconds + limits.seconds_per_mib * size / 2**20
-        most = 2 * (limits.table_bytes + limits.table_ratio * size)
+    def __init__(self, path: Path, file: TableFile, reader: str, libraries: Sequence[str]) -> None:
+        self._path, self._file, self._reader, self._libraries = path, file, reader, libraries
+        self._seconds = file.limits.seconds + file.limits.seconds_per_mib * file.size / 2**20
+        most = 2 * (file.limits.table_bytes + file.limits.table_ratio * file.size)
         self._bytes = min(most, psutil.virtual_memory().available)
         self._child: Child | None = None
         self._resources = ExitStack()
@@ -128,11 +127,10 @@ class _Session:
             raise SpanDamageError("its reader died")
         self._starts -= 1
         folder = self._resources.enter_context(scratch_folder())
-        limits, timeout_s = self._file.meter.limits, _PATIENCE_S + _PATIENCE * self._seconds
-        with self._file.path.open("rb") as stream:
+        timeout_s = _PATIENCE_S + _PATIENCE * self._seconds
+        with self._path.open("rb") as stream:
             self._child = _fork(self._reader, self._libraries, stream.fileno(), timeout_s)
-        settings = self._file.settings
-        order = _Order(self._reader, self._where, self._size, limits, settings, folder, self._bytes, self._seconds)
+        order = _Order(self._reader, self._file, folder, self._bytes, self._seconds)
         with suppress(OSError):  # the next request notices the end of the reader
             self._child.connection.send(order)
 
@@ -140,7 +138,7 @@ class _Session:
         assert self._child is not None
         try:
             self._child.connection.send(request)
-            head, arrays = _answer(self._child.connection, self._file.meter.limits.metadata_bytes, self._bytes)
+            head, arrays = _answer(self._child.connection, self._file.limits.metadata_bytes, self._bytes)
         except (OSError, EOFError, ValueError, TypeError, KeyError) as error:
             raise self._death(self.close(), error) from None
         if "error" not in head:
@@ -150,21 +148,18 @@ class _Session:
 
     def _death(self, code: int | None, error: Exception) -> LogError:
         if code == -signal.SIGXCPU or isinstance(error, BlockingIOError):
-            return _over("processor time", f"{self._seconds:.3g} s", self._where)
+            return _over("processor time", f"{self._seconds:.3g} s", self._file.name)
         how = "an unknown cause" if code is None else f"exit code {code}" if code >= 0 else signal.Signals(-code).name
         got = f"one that ends its reader ({how})"
-        return LogError(expected="a readable file", got=got, where=self._where, remedy=_REMEDY)
+        return LogError(expected="a readable file", got=got, where=self._file.name, remedy=_REMEDY)
 
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """Settings of a reader process."""
+    """Settings of a reader process; it has the stream of the file."""
 
     reader: str
-    name: str
-    size: int
-    limits: ResourceLimits
-    settings: TableSettings
+    file: TableFile
     folder: str
     more_bytes: int
     seconds: float
@@ -209,14 +204,13 @@ def serve_tables(connection: Connection, descriptor: int) -> None:
             allow_processor_time(order.seconds)
             try:
                 if name == "open":
-                    file = TableFile(stream, order.size, order.name, order.limits, order.settings)
-                    tables = pkgutil.resolve_name(order.reader)(file)
+                    tables = pkgutil.resolve_name(order.reader)(replace(order.file, stream=stream))
                     head, arrays = _contents(tables), [t.stamps_ns for t in tables.tables]
                 else:
                     number, path, start, stop = arguments
                     head, arrays = {}, [np.asarray(tables.tables[number].load(path, slice(start, stop)))]
             except MemoryError:
-                head, arrays = _failure(_over("memory", f"{order.more_bytes / 1e6:.0f} MB", order.name)), []
+                head, arrays = _failure(_over("memory", f"{order.more_bytes / 1e6:.0f} MB", order.file.name)), []
             except Exception as error:  # noqa: BLE001  any error of a library
                 head, arrays = _failure(error), []
             _reply(connection, head, arrays)

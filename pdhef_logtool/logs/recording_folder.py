@@ -12,11 +12,10 @@ from pathlib import Path
 
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.formats import HEAD_BYTES, recognised_format
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.reader_process import log_of_tables
 from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.table_columns import field_name, unique
-from pdhef_logtool.logs.table_file import Tables, TableSettings
+from pdhef_logtool.logs.table_file import LogFile, Tables, TableSettings
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss

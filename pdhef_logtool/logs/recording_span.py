@@ -15,12 +15,13 @@ A sound log keeps all messages, and its first and last log time.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import Container, Span
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
@@ -163,9 +164,9 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Rec
     ----------
     times : reads the times of a span. where : name of the log in losses.
     """
-    look = _look(containers, times)
-    intervals, left_out, losses, total = _kept_epoch(look, where)
-    cuts = _cuts(look, intervals)
+    pieces, topics = _look(containers, times)
+    intervals, left_out, losses = _kept_epoch(pieces, topics, where)
+    cuts = _cuts(pieces, topics, intervals)
     twice: list[IntArray] = []
     for c, span in ((c, span) for c, of in enumerate(containers) for span in of.spans) if cuts else ():
         place = (c, span.index)
@@ -179,130 +180,106 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Rec
                 twice.append(again)
     if twice:
         all_of_it = np.concatenate(twice)
-        losses.append(_loss(TIME_JUMP, where, all_of_it, all_of_it + 1, all_of_it.size, total))
+        losses.append(_loss(TIME_JUMP, where, all_of_it, all_of_it + 1, all_of_it.size, int(pieces["count"].sum())))
     return RecordingSpan(tuple(intervals), tuple(cuts), left_out, tuple(losses))
 
 
 def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> RecordingSpan:
     """Find the times of a log from all log times [N] of each topic; ``where`` as for :func:`survey`."""
-    none = Span(0, 0, 0, {})
-    look = [_Looked(0, none, {0: t}, {0: s}) for t, s in stamps_ns.items() if len(s)]
-    intervals, left_out, losses, _ = _kept_epoch(look, where)
+    listed = [_stretches(times, i) for i, times in enumerate(stamps_ns.values()) if len(times)]
+    intervals, left_out, losses = _kept_epoch(np.concatenate([_NO_PIECE, *listed]), [*stamps_ns], where)
     return RecordingSpan(tuple(intervals), left_out=left_out, losses=tuple(losses))
 
 
 def _kept_epoch(
-    look: Sequence[_Looked], where: str
-) -> tuple[list[tuple[int, int]], dict[str, Counter[str]], list[Loss], int]:
-    """Return the intervals that are kept, the messages left out by topic and reason, their losses, and all messages."""
-    pieces = [piece for of in look for piece in of.pieces()]
-    start, end, count = (np.array([p[i] for p in pieces], dtype=np.int64) for i in (0, 1, 2))
-    intervals, kept, outlier = find_epochs(start, end, count)
+    pieces: NDArray[np.void], topics: Sequence[str], where: str
+) -> tuple[list[tuple[int, int]], dict[str, Counter[str]], list[Loss]]:
+    """Return the intervals that are kept, the messages left out by topic and reason, and their losses."""
+    intervals, kept, outlier = find_epochs(pieces["start"], pieces["end"], pieces["count"])
     left_out: dict[str, Counter[str]] = {}
     losses = []
-    total = int(count.sum())
     for reason, which in ((OUTLIER, outlier), (OTHER_EPOCH, ~kept & ~outlier)):
-        for i in np.flatnonzero(which).tolist():
-            for topic, n in pieces[i][3].items():
-                left_out.setdefault(topic, Counter())[reason] += n
-        if count[which].any():
-            rows = np.flatnonzero(which)
-            losses.append(_loss(reason, where, start[rows], end[rows], int(count[rows].sum()), total))
-    return intervals, left_out, losses, total
+        out = pieces[which]
+        for i in np.unique(out["topic"]).tolist():
+            left_out.setdefault(topics[i], Counter())[reason] = int(out["count"][out["topic"] == i].sum())
+        if len(out):
+            total = int(pieces["count"].sum())
+            losses.append(_loss(reason, where, out["start"], out["end"], int(out["count"].sum()), total))
+    return intervals, left_out, losses
 
 
 # ---- the look at the spans ----
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Looked:
-    """A span, with its times by channel if these were read because the bounds of the span are not enough."""
-
-    c: int
-    span: Span
-    topics: Mapping[int, str]
-    stamps: Mapping[int, IntArray] | None = None
-
-    def pieces(self) -> Iterator[tuple[int, int, int, Mapping[str, int]]]:
-        """Yield start, end, messages, and messages by topic; one piece per stretch."""
-        if self.stamps is None:
-            counts: Counter[str] = Counter()
-            for id_, messages in self.span.counts.items():
-                counts[self.topics[id_]] += messages
-            yield self.span.start_ns, self.span.end_ns, sum(counts.values()), counts
-            return
-        times = np.concatenate([*self.stamps.values()])
-        channel = np.repeat([*self.stamps], [len(its) for its in self.stamps.values()])
-        order = np.argsort(times, kind="stable")
-        stretch = _groups(times[order], times[order], SILENCE_NS)
-        for rows in np.split(order, np.flatnonzero(np.diff(stretch)) + 1):
-            ids, n = np.unique(channel[rows], return_counts=True)
-            by_topic: Counter[str] = Counter()
-            for id_, m in zip(ids.tolist(), n.tolist(), strict=True):
-                by_topic[self.topics[id_]] += m
-            yield int(times[rows[0]]), int(times[rows[-1]]) + 1, rows.shape[0], by_topic
-
-    def last_ns(self, id_: int) -> int:
-        """Return the last time of a channel, 0 without any."""
-        return self.span.end_ns - 1 if self.stamps is None else int(self.of_channel(id_).max(initial=0))
-
-    def of_channel(self, id_: int) -> IntArray:
-        """Return the times of a channel in file order; of an ordered span its bounds."""
-        if self.stamps is None:
-            return np.array([self.span.start_ns, self.span.end_ns - 1])
-        return self.stamps.get(id_, np.empty(0, np.int64))
+#: A piece of a recording: messages of a channel in a span, [start, end); ``row`` in the span is -1 for all of them.
+_NO_PIECE = np.empty(0, [(name, np.int64) for name in ("start", "end", "count", "topic", "file", "span", "row")])
 
 
-def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
-    """Return all spans in file order, with their times if the bounds of a span are not enough."""
-    looked: list[_Looked] = []
-    newest: dict[str, int] = {}
+def _of_messages(times_ns: IntArray, topic: int, file: int, span: int) -> NDArray[np.void]:
+    """Return each message as a piece."""
+    pieces = np.empty(len(times_ns), _NO_PIECE.dtype)
+    pieces["start"], pieces["end"], pieces["count"], pieces["row"] = times_ns, times_ns + 1, 1, np.arange(len(times_ns))
+    pieces["topic"], pieces["file"], pieces["span"] = topic, file, span
+    return pieces
+
+
+def _stretches(times_ns: IntArray, topic: int) -> NDArray[np.void]:
+    """Return the pieces of ascending times that a silence keeps apart."""
+    first = np.flatnonzero(np.append(True, np.diff(times_ns.astype(np.float64)) > SILENCE_NS))
+    pieces = _of_messages(times_ns[first], topic, 0, 0)
+    pieces["end"], pieces["count"] = times_ns[np.append(first[1:], 0) - 1] + 1, np.diff(first, append=len(times_ns))
+    return pieces
+
+
+def _look(containers: Sequence[Container], times: SpanTimes) -> tuple[NDArray[np.void], list[str]]:
+    """Return pieces in file order, and the topics: each message where the bounds of a span are not enough."""
+    looked: list[NDArray[np.void]] = [_NO_PIECE]
+    names: dict[str, int] = {}
+    newest: dict[int, int] = {}
     for c, container in enumerate(containers):
-        topics = {id_: channel.topic for id_, channel in container.channels.items()}
+        topics = {id_: names.setdefault(channel.topic, len(names)) for id_, channel in container.channels.items()}
         for span in container.spans:
             if not span.counts:
                 continue  # it has no message of a declared channel
             lasts = span.end_ns - span.start_ns
-            behind = any(span.start_ns < newest.get(topics[id_], 0) - STEP_BACK_NS for id_ in span.counts)
-            of = _Looked(c, span, topics)
-            if lasts <= 0 or lasts > SILENCE_NS or behind or (lasts > STEP_BACK_NS and not span.ordered):
-                stamps = times(c, span)
-                if stamps is None:
-                    continue  # damaged: nothing of it can be read
-                disorder = any((np.diff(times_ns) < -STEP_BACK_NS).any() for times_ns in stamps.values())
-                if stamps and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
-                    of = _Looked(c, span, topics, stamps)
-            for id_ in span.counts:
-                newest[topics[id_]] = max(newest.get(topics[id_], 0), of.last_ns(id_))
-            looked.append(of)
-    return looked
+            is_torn = lasts <= 0 or lasts > SILENCE_NS
+            is_torn |= any(span.start_ns < newest.get(topics[id_], 0) - STEP_BACK_NS for id_ in span.counts)
+            stamps = times(c, span) if is_torn or (lasts > STEP_BACK_NS and not span.ordered) else {}
+            if stamps is None:
+                continue  # damaged: nothing of it can be read
+            if not is_torn and not any((np.diff(its) < -STEP_BACK_NS).any() for its in stamps.values()):
+                bounds = span.start_ns, span.end_ns
+                whole = [(*bounds, n, topics[id_], c, span.index, -1) for id_, n in span.counts.items()]
+                looked.append(np.array(whole, _NO_PIECE.dtype))
+                stamps = dict.fromkeys(span.counts, np.array([span.end_ns - 1]))
+            else:
+                looked += [_of_messages(its, topics[id_], c, span.index) for id_, its in stamps.items()]
+            for id_, its in stamps.items():
+                newest[topics[id_]] = max(newest.get(topics[id_], 0), int(its.max(initial=0)))
+    return np.concatenate(looked), [*names]
 
 
-def _cuts(looked: Sequence[_Looked], intervals: Sequence[tuple[int, int]]) -> list[Cut]:
+def _cuts(pieces: NDArray[np.void], topics: Sequence[str], intervals: Sequence[tuple[int, int]]) -> list[Cut]:
     """Return the intervals that were recorded twice, of all topics, if the time of one of them clearly stepped back."""
-    if all(of.stamps is None for of in looked):
-        return []
-    sequences: dict[str, tuple[IntArray, list[tuple[int, int, int, int]]]] = {}
-    parts: dict[str, list[tuple[IntArray, int, int]]] = {}
-    for of in looked:
-        for id_ in of.span.counts:
-            channel_times = of.of_channel(id_)
-            inside = _inside(channel_times, intervals)
-            if inside.any():  # left-out rows take the time of a neighbour, so that rows keep their places
-                last = np.maximum.accumulate(np.where(inside, np.arange(channel_times.shape[0]), -1))
-                channel_times = channel_times[np.where(last >= 0, last, int(np.argmax(inside)))]
-                parts.setdefault(of.topics[id_], []).append((channel_times, of.c, of.span.index))
-    for topic, those in parts.items():
-        bounds = np.cumsum([0, *(channel_times.shape[0] for channel_times, _, _ in those)]).tolist()
-        places = [(a, b, c, index) for a, b, (_, c, index) in zip(bounds[:-1], bounds[1:], those, strict=True)]
-        sequences[topic] = np.concatenate([channel_times for channel_times, _, _ in those]), places
-    if not any(steps_back(channel_times).size for channel_times, _ in sequences.values()):
+    is_message = pieces["row"] >= 0
+    sequences: list[tuple[str, IntArray, NDArray[np.void]]] = []
+    for i, topic in enumerate(topics) if is_message.any() else ():
+        its = pieces[pieces["topic"] == i]
+        # First and last time of a span, the only one of a message.
+        ends = np.stack([its["start"], its["end"] - 1], axis=1)
+        used = np.stack([its["row"] >= -1, its["row"] < 0], axis=1)
+        times, places = ends[used], its[np.nonzero(used)[0]]
+        if (inside := _inside(times, intervals)).any():
+            # Left-out messages take the time of a neighbour, so that the others keep their places.
+            last = np.maximum.accumulate(np.where(inside, np.arange(len(times)), -1))
+            sequences.append((topic, times[np.where(last >= 0, last, int(np.argmax(inside)))], places))
+    if not any(steps_back(times).size for _, times, _ in sequences):
         return []
     cuts = []
-    for topic, (channel_times, places) in sequences.items():
-        for place, low, high in recorded_twice(channel_times):
-            c, index, row = next((c, index, place - a) for a, b, c, index in places if a <= place < b)
-            cuts.append(Cut(topic, (c, index, row), low, high))
+    for topic, times, places in sequences:
+        for place, low, high in recorded_twice(times):
+            c, index, row = (int(places[name][place]) for name in ("file", "span", "row"))
+            cuts.append(Cut(topic, (c, index, max(row, 0)), low, high))
     return cuts
 
 

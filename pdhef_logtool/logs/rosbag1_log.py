@@ -5,7 +5,6 @@ Bags without an index are walked like any other, so that an unindexed bag gives 
 
 from __future__ import annotations
 
-import contextlib
 import struct
 from array import array
 from collections import Counter
@@ -125,7 +124,6 @@ class Rosbag1Container(FileContainer):
         index_at, chunks = self._header
         if index_at and not self.lost:
             self._check_infos(chunks)
-        self._declare_from_chunks()
         if not index_at and not self.lost:
             what = "the bag has no index (it was not closed); its complete chunks were read by a scan"
             self.lose("unindexed", what, self.last_ns())
@@ -157,13 +155,6 @@ class Rosbag1Container(FileContainer):
         words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
         chunk.indexes.append((connection, words[:, 0] * 1_000_000_000 + words[:, 1]))
 
-    def _declare_from_chunks(self) -> None:
-        """Find connections that only the chunks declare, as in a bag without its index section."""
-        for span in self.spans:
-            if not set(span.counts) <= set(self.channels):
-                with contextlib.suppress(Exception):  # a read of the span reports the damage
-                    self._decoded(self.chunks[span.index], declare=True)
-
     def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
         inner = _header_fields(payload)
         id_ = _U32.unpack(fields["conn"])[0]
@@ -186,16 +177,17 @@ class Rosbag1Container(FileContainer):
         )
 
     def _close_chunk(self, complete: bool = True) -> None:
-        """Add the chunk after its index records; open it if they are missing or implausible."""
+        """Add the chunk after its index records; open it if they are missing or implausible, or new connections."""
         chunk, self._pending = self._pending, None
         if chunk is None:
             return
         self._found += 1
         span = span_of_indexes(chunk.indexes)
-        if not complete or not span.counts or sum(span.counts.values()) * _LEAST_MESSAGE_BYTES > chunk.size:
-            self.add_content(chunk)
-        else:
+        is_known = bool(span.counts) and span.counts.keys() <= self.channels.keys()
+        if complete and is_known and sum(span.counts.values()) * _LEAST_MESSAGE_BYTES <= chunk.size:
             self.add_span(chunk, span)
+        else:
+            self.add_content(chunk)
 
     def _decoded(self, chunk: _Chunk, *, declare: bool) -> Block:
         self.meter.limits.check("chunk_bytes", chunk.end - chunk.stored_start, "a chunk")

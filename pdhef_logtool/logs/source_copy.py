@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields, replace
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
 from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk, Span
-from pdhef_logtool.logs.schema_files import message_definition
+from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 
 #: Times of MCAP are unsigned; times in this package are signed.

@@ -249,20 +249,21 @@ def with_fractions(clock: Clock, fractions: FloatArray, unit_ns: int, name: str)
     return replace(clock, stamps_ns=np.where(has_time, clock.stamps_ns + rest, NO_TIME), columns=clock.columns | {name})
 
 
-def spread(clock: Clock) -> Clock:
-    """Return a clock with rows spread evenly where several share a time, as in exports in whole seconds."""
-    rows = np.flatnonzero(clock.stamps_ns != NO_TIME)
-    times, first, count = np.unique(clock.stamps_ns[rows], return_index=True, return_counts=True)
-    if len(times) < _CLOCKS["few_rows"] or (np.diff(first) < 0).any() or (usual := int(np.median(count))) < 2:
-        return clock
+def spread(stamps: IntArray) -> tuple[IntArray, str]:
+    """Return ascending times [N], spread evenly where several rows share one, as in exports in whole seconds; a note.
+
+    Without shared times they stay as they are, and the note is empty.
+    """
+    times, first, count = np.unique(stamps, return_index=True, return_counts=True)
+    if len(times) < _CLOCKS["few_rows"] or (usual := int(np.median(count))) < 2:
+        return stamps, ""
     step = float(np.median(np.diff(times))) / usual
     # The first and last time may have fewer rows than the others.
     ends = np.array([first[1] - usual, *first[1:], first[-1] + usual])
     given = np.array([times[1] - usual * step, *times[1:], times[-1] + usual * step])
-    stamps = clock.stamps_ns.copy()
-    stamps[rows] = np.round(np.interp(np.arange(len(rows)), ends, given - times[0])).astype(np.int64) + times[0]
+    between = np.interp(np.arange(len(stamps)), ends, given - times[0])
     note = f"{usual} rows share each time: they are spread over {usual * step / _SECONDS:g} s"
-    return replace(clock, stamps_ns=stamps, notes=(*clock.notes, note))
+    return np.round(between).astype(np.int64) + times[0], note
 
 
 # ---- GPS weeks ----

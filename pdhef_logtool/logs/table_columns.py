@@ -286,15 +286,16 @@ def tables_of(
     if stamps is None:
         named_values = _named_values(sheet)
         clock = find_clock(sheet, where, rate_hz=None if named_values else rate_hz)
-        clock = clock if named_values else spread(clock)
         stamps, used = clock.stamps_ns, clock.columns
-        losses.extend(clock_notes(clock, where))
+        losses.extend(clock_notes(clock.notes, where))
         if named_values and (long := list(_of_long_form(sheet, stamps, *named_values))):
             for name, (part, its) in zip(unique(part.name for part, _ in long), long, strict=True):
                 yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
             return
     rows, lost = ascending_rows(stamps, f"{where}, {sheet.name}")
     losses.extend(lost)
+    times, note = spread(stamps[rows]) if used else (stamps[rows], "")
+    losses.extend(clock_notes([note] if note else (), where))
     groups: dict[bytes, tuple[BoolArray, dict[str, NDArray[Any]]]] = {}
     unusable = []
     for name, column in sheet.columns.items():
@@ -309,7 +310,7 @@ def tables_of(
             losses.append(Loss("bad-column", f"{name}: {len(column)} values for {len(stamps)} times", where))
             continue
         values = column[rows]
-        there = _own_rows(np.isfinite(values), stamps[rows])
+        there = _own_rows(np.isfinite(values), times)
         groups.setdefault(np.packbits(there).tobytes(), (there, {}))[1][name] = values[there]
     if unusable:
         what = f"columns without numbers are left out: {', '.join(unusable)}"
@@ -317,7 +318,7 @@ def tables_of(
     ordered = sorted(groups.values(), key=lambda group: -np.count_nonzero(group[0]))
     for number, (there, columns) in enumerate(ordered, 1):
         name = sheet.name if number == 1 else f"{sheet.name}_{number}"
-        yield Table.of_arrays(name, stamps[rows][there], columns, sheet.units, sheet.type_name)
+        yield Table.of_arrays(name, times[there], columns, sheet.units, sheet.type_name)
 
 
 def by_times(name: str, columns: dict[str, Any], units: dict[str, str]) -> Iterator[Sheet]:
@@ -337,9 +338,9 @@ def _ascends(column: NDArray[Any] | Series) -> bool:
     return isinstance(column, np.ndarray) and bool((np.diff(column[np.isfinite(column)]) > 0).all())
 
 
-def clock_notes(clock: Clock, where: str) -> list[Loss]:
+def clock_notes(notes: Iterable[str], where: str) -> list[Loss]:
     """Return the assumptions of a clock as notes."""
-    return [Loss("clock", note, where, severity="note") for note in clock.notes]
+    return [Loss("clock", note, where, severity="note") for note in notes]
 
 
 def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:

@@ -1,4 +1,4 @@
-"""Argument and result of a reader of tables.
+"""A file that is opened as a log; argument and result of a reader of tables.
 
 A reader of a table format (CSV, Parquet, MAT, MDF, BLF, ...) is a function ``TableFile -> Tables``. It runs in a
 separate process (:mod:`~pdhef_logtool.logs.reader_process`), which has an open file and limits, and no path.
@@ -7,11 +7,13 @@ separate process (:mod:`~pdhef_logtool.logs.reader_process`), which has an open 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
 
-from pdhef_logtool.logs.resource_limits import ResourceLimits
+from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import Meter, ResourceLimits
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
@@ -36,6 +38,25 @@ class TableSettings:
 
 
 NO_SETTINGS = TableSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class LogFile:
+    """A file to open.
+
+    Attributes
+    ----------
+    path : on this machine. place : as the user named it; ``path`` may be a decompressed or downloaded copy.
+    meter : counts the cost of reading. release : to be called when the log is closed; removes a copy.
+    cut : why a copy does not have all of the file; empty where it does. settings : of tables.
+    """
+
+    path: Path
+    place: LogPlace
+    meter: Meter
+    release: Callable[[], None] = lambda: None
+    cut: str = ""
+    settings: TableSettings = NO_SETTINGS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

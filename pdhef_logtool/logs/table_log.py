@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo, nearest
 from pdhef_logtool.logs.recording_span import survey_stamps
 from pdhef_logtool.logs.table_clocks import unlike_lengths
+from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -43,24 +43,6 @@ class Leaf:
     count: int | None
 
 
-@dataclass(frozen=True, slots=True)
-class WireLayout:
-    """Offsets of all leaves of a message.
-
-    Attributes
-    ----------
-    size : bytes of one message, encapsulation header included.
-    leaves : by their steps; arrays of primitives as one leaf.
-    lengths : (offset, uint32) in wire order: lengths of strings and sequences, which identify this layout.
-    texts : (offset, length without terminator) of every string, by its steps.
-    """
-
-    size: int
-    leaves: Mapping[Steps, Leaf]
-    lengths: tuple[tuple[int, int], ...]
-    texts: Mapping[Steps, tuple[int, int]]
-
-
 #: Returns the length of the string or sequence at these steps, with its length word at this offset.
 LengthOf: TypeAlias = Callable[[Steps, int, bool], int]
 
@@ -80,83 +62,89 @@ def layout_of_message(root: Node, wire: str, message: bytes) -> WireLayout:
             raise NoLayoutError("a length exceeds the message")
         return int(length)
 
-    return _Builder(wire, length_of, len(message)).built(root)
+    return WireLayout(root, wire, length_of, len(message))
 
 
-def build_layout(root: Node, wire: str, length_of: LengthOf) -> WireLayout:
-    """Lay out a message type with the variable lengths of ``length_of``; raises :class:`NoLayoutError`."""
-    return _Builder(wire, length_of, sys.maxsize).built(root)
+class WireLayout:
+    """Offsets of all leaves of a message type with the variable lengths of ``length_of``.
 
+    Attributes
+    ----------
+    size : bytes of one message, encapsulation header included.
+    leaves : by their steps; arrays of primitives as one leaf.
+    lengths : (offset, uint32) in wire order: lengths of strings and sequences, which identify this layout.
+    texts : (offset, length without terminator) of every string, by its steps.
 
-class _Builder:
-    def __init__(self, wire: str, length_of: LengthOf, end: int) -> None:
-        self.aligned = wire == "cdr"
-        self.origin = 4 if self.aligned else 0
-        self.position = self.origin
-        self.length_of = length_of
-        self.end = end
-        self.places = 0
+    Raises
+    ------
+    NoLayoutError : it has none, or is longer than ``end`` bytes.
+    """
+
+    def __init__(self, root: Node, wire: str, length_of: LengthOf, end: int = sys.maxsize) -> None:
+        self._aligned = wire == "cdr"
+        self._origin = 4 if self._aligned else 0
+        self.size = self._origin
+        self._length_of = length_of
+        self._end = end
+        self._places = 0
         self.leaves: dict[Steps, Leaf] = {}
         self.lengths: list[tuple[int, int]] = []
         self.texts: dict[Steps, tuple[int, int]] = {}
-
-    def built(self, root: Node) -> WireLayout:
-        self.place(root, ())
-        if self.position > self.end:
+        self._place(root, ())
+        if self.size > self._end:
             raise NoLayoutError("the message ends early")
-        return WireLayout(self.position, self.leaves, tuple(self.lengths), self.texts)
 
-    def align(self, size: int) -> None:
-        if self.aligned:
-            self.position += -(self.position - self.origin) % size
+    def _align(self, size: int) -> None:
+        if self._aligned:
+            self.size += -(self.size - self._origin) % size
 
-    def length_word(self, steps: Steps, is_text: bool) -> int:
-        self.align(4)
-        length = self.length_of(steps, self.position, is_text)
-        self.lengths.append((self.position, length))
-        self.position += 4
+    def _length_word(self, steps: Steps, is_text: bool) -> int:
+        self._align(4)
+        length = self._length_of(steps, self.size, is_text)
+        self.lengths.append((self.size, length))
+        self.size += 4
         return length
 
-    def place(self, node: Node, steps: Steps) -> None:
+    def _place(self, node: Node, steps: Steps) -> None:
         # Arrays in arrays multiply.
-        self.places += 1
-        if self.position > self.end or self.places > _MOST_PLACES:
-            raise NoLayoutError("the message ends early" if self.position > self.end else "too many places")
+        self._places += 1
+        if self.size > self._end or self._places > _MOST_PLACES:
+            raise NoLayoutError("the message ends early" if self.size > self._end else "too many places")
         if isinstance(node, Struct):
             for name, member in node.members.items():
-                self.place(member, (*steps, name))
+                self._place(member, (*steps, name))
         elif isinstance(node, Array):
-            count = node.length if node.length is not None else self.length_word(steps, False)
-            self.place_items(node.item, steps, count)
+            count = node.length if node.length is not None else self._length_word(steps, False)
+            self._place_items(node.item, steps, count)
         elif isinstance(node, Unknown):
             raise NoLayoutError("the type is not known in full")
         elif node.kind == "string":
-            self.place_text(node, steps)
+            self._place_text(node, steps)
         else:
-            self.place_numbers(node, steps, None)
+            self._place_numbers(node, steps, None)
 
-    def place_text(self, node: Scalar, steps: Steps) -> None:
+    def _place_text(self, node: Scalar, steps: Steps) -> None:
         if node.code:
             raise NoLayoutError("wide strings have no layout here")
-        length = self.length_word(steps, True)
-        self.texts[steps] = (self.position, max(length - 1, 0) if self.aligned else length)
-        self.position += length
+        length = self._length_word(steps, True)
+        self.texts[steps] = (self.size, max(length - 1, 0) if self._aligned else length)
+        self.size += length
 
-    def place_items(self, item: Node, steps: Steps, count: int) -> None:
+    def _place_items(self, item: Node, steps: Steps, count: int) -> None:
         if isinstance(item, Scalar) and item.kind != "string":
-            self.place_numbers(item, steps, count)
+            self._place_numbers(item, steps, count)
             return
         if count > UNROLLED_ELEMENTS:
             raise NoLayoutError("too many elements to unroll")
         for i in range(count):
-            self.place(item, (*steps, i))
+            self._place(item, (*steps, i))
 
-    def place_numbers(self, node: Scalar, steps: Steps, count: int | None) -> None:
+    def _place_numbers(self, node: Scalar, steps: Steps, count: int | None) -> None:
         dtype = np.dtype("<" + node.code)
         if count != 0:
-            self.align(dtype.itemsize)
-        self.leaves[steps] = Leaf(self.position, dtype, count)
-        self.position += dtype.itemsize * (1 if count is None else count)
+            self._align(dtype.itemsize)
+        self.leaves[steps] = Leaf(self.size, dtype, count)
+        self.size += dtype.itemsize * (1 if count is None else count)
 
 
 class LayoutReader:

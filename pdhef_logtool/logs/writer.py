@@ -7,9 +7,10 @@ schemas are written before the first chunk that uses them and again in the summa
 from __future__ import annotations
 
 import contextlib
+import heapq
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -37,9 +38,10 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, ChannelRecord, RawChunk
+from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.encoding import CdrEncoder
+from pdhef_logtool.logs.mcap_index import RECORD
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
-from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import LIBRARY
@@ -75,70 +77,13 @@ class TopicBatch:
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
-    """A message as ready bytes on a channel of :meth:`McapLogWriter.add_raw_channel`."""
+    """A message as ready bytes on a channel of :meth:`McapLogWriter.add_channel`."""
 
     channel: int
     log_time_ns: int
     publish_time_ns: int
     sequence: int
     data: bytes
-
-
-#: Message records to be written: log time, channel, bytes, and where they are: number of the source and row in it.
-_LISTED = np.dtype([("log", "<i8"), ("channel", "<i8"), ("length", "<i8"), ("source", "<i8"), ("row", "<i8")])
-
-
-class _Merged:
-    """Message records of several topics in order of log time, taken from the front.
-
-    Parameters
-    ----------
-    topics : channel, log times [N] and complete records uint8 [N, size] of each topic.
-    """
-
-    def __init__(self, topics: Sequence[tuple[int, IntArray, NDArray[np.uint8]]]) -> None:
-        self.sources = [records for _, _, records in topics]
-        self.listed = _in_order(
-            [_listed(log, channel, records.shape[1], i) for i, (channel, log, records) in enumerate(topics)]
-        )
-        self.ends: IntArray = np.cumsum(self.listed["length"])
-        self.position = 0
-
-    def take_until(self, until_ns: int | None) -> NDArray[np.void]:
-        """Remove and return the records before a time (None: all)."""
-        first, self.position = self.position, len(self.listed)
-        if until_ns is not None:
-            self.position = max(first, int(np.searchsorted(self.listed["log"], until_ns, side="left")))
-        return self.listed[first : self.position]
-
-    def take_chunk(self) -> NDArray[np.void]:
-        """Remove and return the records of one chunk."""
-        first, self.position = self.position, _end_of_chunk(self.ends, self.position)
-        return self.listed[first : self.position]
-
-    @property
-    def next_ns(self) -> int | None:
-        """Log time of the first record that is left."""
-        return int(self.listed["log"][self.position]) if self.position < len(self.listed) else None
-
-
-def _listed(log_time_ns: Any, channel: Any, length: Any, source: int) -> NDArray[np.void]:
-    listed = np.empty(len(log_time_ns), _LISTED)
-    listed["log"], listed["channel"], listed["length"], listed["source"] = log_time_ns, channel, length, source
-    listed["row"] = np.arange(len(listed))
-    return listed
-
-
-def _in_order(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
-    """Return lists of records as one, in order of log time; of equal times the earlier list comes first."""
-    listed = np.concatenate([np.empty(0, _LISTED), *parts])
-    return listed[np.argsort(listed["log"], kind="stable")]
-
-
-def _end_of_chunk(ends: IntArray, first: int) -> int:
-    """Return the record behind the chunk that begins with a record; ``ends`` are sums of bytes [N]."""
-    base = int(ends[first - 1]) if first else 0
-    return max(int(np.searchsorted(ends, base + CHUNK_BYTES, side="right")), first + 1)
 
 
 class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
@@ -243,20 +188,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._emit_record(channel)
         return channel.id
 
-    def add_raw_channel(
-        self,
-        topic: str,
-        *,
-        schema_name: str,
-        schema_encoding: str,
-        schema_data: bytes,
-        message_encoding: str,
-        metadata: Mapping[str, str],
-    ) -> int:
-        """Add a channel for :class:`RawMessage`, as :meth:`add_channel`."""
-        schema = schema_name, schema_encoding, schema_data
-        return self.add_channel(ChannelRecord(-1, topic, message_encoding, *schema, metadata))
-
     def has_ids_of(self, channel_id: int, record: ChannelRecord) -> bool:
         """Return whether a channel has the ids of a record, which a :class:`RawChunk` of its file needs."""
         return channel_id == record.id and self._channels[channel_id].schema_id == record.schema_id
@@ -287,30 +218,65 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         return free
 
     def write(self, batches: Sequence[TopicBatch], raws: Iterable[RawMessage | RawChunk] = ()) -> None:
-        """Write messages merged by log time; on equal times raw messages come first, then batches in their order.
+        """Write messages: batches merged by log time, and raw messages, which are consumed as they come and not held.
 
-        Raw messages are consumed as they come (in ascending log time) and not held. Raw chunks are written as they
-        are; the batches then become separate chunks, and all chunks are sorted by their first log times.
+        Raw chunks are written as they are. Raw messages and batches are in separate chunks, which are sorted by their
+        first log times; of equal times raw messages come first.
         """
-        merged = _Merged([self._encode(batch) for batch in batches if len(batch.log_time_ns)])
+        own = self._chunks_of_batches([self._encode(batch) for batch in batches if len(batch.log_time_ns)])
+        for chunk in heapq.merge(self._chunks_of_raws(raws), own, key=lambda chunk: chunk.start_ns):
+            self._emit_chunk(chunk)
+
+    def _chunks_of_raws(self, raws: Iterable[RawMessage | RawChunk]) -> Iterator[RawChunk]:
         group: list[RawMessage] = []
         size = 0
         for raw in raws:
-            if isinstance(raw, RawChunk):
-                start_ns = raw.start_ns
-                if group:
-                    self._write_merged(group, merged, merged.take_until(start_ns))
-                    group, size = [], 0
-                while merged.next_ns is not None and merged.next_ns < start_ns:
-                    self._write_merged([], merged, merged.take_chunk())
-                self._emit_chunk(raw)
-                continue
-            group.append(raw)
-            size += len(raw.data) + MESSAGE_HEAD.itemsize
-            if size >= CHUNK_BYTES:
-                self._write_merged(group, merged, merged.take_until(raw.log_time_ns))
+            if isinstance(raw, RawMessage):
+                group.append(raw)
+                size += MESSAGE_HEAD.itemsize + len(raw.data)
+            if group and (isinstance(raw, RawChunk) or size >= CHUNK_BYTES):
+                yield self._chunk_of(group)
                 group, size = [], 0
-        self._write_merged(group, merged, merged.take_until(None))
+            if isinstance(raw, RawChunk):
+                yield raw
+        if group:
+            yield self._chunk_of(group)
+
+    def _chunk_of(self, raws: Sequence[RawMessage]) -> RawChunk:
+        length = np.array([len(raw.data) for raw in raws]) + MESSAGE_HEAD.itemsize
+        about = zip(length - RECORD.size, raws, strict=True)
+        records = (
+            _PACKED_HEAD.pack(Opcode.MESSAGE, n, r.channel, r.sequence, r.log_time_ns, r.publish_time_ns) + r.data
+            for n, r in about
+        )
+        channel, log_time = np.array([r.channel for r in raws]), np.array([r.log_time_ns for r in raws])
+        return self._compressed(b"".join(records), channel, log_time, np.cumsum(length) - length)
+
+    def _chunks_of_batches(self, topics: Sequence[tuple[int, IntArray, NDArray[np.uint8]]]) -> Iterator[RawChunk]:
+        """Yield the chunks of topics with channel, log times [N] and records uint8 [N, size] each.
+
+        Of equal times the earlier topic comes first.
+        """
+        none = np.empty(0, np.int64)
+        log_time = np.concatenate([none, *(log for _, log, _ in topics)])
+        order = np.argsort(log_time, kind="stable")
+        counts = [len(log) for _, log, _ in topics]
+        log_time, source = log_time[order], np.repeat(np.arange(len(topics)), counts)[order]
+        row = np.concatenate([none, *map(np.arange, counts)])[order]
+        channel = np.array([channel for channel, _, _ in topics], np.int64)[source]
+        length = np.array([records.shape[1] for _, _, records in topics], np.int64)[source]
+        ends = np.cumsum(length)
+        first = 0
+        while first < len(ends):
+            begin = ends[first] - length[first]
+            last = max(int(np.searchsorted(ends, begin + CHUNK_BYTES, side="right")), first + 1)
+            content = np.empty(ends[last - 1] - begin, np.uint8)
+            start = ends[first:last] - length[first:last] - begin
+            for i in np.unique(source[first:last]).tolist():
+                its = source[first:last] == i
+                _scatter(content, start[its], topics[i][2][row[first:last][its]])
+            yield self._compressed(content.data, channel[first:last], log_time[first:last], start)
+            first = last
 
     def _encode(self, batch: TopicBatch) -> tuple[int, IntArray, NDArray[np.uint8]]:
         """Return channel, log times and message records of a batch."""
@@ -332,39 +298,16 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         rows[:, : MESSAGE_HEAD.itemsize] = head.view(np.uint8).reshape(n, MESSAGE_HEAD.itemsize)
         return channel, batch.log_time_ns.astype(np.int64), rows
 
-    def _write_merged(self, raws: Sequence[RawMessage], merged: _Merged, listed: NDArray[np.void]) -> None:
-        """Merge raw messages and listed records by log time and cut into chunks."""
-        raw_records = [
-            _PACKED_HEAD.pack(Opcode.MESSAGE, 22 + len(r.data), r.channel, r.sequence, r.log_time_ns, r.publish_time_ns)
-            + r.data
-            for r in raws
-        ]
-        if raws:
-            log_time, channel = [r.log_time_ns for r in raws], [r.channel for r in raws]
-            listed = _in_order([_listed(log_time, channel, [*map(len, raw_records)], -1), listed])
-        ends = np.cumsum(listed["length"])
-        first = 0
-        while first < len(listed):
-            last = _end_of_chunk(ends, first)
-            part = listed[first:last]
-            start = ends[first:last] - part["length"] - (ends[first] - part["length"][0])
-            content = np.empty(int(part["length"].sum()), dtype=np.uint8)
-            for i in np.unique(part["source"]).tolist():
-                its = part["source"] == i
-                scatter(content, start[its], part["row"][its], raw_records if i < 0 else merged.sources[i])
-            self.write_chunk(content.data, part["channel"], part["log"], start)
-            first = last
-
-    def write_chunk(
+    def _compressed(
         self, records: bytes | memoryview, channel: IntArray, log_time_ns: IntArray, offset: IntArray
-    ) -> None:
-        """Write message records as one chunk; channel, log time and offset [N] of each record in it."""
+    ) -> RawChunk:
+        """Return message records as a chunk; channel, log time and offset [N] of each record in it."""
         if self._compressor is None:
             import zstandard
 
             self._compressor = zstandard.ZstdCompressor(level=self._level)
         stored = self._compressor.compress(records)
-        self._emit_chunk(RawChunk("zstd", stored, len(records), crc32(records), channel, log_time_ns, offset))
+        return RawChunk("zstd", stored, len(records), crc32(records), channel, log_time_ns, offset)
 
     def _emit_chunk(self, chunk: RawChunk) -> None:
         channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
@@ -501,17 +444,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         return start, len(data)
 
 
-def scatter(
-    content: NDArray[np.uint8], start: IntArray, row: IntArray, source: NDArray[np.uint8] | Sequence[bytes]
-) -> None:
-    """Copy records of ``source``, by their rows there, to their places in a chunk."""
-    if isinstance(source, np.ndarray):
-        size = source.shape[1]
-        record = np.dtype((np.void, size))
-        # A view of a record at every byte: one indexed assignment copies them all.
-        places = np.ndarray((len(content) - size + 1,), dtype=record, buffer=content.data, strides=(1,))
-        places[start] = source[row].view(record)[:, 0]
-        return
-    for to, i in zip(start.tolist(), row.tolist(), strict=True):
-        data = source[i]
-        content[to : to + len(data)] = np.frombuffer(data, dtype=np.uint8)
+def _scatter(content: NDArray[np.uint8], start: IntArray, records: NDArray[np.uint8]) -> None:
+    """Copy records [N, size] to their places [N] in a chunk."""
+    record = np.dtype((np.void, records.shape[1]))
+    # A view of a record at every byte: one indexed assignment copies them all.
+    places = np.ndarray((len(content) - record.itemsize + 1,), dtype=record, buffer=content.data, strides=(1,))
+    places[start] = records.view(record)[:, 0]

@@ -154,10 +154,6 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     MappingError : A device clock has no usable stamp in the span.
     """
     resolved = resolve_mapping(log, mapping)
-    expected: dict[str, list[str]] = {}
-    for source in (s for s in resolved.sources() if s.can_signal is None):
-        request_source(log, source, expected)
-    log.expect(expected)
     log = with_can_signals(log, resolved)
     wanted = sources_by_clock(resolved)
     requests: dict[str, list[str]] = {}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.logs.schema_files import schema_file
+from pdhef_logtool.logs.definitions import schema_file
 
 if TYPE_CHECKING:
     import pyarrow as pa

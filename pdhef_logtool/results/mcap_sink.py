@@ -15,9 +15,9 @@ from mcap.records import Attachment
 from numpy.typing import NDArray
 
 from pdhef_logtool.evaluation.dead_reckoned import pose_known
-from pdhef_logtool.logs.container import RawChunk
+from pdhef_logtool.logs.container import ChannelRecord, RawChunk
+from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.errors import OutputError
@@ -240,14 +240,8 @@ class AnnotatedMcap:
             self._writer.write([], raws=raws)
 
     def _raw_channel(self, topic: str, type_name: str) -> int:
-        return self._writer.add_raw_channel(
-            topic,
-            schema_name=type_name,
-            schema_encoding="ros2msg",
-            schema_data=message_definition(type_name).encode(),
-            message_encoding="cdr",
-            metadata={},
-        )
+        definition = message_definition(type_name).encode()
+        return self._writer.add_channel(ChannelRecord(-1, topic, "cdr", type_name, "ros2msg", definition))
 
 
 def _pieces(tracks: Sequence[StateTrack]) -> Iterator[tuple[int, int]]:

@@ -14,6 +14,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.container import ChannelRecord
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.signals import IntArray
 from studies.strangers import buses, tables
@@ -89,8 +90,7 @@ def _joints(writer: McapLogWriter, topic: Topic) -> Iterator[RawMessage]:
     """Yield the messages of joints, with an array of texts as names."""
     types, kind = _store(False).types, topic.type_name
     text = definition(kind).encode()
-    about: dict[str, Any] = {"schema_encoding": "ros2msg", "schema_data": text, "message_encoding": "cdr"}
-    channel = writer.add_raw_channel(topic.name, schema_name=kind, metadata={}, **about)
+    channel = writer.add_channel(ChannelRecord(-1, topic.name, "cdr", kind, "ros2msg", text))
     names = str(topic.constants["name"]).split()
     columns = {name: topic.fields[name] for name in ("position", "velocity", "effort")}
     for i, (arrival, stamp) in enumerate(zip(topic.arrival_ns.tolist(), topic.stamps_ns.tolist(), strict=True)):
@@ -137,13 +137,15 @@ def _mcap_ros1(topics: Sequence[Topic], path: Path) -> Path:
     path = path.with_suffix(".mcap")
     with McapLogWriter(path, profile="ros1") as writer:
         ids = {
-            t.name: writer.add_raw_channel(
-                t.name,
-                schema_name=t.type_name.replace("/msg/", "/"),
-                schema_encoding="ros1msg",
-                schema_data=definition(t.type_name, ros1=True).encode(),
-                message_encoding="ros1",
-                metadata={},
+            t.name: writer.add_channel(
+                ChannelRecord(
+                    -1,
+                    t.name,
+                    "ros1",
+                    t.type_name.replace("/msg/", "/"),
+                    "ros1msg",
+                    definition(t.type_name, ros1=True).encode(),
+                )
             )
             for t in topics
         }
@@ -214,14 +216,8 @@ def _raw_mcap(
     ids = {}
     for t in topics:
         schema_encoding, data = schema(t)
-        ids[t.name] = writer.add_raw_channel(
-            t.name,
-            schema_name=t.type_name if schema_encoding else "",
-            schema_encoding=schema_encoding,
-            schema_data=data,
-            message_encoding=encoding,
-            metadata={},
-        )
+        name = t.type_name if schema_encoding else ""
+        ids[t.name] = writer.add_channel(ChannelRecord(-1, t.name, encoding, name, schema_encoding, data))
     return writer, ids
 
 

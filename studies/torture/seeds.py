@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.logs.schema_files import message_definition
+from pdhef_logtool.logs.definitions import message_definition
 
 START_NS = 1_767_225_600_000_000_000
 _RATE_HZ = 50

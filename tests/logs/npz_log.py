@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pdhef_logtool.logs.formats import LogFormat
-from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.logs.table_log import Table, TableLog
 
 

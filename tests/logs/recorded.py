@@ -11,6 +11,7 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.summary import Summary
 
+from pdhef_logtool.logs.container import ChannelRecord
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter
@@ -78,10 +79,7 @@ def messages_of(path: Path, without: str = "") -> list[tuple[object, ...]]:
 
 def raw_channel(writer: McapLogWriter, topic: str, name: str = "", text: bytes = b"", message: str = "cdr") -> int:
     """Add a channel with a ROS 2 definition, or without a schema."""
-    kind = "ros2msg" if name else ""
-    return writer.add_raw_channel(
-        topic, schema_name=name, schema_encoding=kind, schema_data=text, message_encoding=message, metadata={}
-    )
+    return writer.add_channel(ChannelRecord(-1, topic, message, name, "ros2msg" if name else "", text))
 
 
 def write_vectors(folder: Path, topic: str, count: int, storage: str = "sqlite3", compression: str = "") -> Path:

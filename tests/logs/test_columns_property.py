@@ -166,7 +166,7 @@ def test_columns_equal_the_independent_deserialiser(
 
 def _with_payloads(path: Path, payload_bytes: int) -> None:
     """Write 200 numbers, and as many payloads of another topic between them."""
-    from pdhef_logtool.logs.schema_files import message_definition
+    from pdhef_logtool.logs.definitions import message_definition
 
     name = "std_msgs/msg/Float64"
     noise = np.random.default_rng(0).bytes(payload_bytes)

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.logs.definitions import read_definitions
+from pdhef_logtool.logs.definitions import message_definition, read_definitions
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import MappingError, UsageError

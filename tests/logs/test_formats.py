@@ -18,12 +18,11 @@ import pytest
 from pdhef_logtool import Car, inspect_log, read_drive
 from pdhef_logtool.logs import formats
 from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.mat_log import open_mat
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import LogFile, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError, PdhefError, UsageError
 

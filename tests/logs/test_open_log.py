@@ -185,18 +185,3 @@ def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: py
     assert len(opened) > 3
     # One more time for the example message of a topic without a schema.
     assert sorted(opened.values())[-2:] in ([1, 1], [1, 2])
-
-
-def test_expected_fields_are_those_of_a_plain_read(mixed: Path) -> None:
-    with closing(open_log(mixed)) as log, closing(open_log(mixed)) as plain:
-        requests = {t.name: [f.path for f in log.fields(t.name) if f.kind == "number"][:3] for t in log.topics}
-        requests = {topic: paths for topic, paths in requests.items() if paths}
-        log.expect({topic: paths[:1] for topic, paths in requests.items()})
-        middle = (log.start_ns + log.end_ns) // 2
-        for window in ((log.start_ns, middle), (middle, log.end_ns), (None, None)):
-            for fields in ({t: p[:1] for t, p in requests.items()}, requests):
-                kept, read = log.read(fields, *window), plain.read(fields, *window)
-                for topic, columns in read.items():
-                    np.testing.assert_array_equal(kept[topic].log_time_ns, columns.log_time_ns)
-                    for path, values in columns.fields.items():
-                        np.testing.assert_array_equal(kept[topic].fields[path], values)

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema
+from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, leaves, resolve
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
-from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError
 from tests.mcap_files import mcap_writer
 

@@ -778,3 +778,20 @@ def test_a_magnitude_and_its_sign_are_one_signal(tmp_path: Path) -> None:
     path.write_text("\n".join(["time,ESP_Gierrate [rad/s],ESP_VZ_Gierrate,Other_sign", *rows, ""]))
     source = inspect_log(path).mapping.signals["yaw_rate_rad_s"]
     assert (source.field, source.combine) == (("ESP_Gierrate", "ESP_VZ_Gierrate"), "signed")
+
+
+def test_of_a_table_that_starts_again_the_first_pass_is_kept_and_rows_that_share_seconds_are_still_spread(
+    tmp_path: Path,
+) -> None:
+    passes = [f"{1_700_000_000 + i / 50:.2f},{i}\n" for i in range(150)] * 3
+    seconds = [f"{1_700_000_000 + i // 5},{i}\n" for i in range(150)]
+    seconds[70] = "1699999999,0\n"
+    for name, rows, kept, kind in (("a", passes, 150, "time-jump"), ("b", seconds, 149, "out-of-order")):
+        path = tmp_path / f"{name}.csv"
+        path.write_text("time,speed\n" + "".join(rows))
+        with closing(open_log(path)) as log:
+            stamps = log.read({"csv": ["speed"]})["csv"].log_time_ns
+            (left_out,) = [loss for loss in log.lost if loss.kind != "clock"]
+        assert (len(stamps), len({*stamps.tolist()})) == (kept, kept)
+        assert (left_out.kind, left_out.count) == (kind, len(rows) - kept)
+        assert ("at row 151" in left_out.what, left_out.severity == "lost") == (kind == "time-jump",) * 2
