@@ -27,7 +27,7 @@ from pdhef_logtool.results.opened_run import TABLES, TABLES_FOLDER, table_file
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.tables import drive_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal
-from studies.pages import DOCS, options, table, template, write
+from studies.pages import DOCS, options, table, update
 
 LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2
 COUNTS = (5, 10, 30, 100)
@@ -127,8 +127,8 @@ def cost(drives: int) -> list[str]:
     return [f"{drives:,}", f"{figures:,}", f"{command.seconds:.1f}", f"{command.peak_bytes / (1 << 20):.0f}"]
 
 
-def page(times: int, planted: int, drives: int) -> str:
-    """Return the page of results."""
+def blocks(times: int, planted: int, drives: int) -> dict[str, str]:
+    """Return the tables by name."""
     false_alarms, detected = [], []
     for count in COUNTS:
         alarms = [share_closed(draw, count, times, 0.0, 1) for draw in (normal, heavy_tailed)]
@@ -137,31 +137,23 @@ def page(times: int, planted: int, drives: int) -> str:
         false_alarms.append([str(count), *(f"{x:.1%}" for x in (*alarms, naive))])
         detected.append([str(count), *(f"{x:.1%}" for x in hits)])
     days = [[f"{x:.0%}", *(f"{y:.1%}" for y in shares_of_days(x, times, 4))] for x in SHARED]
-    return template(
-        __file__,
-        times=f"{times:,}",
-        planted=f"{planted:,}",
-        spread=SPREAD,
-        limit=f"{LIMIT:.0%}",
-        worse=f"{PLANTED:.0%}",
-        drives=DAYS * DRIVES_A_DAY,
-        number_of_days=DAYS,
-        false_alarms=table(["drives", "normal", "heavy tails", "ratio of means"], false_alarms, right_from=0),
-        detected=table(["drives", "normal", "heavy tails"], detected, right_from=0),
-        days=table(["between days", "--cluster none", "default: dependence is estimated"], days, right_from=0),
-        cost=table(["drives", "figures", "processor s", "MiB at most"], [cost(drives)], right_from=0),
-    )
+    return {
+        "false_alarms": table("drives, normal, heavy tails, ratio of means", false_alarms, right_from=0),
+        "detected": table("drives, normal, heavy tails", detected, right_from=0),
+        "days": table("between days, --cluster none, default: dependence is estimated", days, right_from=0),
+        "cost": table("drives, figures, processor s, MiB at most", [cost(drives)], right_from=0),
+    }
 
 
 def main() -> None:
-    """Write docs/comparing.md."""
+    """Write the tables into docs/calibration.md."""
     parser = options("comparing", __doc__)
-    parser.add_argument("--times", type=int, default=5000)
-    parser.add_argument("--planted", type=int, default=2000)
-    parser.add_argument("--drives", type=int, default=10_000)
+    parser.add_argument("--times", type=int, default=5000, help="relabellings without a change")
+    parser.add_argument("--planted", type=int, default=2000, help="runs with a change")
+    parser.add_argument("--drives", type=int, default=10_000, help="of the run that is compared with itself")
     parser.add_argument("--out", type=Path, default=DOCS)
     given = parser.parse_args()
-    write(given.out / "comparing.md", page(given.times, given.planted, given.drives))
+    update(given.out, "calibration.md", blocks(given.times, given.planted, given.drives))
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ DRIVES = ROOT.parent / "shared" / "data" / "drives"
 INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
 
 
-def table(head: Iterable[str], body: Iterable[Iterable[str]], *, right_from: int | None = None) -> str:
-    """Return a Markdown table, columns from ``right_from`` on ranged right."""
-    names = list(head)
+def table(head: str | Iterable[str], body: Iterable[Iterable[str]], *, right_from: int | None = None) -> str:
+    """Return a Markdown table, columns from ``right_from`` on ranged right; a text as head has commas between names."""
+    names = head.split(", ") if isinstance(head, str) else list(head)
     rule = ["---" if right_from is None or i < right_from else "---:" for i in range(len(names))]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, rule, *body))
 
@@ -52,8 +52,13 @@ def template(module: str, **texts: object) -> str:
     return Path(module).with_suffix(".md").read_text(encoding="utf-8").format(**texts)
 
 
+def update(folder: Path, name: str, blocks: Mapping[str, str]) -> None:
+    """Write a page of the documentation with new blocks into a folder; the text about them is written by hand."""
+    write(folder / name, fill((DOCS / name).read_text(encoding="utf-8"), blocks, name))
+
+
 def write(path: Path, text: str) -> None:
-    """Write a page atomically and print its path."""
+    """Write a file atomically and print its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, text.encode())
     print(path)

@@ -25,5 +25,5 @@ def test_the_stored_page_is_that_of_the_stored_results(tmp_path: Path) -> None:
     results = conditions.RESULTS / "conditions"
     for name in ("facts.json", "metrics.parquet"):
         (tmp_path / name).write_bytes((results / name).read_bytes())
-    assert conditions.main(["--render", "--results", str(tmp_path), "--out", str(tmp_path)]) == 0
+    assert conditions.main(["--stored", "--results", str(tmp_path), "--out", str(tmp_path)]) == 0
     assert (tmp_path / "conditions.md").read_bytes() == (conditions.DOCS / "conditions.md").read_bytes()
