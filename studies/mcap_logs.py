@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,8 +32,14 @@ def messages(log: Path) -> Iterator[Message]:
             yield Message(*times, channel.topic, message.data, channel.message_encoding, named)
 
 
-def write_log(path: Path, written: Iterable[Message], profile: str = "", **options: Any) -> Path:
-    """Write messages in their order; ``options`` of ``mcap.writer.Writer``."""
+def write_log(
+    path: Path,
+    written: Iterable[Message],
+    profile: str = "",
+    end: Callable[[Writer], object] = lambda _: None,
+    **options: Any,
+) -> Path:
+    """Write messages in their order; ``end`` may write more; ``options`` of ``mcap.writer.Writer``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with PendingFile(path) as pending:
         writer = Writer(str(pending.path), **options)
@@ -44,5 +50,6 @@ def write_log(path: Path, written: Iterable[Message], profile: str = "", **optio
                 schema = writer.register_schema(*m.schema) if m.schema[0] else 0
                 channels[m.topic] = writer.register_channel(m.topic, m.encoding, schema)
             writer.add_message(channels[m.topic], m.log_time_ns, m.data, m.publish_time_ns, i)
+        end(writer)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without types
     return path

@@ -25,11 +25,10 @@ from pdhef_logtool.workers.supervisor import Limits
 from studies.pages import DOCS, ROOT, fill, options, table, write
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
-from studies.torture.formats import HANG_S, format_judge
 from studies.torture.hours import write_hours
-from studies.torture.logs import log_judge
+from studies.torture.mutants import HANG_S, format_judge, log_judge
 from studies.torture.outside import measured
-from studies.torture.table_seeds import FORMATS
+from studies.torture.seeds import FORMATS
 from studies.torture.workers import NO_VERDICT, Verdict, judge, run_cases
 
 _THREE = ("run", "--car", "saloon", "--annotate", "none", "--estimators", "zero,kinematic,phy-ukf")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from studies.torture.mutating import EDGES, TEXTS, damage_bytes
-from studies.torture.table_seeds import TOPICS
+from studies.torture.seeds import TOPICS
 
 #: Writes this file where a reader evaluates it.
 CALL = b"__import__('os').system('echo x > formula_was_run')"
