@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -89,15 +89,6 @@ def signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParame
     """Return a drive's signals as a vehicle file reads them; they were loaded with the starting file's ratio."""
     ratio = start.steering_ratio / vehicle.steering_ratio
     return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
-
-
-def part_of(drive: FitDrive, a: int, b: int) -> FitDrive:
-    """Return the stamps [a, b) of a drive."""
-    columns = {}
-    for f in fields(StateTrack):
-        value = getattr(drive.truth, f.name)
-        columns[f.name] = value if f.name == "name" or value.shape[0] != len(drive.truth) else value[a:b]
-    return replace(drive, signals=drive.signals.rows(a, b), truth=StateTrack(**columns))
 
 
 def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
