@@ -91,7 +91,6 @@ quick: $(VENV)/installed-dev $(VENV)/compiled
 
 pages: $(VENV)/installed-dev $(VENV)/compiled
 	$(PYTEST) tests/reports tests/results
-	OMP_NUM_THREADS=1 $(BIN)/python -m studies.comparing
 	OMP_NUM_THREADS=1 $(BIN)/python tests/reports/screenshots.py
 
 # Tests that take too long for `make test` or need extras: Ray, S3.

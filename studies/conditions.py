@@ -43,6 +43,10 @@ DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
 #: Okabe and Ito (2008), without yellow.
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
 RESAMPLES = 2000
+README_ROWS = (
+    "extrapolation", "unseen-manoeuvre", "other-vehicle", "friction-minus-20", "mass-plus-20", "bank-and-grade",
+    INDEPENDENT_ROW, "in-domain", "paper-a", "paper-b",
+)  # fmt: skip
 KEPT_METRICS = ("rmse", "availability", "coverage95", "lag_s", "nees", "nis", "nis_dof")
 
 
@@ -164,6 +168,8 @@ def write_page(out: Path, folder: Path) -> None:
         numbers = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
         counts.append([reference, *numbers, ", ".join(above) or "none"])
     head = ["row", "condition", "drives", *drawn, f"coverage of {SUBJECT}"]
+    few = [cells[1:-1] for name in README_ROWS for cells in summary if cells[0] == name]
+    update(out, "README.md", {"conditions": table(head[1:-1], few, right_from=1)})
     update(out, "conditions.md", {
         "command": f"Command: `{facts['command']}`. Car: {facts['car']}; pdhef-logtool {facts['version']}.",
         "summary": table(head, summary),

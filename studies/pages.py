@@ -53,8 +53,13 @@ def template(module: str, **texts: object) -> str:
 
 
 def update(folder: Path, name: str, blocks: Mapping[str, str]) -> None:
-    """Write a page of the documentation with new blocks into a folder; the text about them is written by hand."""
-    write(folder / name, fill((DOCS / name).read_text(encoding="utf-8"), blocks, name))
+    """Put new blocks into a page of the documentation, or README.md, whose other text is written by hand.
+
+    ``folder`` : where the page is written if it is not ``docs`` itself.
+    """
+    page = (ROOT if name == "README.md" else DOCS) / name
+    target = page if folder == DOCS else folder / name
+    write(target, fill(page.read_text(encoding="utf-8"), blocks, name))
 
 
 def write(path: Path, text: str) -> None:

@@ -24,7 +24,7 @@ import polars as pl
 
 from studies.gates.tool import Tool
 from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, update, write, write_toml
-from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
+from studies.peers.drives import FULL_SIZE, PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 
 RESULTS_FILE = RESULTS / "teaching.json"
 #: No pair may be worse than untaught by more than the larger of this share and this many degrees.
@@ -200,10 +200,6 @@ def pair_table(results: Sequence[Pair]) -> str:
 
 def summary(results: Sequence[Pair]) -> str:
     """Return the figures that the targets are about."""
-
-    def mean(ratios: Sequence[float]) -> str:
-        return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({len(ratios)} pairs)" if ratios else "–"
-
     referred = [r for r in results if r["reference"]]
     alike, unlike = ([ratio(r) for r in results if (r["hybrid"]["active"] >= ALIKE) is side] for side in (True, False))
     small = [r["hybrid"]["rmse_deg"] / r["kinematic_deg"] for r in results if r["car"] == "1:10 F1TENTH"]
@@ -221,6 +217,24 @@ def summary(results: Sequence[Pair]) -> str:
             str(sum(is_worse(r, "reference") for r in referred)),
     }  # fmt: skip
     return table("figure, value", lines.items())
+
+
+def readme_text(results: Sequence[Pair]) -> str:
+    """Return the result in a sentence."""
+    full_size = {part.car for part in PEER_DRIVES if part.group == FULL_SIZE}
+    full = [ratio(r) for r in results if r["car"] in full_size]
+    worse = ", ".join(f"`{r['scored']}` by {ratio(r) - 1.0:.0%}" for r in results if is_worse(r)) or "none"
+    of_all, of_prior = mean([ratio(r) for r in results]), mean([ratio(r, "prior") for r in results])
+    return (
+        f"A car taught on a recorded drive has {of_all} times the error on other drives, full-size cars {mean(full)}, "
+        f"by the taught prior alone {of_prior}; worse by more than 5 % and 0.03°: {worse} "
+        "([teaching](docs/peers.md#teaching))."
+    )
+
+
+def mean(ratios: Sequence[float]) -> str:
+    """Return the geometric mean of ratios and their number, a dash without any."""
+    return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({len(ratios)} pairs)" if ratios else "–"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -243,6 +257,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 print(pair_table([result]).splitlines()[-1], file=sys.stderr)
         write(given.results, json.dumps(results, indent=1) + "\n")
     stored = json.loads(given.results.read_text(encoding="utf-8"))
+    update(given.out, "README.md", {"teaching": readme_text(stored)})
     update(given.out, "peers.md", {"pairs": pair_table(stored), "pairs_summary": summary(stored)})
     return 0
 
