@@ -221,6 +221,7 @@ TOPICS = (
     Topic("/imu", "bus", _STAMPS, _STAMPS, {"accel_y [m/s^2]": _SPEED * _RATE, "yaw_rate [rad/s]": _RATE}),
     Topic("/car", "bus", _STAMPS, _STAMPS, {"speed [m/s]": _SPEED, "steering_angle [rad]": 0.2 * _RATE}),
 )
+RECORDINGS = ("mcap", "bag", "db3")
 #: Suffix and layouts of each format; a number after a version of MDF is its compression.
 FORMATS: dict[str, tuple[str, tuple[str, ...]]] = {
     "csv": ("csv", ("csv", "csv-german", "csv-gps", "csv-lab", "csv-dated", "csv-sources", "csv-pipes", "csv-long")),
@@ -232,11 +233,14 @@ FORMATS: dict[str, tuple[str, tuple[str, ...]]] = {
     "mdf4": ("mf4", ("mdf", "4.11 2", "can-mdf")),
     "blf": ("blf", ("can-blf",)),
     "asc": ("asc", ("can-asc",)),
+    **{suffix: (suffix, tuple(name for name in SEEDS if name.endswith(suffix))) for suffix in RECORDINGS},
 }
 
 
 def table_seeds(name: str, folder: Path) -> list[bytes]:
     """Return the sound files of a format; a folder takes files in between."""
+    if name in RECORDINGS:
+        return [content for seed, content in write_seeds(folder).items() if seed in FORMATS[name][1]]
     return [_seed(layout, folder) for layout in FORMATS[name][1]]
 
 
