@@ -11,7 +11,7 @@ import sys
 import zlib
 from pathlib import Path
 
-from benchmarks.measuring import ROUNDS, Row, best_seconds, command_cost, peak_bytes
+from benchmarks.measuring import ROUNDS, Row, best_seconds, command_cost
 from benchmarks.one_hour_log import HOUR_S, IMAGE_LOG_S, MAPPED, SHARED_S, drive_log, image_log
 
 #: Share of the hour that the peer decodes.
@@ -79,8 +79,9 @@ def rows() -> list[Row]:
     images = image_log(SHARED_S)
     once = best_seconds({"floor": lambda: decompress_all(images)})
     shared = min(command_cost("inspect", images).seconds for _ in range(ROUNDS))
-    without = peak_bytes("benchmarks.reading", str(drive_log(IMAGE_LOG_S)))
-    with_images = peak_bytes("benchmarks.reading", str(image_log()))
+    without, with_images = (
+        command_cost(log, module="benchmarks.reading").peak_bytes for log in (drive_log(IMAGE_LOG_S), image_log())
+    )
     return [
         Row("decompress all and check the CRC: lower bound", fast["floor"], "s"),
         Row("read 11 fields of 5 topics with CRC", ours, "s", peers={"rosbags": peer / ours}),
