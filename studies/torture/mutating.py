@@ -132,7 +132,7 @@ def _with_text(payload: bytes, rng: random.Random) -> bytes:
 
 #: Head and body: operation and payload of MCAP, header and data of a bag.
 Record = tuple[bytes, bytes]
-_MAGIC = b"\x89MCAP0\r\n"
+MAGIC = b"\x89MCAP0\r\n"
 _CHUNK = b"\6"
 #: Records behind the data of a file, which are missing after its recorder was killed.
 _SUMMARY = (b"\7", b"\x08", b"\x0b", b"\x0d", b"\x0e")
@@ -143,7 +143,7 @@ def damage_mcap(content: bytes, rng: random.Random) -> bytes:
     records = _damaged(_split_mcap(content[8:-8]), _damage_mcap_chunk, rng)
     if rng.random() < 0.2:
         records = [r for r in records if r[0] not in _SUMMARY]
-    return _MAGIC + join_mcap(records) + (_MAGIC if rng.random() < 0.9 else b"")
+    return MAGIC + join_mcap(records) + (MAGIC if rng.random() < 0.9 else b"")
 
 
 def damage_bag(content: bytes, rng: random.Random) -> bytes:
