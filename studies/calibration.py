@@ -27,7 +27,7 @@ from studies.drawn_cars import KINDS, DrawnCar, draw_car
 from studies.gates.tool import Tool, reports
 from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, update, write_toml, write_validated_car
 from truthsim.batch import sensor_noise
-from truthsim.drive import simulate_drive, write_drive
+from truthsim.drive import simulate_drive
 from truthsim.vehicle import GRAVITY_M_S2
 from truthsim.vehicle_choice import choose_vehicle
 
@@ -127,8 +127,6 @@ def outcomes(tool: Tool, index: int) -> tuple[list[dict[str, Any]], list[dict[st
     logs: dict[str, Path] = {}
     for manoeuvre, speed, duration_s in DRIVEN:
         name = f"{manoeuvre}-{speed:.0f}"
-        log = tool.work / "logs" / f"{index}-{name}.mcap"
-        log.parent.mkdir(parents=True, exist_ok=True)
         noise = sensor_noise(dict(car.drawn.sensors) | {"steer_gain": 0.0})
         try:
             drive = simulate_drive(
@@ -138,9 +136,7 @@ def outcomes(tool: Tool, index: int) -> tuple[list[dict[str, Any]], list[dict[st
         except PdhefError as error:  # it would spin
             print(f"car {index}, {manoeuvre} is left out: {error}", file=sys.stderr)
             continue
-        log.unlink(missing_ok=True)
-        write_drive(drive, log, steering_wheel=True)
-        logs[name] = log
+        logs[name] = tool.log(f"{index}-{name}", drive, steering_wheel=True)
     runs, scores = list[dict[str, Any]](), list[dict[str, Any]]()
     for (file, vehicle), is_calibrated in product(car.files.items(), (False, True)):
         name, folder = f"{index}-{file}", tool.work / "cars"

@@ -25,7 +25,7 @@ import polars as pl
 from pdhef_logtool import PdhefError, __version__
 from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool
-from studies.pages import DOCS, INDEPENDENT, RESULTS, ROOT, number, options, table, update, write, write_toml
+from studies.pages import INDEPENDENT, ROOT, number, page_options, table, update, write, write_toml
 from studies.pictures import save, subplots
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
@@ -208,7 +208,7 @@ def plot(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the table; 1 with one line where an input is wrong."""
-    parser = options("conditions", __doc__)
+    parser = page_options("conditions", __doc__)
     parser.add_argument("--car", default="saloon")
     parser.add_argument("--network", type=Path, help="instead of the car's")
     parser.add_argument("--estimators", default=",".join(ESTIMATORS))
@@ -217,10 +217,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--drives", type=int, default=30, help="drives a row")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "conditions")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    parser.add_argument("--results", type=Path, default=RESULTS / "conditions")
-    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
     given = parser.parse_args(arguments)
     try:
         if not given.stored:

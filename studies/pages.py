@@ -97,3 +97,13 @@ def options(name: str, text: str | None) -> argparse.ArgumentParser:
     """Return the parser of ``python -m studies.NAME``; ``text`` is its module's."""
     shape = argparse.RawDescriptionHelpFormatter
     return argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)
+
+
+def page_options(name: str, text: str | None) -> argparse.ArgumentParser:
+    """Return the parser of a study with stored results and a page."""
+    parser = options(name, text)
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / name, help="folder of logs and runs")
+    parser.add_argument("--out", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--results", type=Path, default=RESULTS / name, help="folder of the results")
+    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
+    return parser

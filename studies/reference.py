@@ -29,13 +29,13 @@ from numpy.typing import NDArray
 from pdhef_logtool import Car
 from studies import pages
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
-from studies.gates.tool import Tool, reports, sideslip_rmse_deg
+from studies.gates.tool import Tool, estimates, reports, sideslip_rmse_deg
 from studies.mcap_logs import Message, messages, write_log
 from studies.pages import DRIVES, ROOT, number, table, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.recalibrate import input_digest
 from truthsim.batch import DriveSpec
-from truthsim.drive import DEFAULT_VEHICLE, write_drive
+from truthsim.drive import DEFAULT_VEHICLE
 from truthsim.vehicle_choice import choose_vehicle
 
 FloatArray = NDArray[np.float64]
@@ -281,10 +281,8 @@ def drive_of(case: Case, tool: Tool, name: str) -> tuple[Path, dict[str, Any], d
         peer = _peer(case.log)
         mapping = mapping_table(peer, receiver=case.gnss == REAL)
         return DRIVES / case.log, mapping, vehicle_table(peer), None
-    drive, log = case.spec.simulate(), tool.work / "logs" / f"{name}-simulated.mcap"
-    log.parent.mkdir(parents=True, exist_ok=True)
-    log.unlink(missing_ok=True)
-    write_drive(drive, log)
+    drive = case.spec.simulate()
+    log = tool.log(f"{name}-simulated", drive)
     vehicle = tomllib.loads(pages.SAMPLE_VEHICLE.read_text(encoding="utf-8"))
     if case.spec.vehicle != DEFAULT_VEHICLE:
         fitted = fit_vehicle(choose_vehicle(case.spec.vehicle), FIT_FRICTION, Car.load(pages.SAMPLE_VEHICLE).vehicle)
@@ -309,16 +307,14 @@ def run(
 
 def tracks_of(folder: Path) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Return ground truth and reference of a run at the stamps that both have."""
-    (file,) = folder.glob("logs/*/estimates.parquet")
-    tracks = pl.read_parquet(file)
+    tracks = estimates(folder)
     truth, reference = (tracks.filter(estimator=name).sort("stamp_ns") for name in ("truth", "reference"))
     return truth.join(reference, on="stamp_ns", how="semi"), reference.join(truth, on="stamp_ns", how="semi")
 
 
 def motion_of(folder: Path) -> Motion:
     """Return the motion of a recorded drive from the ground truth of a run."""
-    (file,) = folder.glob("logs/*/estimates.parquet")
-    truth = pl.read_parquet(file).filter(estimator="truth").sort("stamp_ns")
+    truth = estimates(folder).filter(estimator="truth").sort("stamp_ns")
     stamps = truth["stamp_ns"].to_numpy()
     vx, vy, rate = (truth[n].to_numpy() for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
     return Motion(stamps, vx, vy, np.cumsum(np.nan_to_num(rate) * np.gradient(stamps * 1e-9)), np.zeros(len(stamps)))
@@ -414,17 +410,14 @@ def blocks(results: dict[str, Figures]) -> dict[str, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compute the cases that are not stored yet, and write the page."""
-    parser = pages.options("reference", __doc__)
+    parser = pages.page_options("reference", __doc__)
     parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="parts of the names of cases")
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "reference")
-    parser.add_argument("--out", type=Path, default=pages.DOCS)
-    parser.add_argument("--results", type=Path, default=pages.RESULTS / "reference")
     given = parser.parse_args(arguments)
     file = given.results / STORED
     stored: dict[str, Figures] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     source = input_digest(ROOT, [f"{folder}/**/*.py" for folder in ("pdhef_logtool", "truthsim", "studies")])
     tool = Tool(ROOT, given.work.resolve())
-    for case in cases():
+    for case in () if given.stored else cases():
         key = hashlib.sha256(f"{case!r} {source}".encode()).hexdigest()
         if not any(text in case.name for text in given.cases) or stored.get(case.name, {}).get("key") == key:
             continue

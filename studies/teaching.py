@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from studies.gates.tool import Tool
-from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, update, write, write_toml
+from studies.gates.tool import Tool, estimates
+from studies.pages import DRIVES, ROOT, number, page_options, table, update, write, write_toml
 from studies.peers.drives import FULL_SIZE, PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 
-RESULTS_FILE = RESULTS / "teaching.json"
+STORED = "pairs.json"
 #: No pair may be worse than untaught by more than the larger of this share and this many degrees.
 WORSE_SHARE, WORSE_DEG = 0.05, 0.03
 #: Driving counts as alike where the residual is active on this share of it.
@@ -138,8 +138,7 @@ def scores(tool: Tool, part: TeachPart, car: Path, names: Sequence[str], *option
     given = ["--keep", "estimates", "--estimators", ",".join(names), *options_of]
     folder = tool.run(run_name, *inputs(tool, part), "--car", car, *given)
     figures = pl.read_parquet(folder / "metrics.parquet").filter(signal="sideslip_rad", segment="all")
-    (file,) = folder.glob("logs/*/estimates.parquet")
-    active = pl.read_parquet(file).group_by("estimator").agg((pl.col("network_trust").fill_null(0.0) > 0.0).mean())
+    active = estimates(folder).group_by("estimator").agg((pl.col("network_trust").fill_null(0.0) > 0.0).mean())
     found = {}
     for name, share in active.filter(pl.col("estimator").is_in(names)).iter_rows():
         of = dict(figures.filter(estimator=name).select("metric", "value").iter_rows())
@@ -239,12 +238,8 @@ def mean(ratios: Sequence[float]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the pairs and write the page."""
-    parser = options("teaching", __doc__)
+    parser = page_options("teaching", __doc__)
     parser.add_argument("--cars", nargs="+", choices=[c.name for c in CARS], default=[c.name for c in CARS])
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "teaching")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    parser.add_argument("--results", type=Path, default=RESULTS_FILE)
-    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
     given = parser.parse_args(arguments)
     if not given.stored:
         if not DRIVES.is_dir():
@@ -255,8 +250,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for result in pairs_of(Tool(ROOT, given.work.resolve()), car):
                 results.append(result)
                 print(pair_table([result]).splitlines()[-1], file=sys.stderr)
-        write(given.results, json.dumps(results, indent=1) + "\n")
-    stored = json.loads(given.results.read_text(encoding="utf-8"))
+        write(given.results / STORED, json.dumps(results, indent=1) + "\n")
+    stored = json.loads((given.results / STORED).read_text(encoding="utf-8"))
     update(given.out, "README.md", {"teaching": readme_text(stored)})
     update(given.out, "peers.md", {"pairs": pair_table(stored), "pairs_summary": summary(stored)})
     return 0

@@ -30,7 +30,7 @@ from studies.pages import DRIVES, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.torture.seeds import FORMATS, RECORDINGS
 from truthsim.conditions import ROWS
-from truthsim.drive import simulate_drive, write_drive
+from truthsim.drive import simulate_drive
 from truthsim.sensors import SensorNoise
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
@@ -147,13 +147,12 @@ def simulated_log(
     tool: Tool, name: str, spec: tuple[str, float, float, float | None], seed: int, *, steering_wheel: bool = False
 ) -> Path:
     """Simulate a drive of the saloon and return its log; ``steering_wheel``: the log has this angle."""
-    log = tool.work / "simulated" / f"{name.replace(' ', '-')}-{seed}.mcap"
-    if not log.is_file():
-        log.parent.mkdir(parents=True, exist_ok=True)
-        manoeuvre, speed, friction, duration_s = spec
-        drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
-        write_drive(drive, log, steering_wheel=steering_wheel)
-    return log
+    stem = f"{name.replace(' ', '-')}-{seed}"
+    if (log := tool.work / "logs" / f"{stem}.mcap").is_file():
+        return log
+    manoeuvre, speed, friction, duration_s = spec
+    drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
+    return tool.log(stem, drive, steering_wheel=steering_wheel)
 
 
 def bare_vehicle() -> dict[str, Any]:

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from truthsim.drive import Drive, write_drive
+
 #: The longest time for one command, s.
 LIMIT_S = 3600.0
 
@@ -58,6 +60,14 @@ class Tool:
         self.json("run", *arguments, "-o", output, "--annotate", "none", "--no-report")
         return output
 
+    def log(self, name: str, drive: Drive, *, steering_wheel: bool = False) -> Path:
+        """Write a simulated drive as MCAP; return its path."""
+        path = self.work / "logs" / f"{name}.mcap"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        write_drive(drive, path, steering_wheel=steering_wheel)
+        return path
+
     def mapping(self, log: Path) -> dict[str, Any]:
         """Return the mapping that the tool recognises."""
         file = self.work / "mappings" / f"{log.parent.name}-{log.stem}.toml"
@@ -85,6 +95,12 @@ def coverage_percent(run: Path, estimator: str) -> float:
         & (pl.col("estimator") == estimator)
     )
     return 100.0 * float(np.average(rows["value"], weights=rows["n"])) if len(rows) else float("nan")
+
+
+def estimates(run: Path) -> pl.DataFrame:
+    """Return the estimates of a run of one log."""
+    (file,) = run.glob("logs/*/estimates.parquet")
+    return pl.read_parquet(file)
 
 
 def reports(run: Path) -> dict[str, dict[str, Any]]:

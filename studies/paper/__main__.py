@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pdhef_logtool.car.car import Car
 from studies.gates.tool import Tool
-from studies.pages import DOCS, RESULTS, ROOT, options, write
+from studies.pages import ROOT, page_options, write
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
 from studies.paper.page import PAGE_FIGURES, write_page
@@ -35,12 +35,8 @@ def render(results: Path, docs: Path) -> None:
 
 def main() -> int:
     """Run the command line."""
-    parser = options("paper", __doc__)
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of paper.md")
-    parser.add_argument("--results", type=Path, default=RESULTS / "paper", help="folder of results and figures")
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "paper")
+    parser = page_options("paper", __doc__)
     parser.add_argument("--noise-seeds", type=int, default=NOISE_SEEDS, metavar="N", help=f"{NOISE_SEEDS} by default")
-    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
     given = parser.parse_args()
     if not given.stored:
         seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + given.noise_seeds)

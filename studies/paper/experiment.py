@@ -20,7 +20,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.records.signals import FloatArray
-from studies.gates.tool import Tool
+from studies.gates.tool import Tool, estimates
 from studies.paper.schemes import ESP, SCHEMES
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
@@ -148,10 +148,7 @@ def run_experiment(
     done, rows = Experiment(pl.DataFrame()), list[dict[str, Any]]()
     for scenario, seed in product(scenarios, noise_seeds):
         drive = simulate_drive(scenario.manoeuvre, seed=seed, faults=[parse_fault(f) for f in scenario.faults])
-        log = tool.work / "logs" / f"{scenario.name}-{seed}.mcap"
-        log.parent.mkdir(parents=True, exist_ok=True)
-        log.unlink(missing_ok=True)
-        write_drive(drive, log)
+        log = tool.log(f"{scenario.name}-{seed}", drive)
         about = {"scenario": scenario.name, "noise_seed": seed}
         peaks = drive.peak_ay_m_s2 / GRAVITY_M_S2, math.degrees(drive.peak_sideslip_rad)
         done.facts.append(about | dict(zip(_FACTS, (drive.duration_s, *peaks), strict=True)))
@@ -162,12 +159,11 @@ def run_experiment(
             folder = tool.run(
                 f"{log.stem}-{sensors}", log, *given, "--keep", "estimates", "--estimators", ",".join(chosen)
             )
-            (file,) = folder.glob("logs/*/estimates.parquet")
             named = pl.col("estimator").cast(pl.String) + pl.when(estimator="truth").then(pl.lit("")).otherwise(
                 pl.lit(end)
             )
             tracks.append(
-                pl.read_parquet(file).with_columns(named).filter(pl.lit(not end) | (pl.col("estimator") != "truth"))
+                estimates(folder).with_columns(named).filter(pl.lit(not end) | (pl.col("estimator") != "truth"))
             )
             metrics = pl.read_parquet(folder / "metrics.parquet").filter(
                 pl.col("estimator").is_in(chosen), segment="all"

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.options import OFF
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.tracks import StateTrack
-from studies.pages import DOCS, DRIVES, RESULTS, options, update, write
+from studies.pages import DRIVES, page_options, update, write
 from studies.peers.drives import OFFSET, PEER_DRIVES, REFERENCE, PeerDrive, mapping_of, mapping_table, vehicle_of
 from studies.peers.page import CAUSAL, NO_FILE, SEDAN, blocks, estimator_table
 from studies.peers.scoring import Entry, scores
@@ -110,34 +109,31 @@ def _recorder(drive: PeerDrive) -> tuple[object, ...]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Score all estimators; print the tables of logs that are given, or write page and results."""
-    parser = options("peers", __doc__)
+    parser = page_options("peers", __doc__)
     parser.add_argument("--folder", type=Path, help="logs with ground truth")
     parser.add_argument("--published", type=Path, nargs="+", default=[], metavar="CSV", help="of arXiv:2408.15610")
     parser.add_argument("--car", type=Path, help="car folder or vehicle.toml of --folder")
     parser.add_argument("--mapping", type=Path, help="mapping.toml of --folder")
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of peers.md")
-    parser.add_argument("--results", type=Path, default=RESULTS / "peers", help=f"folder of {' and '.join(STORED)}")
-    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
     given = parser.parse_args(arguments)
-    with tempfile.TemporaryDirectory() as name:
-        work = Path(name)
-        if given.folder or given.published:
-            entries = [entry for file in given.published for entry in published(file, work)]
-            entries += of_folder(given.folder, given.car, given.mapping) if given.folder else ()
-            scored(entries[:1])  # loads the compiled code, which no score may contain
-            rows, failed = scored(entries)
-            for (group,), of_group in pl.DataFrame(rows).group_by("group", maintain_order=True) if rows else ():
-                print(f"## {group}\n\n{estimator_table(of_group)}\n")
-            return 1 if not rows else 3 if failed else 0
-        scored_file, parameters_file = (given.results / stored for stored in STORED)
-        if not given.stored:
-            if not DRIVES.is_dir():
-                print("nothing is compared: needs ../shared beside the repository, or --folder")
-                return 0
-            rows, parameters = recorded_scores(work)
-            given.results.mkdir(parents=True, exist_ok=True)
-            pl.DataFrame(rows).write_parquet(scored_file, compression="zstd")
-            write(parameters_file, json.dumps(parameters, indent=1) + "\n")
+    work: Path = given.work
+    work.mkdir(parents=True, exist_ok=True)
+    if given.folder or given.published:
+        entries = [entry for file in given.published for entry in published(file, work)]
+        entries += of_folder(given.folder, given.car, given.mapping) if given.folder else ()
+        scored(entries[:1])  # loads the compiled code, which no score may contain
+        rows, failed = scored(entries)
+        for (group,), of_group in pl.DataFrame(rows).group_by("group", maintain_order=True) if rows else ():
+            print(f"## {group}\n\n{estimator_table(of_group)}\n")
+        return 1 if not rows else 3 if failed else 0
+    scored_file, parameters_file = (given.results / stored for stored in STORED)
+    if not given.stored:
+        if not DRIVES.is_dir():
+            print("nothing is compared: needs ../shared beside the repository, or --folder")
+            return 0
+        rows, parameters = recorded_scores(work)
+        given.results.mkdir(parents=True, exist_ok=True)
+        pl.DataFrame(rows).write_parquet(scored_file, compression="zstd")
+        write(parameters_file, json.dumps(parameters, indent=1) + "\n")
     stored = pl.read_parquet(scored_file), json.loads(parameters_file.read_text(encoding="utf-8"))
     update(given.out, "peers.md", blocks(*stored))
     return 0

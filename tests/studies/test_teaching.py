@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import math
 
-from studies import teaching
-from studies.pages import DOCS
-from studies.teaching import CARS, Pair, is_worse, pair_table, ratio, summary
+from studies.pages import DOCS, RESULTS
+from studies.teaching import CARS, STORED, Pair, is_worse, pair_table, ratio, summary
 
 
 def pair(untaught: float, hybrid: float) -> Pair:
@@ -29,7 +28,7 @@ WORSE = ["f1tenth_xray_0"]
 
 
 def test_the_stored_results_have_every_pair_and_only_the_named_one_is_worse_than_untaught() -> None:
-    stored = json.loads(teaching.RESULTS_FILE.read_text(encoding="utf-8"))
+    stored = json.loads((RESULTS / "teaching" / STORED).read_text(encoding="utf-8"))
     counts = {car.name: len(car.parts) for car in CARS}
     for car in CARS:
         wanted = len(car.parts) - car.taught_on if car.taught_on > 1 else counts[car.name] * (counts[car.name] - 1)
