@@ -14,7 +14,6 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ import numpy as np
 import polars as pl
 
 from pdhef_logtool import Car, PdhefError
-from studies.drawn_cars import KINDS, DrawnCar, draw_car
+from studies.drawn_cars import KINDS, draw_car
 from studies.gates.tool import Tool, reports
 from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, update, write_toml, write_validated_car
 from truthsim.batch import sensor_noise
@@ -46,27 +45,6 @@ ESTIMATORS = ("zero", "open-loop", "phy-ukf", "physics")
 _PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
 #: Half of the last printed decimal is added to a printed standard deviation.
 _ROUNDED = {"ay_m_s2.delay": 0.05, "yaw_rate_rad_s.delay": 0.05, "yaw_rate_rad_s.gain": 0.0005}
-
-
-@dataclass(frozen=True, slots=True)
-class StudiedCar:
-    """A drawn car with its vehicle files, and the true values of the estimated parameters by name."""
-
-    drawn: DrawnCar
-    friction: float
-    files: Mapping[str, dict[str, Any]]
-    true: Mapping[str, float]
-
-
-def studied_car(rng: np.random.Generator) -> StudiedCar:
-    """Draw a car, its files and its true values."""
-    drawn = draw_car(rng, Car.load(SAMPLE_VEHICLE).vehicle, (*KINDS, "hatchback"))
-    friction = float(rng.choice(FRICTIONS))
-    vehicle = drawn.vehicle.model_copy(update={"friction": friction})
-    right = vehicle.model_dump(mode="json", exclude_none=True)
-    wrong = wrong_file(right, rng)
-    true = true_values(right, dict(drawn.sensors)["imu_x_m"])
-    return StudiedCar(drawn, friction, {RIGHT: right, WRONG_FILE: wrong}, true)
 
 
 def wrong_file(right: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
@@ -123,27 +101,31 @@ def outcomes(tool: Tool, index: int) -> tuple[list[dict[str, Any]], list[dict[st
     Returns a row a drive, file, calibration and estimator, and the errors over standard deviation with the wrong file.
     """
     rng = np.random.default_rng([SEED, index])
-    car = studied_car(rng)
+    car = draw_car(rng, Car.load(SAMPLE_VEHICLE).vehicle, (*KINDS, "hatchback"))
+    friction, sensors = float(rng.choice(FRICTIONS)), dict(car.sensors)
+    vehicle = car.vehicle.model_copy(update={"friction": friction})
+    right = vehicle.model_dump(mode="json", exclude_none=True)
+    files, true = {RIGHT: right, WRONG_FILE: wrong_file(right, rng)}, true_values(right, sensors["imu_x_m"])
     logs: dict[str, Path] = {}
     for manoeuvre, speed, duration_s in DRIVEN:
         name = f"{manoeuvre}-{speed:.0f}"
-        noise = sensor_noise(dict(car.drawn.sensors) | {"steer_gain": 0.0})
+        noise = sensor_noise(sensors | {"steer_gain": 0.0})
         try:
             drive = simulate_drive(
-                manoeuvre, speed_km_h=speed, friction=car.friction, seed=int(rng.integers(2**31)),
-                duration_s=duration_s, vehicle=choose_vehicle(car.drawn.text), vehicle_name=car.drawn.text, noise=noise,
+                manoeuvre, speed_km_h=speed, friction=friction, seed=int(rng.integers(2**31)),
+                duration_s=duration_s, vehicle=choose_vehicle(car.text), vehicle_name=car.text, noise=noise,
             )  # fmt: skip
         except PdhefError as error:  # it would spin
             print(f"car {index}, {manoeuvre} is left out: {error}", file=sys.stderr)
             continue
         logs[name] = tool.log(f"{index}-{name}", drive, steering_wheel=True)
     runs, scores = list[dict[str, Any]](), list[dict[str, Any]]()
-    for (file, vehicle), is_calibrated in product(car.files.items(), (False, True)):
+    for (file, document), is_calibrated in product(files.items(), (False, True)):
         name, folder = f"{index}-{file}", tool.work / "cars"
         given = (
-            write_toml(folder / f"{name}.toml", vehicle)
+            write_toml(folder / f"{name}.toml", document)
             if is_calibrated
-            else write_validated_car(folder / name, vehicle)
+            else write_validated_car(folder / name, document)
         )
         keep = ("--car", given, "--keep", "estimates", "--estimators", ",".join(ESTIMATORS))
         run = tool.run(f"{name}-{is_calibrated}", *logs.values(), *keep)
@@ -153,7 +135,7 @@ def outcomes(tool: Tool, index: int) -> tuple[list[dict[str, Any]], list[dict[st
             refused = bool((found[log.stem]["self_calibration"] or {}).get("refused"))
             runs += [about | {"drive": drive_name, "refused": refused} | row for row in figures_of(run, log.stem)]
             if is_calibrated and file == WRONG_FILE:
-                errors = errors_over_sd(found[log.stem], car.true)
+                errors = errors_over_sd(found[log.stem], true)
                 scores += [{"figure": figure, "drive": drive_name, "score": score} for figure, score in errors]
     return runs, scores
 

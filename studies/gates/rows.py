@@ -267,22 +267,13 @@ def exit_codes(tool: Tool) -> Figures:
         '[[requirement]]\nid = "a"\ntitle = "a"\nsignal = "sideslip_rad"\nmetric = "rmse"\nlimit_deg = 0.0001\n'
     )
     quiet = ("--annotate", "none", "--no-report", "--car", "saloon", "--estimators", "zero")
+    must = ("--plan", strict, "--set", "strict=true")
     cases: dict[str, tuple[str | Path, ...]] = {
         "run": ("run", sample, "-o", folder / "ok", *quiet),
         "run, log cut in half": ("run", folder / "cut.mcap", "-o", folder / "cut", *quiet),
         "run, all logs unreadable": ("run", folder / "noise.mcap", "-o", folder / "noise", *quiet),
         "run, one of two logs unreadable": ("run", sample, folder / "noise.mcap", "-o", folder / "two", *quiet),
-        "run, requirement not met": (
-            "run",
-            sample,
-            "-o",
-            folder / "plan",
-            "--plan",
-            strict,
-            "--set",
-            "strict=true",
-            *quiet,
-        ),
+        "run, requirement not met": ("run", sample, "-o", folder / "plan", *must, *quiet),
         "run, no output given": ("run", sample),
         "run, unknown option": ("run", sample, "-o", folder / "x", "--nonsense"),
         "run, unknown estimator": ("run", sample, "-o", folder / "x", "--estimators", "nonsense"),

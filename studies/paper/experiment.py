@@ -142,7 +142,7 @@ def run_experiment(
     *,
     scenarios: Iterable[Scenario] = (A, B, BURST),
     noise_seeds: Sequence[int] = tuple(range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + NOISE_SEEDS)),
-    names: Sequence[str] = tuple(SCHEMES),
+    names: Sequence[str] = SCHEMES,
 ) -> Experiment:
     """Run the schemes on all scenarios with all noise seeds; names may end in ``ESP``."""
     done, rows = Experiment(pl.DataFrame()), list[dict[str, Any]]()
