@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from pdhef_logtool import Car
 from studies import pages
@@ -116,11 +117,9 @@ def made_gnss(
     keep = math.exp(-1.0 / (receiver.rate_hz * receiver.correlated_s))
     columns = []
     for component in (cos * forward - sin * left, sin * forward + cos * left):
-        correlated = np.empty(len(sampled))
-        value = rng.standard_normal()
-        for i in range(len(sampled)):
-            correlated[i] = value
-            value = keep * value + math.sqrt(1.0 - keep**2) * rng.standard_normal()
+        drawn = rng.standard_normal(len(sampled) + 1)[:-1]
+        drawn[1:] *= math.sqrt(1.0 - keep**2)
+        correlated = lfilter([1.0], [1.0, -keep], drawn)
         good = np.isfinite(component)
         made = np.interp(sampled - receiver.delay_s, t[good], component[good])
         columns.append(

@@ -79,21 +79,15 @@ class Tool:
 
 def sideslip_rmse_deg(run: Path) -> dict[str, float]:
     """Return the sideslip RMSE over all samples of all logs of a run by estimator, in degrees."""
-    rows = pl.read_parquet(run / "metrics.parquet").filter(
-        (pl.col("signal") == "sideslip_rad") & (pl.col("segment") == "all") & (pl.col("metric") == "rmse")
-    )
+    rows = pl.read_parquet(run / "metrics.parquet").filter(signal="sideslip_rad", segment="all", metric="rmse")
     pooled = rows.group_by("estimator").agg((pl.col("value") ** 2 * pl.col("n")).sum() / pl.col("n").sum())
     return {name: float(np.degrees(np.sqrt(square))) for name, square in pooled.sort("estimator").iter_rows()}
 
 
 def coverage_percent(run: Path, estimator: str) -> float:
     """Return the share of samples within the 95 % interval of sideslip over all logs of a run."""
-    rows = pl.read_parquet(run / "metrics.parquet").filter(
-        (pl.col("signal") == "sideslip_rad")
-        & (pl.col("segment") == "all")
-        & (pl.col("metric") == "coverage95")
-        & (pl.col("estimator") == estimator)
-    )
+    of = {"signal": "sideslip_rad", "segment": "all", "metric": "coverage95", "estimator": estimator}
+    rows = pl.read_parquet(run / "metrics.parquet").filter(**of)
     return 100.0 * float(np.average(rows["value"], weights=rows["n"])) if len(rows) else float("nan")
 
 
