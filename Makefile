@@ -161,7 +161,7 @@ paper: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.paper
 
 # Every estimator on the condition table, with the car's own network or another.
-DRIVES ?= 30
+DRIVES ?= 10
 conditions: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.conditions --drives $(DRIVES) --jobs $(JOBS) \
 	  --car $(CAR) $(if $(NETWORK),--network $(NETWORK))

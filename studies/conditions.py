@@ -1,6 +1,6 @@
 """The condition table (docs/method.md#evaluation): every estimator on the same drives with one error in each row.
 
-    python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME ...] [--stored]
+    python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 10] [--jobs 2] [--rows NAME ...] [--stored]
 
 Simulates the drives, runs all estimators by ``pdhef run``, and writes the page ``conditions.md`` with two figures to
 ``--out``, and all tables to ``--results``. ``--work`` keeps logs and runs: a repeated call resumes where it stopped.
@@ -214,7 +214,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--estimators", default=",".join(ESTIMATORS))
     all_rows = (*ROW_NAMES, INDEPENDENT_ROW)
     parser.add_argument("--rows", nargs="+", choices=all_rows, default=all_rows, metavar="ROW", help="all by default")
-    parser.add_argument("--drives", type=int, default=30, help="drives a row")
+    parser.add_argument("--drives", type=int, default=10, help="drives a row")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args(arguments)
