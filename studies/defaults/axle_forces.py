@@ -112,11 +112,11 @@ def sampled_errors(
     return np.where(use, error, 0.0), use, every * period_s(drive)
 
 
-def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, similar: bool = False) -> AxleSamples:
+def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> AxleSamples:
     """Return slip angles and forces of all usable stamps of all drives, smoothed to ``SMOOTHING_HZ``.
 
-    ``similar`` : at the vehicle file's friction, for tyres that keep their stiffness: one curve of force over friction
-    by slip over friction.
+    At known friction they are those at the vehicle file's, for tyres that keep their stiffness: one curve of force over
+    friction by slip over friction.
     """
     columns: list[tuple[FloatArray, ...]] = []
     lf, lr = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
@@ -138,8 +138,8 @@ def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, simi
         total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
         front = (lr * total + moment) / (lf + lr) / np.cos(steer)
         rear = (lf * total - moment) / (lf + lr)
-        usable = similar & np.isfinite(drive.signals.friction)
-        grip = np.where(usable, drive.signals.friction / vehicle.assumed_friction, 1.0)
+        friction = drive.signals.friction
+        grip = np.where(np.isfinite(friction), friction / vehicle.assumed_friction, 1.0)
         slips = (steer - np.arctan((vy + lf * r) / vx), -np.arctan((vy - lr * r) / vx))
         columns.append((slips[0] / grip, front / grip, slips[1] / grip, rear / grip))
     joined = [np.concatenate(c) for c in zip(*columns, strict=True)]

@@ -247,7 +247,7 @@ def fit_physics(
     starts : where to start, θ by the parameter's name; the best end counts.
     """
     usable_s = sum(usable_seconds(d, start) for d in drives)
-    samples = axle_samples(drives, start, similar=True)
+    samples = axle_samples(drives, start)
     priors = make_priors(start, parts, samples, usable_s)
 
     def errors(theta: FloatArray) -> list[DriveError]:

@@ -163,11 +163,7 @@ def _bag(compression: str, path: Path) -> None:
         for m in messages():
             if m.topic not in connections:
                 connections[m.topic] = writer.add_connection(m.topic, m.type_name, typestore=store)
-            message = newest.deserialize_cdr(m.cdr, m.type_name)
-            if hasattr(message, "header"):
-                header = store.types["std_msgs/msg/Header"]
-                message.header = header(0, message.header.stamp, message.header.frame_id)
-            writer.write(connections[m.topic], m.time_ns, store.serialize_ros1(message, m.type_name))
+            writer.write(connections[m.topic], m.time_ns, newest.cdr_to_ros1(m.cdr, m.type_name))
 
 
 def _database(path: Path) -> None:
