@@ -16,7 +16,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
 .PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers benchmark-sideslip torture \
-  gates gates-quick gates-freeze recalibrate docs paper strangers wheel release lock clean
+  gates gates-quick gates-freeze recalibrate evidence docs paper strangers wheel release lock clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -32,13 +32,13 @@ help:
 	@echo "make gates    figures of the tool that moved since they were frozen (an hour; make gates-quick: five minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make recalibrate  regenerate all that is derived: shipped cars and networks, evidence pages (hours; resumable)"
+	@echo "make evidence  regenerate the evidence pages alone, with the shipped cars and networks (hours; resumable)"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, half an hour or so)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
-	@echo "make peers    docs/peers.md: published sideslip estimators on the recorded drives in ../shared (three minutes)"
-	@echo "make benchmark-sideslip  docs/benchmark.md: every estimator on the recorded drives, or FOLDER=logs with ground truth"
+	@echo "make peers    docs/peers.md: every estimator on the recorded drives in ../shared, and published ones (three minutes)"
+	@echo "make benchmark-sideslip FOLDER=logs  the same table of your own logs with ground truth"
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
-	@echo "make  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
 	@echo "make wheel    dist/: the wheel and the source archive of what is committed, looked at"
 	@echo "make release  the same, installed into a new environment, where the sample job runs"
@@ -92,7 +92,6 @@ quick: $(VENV)/installed-dev $(VENV)/compiled
 
 pages: $(VENV)/installed-dev $(VENV)/compiled
 	$(PYTEST) tests/reports tests/results
-	OMP_NUM_THREADS=1 $(BIN)/python -m studies.comparing
 	OMP_NUM_THREADS=1 $(BIN)/python tests/reports/screenshots.py
 
 # Tests that take too long for `make test` or need extras: Ray, S3.
@@ -143,6 +142,9 @@ gates-freeze: $(VENV)/installed-dev $(VENV)/compiled
 recalibrate: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.recalibrate $(if $(ONLY),--only $(ONLY))
 
+evidence: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python -m studies.recalibrate --evidence
+
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
 
@@ -160,7 +162,7 @@ paper: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.paper
 
 # Every estimator on the condition table, with the car's own network or another.
-DRIVES ?= 30
+DRIVES ?= 10
 conditions: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.conditions --drives $(DRIVES) --jobs $(JOBS) \
 	  --car $(CAR) $(if $(NETWORK),--network $(NETWORK))
@@ -168,9 +170,9 @@ conditions: $(VENV)/installed-dev $(VENV)/compiled
 peers: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.peers
 
-# Without FOLDER the recorded drives and the page; CAR and MAPPING are those of the folder.
+# CAR and MAPPING are those of the folder.
 benchmark-sideslip: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m studies.peers.benchmark $(if $(FOLDER),--folder $(FOLDER)) \
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.peers --folder $(FOLDER) \
 	  $(if $(filter command line,$(origin CAR)),--car $(CAR)) $(if $(MAPPING),--mapping $(MAPPING))
 
 torture: $(VENV)/installed-dev $(VENV)/compiled

@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.fleet_drive import DRIVES, drives
-from benchmarks.hour import drive_hour, run_words
+from benchmarks.hour import run_words
 from benchmarks.measuring import CACHE, ROOT, ROUNDS, Row, command_cost
-from benchmarks.one_hour_log import hour_log, shared_log
+from benchmarks.one_hour_log import SHARED_S, drive_log, image_log
 from benchmarks.starting import LIGHT
 
 _FLEET = ("--car", "saloon", "--keep", "metrics", "--no-report")
@@ -22,8 +22,8 @@ def works() -> dict[str, tuple[str | Path, ...]]:
     out = CACHE / "against"
     return {
         "a new process runs 10 s, figures": LIGHT,
-        "inspect 60 s with 150 MB of images in shared chunks": ("inspect", shared_log()),
-        "inspect the hour": ("inspect", hour_log()),
+        "inspect 60 s with 150 MB of images in shared chunks": ("inspect", image_log(SHARED_S)),
+        "inspect the hour": ("inspect", drive_log()),
         f"{DRIVES} drives of a fleet": ("run", *drives(), *_FLEET, "-o", out),
         "run of the hour, light outputs": run_words(out, light=True),
         "run of the hour, everything": run_words(out, light=False),
@@ -32,7 +32,6 @@ def works() -> dict[str, tuple[str | Path, ...]]:
 
 def rows(other: Path) -> list[Row]:
     """Measure this tree and another one."""
-    drive_hour()
     measured = []
     for work, words in works().items():
         seconds = {ROOT: float("inf"), other: float("inf")}

@@ -70,20 +70,6 @@ def _processor_seconds() -> float:
     return sum(sum(getrusage(who)[:2]) for who in (RUSAGE_SELF, RUSAGE_CHILDREN))
 
 
-def peak_bytes(module: str, *arguments: str) -> int:
-    """Return the peak resident memory of ``python -m module arguments`` in a new process.
-
-    Linux counts the peak of a process from its parent's size on, so a small one in between starts it.
-    """
-    code = (
-        "import resource, subprocess, sys; subprocess.run([sys.executable, '-m', *sys.argv[1:]], check=True);"
-        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
-    )
-    command = [sys.executable, "-c", code, module, *arguments]
-    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
-    return int(done.stdout.split()[-1]) * _RSS_UNIT
-
-
 @dataclass(frozen=True, slots=True)
 class Cost:
     """Processor seconds and peak resident memory of a command."""
@@ -92,21 +78,24 @@ class Cost:
     peak_bytes: int
 
 
-def command_cost(*arguments: str | Path, tree: Path = ROOT) -> Cost:
-    """Return the cost of ``pdhef ARGUMENTS`` of a source tree on one thread; its exit code must be 0 or 3."""
+def command_cost(*arguments: str | Path, tree: Path = ROOT, module: str = "pdhef_logtool") -> Cost:
+    """Return the cost of ``pdhef ARGUMENTS`` of a source tree on one thread; its exit code must be 0 or 3.
+
+    Linux counts the peak of a process from the size of its parent on, so a small one in between starts it.
+    """
     code = (
         "import json, resource, subprocess, sys; done = subprocess.run(sys.argv[1:], capture_output=True, text=True);"
         "used = resource.getrusage(resource.RUSAGE_CHILDREN);"
         "print(json.dumps([done.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss]))"
     )
-    command = [sys.executable, "-c", code, sys.executable, "-m", "pdhef_logtool", *map(str, arguments)]
+    command = [sys.executable, "-c", code, sys.executable, "-m", module, *map(str, arguments)]
     # Byte code is kept, as in an installation.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     environment |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(tree)}
     done = subprocess.run(command, cwd=tree, check=True, capture_output=True, text=True, env=environment)
     code_of, seconds, peak = json.loads(done.stdout)
     if code_of not in (0, 3):
-        raise SystemExit(f"pdhef {' '.join(map(str, arguments))} ended with {code_of}")
+        raise SystemExit(f"{module} {' '.join(map(str, arguments))} ended with {code_of}")
     return Cost(seconds, peak * _RSS_UNIT)
 
 

@@ -14,31 +14,19 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from pdhef_logtool import Car, PdhefError
-from studies.drawn_cars import KINDS, DrawnCar, draw_car
+from studies.drawn_cars import KINDS, draw_car
 from studies.gates.tool import Tool, reports
-from studies.pages import (
-    DOCS,
-    ROOT,
-    SAMPLE_VEHICLE,
-    number,
-    options,
-    table,
-    template,
-    write,
-    write_toml,
-    write_validated_car,
-)
+from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, update, write_toml, write_validated_car
 from truthsim.batch import sensor_noise
-from truthsim.drive import simulate_drive, write_drive
+from truthsim.drive import simulate_drive
 from truthsim.vehicle import GRAVITY_M_S2
 from truthsim.vehicle_choice import choose_vehicle
 
@@ -53,48 +41,10 @@ FRICTIONS, WRONG = (0.85, 1.0), (0.5, 2.0)
 ACCEPTED = (0.90, 0.98)
 NORMAL_95 = 1.959964
 RIGHT, WRONG_FILE = "right", "wrong"
+ESTIMATORS = ("zero", "open-loop", "phy-ukf", "physics")
 _PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
 #: Half of the last printed decimal is added to a printed standard deviation.
 _ROUNDED = {"ay_m_s2.delay": 0.05, "yaw_rate_rad_s.delay": 0.05, "yaw_rate_rad_s.gain": 0.0005}
-
-
-class Run(NamedTuple):
-    """One drive with one file: sideslip RMSE in degrees and d2 in m/s by estimator, and the report."""
-
-    rmse: Mapping[str, float]
-    d2: Mapping[str, float]
-    report: dict[str, Any]
-    coverage: float
-    width: float
-
-
-class Outcome(NamedTuple):
-    """The runs of a drive by file and whether the car is calibrated, and the true values of the car."""
-
-    manoeuvre: str
-    runs: Mapping[tuple[str, bool], Run]
-    true: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class StudiedCar:
-    """A drawn car with its vehicle files, and the true values of the estimated parameters by name."""
-
-    drawn: DrawnCar
-    friction: float
-    files: Mapping[str, dict[str, Any]]
-    true: Mapping[str, float]
-
-
-def studied_car(rng: np.random.Generator) -> StudiedCar:
-    """Draw a car, its files and its true values."""
-    drawn = draw_car(rng, Car.load(SAMPLE_VEHICLE).vehicle, (*KINDS, "hatchback"))
-    friction = float(rng.choice(FRICTIONS))
-    vehicle = drawn.vehicle.model_copy(update={"friction": friction})
-    right = vehicle.model_dump(mode="json", exclude_none=True)
-    wrong = wrong_file(right, rng)
-    true = true_values(right, dict(drawn.sensors)["imu_x_m"])
-    return StudiedCar(drawn, friction, {RIGHT: right, WRONG_FILE: wrong}, true)
 
 
 def wrong_file(right: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
@@ -145,72 +95,83 @@ def errors_over_sd(report: Mapping[str, Any], true: Mapping[str, float]) -> Iter
             yield f"check `{check['name']}`", (float(shown[1]) - true[check["name"]]) / sd
 
 
-def outcomes(tool: Tool, index: int) -> Iterator[Outcome]:
-    """Simulate the drives of a car and run them with both files, with and without calibration."""
+def outcomes(tool: Tool, index: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Simulate the drives of a car and run them with both files, with and without calibration.
+
+    Returns a row a drive, file, calibration and estimator, and the errors over standard deviation with the wrong file.
+    """
     rng = np.random.default_rng([SEED, index])
-    car = studied_car(rng)
+    car = draw_car(rng, Car.load(SAMPLE_VEHICLE).vehicle, (*KINDS, "hatchback"))
+    friction, sensors = float(rng.choice(FRICTIONS)), dict(car.sensors)
+    vehicle = car.vehicle.model_copy(update={"friction": friction})
+    right = vehicle.model_dump(mode="json", exclude_none=True)
+    files, true = {RIGHT: right, WRONG_FILE: wrong_file(right, rng)}, true_values(right, sensors["imu_x_m"])
     logs: dict[str, Path] = {}
     for manoeuvre, speed, duration_s in DRIVEN:
-        log = tool.work / "logs" / f"{index}-{manoeuvre}-{speed:.0f}.mcap"
-        log.parent.mkdir(parents=True, exist_ok=True)
-        noise = sensor_noise(dict(car.drawn.sensors) | {"steer_gain": 0.0})
+        name = f"{manoeuvre}-{speed:.0f}"
+        noise = sensor_noise(sensors | {"steer_gain": 0.0})
         try:
             drive = simulate_drive(
-                manoeuvre, speed_km_h=speed, friction=car.friction, seed=int(rng.integers(2**31)),
-                duration_s=duration_s, vehicle=choose_vehicle(car.drawn.text), vehicle_name=car.drawn.text, noise=noise,
+                manoeuvre, speed_km_h=speed, friction=friction, seed=int(rng.integers(2**31)),
+                duration_s=duration_s, vehicle=choose_vehicle(car.text), vehicle_name=car.text, noise=noise,
             )  # fmt: skip
         except PdhefError as error:  # it would spin
             print(f"car {index}, {manoeuvre} is left out: {error}", file=sys.stderr)
             continue
-        log.unlink(missing_ok=True)
-        write_drive(drive, log, steering_wheel=True)
-        logs[log.stem] = log
-    runs = {
-        (file, is_calibrated): runs_of(tool, f"{index}-{file}", document, list(logs.values()), is_calibrated)
-        for file, document in car.files.items()
-        for is_calibrated in (False, True)
-    }
-    for stem in logs:
-        yield Outcome(stem.split("-", 1)[1], {key: of[stem] for key, of in runs.items()}, car.true)
+        logs[name] = tool.log(f"{index}-{name}", drive, steering_wheel=True)
+    runs, scores = list[dict[str, Any]](), list[dict[str, Any]]()
+    for (file, document), is_calibrated in product(files.items(), (False, True)):
+        name, folder = f"{index}-{file}", tool.work / "cars"
+        given = (
+            write_toml(folder / f"{name}.toml", document)
+            if is_calibrated
+            else write_validated_car(folder / name, document)
+        )
+        keep = ("--car", given, "--keep", "estimates", "--estimators", ",".join(ESTIMATORS))
+        run = tool.run(f"{name}-{is_calibrated}", *logs.values(), *keep)
+        found = reports(run)
+        about = {"car": index, "file": file, "calibrated": is_calibrated}
+        for drive_name, log in logs.items():
+            refused = bool((found[log.stem]["self_calibration"] or {}).get("refused"))
+            runs += [about | {"drive": drive_name, "refused": refused} | row for row in figures_of(run, log.stem)]
+            if is_calibrated and file == WRONG_FILE:
+                errors = errors_over_sd(found[log.stem], true)
+                scores += [{"figure": figure, "drive": drive_name, "score": score} for figure, score in errors]
+    return runs, scores
 
 
-def runs_of(
-    tool: Tool, name: str, vehicle: Mapping[str, Any], logs: Sequence[Path], is_calibrated: bool
-) -> dict[str, Run]:
-    """Run the estimators on the drives of a car; return the results by log."""
-    place = tool.work / "cars" / name
-    file = write_toml(place.parent / f"{name}.toml", vehicle) if is_calibrated else write_validated_car(place, vehicle)
-    names = "zero,open-loop,phy-ukf,physics"
-    given = ("--car", file, "--keep", "estimates", "--estimators", names)
-    folder = tool.run(f"{name}-{is_calibrated}", *logs, *given)
-    metrics = pl.read_parquet(folder / "metrics.parquet").filter(segment="all")
-    runs = {}
-    for log, report in reports(folder).items():
-        of = {
-            metric: dict(metrics.filter(log=log, signal=signal, metric=metric).select("estimator", "value").iter_rows())
-            for signal, metric in (("sideslip_rad", "rmse"), ("vy_m_s", "d2"), ("sideslip_rad", "coverage95"))
+def figures_of(run: Path, log: str) -> Iterator[dict[str, Any]]:
+    """Yield RMSE in degrees, d2 in m/s, coverage and width of the 95 % intervals of each estimator on a drive."""
+    metrics = pl.read_parquet(run / "metrics.parquet").filter(log=log, segment="all")
+    tracks = pl.read_parquet(run / "logs" / log / "estimates.parquet").filter("valid")
+    for name in ESTIMATORS:
+        rows = metrics.filter(estimator=name).select("signal", "metric", "value").iter_rows()
+        of = {(signal, metric): value for signal, metric, value in rows}
+        std, rmse = tracks.filter(estimator=name)["sideslip_std_rad"].to_numpy(), of["sideslip_rad", "rmse"]
+        yield {
+            "estimator": name,
+            "rmse": math.degrees(rmse),
+            "d2": of.get(("vy_m_s", "d2")),
+            "coverage": of.get(("sideslip_rad", "coverage95")),
+            "width": 2.0 * NORMAL_95 * float(np.nanmean(std)) / rmse if np.isfinite(std).any() else None,
         }
-        rmse = {estimator: math.degrees(value) for estimator, value in of["rmse"].items()}
-        tracks = pl.read_parquet(folder / "logs" / log / "estimates.parquet")
-        stds = tracks.filter(pl.col("valid"), estimator="physics")["sideslip_std_rad"].to_numpy()
-        width = 2.0 * NORMAL_95 * math.degrees(float(np.nanmean(stds))) / rmse["physics"]
-        runs[log] = Run(rmse, of["d2"], report, of["coverage95"]["physics"], width)
-    return runs
 
 
 # ------------------------------------------------------------------------------------------------ tables
 
 
-def by_manoeuvre(done: Sequence[Outcome]) -> Iterator[tuple[str, list[Outcome]]]:
-    """Yield the outcomes of each manoeuvre, and all."""
-    for name in (*dict.fromkeys(o.manoeuvre for o in done), "all"):
-        yield name, [o for o in done if name in (o.manoeuvre, "all")]
+def by_manoeuvre(runs: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
+    """Yield the runs of each manoeuvre, and all."""
+    for (name,), some in runs.group_by("drive", maintain_order=True):
+        yield str(name), some
+    yield "all", runs
 
 
-def error_table(done: Sequence[Outcome]) -> str:
+def error_table(runs: pl.DataFrame) -> str:
     """Return the median errors, a line a manoeuvre."""
     columns = {
-        f"{file} file{', calibrated' if is_calibrated else ''}: {name}": (file, is_calibrated, name)
+        f"{file} file{', calibrated' if is_calibrated else ''}: {name}":
+            {"file": file, "calibrated": is_calibrated, "estimator": name}
         for file, is_calibrated, names in (
             (RIGHT, False, ("phy-ukf", "physics")), (WRONG_FILE, False, ("phy-ukf", "physics")),
             (WRONG_FILE, True, ("physics",)), (RIGHT, True, ("physics",)),
@@ -218,35 +179,35 @@ def error_table(done: Sequence[Outcome]) -> str:
         for name in names
     }  # fmt: skip
     body = []
-    for manoeuvre, some in by_manoeuvre(done):
-        cells = [number(float(np.median([o.runs[f, c].rmse[n] for o in some]))) for f, c, n in columns.values()]
-        ratio = [o.runs[WRONG_FILE, True].rmse["physics"] / o.runs[RIGHT, False].rmse["physics"] for o in some]
+    for manoeuvre, some in by_manoeuvre(runs):
+        rmse = {title: some.filter(**of)["rmse"].to_numpy() for title, of in columns.items()}
+        ratio = rmse["wrong file, calibrated: physics"] / rmse["right file: physics"]
         low, middle, high = np.percentile(ratio, [10, 50, 90])
-        refused = sum(bool((o.runs[WRONG_FILE, True].report["self_calibration"] or {}).get("refused")) for o in some)
-        body.append([manoeuvre, str(len(some)), str(refused), *cells, f"{middle:.2f} ({low:.2f} to {high:.2f})"])
+        refused = some.filter(file=WRONG_FILE, calibrated=True, estimator="physics")["refused"].sum()
+        cells = [number(float(np.median(values))) for values in rmse.values()]
+        body.append([manoeuvre, str(len(ratio)), str(refused), *cells, f"{middle:.2f} ({low:.2f} to {high:.2f})"])
     return table(["drive", "cars", "refused", *columns, "physics calibrated / right file"], body, right_from=1)
 
 
-def interval_table(done: Sequence[Outcome]) -> str:
+def interval_table(runs: pl.DataFrame) -> str:
     """Return coverage and width of the 95 % intervals of calibrated cars."""
     body = []
-    for manoeuvre, some in by_manoeuvre(done):
-        runs = [o.runs[file, True] for o in some for file in (RIGHT, WRONG_FILE)]
-        coverage = np.array([r.coverage for r in runs])
+    for manoeuvre, some in by_manoeuvre(runs.filter(calibrated=True, estimator="physics")):
+        coverage = some["coverage"].to_numpy()
         shares = [f"{x:.0%}" for x in (np.mean(coverage), *np.percentile(coverage, [10, 50, 90]))]
-        body.append([manoeuvre, str(len(runs)), *shares, number(float(np.median([r.width for r in runs])), 2)])
-    head = ["drive", "intervals", "coverage: mean", "10 %", "median", "90 %", "width / RMSE: median"]
+        width = number(float(np.median(some["width"].to_numpy())), 2)
+        body.append([manoeuvre, str(len(coverage)), *shares, width])
+    head = "drive, intervals, coverage: mean, 10 %, median, 90 %, width / RMSE: median"
     return table(head, body, right_from=1)
 
 
-def d2_table(done: Sequence[Outcome]) -> str:
+def d2_table(runs: pl.DataFrame) -> str:
     """Return the RMSE ratio of an estimate to the estimate with the lowest d2."""
     pairs = []
-    for o in done:
-        runs = (o.runs[WRONG_FILE, False], o.runs[WRONG_FILE, True])
-        both = {(i, n): (d2, r.rmse[n]) for i, r in enumerate(runs) for n, d2 in r.d2.items() if n in r.rmse}
-        for key, (d2, error) in both.items():
-            best = min((v for k, v in both.items() if k != key), default=None)
+    for _, some in runs.filter(pl.col("d2").is_not_null(), file=WRONG_FILE).group_by("car", "drive"):
+        both = some.select("d2", "rmse").rows()
+        for i, (d2, error) in enumerate(both):
+            best = min((pair for k, pair in enumerate(both) if k != i), default=None)
             if best is not None:
                 pairs.append((d2 / best[0], error / best[1]))
     values, body = np.array(pairs), []
@@ -255,24 +216,21 @@ def d2_table(done: Sequence[Outcome]) -> str:
         if inside.size:
             cells = [f"{x:.2f}" for x in np.percentile(inside, [0, 10, 50, 100])]
             body.append([f"{low:g} to {high:g}", str(inside.size), *cells])
-    head = ["v̇_y residual / lowest of the others", "estimates", "RMSE ratio: lowest", "10 %", "median", "most"]
-    return table(head, body, right_from=1)
+    return table("v̇_y residual / lowest of the others, estimates, RMSE ratio: lowest, 10 %, median, most", body,
+                 right_from=1)  # fmt: skip
 
 
-def coverage_table(scores: Sequence[tuple[str, str, float]]) -> str:
-    """Return the share of true values within ± 1.96 sd: of quantity, manoeuvre, and error over standard deviation."""
+def coverage_table(scores: pl.DataFrame) -> str:
+    """Return the share of true values within ± 1.96 sd by figure; ``scores``: errors over standard deviation."""
     body, (lowest, highest) = [], ACCEPTED
-    for name in sorted({quantity for quantity, _, _ in scores}):
-        of: dict[str, list[float]] = {}
-        for _, manoeuvre, score in (s for s in scores if s[0] == name):
-            of.setdefault(manoeuvre, []).append(score)
-        values = np.concatenate(list(of.values()))
-        shares = {m: float(np.mean(np.abs(v) <= NORMAL_95)) for m, v in of.items()}
-        share, least = float(np.mean(np.abs(values) <= NORMAL_95)), min(shares, key=lambda m: shares[m])
+    within = scores.with_columns(within=pl.col("score").abs() <= NORMAL_95)
+    for (name,), of in within.sort("figure").group_by("figure", maintain_order=True):
+        shares = of.group_by("drive", maintain_order=True).agg(pl.col("within").mean())
+        drive, least = shares.sort("within", maintain_order=True).row(0)
+        share, rms = float(of["within"].to_numpy().mean()), float(np.sqrt(np.mean(of["score"].to_numpy() ** 2)))
         word = "yes" if lowest <= share <= highest else "too wide" if share > highest else "no"
-        rms = f"{np.sqrt(np.mean(values**2)):.2f}"
-        body.append([name, str(len(values)), f"{share:.0%}", rms, f"{shares[least]:.0%} ({least})", word])
-    head = ["figure", "values", "within ± 1.96 sd", "RMS error / sd", "lowest of a manoeuvre", "90 to 98 %"]
+        body.append([str(name), str(len(of)), f"{share:.0%}", f"{rms:.2f}", f"{least:.0%} ({drive})", word])
+    head = "figure, values, within ± 1.96 sd, RMS error / sd, lowest of a manoeuvre, 90 to 98 %"
     return table(head, body, right_from=1)
 
 
@@ -283,21 +241,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "calibration")
     parser.add_argument("--out", type=Path, default=DOCS)
     given = parser.parse_args(arguments)
-    done: list[Outcome] = []
+    runs, scores = list[dict[str, Any]](), list[dict[str, Any]]()
     for index in range(given.cars):
-        done += outcomes(Tool(ROOT, given.work.resolve()), index)
+        of_car = outcomes(Tool(ROOT, given.work.resolve()), index)
+        runs += of_car[0]
+        scores += of_car[1]
         print(f"car {index}", file=sys.stderr)
-    scores = [
-        (name, o.manoeuvre, score)
-        for o in done
-        for name, score in errors_over_sd(o.runs[WRONG_FILE, True].report, o.true)
-    ]
-    texts = {"errors": error_table(done), "intervals": interval_table(done), "d2": d2_table(done)}
-    texts["plus_minus"] = coverage_table(scores)
-    write(
-        given.out / "calibration.md",
-        template(__file__, cars=given.cars, seed=SEED, low=WRONG[0], high=WRONG[1], **texts),
-    )
+    done = pl.DataFrame(runs)
+    update(given.out, "calibration.md", {
+        "cars": f"{given.cars} simulated cars, seed {SEED}.",
+        "errors": error_table(done),
+        "intervals": interval_table(done),
+        "d2": d2_table(done),
+        "plus_minus": coverage_table(pl.DataFrame(scores)),
+    })  # fmt: skip
     return 0
 
 

@@ -1,10 +1,10 @@
 """The condition table (docs/method.md#evaluation): every estimator on the same drives with one error in each row.
 
-    python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME,...] [--render]
+    python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 10] [--jobs 2] [--rows NAME ...] [--stored]
 
 Simulates the drives, runs all estimators by ``pdhef run``, and writes the page ``conditions.md`` with two figures to
 ``--out``, and all tables to ``--results``. ``--work`` keeps logs and runs: a repeated call resumes where it stopped.
-``--render`` renders the page from ``--results``. Friction is the only input of an estimator from the ground truth, and
+``--stored`` renders the page from ``--results``. Friction is the only input of an estimator from the ground truth, and
 only with the factor of the row. The runs of the independent simulator are a row if ``../shared`` is beside the
 repository.
 """
@@ -14,16 +14,19 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from pdhef_logtool import PdhefError, __version__
-from studies.conditions_page import write_page
+from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool
-from studies.pages import DOCS, INDEPENDENT, RESULTS, ROOT, options, write, write_toml
+from studies.pages import INDEPENDENT, ROOT, number, page_options, table, update, write, write_toml
+from studies.pictures import save, subplots
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
 INDEPENDENT_ROW = "independent-simulator"
@@ -33,29 +36,18 @@ ESTIMATORS = (
     "pd-hef-paper", "pd-hef:fixed-r", "pd-hef", "pd-hef-smoothed",
 )  # fmt: skip
 COLUMNS = ("row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n")
+#: The estimator of interest, the references of its RMSE ratios, and the ratio from which it is worse.
+SUBJECT, REFERENCES, MARGIN = "pd-hef", ("physics", "phy-ukf", "pd-hef-paper"), 1.05
+#: In the picture with their spans, from the naive to the best; the others are medians in grey.
+DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
+#: Okabe and Ito (2008), without yellow.
+COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
+RESAMPLES = 2000
+README_ROWS = (
+    "extrapolation", "unseen-manoeuvre", "other-vehicle", "friction-minus-20", "mass-plus-20", "bank-and-grade",
+    INDEPENDENT_ROW, "in-domain", "paper-a", "paper-b",
+)  # fmt: skip
 KEPT_METRICS = ("rmse", "availability", "coverage95", "lag_s", "nees", "nis", "nis_dof")
-
-
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the command line's options."""
-    parser = options("conditions", __doc__)
-    parser.add_argument("--car", default="saloon")
-    parser.add_argument("--network", type=Path, help="instead of the car's")
-    parser.add_argument("--estimators", default=",".join(ESTIMATORS))
-    parser.add_argument("--rows", default=",".join((*ROW_NAMES, INDEPENDENT_ROW)))
-    parser.add_argument("--drives", type=int, default=30, help="drives a row")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "conditions")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    parser.add_argument("--results", type=Path, default=RESULTS / "conditions")
-    parser.add_argument("--render", action="store_true", help="render the page from the stored results")
-    given = parser.parse_args(arguments)
-    given.rows = given.rows.split(",")
-    unknown = [r for r in given.rows if r not in (*ROW_NAMES, INDEPENDENT_ROW)]
-    if unknown:
-        parser.error(f"--rows: expected names out of {', '.join((*ROW_NAMES, INDEPENDENT_ROW))}, got {unknown}")
-    return given
 
 
 def row_logs(work: Path, row: str, drives: int, seed: int = 1, jobs: int = 1) -> tuple[list[Path], dict[str, Any]]:
@@ -92,7 +84,7 @@ def runs_of(tool: Tool, row: str, given: argparse.Namespace) -> Iterator[Path]:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Run all rows, and write results and page."""
+    """Run all rows and write the results."""
     tool, frames = Tool(ROOT, given.work.resolve()), []
     for row in given.rows:
         print(row, file=sys.stderr)
@@ -100,28 +92,134 @@ def run(given: argparse.Namespace) -> None:
             pl.read_parquet(folder / "metrics.parquet").rename({"log": "drive"}).with_columns(row=pl.lit(row))
             for folder in runs_of(tool, row, given)
         ]
-    metrics = pl.concat(frames).select(COLUMNS).filter(pl.col("metric").is_in(KEPT_METRICS))
-    metrics = metrics.filter(pl.col("segment").is_in(("all", "linear", "nonlinear")))
+    kept = pl.col("metric").is_in(KEPT_METRICS) & pl.col("segment").is_in(("all", "linear", "nonlinear"))
     network = "" if given.network is None else f" --network {given.network.name}"
-    command = f"python -m studies.conditions --car {given.car}{network} --drives {given.drives} --seed {given.seed}"
-    rows = {r.name: r.description for r in ROWS} | {INDEPENDENT_ROW: "runs of another simulator, true friction"}
     facts = {
-        "command": command,
+        "command": f"python -m studies.conditions --car {given.car}{network} --drives {given.drives}"
+        f" --seed {given.seed}",
         "car": given.car,
         "version": __version__,
-        "rows": rows,
+        "rows": {r.name: r.description for r in ROWS} | {INDEPENDENT_ROW: "runs of another simulator, true friction"},
         "order": given.estimators.split(","),
     }
     given.results.mkdir(parents=True, exist_ok=True)
+    metrics = pl.concat(frames).select(COLUMNS).filter(kept)
     metrics.write_parquet(given.results / "metrics.parquet", compression="zstd", compression_level=19)
     write(given.results / "facts.json", json.dumps(facts, indent=1) + "\n")
 
 
+# ------------------------------------------------------------------------------------------------ the page
+
+
+def ratio_of_medians(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return lower bound, median(a) / median(b) and upper bound over drives [N], paired; NaN without two drives.
+
+    The bootstrap draws whole drives with replacement, the same for both sides; the bounds are those of 95 %.
+    """
+    both = np.isfinite(a) & np.isfinite(b)
+    a, b = a[both], b[both]
+    if not len(a):
+        return np.full(3, np.nan)
+    draw = np.random.default_rng(0).integers(len(a), size=(RESAMPLES, len(a)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value, drawn = np.median(a) / np.median(b), np.median(a[draw], axis=1) / np.median(b[draw], axis=1)
+    low, high = np.nanpercentile(drawn, [2.5, 97.5]) if len(a) > 1 else (np.nan, np.nan)
+    return np.array([low, value, high])
+
+
+def verdict(low: float, high: float) -> str:
+    """Return the verdict from the interval of a ratio."""
+    if not np.isfinite(low):
+        return "–"
+    return "better" if high < 1.0 else "worse" if low > MARGIN else "not worse" if high <= MARGIN else "open"
+
+
+def write_page(out: Path, folder: Path) -> None:
+    """Render the page and its two figures from the results in a folder; drives without a scored sample do not count."""
+    facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
+    sideslip = pl.col("signal").cast(pl.String) == "sideslip_rad"
+    metrics = pl.read_parquet(folder / "metrics.parquet").filter(sideslip, segment="all")
+    errors = metrics.filter(metric="rmse").pivot("estimator", index=["row", "drive"], values="value").sort("drive")
+    names = [n for n in facts["order"] if n in errors.columns]
+    rows = [r for r in facts["rows"] if r in set(errors["row"])]
+    rmse = {r: {n: np.degrees(errors.filter(row=r)[n].to_numpy()) for n in names} for r in rows}
+    references = [r for r in REFERENCES if r in names] if SUBJECT in names else []
+    ratios = {o: np.array([ratio_of_medians(rmse[r][SUBJECT], rmse[r][o]) for r in rows]) for o in references}
+    spans = {n: np.array([np.nanpercentile(rmse[r][n], [10, 50, 90]) for r in rows]) for n in names}
+    drawn = {n: spans[n] for n in DRAWN if n in spans}
+    others = {n: span for n, span in spans.items() if n not in drawn}
+    pictures = out / "conditions"
+    pictures.mkdir(parents=True, exist_ok=True)
+    label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"
+    plot(pictures / "sideslip.png", rows, drawn, label, medians=others)
+    label = f"median sideslip RMSE of {SUBJECT} over that of the reference, 95 % interval"
+    plot(pictures / "ratios.png", rows, ratios, label, limits={1.0: "-", MARGIN: ":"})
+
+    covered = metrics.filter(metric="coverage95", estimator=SUBJECT)
+    summary, counts = [], []
+    for i, row in enumerate(rows):
+        of = covered.filter(row=row)
+        share = f"{100 * np.average(of['value'], weights=of['n']):.0f} %" if len(of) else "–"
+        cells = [number(drawn[n][i, 1]) for n in drawn]
+        summary.append([row, facts["rows"][row], str(errors.filter(row=row).height), *cells, share])
+    for reference, bounds in ratios.items():
+        words = [verdict(low, high) for low, _, high in bounds]
+        above = [f"{r} ({value:.2f})" for r, (_, value, _) in zip(rows, bounds, strict=True) if value > MARGIN]
+        numbers = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
+        counts.append([reference, *numbers, ", ".join(above) or "none"])
+    head = ["row", "condition", "drives", *drawn, f"coverage of {SUBJECT}"]
+    few = [cells[1:-1] for name in README_ROWS for cells in summary if cells[0] == name]
+    update(out, "README.md", {"conditions": table(head[1:-1], few, right_from=1)})
+    update(out, "conditions.md", {
+        "command": f"Command: `{facts['command']}`. Car: {facts['car']}; pdhef-logtool {facts['version']}.",
+        "summary": table(head, summary),
+        "counts": table(f"reference, better, not worse, open, worse, ratio above {MARGIN}", counts),
+    })  # fmt: skip
+
+
+def plot(
+    path: Path, rows: Sequence[str], spans: Mapping[str, FloatArray], label: str, *,
+    medians: Mapping[str, FloatArray] = MappingProxyType({}), limits: Mapping[float, str] = MappingProxyType({}),
+) -> None:  # fmt: skip
+    """Draw low, middle and high [rows, 3] of every name in a lane per row, and medians in grey."""
+    fig, grid = subplots(1, 1, 9.0, 1.5 + 0.36 * len(rows), {"font.size": 9})
+    axes = grid[0, 0]
+    for row in range(0, len(rows), 2):
+        axes.axhspan(row - 0.5, row + 0.5, color="0.94", linewidth=0)
+    step = 0.8 / max(len(spans), 1)
+    for i, (name, span) in enumerate(spans.items()):
+        y = np.arange(len(rows)) + (i - 0.5 * (len(spans) - 1)) * step
+        colour, marker = COLOURS[i % len(COLOURS)], "osD^vP"[i % 6]
+        axes.hlines(y, span[:, 0], span[:, 2], color=colour, linewidth=1.6, alpha=0.55)
+        axes.plot(span[:, 1], y, marker, markersize=4.5, color=colour, label=name)
+    for i, span in enumerate(medians.values()):
+        label_of = None if i else "the others of the table"
+        axes.plot(span[:, 1], np.arange(len(rows)), "|", markersize=7, color="0.6", zorder=1.5, label=label_of)
+    for limit, dash in limits.items():
+        axes.axvline(limit, color="black", linewidth=0.8, linestyle=dash)
+    axes.set(xscale="log", xlabel=label, ylim=(len(rows) - 0.5, -0.5))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_yticks(range(len(rows)), rows)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(alpha=0.4, axis="x")
+    fig.legend(frameon=False, loc="outside upper center", ncols=7)
+    save(fig, path)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the table; 1 with one line where an input is wrong."""
-    given = parse(arguments)
+    parser = page_options("conditions", __doc__)
+    parser.add_argument("--car", default="saloon")
+    parser.add_argument("--network", type=Path, help="instead of the car's")
+    parser.add_argument("--estimators", default=",".join(ESTIMATORS))
+    all_rows = (*ROW_NAMES, INDEPENDENT_ROW)
+    parser.add_argument("--rows", nargs="+", choices=all_rows, default=all_rows, metavar="ROW", help="all by default")
+    parser.add_argument("--drives", type=int, default=10, help="drives a row")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2)
+    given = parser.parse_args(arguments)
     try:
-        if not given.render:
+        if not given.stored:
             run(given)
         write_page(given.out, given.results)
     except (PdhefError, RuntimeError) as error:

@@ -24,9 +24,9 @@ DRIVES = ROOT.parent / "shared" / "data" / "drives"
 INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
 
 
-def table(head: Iterable[str], body: Iterable[Iterable[str]], *, right_from: int | None = None) -> str:
-    """Return a Markdown table, columns from ``right_from`` on ranged right."""
-    names = list(head)
+def table(head: str | Iterable[str], body: Iterable[Iterable[str]], *, right_from: int | None = None) -> str:
+    """Return a Markdown table, columns from ``right_from`` on ranged right; a text as head has commas between names."""
+    names = head.split(", ") if isinstance(head, str) else list(head)
     rule = ["---" if right_from is None or i < right_from else "---:" for i in range(len(names))]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, rule, *body))
 
@@ -52,8 +52,18 @@ def template(module: str, **texts: object) -> str:
     return Path(module).with_suffix(".md").read_text(encoding="utf-8").format(**texts)
 
 
+def update(folder: Path, name: str, blocks: Mapping[str, str]) -> None:
+    """Put new blocks into a page of the documentation, or README.md, whose other text is written by hand.
+
+    ``folder`` : where the page is written if it is not ``docs`` itself.
+    """
+    page = (ROOT if name == "README.md" else DOCS) / name
+    target = page if folder == DOCS else folder / name
+    write(target, fill(page.read_text(encoding="utf-8"), blocks, name))
+
+
 def write(path: Path, text: str) -> None:
-    """Write a page atomically and print its path."""
+    """Write a file atomically and print its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, text.encode())
     print(path)
@@ -87,3 +97,13 @@ def options(name: str, text: str | None) -> argparse.ArgumentParser:
     """Return the parser of ``python -m studies.NAME``; ``text`` is its module's."""
     shape = argparse.RawDescriptionHelpFormatter
     return argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)
+
+
+def page_options(name: str, text: str | None) -> argparse.ArgumentParser:
+    """Return the parser of a study with stored results and a page."""
+    parser = options(name, text)
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / name, help="folder of logs and runs")
+    parser.add_argument("--out", type=Path, default=DOCS, help="folder of the page")
+    parser.add_argument("--results", type=Path, default=RESULTS / name, help="folder of the results")
+    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
+    return parser

@@ -1,12 +1,12 @@
 """Regenerate everything that is derived from the sources: shipped vehicle files, cars, networks, evidence pages.
 
-    python -m studies.recalibrate [--list] [--only STAGE ...]
+    python -m studies.recalibrate [--list] [--only STAGE ...] [--evidence]
 
 The stages run in the order of ``recalibrate.toml``. A stage is skipped if its outputs exist and its command and
 the digest of its inputs have not changed since its last completion. After a failure or an interruption, the same
 command continues with the stage that was not completed; if its inputs have changed since, its work folders are deleted
 first. Comments, docstrings and the layout of pages (``studies.pages``, ``studies.pictures``) do not count as inputs.
-The stamp files are in ``out/recalibrate``.
+The stamp files are in ``out/recalibrate``. ``--evidence``: only the stages that write pages of ``docs``.
 """
 
 from __future__ import annotations
@@ -164,7 +164,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="print the stages and run none")
     stages = load_stages()
     parser.add_argument("--only", nargs="+", choices=[s.name for s in stages], metavar="STAGE", help="run these alone")
+    parser.add_argument("--evidence", action="store_true", help="run the stages that write pages of docs alone")
     given = parser.parse_args(arguments)
+    if given.evidence:
+        given.only = [s.name for s in stages if any(output.startswith("docs/") for output in s.outputs)]
     recalibration = Recalibration(ROOT, stages)
     if given.list:
         print(recalibration.listed())

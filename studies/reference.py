@@ -1,6 +1,6 @@
 """The sideslip reference against ground truth: recorded and simulated drives, with and without GNSS.
 
-    python -m studies.reference [--cases NAME,...] [--work out/reference] [--out docs] [--results DIR]
+    python -m studies.reference [--cases TEXT ...] [--work out/reference] [--out docs] [--results DIR]
 
 Each case is a run of ``pdhef run --reference on`` (docs/method.md#reference). Recorded drives are in
 ``../shared``, which may not be redistributed: without them, their stored figures stay. GNSS of most of them is made
@@ -11,43 +11,32 @@ Recorded drives were seen while constants were chosen: their figures are develop
 from __future__ import annotations
 
 import hashlib
+import heapq
 import json
 import math
 import sys
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
-from mcap.reader import make_reader
-from mcap.writer import Writer
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from pdhef_logtool import Car
+from studies import pages
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
-from studies.gates.tool import Tool, reports, sideslip_rmse_deg
-from studies.pages import (
-    DOCS,
-    DRIVES,
-    RESULTS,
-    ROOT,
-    SAMPLE_VEHICLE,
-    number,
-    options,
-    table,
-    template,
-    write,
-    write_toml,
-    write_validated_car,
-)
+from studies.gates.tool import Tool, estimates, reports, sideslip_rmse_deg
+from studies.mcap_logs import Message, messages, write_log
+from studies.pages import DRIVES, ROOT, number, table, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.recalibrate import input_digest
 from truthsim.batch import DriveSpec
-from truthsim.drive import DEFAULT_VEHICLE, write_drive
+from truthsim.drive import DEFAULT_VEHICLE
 from truthsim.vehicle_choice import choose_vehicle
 
 FloatArray = NDArray[np.float64]
@@ -128,11 +117,9 @@ def made_gnss(
     keep = math.exp(-1.0 / (receiver.rate_hz * receiver.correlated_s))
     columns = []
     for component in (cos * forward - sin * left, sin * forward + cos * left):
-        correlated = np.empty(len(sampled))
-        value = rng.standard_normal()
-        for i in range(len(sampled)):
-            correlated[i] = value
-            value = keep * value + math.sqrt(1.0 - keep**2) * rng.standard_normal()
+        drawn = rng.standard_normal(len(sampled) + 1)[:-1]
+        drawn[1:] *= math.sqrt(1.0 - keep**2)
+        correlated = lfilter([1.0], [1.0, -keep], drawn)
         good = np.isfinite(component)
         made = np.interp(sampled - receiver.delay_s, t[good], component[good])
         columns.append(
@@ -150,27 +137,13 @@ def made_gnss(
 
 def add_gnss(log: Path, output: Path, stamps_ns: NDArray[np.int64], velocity_m_s: FloatArray) -> Path:
     """Copy an MCAP log and add a topic with GNSS velocity as JSON; it arrives ``LATE_S`` after its stamp."""
-    schema = {"type": "object", "properties": {name: {"type": "number"} for name in ("east", "north")}}
-    output.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("rb") as source, output.open("wb") as target:
-        writer = Writer(target)
-        writer.start()
-        schemas: dict[int, int] = {}
-        channels: dict[int, int] = {}
-        for kind, channel, message in make_reader(source).iter_messages(log_time_order=False):
-            if channel.id not in channels:
-                if kind is not None and kind.id not in schemas:
-                    schemas[kind.id] = writer.register_schema(kind.name, kind.encoding, kind.data)
-                of = 0 if kind is None else schemas[kind.id]
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        added = writer.register_schema("Velocity", "jsonschema", json.dumps(schema).encode())
-        topic = writer.register_channel(GNSS_TOPIC, "json", added)
-        for stamp, (east, north) in zip(stamps_ns.tolist(), velocity_m_s.tolist(), strict=True):
-            payload = json.dumps({"east": east, "north": north}).encode()
-            writer.add_message(topic, stamp + round(1e9 * LATE_S), payload, stamp)
-        writer.finish()  # type: ignore[no-untyped-call]
-    return output
+    types = {"type": "object", "properties": {name: {"type": "number"} for name in ("east", "north")}}
+    schema, late_ns = ("Velocity", "jsonschema", json.dumps(types).encode()), round(1e9 * LATE_S)
+    added = (
+        Message(stamp + late_ns, stamp, GNSS_TOPIC, json.dumps({"east": e, "north": n}).encode(), "json", schema)
+        for stamp, (e, n) in zip(stamps_ns.tolist(), velocity_m_s.tolist(), strict=True)
+    )
+    return write_log(output, heapq.merge(messages(log), added, key=lambda m: m.log_time_ns))
 
 
 GNSS_TOPIC = "/made/gnss_velocity"
@@ -263,31 +236,16 @@ def cases() -> Iterator[Case]:
         yield Case(title, MADE, spec=replace(SIMULATED[title], sensors=REAR_IMU), fault=MOVED_IMU)
 
 
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """Figures of a case; angles in degrees. ``truth``: RMS of the ground truth.
-
-    ``physics``, ``aided``: RMSE of ``physics`` without and with GNSS. ``pairs`` of estimates: that the reference ranks,
-    of these as by ground truth; that differ by more than ``CLEAR_DEG``, of these that the reference ranks.
-    """
-
-    truth: float
-    rmse: float
-    std: float
-    coverage: float
-    valid_share: float
-    valid_rmse: float
-    used_gnss: bool
-    refused: str
-    physics: float = math.nan
-    aided: float = math.nan
-    pairs: tuple[int, int, int, int] = (0, 0, 0, 0)
+#: Figures of a case; angles in degrees. ``truth``: RMS of the ground truth. ``physics``, ``aided``: RMSE of ``physics``
+#: without and with GNSS. ``pairs`` of estimates: that the reference ranks, of these as by ground truth; that differ by
+#: more than ``CLEAR_DEG``, of these that the reference ranks.
+Figures = dict[str, Any]
 
 
-def figures(case: Case, tool: Tool, *, with_filters: bool = True) -> Figures:
+def figures(case: Case, tool: Tool) -> Figures:
     """Run a case and compare its reference with the ground truth at all stamps above the least speed.
 
-    ``with_filters``: also run the estimators that the reference ranks, with and without GNSS.
+    With GNSS, the estimators that the reference ranks also run, with and without it.
     """
     name = "".join(c if c.isalnum() else "-" for c in case.name)
     log, mapping, vehicle, motion = drive_of(case, tool, name)
@@ -305,15 +263,15 @@ def figures(case: Case, tool: Tool, *, with_filters: bool = True) -> Figures:
         mapping["signals"]["ay_m_s2"]["offset"] = 0.5
         mapping["signals"]["yaw_rate_rad_s"] = yaw_rate | {"scale": 1.01 * yaw_rate.get("scale", 1.0), "offset": 0.005}
     scored = scored_run(run(case, tool, name, log, mapping, vehicle), case, vehicle)
-    if case.gnss == NONE or not scored.used_gnss or not with_filters:
+    if case.gnss == NONE or not scored["used_gnss"]:
         return scored
     bare = ("--estimators", ",".join(RANKED))
     without, aided = (
         run(case, tool, f"{name}-{gnss}", log, mapping, vehicle, *bare, "--gnss", gnss) for gnss in ("off", "auto")
     )
     errors = sideslip_rmse_deg(without)
-    pairs = (0, 0, 0, 0) if scored.refused else rankings(aided, errors)
-    return replace(scored, physics=errors["physics"], aided=sideslip_rmse_deg(aided)["physics"], pairs=pairs)
+    scored |= {"physics": errors["physics"], "aided": sideslip_rmse_deg(aided)["physics"]}
+    return scored if scored["refused"] else scored | {"pairs": rankings(aided, errors)}
 
 
 def drive_of(case: Case, tool: Tool, name: str) -> tuple[Path, dict[str, Any], dict[str, Any], Motion | None]:
@@ -322,13 +280,11 @@ def drive_of(case: Case, tool: Tool, name: str) -> tuple[Path, dict[str, Any], d
         peer = _peer(case.log)
         mapping = mapping_table(peer, receiver=case.gnss == REAL)
         return DRIVES / case.log, mapping, vehicle_table(peer), None
-    drive, log = case.spec.simulate(), tool.work / "logs" / f"{name}-simulated.mcap"
-    log.parent.mkdir(parents=True, exist_ok=True)
-    log.unlink(missing_ok=True)
-    write_drive(drive, log)
-    vehicle = tomllib.loads(SAMPLE_VEHICLE.read_text(encoding="utf-8"))
+    drive = case.spec.simulate()
+    log = tool.log(f"{name}-simulated", drive)
+    vehicle = tomllib.loads(pages.SAMPLE_VEHICLE.read_text(encoding="utf-8"))
     if case.spec.vehicle != DEFAULT_VEHICLE:
-        fitted = fit_vehicle(choose_vehicle(case.spec.vehicle), FIT_FRICTION, Car.load(SAMPLE_VEHICLE).vehicle)
+        fitted = fit_vehicle(choose_vehicle(case.spec.vehicle), FIT_FRICTION, Car.load(pages.SAMPLE_VEHICLE).vehicle)
         vehicle = fitted.model_dump(mode="json", exclude_none=True)
     stamps = drive.start_ns + np.rint(drive.times_s * 1e9).astype(np.int64)
     columns = (drive.truth[n] for n in ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s"))
@@ -341,7 +297,7 @@ def run(
     """Run the reference on a drive; return the output folder."""
     file = write_toml(tool.work / "mappings" / f"{name}.toml", mapping)
     place = tool.work / "cars" / name
-    car = write_validated_car(place, vehicle) if more else write_toml(place.parent / f"{name}.toml", vehicle)
+    car = pages.write_validated_car(place, vehicle) if more else write_toml(place.parent / f"{name}.toml", vehicle)
     files = ("--mapping", file, "--car", car)
     waived = [word for check in SPIN_CHECKS for word in ("--waive", check)] if "spin" in case.title else []
     given = more or ("--estimators", "zero,physics")
@@ -350,16 +306,14 @@ def run(
 
 def tracks_of(folder: Path) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Return ground truth and reference of a run at the stamps that both have."""
-    (file,) = folder.glob("logs/*/estimates.parquet")
-    tracks = pl.read_parquet(file)
+    tracks = estimates(folder)
     truth, reference = (tracks.filter(estimator=name).sort("stamp_ns") for name in ("truth", "reference"))
     return truth.join(reference, on="stamp_ns", how="semi"), reference.join(truth, on="stamp_ns", how="semi")
 
 
 def motion_of(folder: Path) -> Motion:
     """Return the motion of a recorded drive from the ground truth of a run."""
-    (file,) = folder.glob("logs/*/estimates.parquet")
-    truth = pl.read_parquet(file).filter(estimator="truth").sort("stamp_ns")
+    truth = estimates(folder).filter(estimator="truth").sort("stamp_ns")
     stamps = truth["stamp_ns"].to_numpy()
     vx, vy, rate = (truth[n].to_numpy() for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
     return Motion(stamps, vx, vy, np.cumsum(np.nan_to_num(rate) * np.gradient(stamps * 1e-9)), np.zeros(len(stamps)))
@@ -382,10 +336,19 @@ def scored_run(folder: Path, case: Case, vehicle: dict[str, Any]) -> Figures:
     def rms(values: FloatArray) -> float:
         return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
-    covered = float(np.mean(np.abs(error[used]) < NORMAL_95 * std[used]))
-    of_valid = float(valid.sum() / max(used.sum(), 1)), rms(error[valid])
-    refused = str(report["refused"] or "")
-    return Figures(rms(beta[used]), rms(error[used]), rms(std[used]), covered, *of_valid, report["gnss"], refused)
+    return {
+        "truth": rms(beta[used]),
+        "rmse": rms(error[used]),
+        "std": rms(std[used]),
+        "coverage": float(np.mean(np.abs(error[used]) < NORMAL_95 * std[used])),
+        "valid_share": float(valid.sum() / max(used.sum(), 1)),
+        "valid_rmse": rms(error[valid]),
+        "used_gnss": report["gnss"],
+        "refused": str(report["refused"] or ""),
+        "physics": math.nan,
+        "aided": math.nan,
+        "pairs": (0, 0, 0, 0),
+    }
 
 
 def rankings(folder: Path, errors: dict[str, float]) -> tuple[int, int, int, int]:
@@ -398,15 +361,21 @@ def rankings(folder: Path, errors: dict[str, float]) -> tuple[int, int, int, int
     return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)
 
 
-_HEAD = ("drive", "GNSS", "true RMS", "RMSE", "±", "coverage", "valid", "RMSE there", "refused")
+_HEAD = "drive, GNSS, fault, true RMS, RMSE, target, ±, coverage, valid, RMSE there, physics, with GNSS, refused"
 
 
 def _row(case: Case, got: Figures) -> list[str]:
-    gnss = case.gnss if got.used_gnss or case.gnss == NONE else f"{case.gnss}, not used"
-    coverage = f"{100 * got.coverage:.0f} %" if math.isfinite(got.coverage) else "–"
-    cells = (number(got.truth, 2), number(got.rmse, 2), number(got.std, 2), coverage)
-    valid = f"{100 * got.valid_share:.0f} %"
-    return [case.title, gnss, *cells, valid, number(got.valid_rmse, 2), got.refused.partition(" (")[0] or "–"]
+    """Return the line of a case; an error above its target is bold."""
+    gnss = case.gnss if got["used_gnss"] or case.gnss == NONE else f"{case.gnss}, not used"
+    rmse, target = number(got["rmse"]), case.target_deg
+    missed = target is not None and not (got["rmse"] <= target and not got["refused"])
+    coverage = f"{100 * got['coverage']:.0f} %" if math.isfinite(got["coverage"]) else "–"
+    return [
+        case.title, gnss, case.fault or "–", number(got["truth"], 2), f"**{rmse}**" if missed else rmse,
+        "–" if target is None else f"{target:.2f}", number(got["std"], 2), coverage,
+        f"{100 * got['valid_share']:.0f} %", number(got["valid_rmse"], 2), number(got["physics"]), number(got["aided"]),
+        got["refused"].partition(" (")[0] or "–",
+    ]  # fmt: skip
 
 
 def _rankings(done: Sequence[tuple[Case, Figures]]) -> list[list[str]]:
@@ -416,81 +385,47 @@ def _rankings(done: Sequence[tuple[Case, Figures]]) -> list[list[str]]:
         ("simulated", (*SIMULATED, "road, 60 s")),
         ("simulated, other cars", OTHER_CARS),
     ):
-        pairs = [f.pairs for c, f in done if c.title in titles and c.fault != AT_ANTENNA]
-        claimed, agreed, clear, found = map(sum, zip(*pairs, strict=True))
+        pairs = [f["pairs"] for c, f in done if c.title in titles and c.fault != AT_ANTENNA]
+        claimed, agreed, clear, found = np.sum(np.array(pairs).reshape(-1, 4), axis=0, dtype=int).tolist()
         agree = "–" if not claimed else f"{100.0 * agreed / claimed:.0f} %"
         share = "–" if not clear else f"{100.0 * found / clear:.0f} %"
         rows.append([name, str(claimed), agree, str(clear), share])
     return rows
 
 
-def page(results: dict[str, Figures]) -> str:
-    """Return the page of the stored figures."""
+def blocks(results: dict[str, Figures]) -> dict[str, str]:
+    """Return the tables of the stored figures by name."""
     done = [(case, results[case.name]) for case in cases() if case.name in results]
-    aided = [(c, f) for c, f in done if math.isfinite(f.aided) and c.fault != AT_ANTENNA]
-    worse = sum(f.aided > f.physics + max(0.05 * f.physics, 0.003) for _, f in aided)
-    recorded = [_row(c, f) for c, f in done if c.log and not c.fault]
-    antenna = [_row(c, f) for c, f in done if c.fault == AT_ANTENNA]
-    simulated = [_row(c, f) for c, f in done if c.spec is not None and not c.fault]
-    faults = [[c.fault, *_row(c, f)] for c, f in done if c.fault and c.spec is not None]
-    targets = [
-        [c.name, f"{c.target_deg:.2f}", number(f.rmse), "yes" if f.rmse <= c.target_deg and not f.refused else "**no**"]
-        for c, f in done
-        if c.target_deg is not None
-    ]
-    return template(
-        __file__,
-        made=MADE,
-        late=1e3 * LATE_S,
-        worse=worse,
-        all=len(aided),
-        causal=table(
-            ("drive", "physics", "with GNSS"), [[c.name, number(f.physics, 3), number(f.aided, 3)] for c, f in aided]
-        ),
-        ranked=", ".join(f"`{name}`" for name in RANKED),
-        rankings=table(
-            (
-                "drives",
-                "ranked",
-                "as by ground truth",
-                f"pairs that differ by more than {CLEAR_DEG}°",
-                "of these ranked",
-            ),
-            _rankings(done),
-        ),
-        recorded=table(_HEAD, recorded),
-        antenna=table(_HEAD, antenna),
-        simulated=table(_HEAD, simulated),
-        faults=table(("fault", *_HEAD), faults),
-        targets=table(("drive", "target", "RMSE", "reached"), targets),
-    )
+    aided = [f for c, f in done if math.isfinite(f["aided"]) and c.fault != AT_ANTENNA]
+    worse = sum(f["aided"] > f["physics"] + max(0.05 * f["physics"], 0.003) for f in aided)
+    head = f"drives, ranked, as by ground truth, pairs that differ by more than {CLEAR_DEG}°, of these ranked"
+    return {
+        "recorded": table(_HEAD, [_row(c, f) for c, f in done if c.log]),
+        "simulated": table(_HEAD, [_row(c, f) for c, f in done if c.spec is not None]),
+        "causal": f"In {worse} of {len(aided)} rows, `physics` is worse with GNSS by more than 5 % and 0.003°.",
+        "rankings": table(head, _rankings(done)),
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compute the cases that are not stored yet, and write the page."""
-    parser = options("reference", __doc__)
-    parser.add_argument("--cases", default="", help="parts of names of cases, comma-separated")
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "reference")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    parser.add_argument("--results", type=Path, default=RESULTS / "reference")
+    parser = pages.page_options("reference", __doc__)
+    parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="parts of the names of cases")
     given = parser.parse_args(arguments)
     file = given.results / STORED
-    stored: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    wanted = given.cases.split(",")
+    stored: dict[str, Figures] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     source = input_digest(ROOT, [f"{folder}/**/*.py" for folder in ("pdhef_logtool", "truthsim", "studies")])
     tool = Tool(ROOT, given.work.resolve())
-    for case in cases():
+    for case in () if given.stored else cases():
         key = hashlib.sha256(f"{case!r} {source}".encode()).hexdigest()
-        if not any(w in case.name for w in wanted) or stored.get(case.name, {}).get("key") == key:
+        if not any(text in case.name for text in given.cases) or stored.get(case.name, {}).get("key") == key:
             continue
         if case.log and not (DRIVES / case.log).exists():
             continue
         print(case.name, file=sys.stderr)
-        stored[case.name] = {"key": key, **asdict(figures(case, tool))}
-        write(file, json.dumps(stored, indent=1) + "\n")
-    names = {case.name for case in cases()}
-    results = {n: Figures(**{k: v for k, v in s.items() if k != "key"}) for n, s in stored.items() if n in names}
-    write(given.out / "reference.md", page(results))
+        stored[case.name] = {"key": key, **figures(case, tool)}
+        pages.write(file, json.dumps(stored, indent=1) + "\n")
+    pages.update(given.out, "reference.md", blocks(stored))
     return 0
 
 

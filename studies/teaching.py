@@ -1,6 +1,6 @@
 """Teaching on recorded drives: taught on one drive with ground truth, scored on another one of the same car.
 
-    python -m studies.teaching [--cars GTI,...] [--out docs] [--stored]
+    python -m studies.teaching [--cars GTI ...] [--out docs] [--stored]
 
 ``pdhef learn`` teaches; ``pdhef run`` calibrates the car on the sensors of the scored drive, without ground truth.
 Columns: ``physics`` of the untaught car, of the taught car, and ``pd-hef`` of the taught car with its residual; also
@@ -15,18 +15,18 @@ import math
 import sys
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from itertools import permutations
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 
-from studies.gates.tool import Tool
-from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, template, write, write_toml
-from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
+from studies.gates.tool import Tool, estimates
+from studies.pages import DRIVES, ROOT, number, page_options, table, update, write, write_toml
+from studies.peers.drives import FULL_SIZE, PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 
-RESULTS_FILE = RESULTS / "teaching.json"
+STORED = "pairs.json"
 #: No pair may be worse than untaught by more than the larger of this share and this many degrees.
 WORSE_SHARE, WORSE_DEG = 0.05, 0.03
 #: Driving counts as alike where the residual is active on this share of it.
@@ -75,46 +75,21 @@ CARS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Score:
-    """RMSE in degrees, also without the constant; shares with an active residual and inside 95 % intervals."""
-
-    rmse_deg: float
-    without_constant_deg: float
-    active: float
-    covered: float | None
+#: RMSE in degrees, also without the constant; shares with an active residual and inside 95 % intervals.
+Score = dict[str, Any]
+#: A pair as it is stored: names of car and parts, the scores ``untaught``, ``prior``, ``hybrid`` and ``reference``.
+Pair = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class PairResult:
-    """A pair: taught on ``taught``, scored on ``scored``."""
+def ratio(pair: Pair, way: str = "hybrid") -> float:
+    """Return the RMSE of a way over that of untaught ``physics``."""
+    return float(pair[way]["rmse_deg"] / pair["untaught"]["rmse_deg"])
 
-    car: str
-    taught: str
-    scored: str
-    untaught: Score
-    prior: Score
-    hybrid: Score
-    kinematic_deg: float
-    paper_deg: float
-    rung: str
-    reference: Score | None = None
 
-    @property
-    def worse(self) -> bool:
-        """Whether teaching costs more than it may."""
-        limit = max((1.0 + WORSE_SHARE) * self.untaught.rmse_deg, self.untaught.rmse_deg + WORSE_DEG)
-        return self.hybrid.rmse_deg > limit
-
-    @property
-    def ratio(self) -> float:
-        """RMSE of ``pd-hef`` of the taught car over the RMSE of untaught ``physics``."""
-        return self.hybrid.rmse_deg / self.untaught.rmse_deg
-
-    @property
-    def referred(self) -> PairResult | None:
-        """The same if the reference teaches, None if it cannot."""
-        return None if self.reference is None else replace(self, hybrid=self.reference)
+def is_worse(pair: Pair, way: str = "hybrid") -> bool:
+    """Return whether teaching costs more than it may."""
+    untaught = pair["untaught"]["rmse_deg"]
+    return bool(pair[way]["rmse_deg"] > max((1.0 + WORSE_SHARE) * untaught, untaught + WORSE_DEG))
 
 
 def peer_of(part: TeachPart) -> PeerDrive:
@@ -163,132 +138,123 @@ def scores(tool: Tool, part: TeachPart, car: Path, names: Sequence[str], *option
     given = ["--keep", "estimates", "--estimators", ",".join(names), *options_of]
     folder = tool.run(run_name, *inputs(tool, part), "--car", car, *given)
     figures = pl.read_parquet(folder / "metrics.parquet").filter(signal="sideslip_rad", segment="all")
-    (file,) = folder.glob("logs/*/estimates.parquet")
-    tracks = pl.read_parquet(file)
+    active = estimates(folder).group_by("estimator").agg((pl.col("network_trust").fill_null(0.0) > 0.0).mean())
     found = {}
-    for name in names:
+    for name, share in active.filter(pl.col("estimator").is_in(names)).iter_rows():
         of = dict(figures.filter(estimator=name).select("metric", "value").iter_rows())
-        trust = tracks.filter(estimator=name)["network_trust"].to_numpy()
-        constant = math.sqrt(max(of["rmse"] ** 2 - of["bias"] ** 2, 0.0))
-        degrees = math.degrees(of["rmse"]), math.degrees(constant)
-        found[name] = Score(*degrees, float(np.mean(trust > 0.0)), of.get("coverage95"))
+        found[str(name)] = {
+            "rmse_deg": math.degrees(of["rmse"]),
+            "without_constant_deg": math.degrees(math.sqrt(max(of["rmse"] ** 2 - of["bias"] ** 2, 0.0))),
+            "active": share,
+            "covered": of.get("coverage95"),
+        }
     return found
 
 
-def pairs_of(tool: Tool, car: TeachCar) -> Iterator[PairResult]:
+def pairs_of(tool: Tool, car: TeachCar) -> Iterator[Pair]:
     """Yield the results of a car's pairs."""
     parts = car.parts
-    file = write_toml(tool.work / "cars" / f"{car.name}.toml".replace(" ", "-").replace(":", "-"),
-                      vehicle_table(peer_of(parts[0])))  # fmt: skip
+    stem = car.name.replace(" ", "-").replace(":", "-")
+    file = write_toml(tool.work / "cars" / f"{stem}.toml", vehicle_table(peer_of(parts[0])))
     untaught = [scores(tool, part, file, ("physics", "kinematic")) for part in parts]
     paper = [scores(tool, part, file, (PAPER,), "--network", "default")[PAPER] for part in parts]
-    choices: list[tuple[tuple[int, ...], int]] = [((a,), b) for a, b in permutations(range(len(parts)), 2)]
-    if car.taught_on > 1:
-        choices = [(tuple(range(car.taught_on)), k) for k in range(car.taught_on, len(parts))]
-    learned: dict[tuple[int, ...], tuple[Path, str, Path | None]] = {}
-    for teachers, k in choices:
-        taught_on = parts[teachers[0]].name if len(teachers) == 1 else f"{len(teachers)} runs"
-        if teachers not in learned:
-            name = f"{file.stem}-{teachers[0]}"
-            taught, rung = learn(tool, file, [parts[i] for i in teachers], name)
-            has_receiver = parts[teachers[0]].log.startswith("v40_")
-            by_reference = (
-                learn_by_reference(tool, file, parts[teachers[0]], f"{name}-reference") if has_receiver else None
-            )
-            learned[teachers] = taught, rung, by_reference
-        taught, rung, by_reference = learned[teachers]
-        after = scores(tool, parts[k], taught, ("physics", "pd-hef"))
-        referred = None if by_reference is None else scores(tool, parts[k], by_reference, ("pd-hef",))["pd-hef"]
-        of = untaught[k]
-        yield PairResult(
-            car.name, taught_on, parts[k].name, of["physics"], after["physics"], after["pd-hef"],
-            of["kinematic"].rmse_deg, paper[k].rmse_deg, rung, referred,
-        )  # fmt: skip
+    teachers = [(a,) for a in range(len(parts))] if car.taught_on == 1 else [tuple(range(car.taught_on))]
+    for chosen in teachers:
+        name, first = f"{stem}-{chosen[0]}", parts[chosen[0]]
+        taught, rung = learn(tool, file, [parts[i] for i in chosen], name)
+        has_receiver = first.log.startswith("v40_")
+        by_reference = learn_by_reference(tool, file, first, f"{name}-reference") if has_receiver else None
+        for k in (k for k in range(len(parts)) if k not in chosen):
+            after = scores(tool, parts[k], taught, ("physics", "pd-hef"))
+            yield {
+                "car": car.name,
+                "taught": first.name if len(chosen) == 1 else f"{len(chosen)} runs",
+                "scored": parts[k].name,
+                "untaught": untaught[k]["physics"],
+                "prior": after["physics"],
+                "hybrid": after["pd-hef"],
+                "kinematic_deg": untaught[k]["kinematic"]["rmse_deg"],
+                "paper_deg": paper[k]["rmse_deg"],
+                "rung": rung,
+                "reference": by_reference and scores(tool, parts[k], by_reference, ("pd-hef",))["pd-hef"],
+            }
 
 
-def pair_table(results: Sequence[PairResult]) -> str:
+def pair_table(results: Sequence[Pair]) -> str:
     """Return one line per pair."""
 
     def cell(s: Score) -> str:
-        return f"{s.rmse_deg:.3f} ({s.without_constant_deg:.3f})"
+        return f"{s['rmse_deg']:.3f} ({s['without_constant_deg']:.3f})"
 
     body = [[
-            r.car, r.taught, r.scored, cell(r.untaught), cell(r.prior), cell(r.hybrid),
-            number(r.ratio, 2) + (" worse" if r.worse else ""), geometric_mean([p.ratio] if (p := r.referred) else []),
-            number(r.paper_deg, 3), r.rung, f"{r.hybrid.active:.0%}",
-            " / ".join("–" if s.covered is None else f"{s.covered:.0%}" for s in (r.untaught, r.hybrid)),
+            r["car"], r["taught"], r["scored"], *(cell(r[way]) for way in ("untaught", "prior", "hybrid")),
+            number(ratio(r), 2) + (" worse" if is_worse(r) else ""),
+            number(ratio(r, "reference"), 2) if r["reference"] else "–",
+            number(r["paper_deg"], 3), r["rung"], f"{r['hybrid']['active']:.0%}",
+            " / ".join("–" if (c := r[way]["covered"]) is None else f"{c:.0%}" for way in ("untaught", "hybrid")),
         ] for r in results]  # fmt: skip
     head = "car, taught on, scored on, untaught, taught, pd-hef, ratio, reference, paper, residual, active, 95 %"
-    return table(head.split(", "), body, right_from=3)
+    return table(head, body, right_from=3)
 
 
-def summary(results: Sequence[PairResult]) -> str:
+def summary(results: Sequence[Pair]) -> str:
     """Return the figures that the targets are about."""
-
-    def mean(ratios: Sequence[float]) -> str:
-        return f"{geometric_mean(ratios)} ({len(ratios)} pairs)" if ratios else "–"
-
-    alike = [r for r in results if r.hybrid.active >= ALIKE]
-    unlike = [r for r in results if r.hybrid.active < ALIKE]
-    small = [r for r in results if r.car == "1:10 F1TENTH"]
-    pairs = [(r, p) for r in results if (p := r.referred) is not None]
-    lines = [
-        ["pairs worse than untaught by more than max(5 %, 0.03°)", str(sum(r.worse for r in results))],
-        ["geometric mean of the ratios, residual active on at least 50 %", mean([r.ratio for r in alike])],
-        ["geometric mean of the ratios, residual active on less", mean([r.ratio for r in unlike])],
-        ["the same with the prior alone, all pairs", mean([r.prior.rmse_deg / r.untaught.rmse_deg for r in results])],
-        ["the same with the paper's network, all pairs", mean([r.paper_deg / r.untaught.rmse_deg for r in results])],
-        ["1:10 cars, pd-hef over kinematic", mean([r.hybrid.rmse_deg / r.kinematic_deg for r in small])],
-        ["geometric mean of the ratios, taught by the reference", mean([p.ratio for _, p in pairs])],
-        ["the same pairs, taught by ground truth", mean([r.ratio for r, _ in pairs])],
-        ["pairs worse than untaught by more than that, taught by the reference", str(sum(p.worse for _, p in pairs))],
-    ]
-    return table(["figure", "value"], lines)
+    referred = [r for r in results if r["reference"]]
+    alike, unlike = ([ratio(r) for r in results if (r["hybrid"]["active"] >= ALIKE) is side] for side in (True, False))
+    small = [r["hybrid"]["rmse_deg"] / r["kinematic_deg"] for r in results if r["car"] == "1:10 F1TENTH"]
+    paper = [r["paper_deg"] / r["untaught"]["rmse_deg"] for r in results]
+    lines = {
+        "pairs worse than untaught by more than max(5 %, 0.03°)": str(sum(map(is_worse, results))),
+        "geometric mean of the ratios, residual active on at least 50 %": mean(alike),
+        "geometric mean of the ratios, residual active on less": mean(unlike),
+        "the same with the prior alone, all pairs": mean([ratio(r, "prior") for r in results]),
+        "the same with the paper's network, all pairs": mean(paper),
+        "1:10 cars, pd-hef over kinematic": mean(small),
+        "geometric mean of the ratios, taught by the reference": mean([ratio(r, "reference") for r in referred]),
+        "the same pairs, taught by ground truth": mean([ratio(r) for r in referred]),
+        "pairs worse than untaught by more than that, taught by the reference":
+            str(sum(is_worse(r, "reference") for r in referred)),
+    }  # fmt: skip
+    return table("figure, value", lines.items())
 
 
-def geometric_mean(ratios: Sequence[float]) -> str:
-    """Return the geometric mean of ratios, a dash without any."""
-    return f"{math.exp(float(np.mean(np.log(ratios)))):.2f}" if ratios else "–"
+def readme_text(results: Sequence[Pair]) -> str:
+    """Return the result in a sentence."""
+    full_size = {part.car for part in PEER_DRIVES if part.group == FULL_SIZE}
+    full = [ratio(r) for r in results if r["car"] in full_size]
+    worse = ", ".join(f"`{r['scored']}` by {ratio(r) - 1.0:.0%}" for r in results if is_worse(r)) or "none"
+    of_all, of_prior = mean([ratio(r) for r in results]), mean([ratio(r, "prior") for r in results])
+    return (
+        f"A car taught on a recorded drive has {of_all} times the error on other drives, full-size cars {mean(full)}, "
+        f"by the taught prior alone {of_prior}; worse by more than 5 % and 0.03°: {worse} "
+        "([teaching](docs/peers.md#teaching))."
+    )
+
+
+def mean(ratios: Sequence[float]) -> str:
+    """Return the geometric mean of ratios and their number, a dash without any."""
+    return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({len(ratios)} pairs)" if ratios else "–"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the pairs and write the page."""
-    parser = options("teaching", __doc__)
-    parser.add_argument("--cars", default=",".join(c.name for c in CARS))
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "teaching")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    parser.add_argument("--results", type=Path, default=RESULTS_FILE)
-    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
+    parser = page_options("teaching", __doc__)
+    parser.add_argument("--cars", nargs="+", choices=[c.name for c in CARS], default=[c.name for c in CARS])
     given = parser.parse_args(arguments)
-    if given.stored:
-        write_page(given.out, stored_results(given.results))
-        return 0
-    if not DRIVES.is_dir():
-        print("needs ../shared beside the repository (recorded drives that may not be redistributed); nothing is done")
-        return 0
-    wanted = given.cars.split(",")
-    if unknown := set(wanted) - {c.name for c in CARS}:
-        parser.error(f"--cars: expected names out of {', '.join(c.name for c in CARS)}, got {', '.join(unknown)}")
-    results = []
-    for car in (c for c in CARS if c.name in wanted):
-        for result in pairs_of(Tool(ROOT, given.work.resolve()), car):
-            results.append(result)
-            print(pair_table([result]).splitlines()[-1], file=sys.stderr)
-    write(given.results, json.dumps([asdict(r) for r in results], indent=1) + "\n")
-    write_page(given.out, results)
+    if not given.stored:
+        if not DRIVES.is_dir():
+            print("nothing is done: needs ../shared beside the repository")
+            return 0
+        results = []
+        for car in (c for c in CARS if c.name in given.cars):
+            for result in pairs_of(Tool(ROOT, given.work.resolve()), car):
+                results.append(result)
+                print(pair_table([result]).splitlines()[-1], file=sys.stderr)
+        write(given.results / STORED, json.dumps(results, indent=1) + "\n")
+    stored = json.loads((given.results / STORED).read_text(encoding="utf-8"))
+    update(given.out, "README.md", {"teaching": readme_text(stored)})
+    update(given.out, "peers.md", {"pairs": pair_table(stored), "pairs_summary": summary(stored)})
     return 0
-
-
-def stored_results(file: Path) -> list[PairResult]:
-    """Return the results of a stored run."""
-    scores = ("untaught", "prior", "hybrid", "reference")
-    documents = json.loads(file.read_text(encoding="utf-8"))
-    return [PairResult(**{**d, **{name: Score(**d[name]) for name in scores if d.get(name)}}) for d in documents]
-
-
-def write_page(folder: Path, results: Sequence[PairResult]) -> None:
-    """Write the page of results."""
-    write(folder / "teaching.md", template(__file__, pairs=pair_table(results), summary=summary(results)))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 the scores and widens intervals by the design effect D = 1 + r P / n of n drives with P ordered pairs (Kish 1965,
 section 8.2). A pair that shares several factors counts once (Cameron, Gelbach and Miller 2011), so that nested factors
 are not counted twice. With G groups, the degrees of freedom are (G - 1) D / (D - 1). The formula of Satterthwaite
-(1946), (G - 1) (D / (D - 1))^2, gives too many, because r is limited to r >= 0; docs/comparing.md shows the resulting
+(1946), (G - 1) (D / (D - 1))^2, gives too many, because r is limited to r >= 0; docs/calibration.md shows the resulting
 rate of false alarms.
 
 **Pooled statistics** have bounds from the studentised bootstrap (Efron & Tibshirani 1993, chapter 12) of the logarithm,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -91,15 +91,6 @@ def signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParame
     return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
 
 
-def part_of(drive: FitDrive, a: int, b: int) -> FitDrive:
-    """Return the stamps [a, b) of a drive."""
-    columns = {}
-    for f in fields(StateTrack):
-        value = getattr(drive.truth, f.name)
-        columns[f.name] = value if f.name == "name" or value.shape[0] != len(drive.truth) else value[a:b]
-    return replace(drive, signals=drive.signals.rows(a, b), truth=StateTrack(**columns))
-
-
 def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
     """Return how long a drive can be used for identification."""
     return float(np.count_nonzero(usable_stamps(drive.signals, drive.truth, vehicle))) * period_s(drive)
@@ -121,11 +112,11 @@ def sampled_errors(
     return np.where(use, error, 0.0), use, every * period_s(drive)
 
 
-def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, similar: bool = False) -> AxleSamples:
+def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> AxleSamples:
     """Return slip angles and forces of all usable stamps of all drives, smoothed to ``SMOOTHING_HZ``.
 
-    ``similar`` : at the vehicle file's friction, for tyres that keep their stiffness: one curve of force over friction
-    by slip over friction.
+    At known friction they are those at the vehicle file's, for tyres that keep their stiffness: one curve of force over
+    friction by slip over friction.
     """
     columns: list[tuple[FloatArray, ...]] = []
     lf, lr = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
@@ -147,8 +138,8 @@ def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, simi
         total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
         front = (lr * total + moment) / (lf + lr) / np.cos(steer)
         rear = (lf * total - moment) / (lf + lr)
-        usable = similar & np.isfinite(drive.signals.friction)
-        grip = np.where(usable, drive.signals.friction / vehicle.assumed_friction, 1.0)
+        friction = drive.signals.friction
+        grip = np.where(np.isfinite(friction), friction / vehicle.assumed_friction, 1.0)
         slips = (steer - np.arctan((vy + lf * r) / vx), -np.arctan((vy - lr * r) / vx))
         columns.append((slips[0] / grip, front / grip, slips[1] / grip, rear / grip))
     joined = [np.concatenate(c) for c in zip(*columns, strict=True)]

@@ -1,8 +1,7 @@
-"""Noise of the tuned filters of the shipped car, by one search for all (docs/method.md#noise).
+"""Noise of the tuned filter of the shipped car (docs/method.md#noise).
 
-A trial is a point of the space. The first half of the trials is a scrambled Sobol sequence, the same points for all
-filters. The rest are Gaussian steps from each filter's best point so far, in the logarithms of the factors, with a
-width that shrinks on the same schedule and with the same random numbers for all.
+A trial is a point of the space. The first half of the trials is a scrambled Sobol sequence. The rest are Gaussian steps
+from the best point so far, in the logarithms of the factors, with a width that shrinks.
 
 The objective is the mean over drives of ln √(RMSE² + floor²) of the sideslip, reported as its exponential, a geometric
 mean in degrees: every drive counts by its relative error. The floor limits the effect of drives that hardly turn.
@@ -31,8 +30,8 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: Seed of the random draws on validation drives.
 SEED = 0
-#: Filters with a searched noise; the noise of ``physics`` is identified together with its values.
-TUNED = ("phy-ukf:tuned",)
+#: The filter with a searched noise; the noise of ``physics`` is identified together with its values.
+TUNED = "phy-ukf:tuned"
 #: Added to each drive's RMSE as squares.
 FLOOR_RAD = math.radians(0.05)
 #: Drives with fewer scored stamps are left out.
@@ -62,7 +61,7 @@ class Trial:
 
 
 def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
-    """Return the noise of the tuned filters: the best of ``trials`` each.
+    """Return the noise of the tuned filter: the best of ``trials``.
 
     Raises
     ------
@@ -74,24 +73,18 @@ def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
     if not drives:
         raise SystemExit("noise: at least one drive with a true sideslip and the signals of the filters is needed")
 
-    def objective(name: str, values: Point) -> float:
-        car = task.car.with_noise(name, filter_noise(values))
-        estimator = spec_of(name).make(car, Options(options.use_speed))
-        given = ((DriveSignals.of(d.signals, car).of_estimator(name), d.truth) for d in drives)
+    def objective(values: Point) -> float:
+        car = task.car.with_noise(TUNED, filter_noise(values))
+        estimator = spec_of(TUNED).make(car, Options(options.use_speed))
+        given = ((DriveSignals.of(d.signals, car).of_estimator(TUNED), d.truth) for d in drives)
         return objective_deg(
             [error_rad(run_estimator(estimator, s), truth, slow) for s, truth in given if truth is not None]
         )
 
-    best = {}
-    for name in TUNED:
-        best[name] = min(search(partial(objective, name), trials, SEED), key=_order)
-        print(f"{name}: trial {best[name].number} of {trials}, {best[name].objective_deg:.4f}°", flush=True)
-    return {name: _noise(trial) for name, trial in best.items()}
-
-
-def _noise(trial: Trial) -> FilterNoise:
-    score = {"score_deg": round(trial.objective_deg, 4), "trial": trial.number}
-    return filter_noise(trial.values).model_copy(update=score)
+    best = min(search(objective, trials, SEED), key=_order)
+    print(f"{TUNED}: trial {best.number} of {trials}, {best.objective_deg:.4f}°", flush=True)
+    score = {"score_deg": round(best.objective_deg, 4), "trial": best.number}
+    return {TUNED: filter_noise(best.values).model_copy(update=score)}
 
 
 def _order(trial: Trial) -> tuple[float, int]:

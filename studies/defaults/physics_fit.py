@@ -37,12 +37,9 @@ from studies.defaults.axle_forces import (
     FitDrive,
     axle_samples,
     fit_axle,
-    part_of,
-    period_s,
     sampled_errors,
     signals_of,
     usable_seconds,
-    usable_stamps,
 )
 
 #: Correlation time of the errors, s; settling time of the filter, excluded from the error, s.
@@ -77,11 +74,8 @@ class Prior:
 
     def value(self, theta: float) -> float:
         """Return the parameter at a normalised distance from the prior."""
-        return self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
-
-    def theta(self, value: float) -> float:
-        """Return the normalised distance of a value."""
-        return math.log(value / self.mean) / self.std if self.log else (value - self.mean) / self.std
+        value = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
+        return value if self.low is None else max(value, self.low)
 
 
 def make_priors(
@@ -142,11 +136,6 @@ def make_priors(
     return tuple(priors)
 
 
-def _value(prior: Prior, theta: float) -> float:
-    value = prior.value(theta)
-    return value if prior.low is None else max(value, prior.low)
-
-
 def build_car(
     start: VehicleParameters, parts: PhysicsParts, priors: Sequence[Prior], theta: FloatArray, *, digits: int = 17
 ) -> tuple[VehicleParameters, FilterNoise]:
@@ -155,7 +144,7 @@ def build_car(
     def rounded(value: float) -> float:
         return float(f"{value:.{digits}g}")
 
-    v = {p.name: rounded(_value(p, float(t))) for p, t in zip(priors, theta, strict=True)}
+    v = {p.name: rounded(p.value(float(t))) for p, t in zip(priors, theta, strict=True)}
     mu = start.assumed_friction
 
     def tyre(axle: str) -> AxleTyre:
@@ -258,7 +247,7 @@ def fit_physics(
     starts : where to start, θ by the parameter's name; the best end counts.
     """
     usable_s = sum(usable_seconds(d, start) for d in drives)
-    samples = axle_samples(drives, start, similar=True)
+    samples = axle_samples(drives, start)
     priors = make_priors(start, parts, samples, usable_s)
 
     def errors(theta: FloatArray) -> list[DriveError]:
@@ -328,29 +317,8 @@ ORDER = ("braking", "force_scale", "bank", "biases", "load_transfer", "roll", "l
 LEAST_GAIN = 0.01
 #: Steps of a fit that only states whether a part is worth having; it starts where the one with the part ended.
 TRIAL_ITERATIONS = 8
-#: Smallest number of drives for folds of whole drives; usable driving per fold (75 s selected worse parts than no
-#: selection, 150 s cannot select a structure); excluded time on each side of a cut.
-WHOLE_DRIVES, LEAST_FOLD_S, GUARD_S = 4, 100.0, 2.5
-
-
+#: Driving to fit, and driving to score.
 Fold = tuple[Sequence[FitDrive], Sequence[FitDrive]]
-
-
-def make_folds(drives: Sequence[FitDrive], start: VehicleParameters) -> list[Fold]:
-    """Return two folds of training and scoring drives, or an empty list if there is too little driving."""
-    usable = [d for d in drives if usable_seconds(d, start) > 0.0]
-    halves: tuple[list[FitDrive], list[FitDrive]] = ([], [])
-    if len(usable) >= WHOLE_DRIVES:
-        halves = (usable[::2], usable[1::2])
-    else:
-        for drive in usable:
-            usable_index = np.flatnonzero(usable_stamps(drive.signals, drive.truth, start))
-            middle, guard = int(usable_index[usable_index.size // 2]), round(GUARD_S / period_s(drive))
-            halves[0].append(part_of(drive, 0, max(middle - guard, 0)))
-            halves[1].append(part_of(drive, min(middle + guard, len(drive.signals)), len(drive.signals)))
-    if min(sum(usable_seconds(d, start) for d in half) for half in halves) < LEAST_FOLD_S:
-        return []
-    return [(halves[0], halves[1]), (halves[1], halves[0])]
 
 
 def choose_parts(
@@ -406,21 +374,15 @@ def find_physics(
     drives: Sequence[FitDrive],
     start: VehicleParameters,
     *,
-    parts: PhysicsParts | None = None,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> tuple[PhysicsFit, FittedPhysics]:
     """Identify ``physics`` of a car on drives with ground truth; also return it in the format of a car.
 
-    Parameters
-    ----------
-    parts : of the model. None: selected by cross-validation between two parts of the drives.
+    The parts of the model are chosen by cross-validation between two halves of the drives.
     """
-    tried: tuple[TriedParts, ...] = ()
-    if parts is None:
-        folds = make_folds(drives, start)
-        parts = PhysicsParts()
-        if folds:
-            parts, tried = choose_parts(folds, start, progress=lambda text, share: progress(text, 0.7 * share))
+    usable = [d for d in drives if usable_seconds(d, start) > 0.0]
+    halves = usable[::2], usable[1::2]
+    parts, tried = choose_parts([halves, halves[::-1]], start, progress=lambda text, x: progress(text, 0.7 * x))
     progress("fitting the physics filter's sideslip to the ground truth", 0.7)
     result = fit_physics(drives, start, parts)
     values = FittedValues.of(result.vehicle)

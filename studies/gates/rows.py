@@ -28,10 +28,9 @@ from studies.gates.tool import (
 from studies.mapping_mistakes import VERDICTS, outcomes
 from studies.pages import DRIVES, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
-from studies.torture.mutating import mutant
-from studies.torture.seeds import write_seeds
+from studies.torture.seeds import FORMATS, RECORDINGS
 from truthsim.conditions import ROWS
-from truthsim.drive import simulate_drive, write_drive
+from truthsim.drive import simulate_drive
 from truthsim.sensors import SensorNoise
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
@@ -96,14 +95,6 @@ def condition(row: str, drives: int, tool: Tool) -> Figures:
     return rmse_figures(run, 0.003, "pd-hef")
 
 
-def conditions() -> Iterator[GateRow]:
-    """Yield the rows of the condition table."""
-    for row in ROWS:
-        yield GateRow("conditions", row.name, (FULL,), partial(condition, row.name, 10))
-    for name in ("in-domain", "gyro-stuck"):
-        yield GateRow("conditions", f"{name}, 2 drives", (QUICK, FULL), partial(condition, name, 2))
-
-
 # ------------------------------------------------------------------------------------------------ recorded drives
 
 
@@ -137,15 +128,6 @@ def parameter_figures(report: dict[str, Any]) -> Figures:
 QUICK_DRIVES = ("gti_pole_aa.mcap", "v40_slalom.mcap", "f1tenth_xray_0.bag")
 
 
-def recorded_rows() -> Iterator[GateRow]:
-    """Yield the recorded drives, and the drives of the V40 again with their GNSS receiver."""
-    for drive in PEER_DRIVES:
-        sets = (QUICK, FULL) if drive.log in QUICK_DRIVES else (FULL,)
-        yield GateRow("recorded drives", drive.log, sets, partial(recorded, drive, False))
-        if drive.log.startswith("v40_"):
-            yield GateRow("recorded drives", f"{drive.log}, GNSS velocity", (FULL,), partial(recorded, drive, True))
-
-
 # ------------------------------------------------------------------------------------------------ simulated reference
 
 #: Manoeuvre, km/h, friction, longest duration (s) of the drives of the reference.
@@ -165,13 +147,12 @@ def simulated_log(
     tool: Tool, name: str, spec: tuple[str, float, float, float | None], seed: int, *, steering_wheel: bool = False
 ) -> Path:
     """Simulate a drive of the saloon and return its log; ``steering_wheel``: the log has this angle."""
-    log = tool.work / "simulated" / f"{name.replace(' ', '-')}-{seed}.mcap"
-    if not log.is_file():
-        log.parent.mkdir(parents=True, exist_ok=True)
-        manoeuvre, speed, friction, duration_s = spec
-        drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
-        write_drive(drive, log, steering_wheel=steering_wheel)
-    return log
+    stem = f"{name.replace(' ', '-')}-{seed}"
+    if (log := tool.work / "logs" / f"{stem}.mcap").is_file():
+        return log
+    manoeuvre, speed, friction, duration_s = spec
+    drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
+    return tool.log(stem, drive, steering_wheel=steering_wheel)
 
 
 def bare_vehicle() -> dict[str, Any]:
@@ -187,13 +168,6 @@ def reference(name: str, tool: Tool) -> Figures:
     names = "zero,kinematic,open-loop,phy-ukf,physics"
     run = tool.run(f"reference-{log.stem}", log, "--car", car, "--reference", "on", "--estimators", names)
     return rmse_figures(run, 0.003, "reference")
-
-
-def reference_rows() -> Iterator[GateRow]:
-    """Yield the simulated drives of the reference."""
-    for name in REFERENCE_DRIVES:
-        sets = (QUICK, FULL) if name == "double lane change" else (FULL,)
-        yield GateRow("reference", name, sets, partial(reference, name))
 
 
 # ------------------------------------------------------------------------------------------------ ±
@@ -223,12 +197,6 @@ def plus_minus(seeds: range, tool: Tool) -> Figures:
     return figures | {"within ± 1.96 sd": share, "values": Figure(float(len(everything)), "count", 0.0)}
 
 
-def plus_minus_rows() -> Iterator[GateRow]:
-    """Yield the coverage of the standard deviations."""
-    yield GateRow("plus-minus", "20 cars", (FULL,), partial(plus_minus, range(20)))
-    yield GateRow("plus-minus", "1 car", (QUICK, FULL), partial(plus_minus, range(2, 3)))
-
-
 # ------------------------------------------------------------------------------------------------ mapping mistakes
 
 
@@ -243,15 +211,6 @@ def mistakes(log: str, kinds: tuple[tuple[str, str], ...], tool: Tool) -> Figure
     found = outcomes(look, path, tool.mapping(path), folder / f"mistakes-{len(kinds)}", kinds)
     counts = Counter(outcome.verdict for outcome in found)
     return {name: Figure(float(counts[name]), "count", 0.0) for name in VERDICTS}
-
-
-def mistake_rows() -> Iterator[GateRow]:
-    """Yield the mistakes in mappings of sample logs."""
-    for log in ("dlc.mcap", "road.mcap"):
-        yield GateRow("mapping mistakes", log, (FULL,), partial(mistakes, log, ()))
-    few = (("steer_rad", "sign"), ("yaw_rate_rad_s", "x57.3"), ("ay_m_s2", "/9.81"), ("wheel_speed", "x3.6"),
-           ("ax_m_s2", "axis"), ("truth.vy_m_s", "sign"))  # fmt: skip
-    yield GateRow("mapping mistakes", "dlc.mcap, 6 mistakes", (QUICK, FULL), partial(mistakes, "dlc.mcap", few))
 
 
 # ------------------------------------------------------------------------------------------------ third-party logs
@@ -273,58 +232,23 @@ def strangers(only: tuple[str, ...], tool: Tool) -> Figures:
     return {"wrong, not reported": silent, "recognised": Figure(share, "%", 0.0, 0.5)}
 
 
-def stranger_rows() -> Iterator[GateRow]:
-    """Yield the third-party logs."""
-    yield GateRow("third-party logs", "all", (FULL,), partial(strangers, ()))
-    few = ("csv-german", "can-mdf", "vbo-file", "z-down", "steering-deg", "kart-parquet", "electric-blf")
-    yield GateRow("third-party logs", "7 layouts", (QUICK, FULL), partial(strangers, few))
-
-
 # ------------------------------------------------------------------------------------------------ fuzz
 
 
-def fuzz(part: str, options: tuple[str, ...], tool: Tool) -> Figures:
-    """Count how commands end on mutated files."""
-    work = tool.work / "-".join(("fuzz", part, *(o.strip("-") for o in options)))
-    done = tool.python("studies.torture", part, "--work", work, "--jobs", "1", *options,
-                       "--out", work / "none.md")  # fmt: skip
-    file = work / f"{part}.json"
+def fuzz(name: str, count: int, tool: Tool) -> Figures:
+    """Count how commands end on mutants of a format."""
+    work = tool.work / f"fuzz-{name}-{count}"
+    given = ("--work", work, "--jobs", "1", "--format", name, "--count", str(count), "--out", work / "none.md")
+    done = tool.python("studies.torture", "formats", *given)
+    file = work / "formats.json"
     if not file.is_file():
         raise RuntimeError(done.stderr[-2000:])
-    figures: Figures = {}
-    for name, judged in json.loads(file.read_text(encoding="utf-8")).items():
-        figures[f"{name}: problems"] = Figure(float(len(judged["problems"])), "count", 0.0)
-        for end in ("exit 0", "exit 1", "exit 3"):
-            count = sum(n for text, n in judged["ends"].items() if text.partition(",")[0] == end)
-            figures[f"{name}: {end}"] = Figure(float(count), "count", 0.03, 1.0)
+    judged = json.loads(file.read_text(encoding="utf-8"))[name]
+    figures = {f"{name}: problems": Figure(float(len(judged["problems"])), "count", 0.0)}
+    for end in ("exit 0", "exit 1", "exit 3"):
+        ended = sum(n for text, n in judged["ends"].items() if text.partition(",")[0] == end)
+        figures[f"{name}: {end}"] = Figure(float(ended), "count", 0.03, 1.0)
     return figures
-
-
-def mutants(suffix: str, count: int, tool: Tool) -> Figures:
-    """Count how ``inspect`` ends on mutated recordings; a problem is a traceback or another exit code."""
-    seeds = write_seeds(tool.work / "seeds")
-    names = sorted(name for name in seeds if name.endswith(suffix))
-    ends: Counter[str] = Counter()
-    for i in range(count):
-        name = names[i % len(names)]
-        path = tool.work / f"mutant-{count}-{i}{suffix}"
-        path.write_bytes(mutant(name, seeds[name], 1, i)[1])
-        done = tool.pdhef("inspect", path, "--json")
-        sound = done.returncode in (0, 1, 3) and "Traceback" not in done.stderr
-        ends[f"exit {done.returncode}" if sound else "problems"] += 1
-    figures = {end: Figure(float(ends[end]), "count", 0.03, 1.0) for end in ("exit 0", "exit 1", "exit 3")}
-    return figures | {"problems": Figure(float(ends["problems"]), "count", 0.0)}
-
-
-def fuzz_rows() -> Iterator[GateRow]:
-    """Yield the mutants of each format."""
-    for name in ("csv", "vbo", "parquet", "mat5", "mat73", "mdf3", "mdf4", "blf", "asc"):
-        few = ((QUICK, FULL), f"{name}, 3 mutants", "3")
-        for sets, text, count in (((FULL,), name, "50"), *([few] if name in ("csv", "blf") else [])):
-            yield GateRow("fuzz", text, sets, partial(fuzz, "formats", ("--format", name, "--count", count)))
-    for suffix in ("mcap", "bag", "db3"):
-        yield GateRow("fuzz", suffix, (FULL,), partial(mutants, f".{suffix}", 50))
-        yield GateRow("fuzz", f"{suffix}, 3 mutants", (QUICK, FULL), partial(mutants, f".{suffix}", 3))
 
 
 # ------------------------------------------------------------------------------------------------ contract
@@ -343,22 +267,13 @@ def exit_codes(tool: Tool) -> Figures:
         '[[requirement]]\nid = "a"\ntitle = "a"\nsignal = "sideslip_rad"\nmetric = "rmse"\nlimit_deg = 0.0001\n'
     )
     quiet = ("--annotate", "none", "--no-report", "--car", "saloon", "--estimators", "zero")
+    must = ("--plan", strict, "--set", "strict=true")
     cases: dict[str, tuple[str | Path, ...]] = {
         "run": ("run", sample, "-o", folder / "ok", *quiet),
         "run, log cut in half": ("run", folder / "cut.mcap", "-o", folder / "cut", *quiet),
         "run, all logs unreadable": ("run", folder / "noise.mcap", "-o", folder / "noise", *quiet),
         "run, one of two logs unreadable": ("run", sample, folder / "noise.mcap", "-o", folder / "two", *quiet),
-        "run, requirement not met": (
-            "run",
-            sample,
-            "-o",
-            folder / "plan",
-            "--plan",
-            strict,
-            "--set",
-            "strict=true",
-            *quiet,
-        ),
+        "run, requirement not met": ("run", sample, "-o", folder / "plan", *must, *quiet),
         "run, no output given": ("run", sample),
         "run, unknown option": ("run", sample, "-o", folder / "x", "--nonsense"),
         "run, unknown estimator": ("run", sample, "-o", folder / "x", "--estimators", "nonsense"),
@@ -410,12 +325,6 @@ def keys(document: dict[str, Any], depth: int) -> Iterator[str]:
             yield from (f"{name}.{key}" for key in keys(inner, depth - 1))
 
 
-def contract_rows() -> Iterator[GateRow]:
-    """Yield the contract of the command line and of the files."""
-    for name, measure in (("exit codes", exit_codes), ("options", options), ("files and keys", files_and_keys)):
-        yield GateRow("contract", name, (QUICK, FULL), measure)
-
-
 # ------------------------------------------------------------------------------------------------ speed
 
 
@@ -432,14 +341,42 @@ def speed(benchmark: str, tool: Tool) -> Figures:
     return figures
 
 
-def speed_rows() -> Iterator[GateRow]:
-    """Yield the ratios of speed to peers."""
-    for name in ("reading", "reading_mdf"):
-        yield GateRow("speed", name, (FULL,), partial(speed, name))
+# ------------------------------------------------------------------------------------------------ all
+
+_FEW_MISTAKES = (("steer_rad", "sign"), ("yaw_rate_rad_s", "x57.3"), ("ay_m_s2", "/9.81"), ("wheel_speed", "x3.6"),
+                 ("ax_m_s2", "axis"), ("truth.vy_m_s", "sign"))  # fmt: skip
+_FEW_LAYOUTS = ("csv-german", "can-mdf", "vbo-file", "z-down", "steering-deg", "kart-parquet", "electric-blf")
+#: Formats of which a few mutants are quick.
+_FEW_FORMATS = ("csv", "blf", *RECORDINGS)
 
 
 def all_rows() -> list[GateRow]:
     """Return all rows in the order of the file; the fuzz tests, which take longest, are last."""
-    makers = (contract_rows, reference_rows, recorded_rows, conditions, speed_rows, stranger_rows,
-              plus_minus_rows, mistake_rows, fuzz_rows)  # fmt: skip
-    return [row for make in makers for row in make()]
+    full, quick = (FULL,), (QUICK, FULL)
+    contract = {"exit codes": exit_codes, "options": options, "files and keys": files_and_keys}
+    sets = {name: quick if name in (*QUICK_DRIVES, "double lane change") else full
+            for name in (*REFERENCE_DRIVES, *(d.log for d in PEER_DRIVES))}  # fmt: skip
+    gnss = [d for d in PEER_DRIVES if d.log.startswith("v40_")]
+    counts = [(name, few) for name in FORMATS for few in (False, True) if not few or name in _FEW_FORMATS]
+    return [
+        *(GateRow("contract", name, quick, measure) for name, measure in contract.items()),
+        *(GateRow("reference", name, sets[name], partial(reference, name)) for name in REFERENCE_DRIVES),
+        *(GateRow("recorded drives", d.log, sets[d.log], partial(recorded, d, False)) for d in PEER_DRIVES),
+        *(GateRow("recorded drives", f"{d.log}, GNSS velocity", full, partial(recorded, d, True)) for d in gnss),
+        *(GateRow("conditions", row.name, full, partial(condition, row.name, 10)) for row in ROWS),
+        *(
+            GateRow("conditions", f"{n}, 2 drives", quick, partial(condition, n, 2))
+            for n in ("in-domain", "gyro-stuck")
+        ),
+        *(GateRow("speed", name, full, partial(speed, name)) for name in ("reading", "reading_mdf")),
+        GateRow("third-party logs", "all", full, partial(strangers, ())),
+        GateRow("third-party logs", "7 layouts", quick, partial(strangers, _FEW_LAYOUTS)),
+        GateRow("plus-minus", "20 cars", full, partial(plus_minus, range(20))),
+        GateRow("plus-minus", "1 car", quick, partial(plus_minus, range(2, 3))),
+        *(GateRow("mapping mistakes", log, full, partial(mistakes, log, ())) for log in ("dlc.mcap", "road.mcap")),
+        GateRow("mapping mistakes", "dlc.mcap, 6 mistakes", quick, partial(mistakes, "dlc.mcap", _FEW_MISTAKES)),
+        *(
+            GateRow("fuzz", f"{n}, 3 mutants" if few else n, quick if few else full, partial(fuzz, n, 3 if few else 50))
+            for n, few in counts
+        ),
+    ]

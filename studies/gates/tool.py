@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from truthsim.drive import Drive, write_drive
+
 #: The longest time for one command, s.
 LIMIT_S = 3600.0
 
@@ -58,6 +60,14 @@ class Tool:
         self.json("run", *arguments, "-o", output, "--annotate", "none", "--no-report")
         return output
 
+    def log(self, name: str, drive: Drive, *, steering_wheel: bool = False) -> Path:
+        """Write a simulated drive as MCAP; return its path."""
+        path = self.work / "logs" / f"{name}.mcap"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        write_drive(drive, path, steering_wheel=steering_wheel)
+        return path
+
     def mapping(self, log: Path) -> dict[str, Any]:
         """Return the mapping that the tool recognises."""
         file = self.work / "mappings" / f"{log.parent.name}-{log.stem}.toml"
@@ -69,22 +79,22 @@ class Tool:
 
 def sideslip_rmse_deg(run: Path) -> dict[str, float]:
     """Return the sideslip RMSE over all samples of all logs of a run by estimator, in degrees."""
-    rows = pl.read_parquet(run / "metrics.parquet").filter(
-        (pl.col("signal") == "sideslip_rad") & (pl.col("segment") == "all") & (pl.col("metric") == "rmse")
-    )
+    rows = pl.read_parquet(run / "metrics.parquet").filter(signal="sideslip_rad", segment="all", metric="rmse")
     pooled = rows.group_by("estimator").agg((pl.col("value") ** 2 * pl.col("n")).sum() / pl.col("n").sum())
     return {name: float(np.degrees(np.sqrt(square))) for name, square in pooled.sort("estimator").iter_rows()}
 
 
 def coverage_percent(run: Path, estimator: str) -> float:
     """Return the share of samples within the 95 % interval of sideslip over all logs of a run."""
-    rows = pl.read_parquet(run / "metrics.parquet").filter(
-        (pl.col("signal") == "sideslip_rad")
-        & (pl.col("segment") == "all")
-        & (pl.col("metric") == "coverage95")
-        & (pl.col("estimator") == estimator)
-    )
+    of = {"signal": "sideslip_rad", "segment": "all", "metric": "coverage95", "estimator": estimator}
+    rows = pl.read_parquet(run / "metrics.parquet").filter(**of)
     return 100.0 * float(np.average(rows["value"], weights=rows["n"])) if len(rows) else float("nan")
+
+
+def estimates(run: Path) -> pl.DataFrame:
+    """Return the estimates of a run of one log."""
+    (file,) = run.glob("logs/*/estimates.parquet")
+    return pl.read_parquet(file)
 
 
 def reports(run: Path) -> dict[str, dict[str, Any]]:

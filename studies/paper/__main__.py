@@ -1,6 +1,6 @@
 """Run the paper's experiment on the shipped car and write ``docs/paper.md``, its figures and its results.
 
-    python -m studies.paper [-o DOCS] [--noise-seeds N] [--render]
+    python -m studies.paper [--out docs] [--noise-seeds N] [--stored]
 
 The constants that the paper leaves open come from ``python -m studies.paper.constants``.
 """
@@ -13,8 +13,8 @@ import sys
 from pathlib import Path
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.records.errors import PdhefError
-from studies.pages import DOCS, RESULTS, options, write
+from studies.gates.tool import Tool
+from studies.pages import ROOT, page_options, write
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
 from studies.paper.page import PAGE_FIGURES, write_page
@@ -35,28 +35,15 @@ def render(results: Path, docs: Path) -> None:
 
 def main() -> int:
     """Run the command line."""
-    parser = options("paper", __doc__)
-    parser.add_argument("-o", "--output", type=Path, default=DOCS, metavar="DOCS", help="folder of paper.md")
-    parser.add_argument("--results", type=Path, default=RESULTS / "paper", help="folder of results and figures")
+    parser = page_options("paper", __doc__)
     parser.add_argument("--noise-seeds", type=int, default=NOISE_SEEDS, metavar="N", help=f"{NOISE_SEEDS} by default")
-    parser.add_argument("--render", action="store_true", help="write the page from stored results")
-    arguments = parser.parse_args()
-    if arguments.render:
-        render(arguments.results, arguments.output)
-        return 0
-    if arguments.noise_seeds < 1:
-        parser.error("--noise-seeds needs at least one")
-    seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + arguments.noise_seeds)
-    try:
-        results = gather(Car.load("saloon"), noise_seeds=seeds, progress=lambda text: print(text, file=sys.stderr))
-    except PdhefError as error:
-        print(error, file=sys.stderr)
-        return 1
-    arguments.results.mkdir(parents=True, exist_ok=True)
-    draw(results, arguments.results)
-    text = json.dumps(document(results), indent=1, allow_nan=False)
-    write(arguments.results / STORED[0], text + "\n")
-    render(arguments.results, arguments.output)
+    given = parser.parse_args()
+    if not given.stored:
+        seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + given.noise_seeds)
+        results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)
+        draw(results, given.results)
+        write(given.results / STORED[0], json.dumps(document(results), indent=1, allow_nan=False) + "\n")
+    render(given.results, given.out)
     return 0
 
 

@@ -2,77 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-
-from studies.paper.experiment import Experiment, Run
+import polars as pl
 
 BOOTSTRAP_DRAWS = 10_000
 BOOTSTRAP_SEED = 0
 LEVEL = 0.95
 
 
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """Median, smallest and largest of a figure over the noise seeds."""
-
-    median: float
-    low: float
-    high: float
-    n: int
+def spread(metrics: pl.DataFrame, scenario: str, scheme: str, figure: str) -> dict[str, Any] | None:
+    """Return median, lowest and highest of a figure over the seeds; None where the scheme has no such figure."""
+    values = metrics.filter(scenario=scenario, scheme=scheme, figure=figure)["value"].to_numpy()
+    if not len(values):
+        return None
+    return {"median": float(np.median(values)), "low": min(values), "high": max(values), "n": len(values)}
 
 
-@dataclass(frozen=True, slots=True)
-class Improvement:
-    """Relative reduction of the pooled RMSE of one scheme against another.
+def improvement(metrics: pl.DataFrame, scenario: str, scheme: str, baseline: str) -> dict[str, Any] | None:
+    """Return the relative reduction of the sideslip RMSE, pooled over the seeds; None if a scheme is missing.
 
-    Attributes
-    ----------
-    low, high : percentile bounds, noise seeds drawn in pairs; NaN with fewer than two.
+    Its bounds are those of a bootstrap in which seeds are drawn in pairs; NaN with fewer than two.
     """
-
-    value: float
-    low: float
-    high: float
-    n: int
-
-
-def _chosen(runs: Iterable[Run], scenario: str, scheme: str, figure: str) -> list[Run]:
-    return [r for r in runs if r.scenario == scenario and r.scheme == scheme and figure in r.values]
-
-
-def spread(experiment: Experiment, scenario: str, scheme: str, figure: str) -> Spread | None:
-    """Return a figure of a scheme over the seeds; None where the scheme has no such figure."""
-    values = [r.values[figure] for r in _chosen(experiment.runs, scenario, scheme, figure)]
-    if not values:
+    of = metrics.filter(scenario=scenario, figure="sideslip_deg")
+    ours, theirs = (of.filter(scheme=name).select("noise_seed", "value") for name in (scheme, baseline))
+    both = ours.join(theirs, on="noise_seed", suffix="_baseline").sort("noise_seed")
+    if both.is_empty():
         return None
-    return Spread(float(np.median(values)), min(values), max(values), len(values))
-
-
-def improvement(
-    experiment: Experiment, scenario: str, scheme: str, baseline: str, figure: str = "sideslip_deg"
-) -> Improvement | None:
-    """Return 1 − RMSE(scheme) / RMSE(baseline), pooled over the seeds, with its bounds; None if one is missing."""
-    ours = _chosen(experiment.runs, scenario, scheme, figure)
-    theirs = _chosen(experiment.runs, scenario, baseline, figure)
-    if not ours or not theirs:
-        return None
-    a, b = ({r.noise_seed: r.values[figure] ** 2 for r in runs} for runs in (ours, theirs))
-    seeds = sorted(a.keys() & b.keys())
-    if not seeds:
-        return None
-    squares = np.array([[a[s], b[s]] for s in seeds])
+    squares = both.select("value", "value_baseline").to_numpy() ** 2
 
     def share(sums: np.ndarray) -> np.ndarray:
         return np.asarray(1.0 - np.sqrt(sums[..., 0] / sums[..., 1]))
 
     low = high = float("nan")
-    if len(seeds) > 1:
-        rng = np.random.default_rng(BOOTSTRAP_SEED)
-        draws = rng.integers(len(seeds), size=(BOOTSTRAP_DRAWS, len(seeds)))
+    if len(squares) > 1:
+        draws = np.random.default_rng(BOOTSTRAP_SEED).integers(len(squares), size=(BOOTSTRAP_DRAWS, len(squares)))
         bounds = np.percentile(share(squares[draws].sum(axis=1)), [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
-        low, high = float(bounds[0]), float(bounds[1])
-    value = float(share(squares.sum(axis=0)))
-    return Improvement(value, low, high, len(seeds))
+        low, high = map(float, bounds)
+    return {"value": float(share(squares.sum(axis=0))), "low": low, "high": high, "n": len(squares)}

@@ -1,30 +1,26 @@
-"""Simulate the paper's two manoeuvres, run every scheme on them and score it, as ``pdhef run`` would.
+"""Simulate the paper's two manoeuvres, run every scheme on them by ``pdhef run``, and read its tables.
 
-A drive is written as an MCAP file and read back by the tool's own path: recognised mapping, alignment, the estimators
-of the table on aligned signals, the metrics of :mod:`pdhef_logtool.evaluation.metrics`. The car gets the friction of
-the drive. Noise seeds change the sensors alone.
+The runs get the friction of the drive. Noise seeds change the sensors alone.
 """
 
 from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
-from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.drive_signals import DriveSignals
-from pdhef_logtool.estimators.presets import Options
-from pdhef_logtool.estimators.table import runnable
-from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
-from pdhef_logtool.evaluation.segments import segment_masks
-from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.runs.estimating import estimate_drive
+from pdhef_logtool.records.signals import FloatArray
+from studies.gates.tool import Tool, estimates
 from studies.paper.schemes import ESP, SCHEMES
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
@@ -67,70 +63,59 @@ BURST = Scenario(
 SCENARIO_PAIR = (A, B)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ReadDrive:
-    """A drive as the estimators see it.
-
-    Attributes
-    ----------
-    whole : of the reading path; signals and truth at the same stamps.
-    facts : of the simulated drive, JSON-able; ``truth_latency_s`` is the latency that the comparison subtracted.
-    """
-
-    scenario: Scenario
-    noise_seed: int
-    whole: WholeDrive
-    facts: dict[str, object]
-
-    @property
-    def signals(self) -> Signals:
-        """Inputs of the estimators."""
-        return self.whole.signals
-
-    @property
-    def truth(self) -> StateTrack:
-        """Ground truth of the scores."""
-        assert self.whole.truth is not None
-        return self.whole.truth
+#: Figure by name: signal, metric, factor to the unit of the tables.
+FIGURES: dict[str, tuple[str, str, float]] = {
+    "sideslip_deg": ("sideslip_rad", "rmse", math.degrees(1.0)),
+    "sideslip_relative": ("sideslip_rad", "rmse_relative", 1.0),
+    "yaw_rate_rad_s": ("yaw_rate_rad_s", "rmse", 1.0),
+    "ay_g": ("ay_m_s2", "rmse", 1.0 / GRAVITY_M_S2),
+    "position_m": ("position_m", "rmse", 1.0),
+    "lateral_1s_m": ("lateral_1s_m", "rmse", 1.0),
+}
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """Figures of one scheme on one drive."""
-
-    scenario: str
-    noise_seed: int
-    scheme: str
-    values: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True)
 class Experiment:
     """Everything that was run.
 
     Attributes
     ----------
-    missing : by scheme, why it is not in the tables.
-    tracks : of the first noise seed, by scenario and scheme.
-    drives : of the first noise seed, by scenario.
+    metrics : scenario, noise seed, scheme, figure and its value.
+    logs, tracks : log and ``estimates.parquet`` of the first noise seed, by scenario.
+    facts : of the simulated drives, JSON-able.
     """
 
-    runs: tuple[Run, ...]
-    missing: dict[str, str]
-    drives: dict[str, ReadDrive]
-    tracks: dict[tuple[str, str], StateTrack]
-    facts: tuple[dict[str, object], ...]
+    metrics: pl.DataFrame
+    logs: dict[str, Path] = field(default_factory=dict)
+    tracks: dict[str, pl.DataFrame] = field(default_factory=dict)
+    facts: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def ran(self) -> tuple[str, ...]:
+        """Schemes that ran."""
+        there = set(self.metrics["scheme"])
+        return tuple(n for n in SCHEMES if n in there)
+
+    def truth(self, scenario: str) -> pl.DataFrame:
+        """Return the ground truth of the first noise seed."""
+        return self.tracks[scenario].filter(estimator="truth").sort("stamp_ns")
+
+    def track(self, scenario: str, scheme: str) -> pl.DataFrame | None:
+        """Return the estimate of a scheme at the stamps of the ground truth; None if it did not run."""
+        own = self.tracks[scenario].filter(estimator=scheme)
+        stamps = self.truth(scenario).select("stamp_ns")
+        return stamps.join(own, on="stamp_ns", how="left", maintain_order="left") if len(own) else None
 
 
-#: Figure by name: signal, segment, metric, factor to the unit of the tables.
-FIGURES: dict[str, tuple[str, str, str, float]] = {
-    "sideslip_deg": ("sideslip_rad", "all", "rmse", math.degrees(1.0)),
-    "sideslip_relative": ("sideslip_rad", "all", "rmse_relative", 1.0),
-    "yaw_rate_rad_s": ("yaw_rate_rad_s", "all", "rmse", 1.0),
-    "ay_g": ("ay_m_s2", "all", "rmse", 1.0 / GRAVITY_M_S2),
-    "position_m": ("position_m", "all", "rmse", 1.0),
-    "lateral_1s_m": ("lateral_1s_m", "all", "rmse", 1.0),
-}
+def valid(track: pl.DataFrame, column: str) -> FloatArray:
+    """Return a column of a track [N], NaN where it must not be used."""
+    return np.where(track["valid"].fill_null(False).to_numpy(), track[column].to_numpy(), np.nan)
+
+
+def time_s(track: pl.DataFrame) -> FloatArray:
+    """Return the time of a track [N] from its first stamp."""
+    stamps = track["stamp_ns"].to_numpy()
+    return np.asarray((stamps - stamps[0]) * 1e-9)
 
 
 def on_the_road(car: Car, friction: float) -> Car:
@@ -138,93 +123,59 @@ def on_the_road(car: Car, friction: float) -> Car:
     return car.with_vehicle(car.vehicle.model_copy(update={"friction": friction}))
 
 
+def read_log(log: Path, car: Car) -> WholeDrive:
+    """Read a simulated log without its friction, mapped by recognition."""
+    with read_drive(log, car, options=ReadOptions(friction=None)) as read:
+        return read.whole()
+
+
 def as_logged(drive: Drive, car: Car) -> WholeDrive:
-    """Return a simulated drive without friction, written as MCAP, mapped by recognition and read."""
+    """Return a simulated drive as the estimators see it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.mcap"
         write_drive(drive, path)
-        with read_drive(path, car, options=ReadOptions(friction=None)) as read:
-            return read.whole()
-
-
-def read_simulated(scenario: Scenario, noise_seed: int, car: Car) -> ReadDrive:
-    """Simulate a drive, write it as a log and read it as ``pdhef run`` does."""
-    faults = [parse_fault(f) for f in scenario.faults]
-    drive = simulate_drive(scenario.manoeuvre, seed=noise_seed, faults=faults)
-    whole = as_logged(drive, on_the_road(car, drive.friction))
-    facts = {
-        "scenario": scenario.name,
-        "noise_seed": noise_seed,
-        "duration_s": drive.duration_s,
-        "peak_ay_g": drive.peak_ay_m_s2 / GRAVITY_M_S2,
-        "peak_sideslip_deg": math.degrees(drive.peak_sideslip_rad),
-        "truth_latency_ms": 1e3 * whole.plan.truth_latency_s,
-    }
-    return ReadDrive(scenario, noise_seed, whole, facts)
-
-
-def track_of(estimator: Estimator, car: Car, drive: ReadDrive) -> StateTrack:
-    """Run an estimator of a car over a drive."""
-    corrected = DriveSignals.of(drive.whole.signals, car)
-    window = estimate_drive(drive.whole, corrected, [estimator])
-    return next(iter(window.tracks.values()))
-
-
-def figures_of(track: StateTrack, drive: ReadDrive) -> dict[str, float]:
-    """Score a track; the figures of ``FIGURES`` that it has."""
-    truth, plan = drive.truth, drive.whole.plan
-    masks, slow = segment_masks(drive.signals, truth, plan.vehicle), plan.vehicle.low_speed_blend_m_s
-    rows = evaluate_drive(EvaluatedDrive(drive.scenario.name, {track.name: track}, truth, None, masks, slow))
-    by_key: dict[tuple[str, str, str], MetricRow] = {(r.signal, r.segment, r.metric): r for r in rows}
-    values = {
-        name: factor * by_key[signal, segment, metric].value
-        for name, (signal, segment, metric, factor) in FIGURES.items()
-        if (signal, segment, metric) in by_key
-    }
-    return {name: value for name, value in values.items() if math.isfinite(value)}
-
-
-def estimators_of(
-    names: Sequence[str], car: Car, available: frozenset[str]
-) -> tuple[dict[str, Estimator], dict[str, str]]:
-    """Return the estimators of the schemes that can run, and why the others cannot; names may end in ``ESP``."""
-    estimators: dict[str, Estimator] = {}
-    reasons: dict[str, str] = {}
-    for end, use_speed in (("", True), (ESP, False)):
-        chosen = [n.removesuffix(ESP) for n in names if n.endswith(ESP) != use_speed]
-        found, skipped = runnable(chosen, car, available, Options(use_speed=use_speed)) if chosen else ([], [])
-        estimators |= {f"{e.name}{end}": e for e in found}
-        reasons |= {f"{s.name}{end}": s.reason for s in skipped}
-    return estimators, reasons
+        return read_log(path, car)
 
 
 def run_experiment(
-    car: Car,
+    tool: Tool,
     *,
     scenarios: Iterable[Scenario] = (A, B, BURST),
     noise_seeds: Sequence[int] = tuple(range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + NOISE_SEEDS)),
-    names: Sequence[str] = tuple(SCHEMES),
-    progress: Callable[[str], None] = lambda _text: None,
+    names: Sequence[str] = SCHEMES,
 ) -> Experiment:
-    """Run the schemes on all scenarios with all noise seeds; the car gets the friction of each drive."""
-    runs: list[Run] = []
-    drives: dict[str, ReadDrive] = {}
-    tracks: dict[tuple[str, str], StateTrack] = {}
-    facts: list[dict[str, object]] = []
-    missing: dict[str, str] = {}
-    for scenario in scenarios:
-        for noise_seed in noise_seeds:
-            drive = read_simulated(scenario, noise_seed, car)
-            facts.append(drive.facts)
-            first_drive = scenario.name not in drives
-            drives.setdefault(scenario.name, drive)
-            on_road = on_the_road(car, scenario.friction)
-            schemes, reasons = estimators_of(names, on_road, drive.whole.plan.alignment.available)
-            missing.update(reasons)
-            for name, scheme in schemes.items():
-                track = track_of(scheme, on_road, drive)
-                runs.append(Run(scenario.name, noise_seed, name, figures_of(track, drive)))
-                if first_drive:
-                    tracks[scenario.name, name] = track
-            progress(f"scenario {scenario.name}, noise seed {noise_seed}")
-    return Experiment(tuple(runs), missing, drives, tracks, tuple(facts))
+    """Run the schemes on all scenarios with all noise seeds; names may end in ``ESP``."""
+    done, rows = Experiment(pl.DataFrame()), list[dict[str, Any]]()
+    for scenario, seed in product(scenarios, noise_seeds):
+        drive = simulate_drive(scenario.manoeuvre, seed=seed, faults=[parse_fault(f) for f in scenario.faults])
+        log = tool.log(f"{scenario.name}-{seed}", drive)
+        about = {"scenario": scenario.name, "noise_seed": seed}
+        peaks = drive.peak_ay_m_s2 / GRAVITY_M_S2, math.degrees(drive.peak_sideslip_rad)
+        done.facts.append(about | dict(zip(_FACTS, (drive.duration_s, *peaks), strict=True)))
+        tracks = []
+        for end, sensors in (("", "full"), (ESP, "esp")):
+            chosen = [n.removesuffix(ESP) for n in names if n.endswith(ESP) == bool(end)]
+            given = ("--car", "saloon", "--friction", str(drive.friction), "--set", f"sensors={sensors}")
+            folder = tool.run(
+                f"{log.stem}-{sensors}", log, *given, "--keep", "estimates", "--estimators", ",".join(chosen)
+            )
+            named = pl.col("estimator").cast(pl.String) + pl.when(estimator="truth").then(pl.lit("")).otherwise(
+                pl.lit(end)
+            )
+            tracks.append(
+                estimates(folder).with_columns(named).filter(pl.lit(not end) | (pl.col("estimator") != "truth"))
+            )
+            metrics = pl.read_parquet(folder / "metrics.parquet").filter(
+                pl.col("estimator").is_in(chosen), segment="all"
+            )
+            for name, (signal, metric, factor) in FIGURES.items():
+                found = metrics.filter(pl.col("value").is_finite(), signal=signal, metric=metric)
+                for scheme, value in found.select("estimator", "value").iter_rows():
+                    rows.append(about | {"scheme": f"{scheme}{end}", "figure": name, "value": factor * value})
+        if scenario.name not in done.logs:
+            done.logs[scenario.name], done.tracks[scenario.name] = log, pl.concat(tracks)
+    done.metrics = pl.DataFrame(rows)
+    return done
+
+
+_FACTS = ("duration_s", "peak_ay_g", "peak_sideslip_deg")

@@ -10,17 +10,14 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.estimators.table import SPECS
-from pdhef_logtool.evaluation.dead_reckoned import position_error
 from pdhef_logtool.records.geometry import dead_reckon, wrap_angle
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.records.tracks import StateTrack
 from studies.paper import published
 from studies.paper.comparison import spread
-from studies.paper.experiment import BURST_S, GRAVITY_M_S2, A, B, Experiment
+from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B, Experiment, time_s, valid
 from studies.paper.probes import RESIDUAL_ROWS, ResidualFit, TrustCurve
 from studies.paper.results import Results
 from studies.paper.schemes import DRAWN
-from studies.paper.step_time import StepTime
 from studies.pictures import STYLE, save, subplots
 
 COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
@@ -48,10 +45,6 @@ def _thin(name: str) -> dict[str, Any]:
     return {"color": COLOURS[name], "linewidth": 0.9, "label": name}
 
 
-def _time_s(track: StateTrack) -> FloatArray:
-    return np.asarray((track.stamps_ns - track.stamps_ns[0]) * 1e-9)
-
-
 def convergence(folder: Path, losses: Mapping[str, Sequence[float]]) -> None:
     """Figure 9: losses of the paper's network over the epochs; the paper's values after 150 epochs dotted."""
     fig, axes = subplots(1, 1, 7.4, 3.0, _STYLE)
@@ -63,11 +56,11 @@ def convergence(folder: Path, losses: Mapping[str, Sequence[float]]) -> None:
     save(fig, folder / "figure09_convergence.png")
 
 
-def step_time_bars(folder: Path, times: Mapping[str, StepTime]) -> None:
+def step_time_bars(folder: Path, times: Mapping[str, Mapping[str, float]]) -> None:
     """Figure 23: processor time of a step; the paper's values as dots, and the controller's cycle dotted."""
     names = [n for n in BARS if n in times][::-1]
     fig, axes = subplots(1, 1, 7.4, 3.0, _STYLE)
-    axes[0, 0].barh(names, [times[n].median_us for n in names], color=[COLOURS[n] for n in names], height=0.72)
+    axes[0, 0].barh(names, [times[n]["median_us"] for n in names], color=[COLOURS[n] for n in names], height=0.72)
     theirs = {"phy-ukf": published.STEP_MS["phy-ukf"], "pd-hef-paper": published.STEP_MS["pd-hef"]}
     axes[0, 0].plot([1e3 * ms for ms in theirs.values()], list(theirs), "o", color="#222222", label="paper, MATLAB")
     axes[0, 0].axvline(1e3 * published.CYCLE_MS, color="#222222", linestyle=":", label="cycle of a controller")
@@ -97,78 +90,97 @@ def residuals(folder: Path, name: str, fit: ResidualFit, title: str) -> None:
     save(fig, folder / f"{name}.png")
 
 
-def history(
-    folder: Path, name: str, experiment: Experiment, scenario: str, signal: str, schemes: Sequence[str]
-) -> None:
-    """Figures 12 to 14 and 16 to 18: a state over time, and the absolute error below it."""
-    attribute, factor, label = SIGNALS[signal]
-    truth = experiment.drives[scenario].truth
-    time_s, real = _time_s(truth), factor * getattr(truth, attribute)
-    fig, axes = subplots(2, 1, 7.4, 4.4, _STYLE, sharex=True)
-    axes[0, 0].plot(time_s, real, color=COLOURS["truth"], linewidth=3.0, label="truth")
-    for scheme in schemes:
-        track = experiment.tracks[scenario, scheme]
-        value = np.where(track.valid, getattr(track, attribute), np.nan) * factor
-        error = value - real
-        if signal == "sideslip":
-            error = np.degrees(wrap_angle(np.radians(error)))
-        axes[0, 0].plot(time_s, value, **_style(scheme))
-        axes[1, 0].plot(time_s, np.abs(error), **_thin(scheme))
-    axes[0, 0].set(ylabel=label)
-    axes[1, 0].set(ylabel=f"absolute error, {label.rsplit(', ', 1)[1]}", xlabel="time, s", ylim=(0.0, None))
-    _legend_above(axes[0, 0])
-    save(fig, folder / f"{name}.png")
+Curve = tuple[FloatArray, FloatArray, Mapping[str, Any]]
+
+
+def panels(
+    path: Path, height: float, stack: Sequence[tuple[Sequence[Curve], Mapping[str, Any]]], span: Sequence[float] = (),
+    **options: Any,
+) -> None:  # fmt: skip
+    """Draw panels one below the other: curves as x, y and style, and the settings of the axes; ``span`` is shaded."""
+    fig, axes = subplots(len(stack), 1, 7.4, height, _STYLE, **options)
+    for ax, (curves, settings) in zip(axes[:, 0], stack, strict=True):
+        for x, y, style in curves:
+            ax.plot(x, y, **style)
+        ax.set(**settings)
+        if span:
+            ax.axvspan(*span, color="#F0E442", alpha=0.25, linewidth=0)
+        if ax is axes[0, 0] or span:
+            _legend_above(ax)
+    save(fig, path)
 
 
 def _legend_above(ax: Any) -> None:
     ax.legend(ncols=6, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.1)
 
 
+_TRUTH = {"color": COLOURS["truth"], "linewidth": 3.0, "label": "truth"}
+_ERROR = {"xlabel": "time, s", "ylim": (0.0, None)}
+
+
+def history(
+    folder: Path, name: str, experiment: Experiment, scenario: str, signal: str, schemes: Sequence[str]
+) -> None:
+    """Figures 12 to 14 and 16 to 18: a state over time, and the absolute error below it."""
+    column, factor, label = SIGNALS[signal]
+    truth = experiment.truth(scenario)
+    at_s, real = time_s(truth), truth[column].to_numpy()
+    states: list[Curve] = [(at_s, factor * real, _TRUTH)]
+    errors: list[Curve] = []
+    for scheme in schemes:
+        if (track := experiment.track(scenario, scheme)) is not None:
+            value = valid(track, column)
+            error = wrap_angle(value - real) if signal == "sideslip" else value - real
+            states.append((at_s, factor * value, _style(scheme)))
+            errors.append((at_s, factor * np.abs(error), _thin(scheme)))
+    below = {"ylabel": f"absolute error, {label.rsplit(', ', 1)[1]}", **_ERROR}
+    panels(folder / f"{name}.png", 4.4, [(states, {"ylabel": label}), (errors, below)], sharex=True)
+
+
 def position(folder: Path, name: str, experiment: Experiment, scenario: str, schemes: Sequence[str]) -> None:
     """Figures 11 and 15: dead-reckoned trajectory beside the true one, and the distance between them over time."""
-    truth = experiment.drives[scenario].truth
-    fig, axes = subplots(2, 1, 7.4, 4.6, _STYLE)
-    axes[0, 0].plot(truth.x_m, truth.y_m, color=COLOURS["truth"], linewidth=3.0, label="truth")
+    truth, columns = experiment.truth(scenario), ("x_m", "y_m", "yaw_rad")
+    poses = truth.select(columns).to_numpy()
+    paths: list[Curve] = [(poses[:, 0], poses[:, 1], _TRUTH)]
+    distances: list[Curve] = []
     for scheme in schemes:
-        track = experiment.tracks[scenario, scheme]
-        finite = track.valid & np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s) & np.isfinite(truth.x_m)
-        first = int(np.flatnonzero(finite)[0])
-        start = (float(truth.x_m[first]), float(truth.y_m[first]), float(truth.yaw_rad[first]))
-        part = slice(first, None)
-        x, y, _ = dead_reckon(
-            track.stamps_ns[part], track.vx_m_s[part], track.vy_m_s[part], track.yaw_rate_rad_s[part], start
-        )
-        axes[0, 0].plot(x, y, **_style(scheme))
-        axes[1, 0].plot(_time_s(truth), position_error(track, truth), **_thin(scheme))
-    axes[0, 0].set(xlabel="x, m", ylabel="y, m (axes not equal)")
-    axes[1, 0].set(xlabel="time, s", ylabel="distance to ground truth, m", ylim=(0.0, None))
-    _legend_above(axes[0, 0])
-    save(fig, folder / f"{name}.png")
+        if (track := experiment.track(scenario, scheme)) is not None:
+            motion = [valid(track, c) for c in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")]
+            first = int(np.flatnonzero(np.isfinite(motion[0] + motion[1] + poses[:, 0]))[0])
+            start = (float(poses[first, 0]), float(poses[first, 1]), float(poses[first, 2]))
+            stamps = track["stamp_ns"].to_numpy()[first:]
+            vx, vy, rate = (values[first:] for values in motion)
+            x, y, _ = dead_reckon(stamps, vx, vy, rate, start)
+            paths.append((x, y, _style(scheme)))
+            away = np.hypot(x - poses[first:, 0], y - poses[first:, 1])
+            distances.append((time_s(truth)[first:], away, _thin(scheme)))
+    above = {"xlabel": "x, m", "ylabel": "y, m (axes not equal)"}
+    below = {"ylabel": "distance to ground truth, m", **_ERROR}
+    panels(folder / f"{name}.png", 4.6, [(paths, above), (distances, below)])
 
 
 def noise_adaptation(folder: Path, experiment: Experiment, adaptive: Sequence[str], compared: Sequence[str]) -> None:
     """Figure 20: yaw rate in the burst, the factor on R, and the sideslip error."""
-    drive = experiment.drives["A-burst"]
-    truth, signals = drive.truth, drive.signals
-    time_s = _time_s(truth)
-    fig, axes = subplots(3, 1, 7.4, 5.8, _STYLE, sharex=True)
-    axes[0, 0].plot(time_s, signals.yaw_rate_rad_s, color="#56B4E9", linewidth=0.7, label="measured")
-    axes[0, 0].plot(time_s, truth.yaw_rate_rad_s, color="#000000", linewidth=1.6, label="truth")
-    axes[0, 0].set(ylabel="yaw rate, rad/s")
-    for scheme in adaptive:
-        track = experiment.tracks["A-burst", scheme]
-        axes[1, 0].plot(time_s, np.where(track.valid, track.r_scale, np.nan), **_style(scheme))
-    axes[1, 0].set(yscale="log", ylabel="factor on R")
-    for scheme in compared:
-        track = experiment.tracks["A-burst", scheme]
-        error = np.degrees(np.abs(wrap_angle(track.sideslip_rad - truth.sideslip_rad)))
-        axes[2, 0].plot(time_s, np.where(track.valid, error, np.nan), **_thin(scheme))
-    axes[2, 0].set(ylabel="absolute sideslip\nerror, deg", xlabel="time, s", ylim=(0.0, None))
-    for ax in axes[:, 0]:
-        ax.axvspan(*BURST_S, color="#F0E442", alpha=0.25, linewidth=0)
-        if ax.get_legend_handles_labels()[0]:
-            _legend_above(ax)
-    save(fig, folder / "figure20_noise_adaptation.png")
+    truth = experiment.truth(BURST.name)
+    tracks = {
+        n: track for n in ("zero:no-lateral", *compared) if (track := experiment.track(BURST.name, n)) is not None
+    }
+    at_s, real = time_s(truth), truth["sideslip_rad"].to_numpy()
+    measured = {"color": "#56B4E9", "linewidth": 0.7, "label": "measured"}
+    rates: list[Curve] = [
+        (at_s, tracks["zero:no-lateral"]["yaw_rate_rad_s"].to_numpy(), measured),
+        (at_s, truth["yaw_rate_rad_s"].to_numpy(), {"color": "#000000", "linewidth": 1.6, "label": "truth"}),
+    ]
+    scales: list[Curve] = [(at_s, valid(tracks[n], "r_scale"), _style(n)) for n in adaptive]
+    errors: list[Curve] = [
+        (at_s, np.degrees(np.abs(wrap_angle(valid(tracks[n], "sideslip_rad") - real))), _thin(n)) for n in compared
+    ]
+    stack: list[tuple[list[Curve], dict[str, Any]]] = [
+        (rates, {"ylabel": "yaw rate, rad/s"}),
+        (scales, {"yscale": "log", "ylabel": "factor on R"}),
+        (errors, {"ylabel": "absolute sideslip\nerror, deg", **_ERROR}),
+    ]
+    panels(folder / "figure20_noise_adaptation.png", 5.8, stack, BURST_S, sharex=True)
 
 
 def trust(folder: Path, curves: Mapping[str, Mapping[str, TrustCurve]]) -> None:
@@ -205,12 +217,12 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
     for i, scenario in enumerate(scenarios):
         for j, (figure, label) in enumerate(BAR_FIGURES.items()):
             ax = axes[i, j]
-            spreads = [(k, n, spread(experiment, scenario, n, figure)) for k, n in enumerate(names)]
+            spreads = [(k, n, spread(experiment.metrics, scenario, n, figure)) for k, n in enumerate(names)]
             for k, name, s in spreads:
                 if s is None:
                     continue
-                ax.barh(k, s.median, color=COLOURS[name], height=0.72)
-                ax.plot([s.low, s.high], [k, k], color="#222222", linewidth=1.1)
+                ax.barh(k, s["median"], color=COLOURS[name], height=0.72)
+                ax.plot([s["low"], s["high"]], [k, k], color="#222222", linewidth=1.1)
             theirs = published.RMSE.get((scenario, figure))
             if theirs is not None:
                 ax.axvline(theirs, color="#222222", linestyle=":", linewidth=1.4)
@@ -225,17 +237,17 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
 
 def draw(r: Results, folder: Path) -> None:
     """Write the PNGs of Figures 9 to 23 into a folder, under the names that the page uses."""
-    schemes = [n for n in DRAWN if n in r.ran]
+    schemes = [n for n in DRAWN if n in r.experiment.ran]
     residuals(folder, "figure10_residual_fit", r.fits[A.name], "scenario A")
     residuals(folder, "figure19_residual_verification", r.fits[B.name], "scenario B")
     for scenario, letter, first in ((A.name, "a", 11), (B.name, "b", 15)):
         position(folder, f"figure{first}_position_{letter}", r.experiment, scenario, schemes)
         for i, signal in enumerate(SIGNALS, start=1):
             history(folder, f"figure{first + i}_{signal}_{letter}", r.experiment, scenario, signal, schemes)
-    compared = [n for n in ("phy-ukf", "pd-hef:fixed-r", "pd-hef-paper", "pd-hef") if n in r.ran]
+    compared = [n for n in ("phy-ukf", "pd-hef:fixed-r", "pd-hef-paper", "pd-hef") if n in r.experiment.ran]
     noise_adaptation(folder, r.experiment, list(r.inflations), compared)
     if any(r.curves.values()):
         trust(folder, {s: c for s, c in r.curves.items() if c})
-    rmse_bars(folder, r.experiment, r.ran, (A.name, B.name))
+    rmse_bars(folder, r.experiment, r.experiment.ran, (A.name, B.name))
     convergence(folder, r.losses)
     step_time_bars(folder, r.times)

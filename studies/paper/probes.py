@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.learning.network.residuals import residual_rows
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from studies.paper.experiment import GRAVITY_M_S2, Experiment, ReadDrive
+from studies.paper.experiment import GRAVITY_M_S2, Experiment, time_s, valid
 
 #: Rows of the residual, with their units.
 RESIDUAL_ROWS = (("v_y", "m/s²"), ("yaw rate", "rad/s²"))
@@ -42,14 +43,12 @@ class ResidualFit:
         return float(self.output[:, row].min() * self.step_s), float(self.output[:, row].max() * self.step_s)
 
 
-def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
+def residual_fit(whole: WholeDrive, car: Car) -> ResidualFit:
     """Compare the residual of a drive with the output of the paper's network, features as in service."""
-    whole = drive.whole
     assert isinstance(car.network, ModelBundle)
     assert car.network.paper_network is not None and whole.truth is not None
     network, period_s = car.network.paper_network, whole.plan.alignment.grid_period_s
-    parallel = filter_of(car, network.model)
-    rows = residual_rows(whole.signals, whole.truth, parallel, period_s=period_s)
+    rows = residual_rows(whole.signals, whole.truth, filter_of(car, network.model), period_s=period_s)
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
     output, _ = network.run(rows.features, starts, None)
     use = rows.weight > 0.0
@@ -72,12 +71,13 @@ class TrustCurve:
 
 def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> TrustCurve | None:
     """Return β of a scheme over the true |a_y|; None where the scheme did not run or has a constant gain."""
-    track = experiment.tracks.get((scenario, scheme))
+    track = experiment.track(scenario, scheme)
     if track is None:
         return None
-    ay = np.abs(experiment.drives[scenario].truth.ay_m_s2) / GRAVITY_M_S2
-    use = track.valid & np.isfinite(track.network_trust) & np.isfinite(ay)
-    ay, trust = ay[use], track.network_trust[use]
+    ay = np.abs(experiment.truth(scenario)["ay_m_s2"].to_numpy()) / GRAVITY_M_S2
+    trust = valid(track, "network_trust")
+    use = np.isfinite(trust) & np.isfinite(ay)
+    ay, trust = ay[use], trust[use]
     if not ay.size or np.ptp(trust) < 1e-9:
         return None
     edges = np.linspace(0.0, ay.max(), bins + 1)
@@ -88,21 +88,17 @@ def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 
     return TrustCurve(ay, trust, centre, points[:, 1], points[:, 0], points[:, 2])
 
 
-@dataclass(frozen=True, slots=True)
-class Inflation:
-    """Factor on R of a scheme: median before the burst and largest within; the first half second is left out."""
+def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float]) -> dict[str, float] | None:
+    """Return the factor on R: median before the burst, without its first half second, and largest within.
 
-    before: float
-    within: float
-
-
-def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float]) -> Inflation | None:
-    """Return the response of R to the burst; None if the scheme did not run or its R is constant."""
-    if (track := experiment.tracks.get(("A-burst", scheme))) is None:
+    None if the scheme did not run or its R is constant.
+    """
+    if (track := experiment.track("A-burst", scheme)) is None:
         return None
-    time_s = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
-    use = track.valid & np.isfinite(track.r_scale)
-    before, within = use & (time_s > 0.5) & (time_s < burst_s[0]), use & (time_s >= burst_s[0]) & (time_s < burst_s[1])
-    if not before.any() or not within.any() or np.ptp(track.r_scale[use]) < 1e-9:
+    scale, at_s = valid(track, "r_scale"), time_s(track)
+    before, within = (
+        scale[(at_s > low) & (at_s < high) & np.isfinite(scale)] for low, high in ((0.5, burst_s[0]), burst_s)
+    )
+    if not before.size or not within.size or np.nanmax(scale) - np.nanmin(scale) < 1e-9:
         return None
-    return Inflation(float(np.median(track.r_scale[before])), float(track.r_scale[within].max()))
+    return {"before": float(np.median(before)), "within": float(within.max())}

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
+
+import polars as pl
 
 from pdhef_logtool.car.car import NETWORK_FOLDER, SHIPPED_CARS, Car
 from pdhef_logtool.learning.network.train_command import HISTORY_FILE
 from pdhef_logtool.residual_model.bundle import PAPER_FOLDER
 from pdhef_logtool.results.run_report import tool_versions
+from studies.gates.tool import Tool
 from studies.paper.comparison import improvement, spread
-from studies.paper.experiment import BURST, BURST_S, FIGURES, A, B, Experiment, on_the_road, run_experiment
-from studies.paper.probes import Inflation, ResidualFit, TrustCurve, inflation, residual_fit, trust_curve
-from studies.paper.schemes import ESP, PAIRS, SCHEMES
-from studies.paper.step_time import StepTime, step_times
+from studies.paper.experiment import BURST, BURST_S, FIGURES, A, B, Experiment, on_the_road, read_log, run_experiment
+from studies.paper.probes import ResidualFit, TrustCurve, inflation, residual_fit, trust_curve
+from studies.paper.schemes import ESP, PAIRS
+from studies.paper.step_time import step_times
 
 SCENARIOS = (A, B, BURST)
 #: Schemes with a variable gain or factor on R.
@@ -36,38 +39,25 @@ class Results:
     car: Car
     fits: Mapping[str, ResidualFit]
     curves: Mapping[str, Mapping[str, TrustCurve]]
-    inflations: Mapping[str, Inflation]
-    times: Mapping[str, StepTime]
+    inflations: Mapping[str, dict[str, float]]
+    times: Mapping[str, dict[str, float]]
 
     @property
     def losses(self) -> dict[str, list[float]]:
         """Losses of the shipped paper's network by epoch."""
-        import polars as pl
-
         history = pl.read_parquet(SHIPPED_CARS["saloon"] / NETWORK_FOLDER / PAPER_FOLDER / HISTORY_FILE)
         return {name: history[name].to_list() for name in ("train_loss", "validation_loss")}
 
-    @property
-    def ran(self) -> tuple[str, ...]:
-        """Schemes that ran."""
-        there = {r.scheme for r in self.experiment.runs}
-        return tuple(n for n in SCHEMES if n in there)
 
-
-def gather(
-    car: Car,
-    *,
-    noise_seeds: Sequence[int],
-    progress: Callable[[str], None] = lambda _text: None,
-) -> Results:
+def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> Results:
     """Run the whole experiment."""
-    experiment = run_experiment(car, scenarios=SCENARIOS, noise_seeds=noise_seeds, progress=progress)
-    fits = {s.name: residual_fit(experiment.drives[s.name], car) for s in (A, B)}
+    experiment = run_experiment(tool, scenarios=SCENARIOS, noise_seeds=noise_seeds)
+    drives = {s.name: read_log(experiment.logs[s.name], on_the_road(car, s.friction)) for s in (A, B)}
+    fits = {name: residual_fit(whole, car) for name, whole in drives.items()}
     curves = {s.name: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s.name, n)) is not None} for s in (A, B)}
     inflations = {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None}
-    progress("step times")
-    names = [n for n in SCHEMES if n not in experiment.missing and not n.endswith(ESP)]
-    times = step_times(experiment.drives[B.name], on_the_road(car, B.friction), names)
+    names = [n for n in experiment.ran if not n.endswith(ESP)]
+    times = step_times(drives[B.name], on_the_road(car, B.friction), names)
     return Results(experiment, car, fits, curves, inflations, times)
 
 
@@ -84,19 +74,19 @@ def _plain(value: Any) -> Any:
 
 def document(r: Results) -> dict[str, Any]:
     """Return all results for ``results.json``; the same but for ``step_time_us`` when made again."""
-    scenarios = [s.name for s in SCENARIOS]
+    metrics, scenarios, network = r.experiment.metrics, [s.name for s in SCENARIOS], r.car.network
     summary = {
         scenario: {
-            scheme: {f: asdict(s) for f in FIGURES if (s := spread(r.experiment, scenario, scheme, f)) is not None}
-            for scheme in r.ran
+            scheme: {f: of for f in FIGURES if (of := spread(metrics, scenario, scheme, f)) is not None}
+            for scheme in r.experiment.ran
         }
         for scenario in scenarios
     }
     gains = [
-        {"scenario": scenario, "scheme": s, "baseline": b, **asdict(gain)}
+        {"scenario": scenario, "scheme": s, "baseline": b, **gain}
         for scenario in scenarios
         for s, b in PAIRS
-        if (gain := improvement(r.experiment, scenario, s, b)) is not None
+        if (gain := improvement(metrics, scenario, s, b)) is not None
     ]
     residuals = {
         scenario: {
@@ -112,7 +102,6 @@ def document(r: Results) -> dict[str, Any]:
         }
         for scenario, curves in r.curves.items()
     }
-    network = r.car.network
     plain: dict[str, Any] = _plain(
         {
             "made_by": "python -m studies.paper",
@@ -121,15 +110,14 @@ def document(r: Results) -> dict[str, Any]:
             "networks": [n.sha256 for n in (network, network and network.paper_network) if n is not None],
             "losses": r.losses,
             "versions": tool_versions(),
-            "missing": r.experiment.missing,
             "summary": summary,
             "improvements": gains,
             "residuals": residuals,
             "trust": trust,
-            "r_factor": {name: asdict(i) for name, i in r.inflations.items()},
-            "drives": list(r.experiment.facts),
-            "runs": [asdict(run) for run in r.experiment.runs],
-            "step_time_us": {name: asdict(t) for name, t in r.times.items()},
+            "r_factor": r.inflations,
+            "drives": r.experiment.facts,
+            "runs": metrics.to_dicts(),
+            "step_time_us": r.times,
         }
     )
     return plain

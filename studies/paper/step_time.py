@@ -4,38 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.table import make_estimator
-from studies.paper.experiment import ReadDrive, track_of
+from pdhef_logtool.runs.estimating import estimate_drive
 
 ROUNDS = 15
 
 
-@dataclass(frozen=True, slots=True)
-class StepTime:
-    """Microseconds a step: median, fastest and slowest round."""
-
-    median_us: float
-    low_us: float
-    high_us: float
-
-
-def step_times(drive: ReadDrive, car: Car, names: Sequence[str], rounds: int = ROUNDS) -> dict[str, StepTime]:
-    """Time the schemes on a drive; the first round, which compiles and loads, does not count."""
-    schemes = [make_estimator(name, car) for name in names]
-    steps = len(drive.signals)
+def step_times(whole: WholeDrive, car: Car, names: Sequence[str], rounds: int = ROUNDS) -> dict[str, dict[str, float]]:
+    """Return median, fastest and slowest round in microseconds a step; the first one compiles and does not count."""
+    schemes, corrected = [make_estimator(name, car) for name in names], DriveSignals.of(whole.signals, car)
     seconds: dict[str, list[float]] = {s.name: [] for s in schemes}
     for number in range(rounds + 1):
         for scheme in schemes:
             start = time.process_time()
-            track_of(scheme, car, drive)
+            estimate_drive(whole, corrected, [scheme])
             if number:
                 seconds[scheme.name].append(time.process_time() - start)
+    us = 1e6 / len(whole.signals)
     return {
-        name: StepTime(*(1e6 * float(f(taken)) / steps for f in (np.median, np.min, np.max)))
+        name: {"median_us": us * float(np.median(taken)), "low_us": us * min(taken), "high_us": us * max(taken)}
         for name, taken in seconds.items()
     }

@@ -1,116 +1,105 @@
-"""Compare this tool with published sideslip estimators on every recorded drive with ground truth: ``docs/peers.md``.
+"""Every estimator and published ones on drives with ground truth: ``docs/peers.md``.
 
-    python -m studies.peers [--out docs] [--results studies/results/peers]
+    python -m studies.peers [--out docs] [--stored]
+    python -m studies.peers --folder DIR [--car CAR] [--mapping FILE] | --published FILE.csv ...
 
-All estimators get the same published vehicle file and the same mapped and aligned signals. Ground truth is used for
-scores only. The drives are in ``../shared`` and may not be redistributed. Without them, the command ends with 0 and
-writes no file.
+Without ``--folder`` and ``--published``: the recorded drives of ``../shared``, which may not be redistributed, and the
+page is written; without these drives, nothing is done. Otherwise the table is printed. All estimators get the same
+vehicle file and the same mapped and aligned signals; ground truth is used for scores only.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
 
-from pdhef_logtool.records.signals import FloatArray, IntArray
-from studies.gates.tool import Tool, reports
-from studies.pages import DOCS, DRIVES, RESULTS, ROOT, options, write, write_toml
-from studies.peers.drives import (
-    PEER_DRIVES,
-    PeerDrive,
-    mapping_of,
-    mapping_table,
-    read_peer_drive,
-    vehicle_of,
-    vehicle_table,
-)
-from studies.peers.page import ESTIMATORS, OURS, page
-from studies.peers.parameters import pairs_table
-from studies.peers.scoring import DriveErrors, score
+import pdhef_logtool as pdhef
+from pdhef_logtool.car.toml_files import part_toml
+from pdhef_logtool.drive.options import OFF
+from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.records.tracks import StateTrack
+from studies.pages import DRIVES, page_options, update, write
+from studies.peers.drives import OFFSET, PEER_DRIVES, REFERENCE, PeerDrive, mapping_of, mapping_table, vehicle_of
+from studies.peers.page import CAUSAL, NO_FILE, SEDAN, blocks, estimator_table
+from studies.peers.scoring import Entry, scores
+
+STORED = ("scores.parquet", "parameters.json")
+RUN_MAPPING = Path(__file__).with_name("published.toml")
+RUN_CAR = REFERENCE / "vehicles" / "f1tenth.toml"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run and score all estimators; write page and results."""
-    parser = options("peers", __doc__)
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of peers.md")
-    parser.add_argument(
-        "--results", type=Path, default=RESULTS / "peers", help="folder of errors.json and parameters.json"
+def recorded(d: PeerDrive) -> Entry:
+    """Return a recorded drive with its published vehicle file."""
+    car = pdhef.Car.of(vehicle_of(d))
+    return Entry(DRIVES / d.log, d.group, d.drive, d.car, car, mapping_of(d), d.least_speed_m_s, d.group == OFFSET)
+
+
+def of_folder(folder: Path, car: Path | None, mapping: Path | None) -> Iterator[Entry]:
+    """Yield the logs below a folder, with the vehicle and mapping files in it."""
+    beside = [folder / name for name in ("vehicle.toml", "mapping.toml")]
+    car, mapping = (
+        given or (file if file.is_file() else None) for given, file in zip((car, mapping), beside, strict=True)
     )
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "peers")
-    given = parser.parse_args(arguments)
-    if not DRIVES.is_dir():
-        print("nothing is compared: needs ../shared beside the repository")
-        return 0
-    tool, parameters, documents = Tool(ROOT, given.work.resolve()), list[dict[str, Any]](), []
-    for drive in PEER_DRIVES:
-        errors, calibration = drive_errors(drive, tool)
-        documents.append(errors.document())
-        if calibration and not calibration["refused"]:
-            parameters.append({"log": drive.log, "parameters": calibration["parameters"]})
-    write(given.results / "errors.json", json.dumps(documents, indent=1) + "\n")
-    write(given.results / "parameters.json", json.dumps(parameters, indent=1) + "\n")
-    write(given.out / "peers.md", page([DriveErrors.of(document) for document in documents], pairs_table(parameters)))
-    return 0
+    loaded = pdhef.Car.load(car), pdhef.load_mapping(mapping) if mapping else None
+    for log in find_logs(str(folder)):
+        yield Entry(Path(str(log.path)), folder.name, log.stem, loaded[0].vehicle.name, *loaded)
 
 
-def drive_errors(drive: PeerDrive, tool: Tool) -> tuple[DriveErrors, dict[str, Any] | None]:
-    """Run all estimators on a drive; return their errors and the calibration with the published vehicle file."""
-    read = read_peer_drive(DRIVES / drive.log, vehicle_of(drive), mapping_of(drive))
-    assert read.truth is not None
-    missing, calibration = np.full(len(read.signals), np.nan), None
-    estimates: dict[str, FloatArray] = {}
-    stds: dict[str, FloatArray] = {}
-    runs: dict[tuple[str, str], dict[str, tuple[FloatArray, FloatArray]]] = {}
-    for name, (model, car, preset) in ESTIMATORS.items():
-        if (model, car) not in runs:
-            folder = tool_run(tool, drive, model, car)
-            runs[model, car] = {} if folder is None else tracks_of(folder, read.signals.stamps_ns)
-            if folder is not None and (model, car) == ("auto", "file"):
-                calibration = calibration_of(folder)
-        estimates[name], std = runs[model, car].get(preset, (missing, missing))
-        if name in OURS:
-            stds[name] = std
-    errors = score(drive, estimates, read.truth, stds)
-    print(drive.log, {name: round(value, 3) for name, value in errors.rmse_deg.items()}, file=sys.stderr)
-    return errors, calibration
+def published(file: Path, folder: Path) -> Iterator[Entry]:
+    """Split a published table of arXiv:2408.15610 into a log for each run, and yield these.
+
+    ``file``: time in s in its first column, which has no name, and ``run_id``.
+    """
+    rows, car = pl.read_csv(file), pdhef.Car.load(RUN_CAR)
+    for (run,), of_run in rows.rename({rows.columns[0]: "time"}).group_by("run_id", maintain_order=True):
+        log = folder / f"{file.stem}_{run}.csv"
+        of_run.sort("time").write_csv(log)
+        yield Entry(log, file.stem, log.stem, car.vehicle.name, car, pdhef.load_mapping(RUN_MAPPING))
 
 
-@cache
-def tool_run(tool: Tool, drive: PeerDrive, model: str, car: str) -> Path | None:
-    """Run the estimators of a model and car with the published mapping and vehicle file; None if the run refuses."""
-    name = f"{drive.log.partition('.')[0]}-{model}-{car}"
-    mapping = write_toml(tool.work / "mappings" / f"{name}.toml", mapping_table(drive))
-    presets = ",".join(preset for *run, preset in ESTIMATORS.values() if run == [model, car])
-    given: tuple[str | Path, ...] = ("--mapping", mapping, "--keep", "estimates", "--estimators", presets)
-    given += ("--model", earlier_model(tool, drive) if model == "earlier" else model)
-    if car == "file":
-        given += ("--car", write_toml(tool.work / "cars" / f"{name}.toml", vehicle_table(drive)))
-    try:
-        return tool.run(name, DRIVES / drive.log, *given)
-    except RuntimeError as error:
-        print(error, file=sys.stderr)
-        return None
+def scored(entries: Iterable[Entry]) -> tuple[list[dict[str, Any]], int]:
+    """Return the scores of all logs, and how many logs cannot be scored."""
+    rows, failed = list[dict[str, Any]](), 0
+    for entry in entries:
+        print(entry.log.name, file=sys.stderr, flush=True)
+        try:
+            rows += scores(entry)[0]
+        except pdhef.PdhefError as error:
+            failed += 1
+            print(error, file=sys.stderr)
+    return rows, failed
 
 
-def earlier_model(tool: Tool, drive: PeerDrive) -> str | Path:
-    """Return model.toml of the longest other drive with the same recorder and vehicle file; ``off`` without one."""
-    models: list[tuple[float, Path]] = []
-    for other in PEER_DRIVES:
-        if other.drive == drive.drive or _recorder(other) != _recorder(drive):
-            continue
-        if (folder := tool_run(tool, other, "auto", "file")) is None:
-            continue
-        (report,) = reports(folder).values()
-        if (calibration := report["self_calibration"]) and not calibration["refused"]:
-            models.append((report["log"]["duration_s"], next(folder.glob("logs/*/model.toml"))))
-    return max(models)[1] if models else "off"
+def recorded_scores(work: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the scores of all recorded drives, and the parameters that were calibrated on each.
+
+    ``work`` takes the models, which the causal variant of other drives uses.
+    """
+    rows, parameters = list[dict[str, Any]](), list[dict[str, Any]]()
+    models, truths = dict[str, tuple[float, Path]](), dict[str, StateTrack | None]()
+    scores(recorded(PEER_DRIVES[0]))  # loads the compiled code
+    for d in PEER_DRIVES:
+        own, model, truths[d.log] = scores(recorded(d))
+        rows += own
+        print(d.log, {r["estimator"]: round(r["rmse_deg"], 3) for r in own}, file=sys.stderr, flush=True)
+        if model.posterior is not None and not model.posterior.refused:
+            parameters.append({"log": d.log, "parameters": model.posterior.to_dict()["parameters"]})
+            models[d.log] = own[0]["length_s"], work / f"{d.log}.model.toml"
+            models[d.log][1].write_text(part_toml(model.file, "Written by python -m studies.peers."))
+    for d in PEER_DRIVES:
+        alike = [o for o in PEER_DRIVES if o.drive != d.drive and _recorder(o) == _recorder(d) and o.log in models]
+        earlier = max((models[o.log] for o in alike), default=(0.0, OFF))[1]
+        causal = replace(recorded(d), names=("pd-hef",), labels={"pd-hef": CAUSAL}, model=earlier)
+        labels = {"linear-kf:open-loop": SEDAN, "pd-hef": NO_FILE}
+        bare = replace(recorded(d), names=tuple(labels), labels=labels, car=pdhef.Car.load(None), truth=truths[d.log])
+        rows += scored([causal, bare])[0]
+    return rows, parameters
 
 
 def _recorder(drive: PeerDrive) -> tuple[object, ...]:
@@ -118,25 +107,36 @@ def _recorder(drive: PeerDrive) -> tuple[object, ...]:
     return drive.car, mapping_table(drive)["signals"], vehicle
 
 
-def calibration_of(folder: Path) -> dict[str, Any] | None:
-    """Return the calibration of a run."""
-    (report,) = reports(folder).values()
-    calibration: dict[str, Any] | None = report["self_calibration"]
-    return calibration
-
-
-def tracks_of(folder: Path, stamps_ns: IntArray) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return sideslip and its standard deviation of the estimators of a run at the stamps [N]."""
-    (file,) = folder.glob("logs/*/estimates.parquet")
-    table = pl.read_parquet(file)
-    tracks = {}
-    for (estimator,), rows in table.group_by("estimator"):
-        usable = rows.filter(pl.col("valid"))
-        at_stamps = np.full((2, len(stamps_ns)), np.nan)
-        index = np.searchsorted(stamps_ns, usable["stamp_ns"].to_numpy())
-        at_stamps[:, index] = usable["sideslip_rad"].to_numpy(), usable["sideslip_std_rad"].to_numpy()
-        tracks[str(estimator)] = at_stamps[0], at_stamps[1]
-    return tracks
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Score all estimators; print the tables of logs that are given, or write page and results."""
+    parser = page_options("peers", __doc__)
+    parser.add_argument("--folder", type=Path, help="logs with ground truth")
+    parser.add_argument("--published", type=Path, nargs="+", default=[], metavar="CSV", help="of arXiv:2408.15610")
+    parser.add_argument("--car", type=Path, help="car folder or vehicle.toml of --folder")
+    parser.add_argument("--mapping", type=Path, help="mapping.toml of --folder")
+    given = parser.parse_args(arguments)
+    work: Path = given.work
+    work.mkdir(parents=True, exist_ok=True)
+    if given.folder or given.published:
+        entries = [entry for file in given.published for entry in published(file, work)]
+        entries += of_folder(given.folder, given.car, given.mapping) if given.folder else ()
+        scored(entries[:1])  # loads the compiled code, which no score may contain
+        rows, failed = scored(entries)
+        for (group,), of_group in pl.DataFrame(rows).group_by("group", maintain_order=True) if rows else ():
+            print(f"## {group}\n\n{estimator_table(of_group)}\n")
+        return 1 if not rows else 3 if failed else 0
+    scored_file, parameters_file = (given.results / stored for stored in STORED)
+    if not given.stored:
+        if not DRIVES.is_dir():
+            print("nothing is compared: needs ../shared beside the repository, or --folder")
+            return 0
+        rows, parameters = recorded_scores(work)
+        given.results.mkdir(parents=True, exist_ok=True)
+        pl.DataFrame(rows).write_parquet(scored_file, compression="zstd")
+        write(parameters_file, json.dumps(parameters, indent=1) + "\n")
+    stored = pl.read_parquet(scored_file), json.loads(parameters_file.read_text(encoding="utf-8"))
+    update(given.out, "peers.md", blocks(*stored))
+    return 0
 
 
 if __name__ == "__main__":

@@ -12,8 +12,6 @@ from typing import Any
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.mapping import Mapping, load_mapping
 from studies.pages import DRIVES, ROOT, write_toml
 
@@ -152,9 +150,3 @@ def vehicle_of(drive: PeerDrive, folder: Path = DRIVES) -> VehicleParameters:
     """Return the published vehicle of a drive."""
     with tempfile.TemporaryDirectory() as work:
         return Car.load(write_toml(Path(work) / "vehicle.toml", vehicle_table(drive, folder))).vehicle
-
-
-def read_peer_drive(log: Path, vehicle: VehicleParameters, mapping: Mapping) -> WholeDrive:
-    """Read a drive as ``pdhef run`` does."""
-    with read_drive(log, Car.of(vehicle), mapping, ReadOptions()) as drive:
-        return drive.whole()

@@ -1,114 +1,144 @@
-"""The page of the peers, of the template beside it."""
+"""Tables of the scores of recorded drives, and of the agreement of calibrated parameters between drives of a car."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any
 
-from studies.pages import number, table, template
-from studies.peers.drives import FULL_SIZE, OFFSET, SMALL
-from studies.peers.scoring import (
-    BEST_PEERS,
-    DriveErrors,
-    best_of,
-    best_peers_median,
-    car_means,
-    geometric,
-    spread,
-)
+import numpy as np
+import polars as pl
 
-#: Model, car and preset of each run. The peers use the vehicle file as it is.
-OURS = {
-    "phy-ukf": ("auto", "file", "phy-ukf"),
-    "physics": ("auto", "file", "physics"),
-    "pd-hef": ("auto", "file", "pd-hef"),
-    "pd-hef, causal": ("earlier", "file", "pd-hef"),
-    "pd-hef, no file": ("auto", "none", "pd-hef"),
-}
-_PUBLISHED = {"open-loop-linear": "linear-kf:open-loop"} | {
-    name: name for name in ("linear-kf", "learned-single-track", "slip-ukf", "washout", "kinematic", "zero")
-}
-ESTIMATORS = {
-    **{name: ("off", "file", preset) for name, preset in _PUBLISHED.items()},
-    "open-loop-sedan": ("off", "none", "linear-kf:open-loop"),
-    **OURS,
-}
-#: Share of missing estimates from which a figure is marked.
-MARKED = 0.05
+from pdhef_logtool.evaluation.statistics import pooled
+from pdhef_logtool.evaluation.track_errors import NORMAL_95
+from studies.pages import number, table
+from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, SMALL, PeerDrive, vehicle_of
+
+SEDAN, CAUSAL, NO_FILE = "open-loop-sedan", "pd-hef, causal", "pd-hef, no file"
+OURS = ("phy-ukf", "physics", "pd-hef", CAUSAL, NO_FILE)
+PUBLISHED = (
+    "linear-kf:open-loop", "linear-kf", "learned-single-track", "slip-ukf", "washout", "kinematic", "zero", SEDAN,
+)  # fmt: skip
+#: Share of missing estimates from which a figure is marked; peers that the ratio of a drive counts.
+MARKED, BEST_PEERS = 0.05, 3
+#: Parameters of the car; biases, offsets and delays belong to a drive.
+STEERING, PEAK = "steering ratio", "peak force over the file's"
+OF_CAR = (
+    "rear cornering stiffness", PEAK, "yaw inertia", "relaxation length", STEERING,
+    "roll gain", "lever of a_y",
+)  # fmt: skip
 
 
-def page(errors: Sequence[DriveErrors], parameters: str) -> str:
-    """Return the page; ``parameters`` : table of their agreement."""
-    groups = {group: [e for e in errors if e.drive.group == group] for group in (FULL_SIZE, SMALL, OFFSET)}
-    full_size = groups[FULL_SIZE]
-    offsets = ", ".join(f"{_name(e)} {number(e.offset_deg, 2)}°" for e in groups[OFFSET])
-    return template(
-        __file__,
-        verdict=_verdict(full_size),
-        logs=len(full_size),
-        means=means_table(full_size),
-        full_size=drives_table(full_size),
-        best=BEST_PEERS,
-        intervals=intervals_table(full_size),
-        small_means=means_table(groups[SMALL]),
-        small=drives_table(groups[SMALL]),
-        offsets=offsets,
-        offset=drives_table(groups[OFFSET]),
-        marked=MARKED,
-        parameters=parameters,
-    )
-
-
-def _name(errors: DriveErrors) -> str:
-    return errors.drive.log.partition(".")[0]
-
-
-def peer_names(errors: DriveErrors) -> list[str]:
-    """Return the names of the peers."""
-    return [name for name in errors.rmse_deg if name not in OURS]
-
-
-def _verdict(errors: Sequence[DriveErrors]) -> str:
-    means = {name: geometric([*car_means(errors, name).values()]) for name in errors[0].rmse_deg}
-    best = min(peer_names(errors[0]), key=lambda name: means[name])
-    ours = "pd-hef"
-    return (
-        f"Geometric mean over {len(car_means(errors, ours))} full-size cars: `{ours}` {number(means[ours], 2)}°, "
+def blocks(rows: pl.DataFrame, parameters: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """Return the parts of the page by name."""
+    full, small, offset = (rows.filter(group=group) for group in (FULL_SIZE, SMALL, OFFSET))
+    means = dict(car_means(full).select("estimator", "mean_deg").iter_rows())
+    best = min(PUBLISHED, key=lambda name: means[name])
+    verdict = (
+        f"Geometric mean over {full['car'].n_unique()} full-size cars: `pd-hef` {number(means['pd-hef'], 2)}°, "
         f"lowest of the peers `{best}` {number(means[best], 2)}°."
     )
+    removed = offset.filter(estimator="zero").select("log", "offset_deg").iter_rows()
+    offsets = ", ".join(f"{_stem(log)} {number(offset_deg, 2)}°" for log, offset_deg in removed)
+    return {
+        "verdict": verdict,
+        "full_size": estimator_table(full),
+        "full_size_drives": drives_table(full),
+        "intervals": intervals_table(full),
+        "parameters": pairs_table(parameters),
+        "small": estimator_table(small),
+        "small_drives": drives_table(small),
+        "offsets": f"Medians of the sideslip on straights: {offsets}.",
+        "offset_drives": drives_table(offset),
+    }
 
 
-def means_table(errors: Sequence[DriveErrors]) -> str:
-    """Return the means by car and over cars, a line an estimator."""
-    names = [*errors[0].rmse_deg]
-    lowest = [best_of(e, names) for e in errors]
+def _stem(log: str) -> str:
+    return log.partition(".")[0]
+
+
+def car_means(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the geometric mean and spread of the RMSE over cars by estimator.
+
+    That of a car is over its drives; logs of the same drive share its weight.
+    """
+    logs = rows.with_columns(pl.col("rmse_deg").log())
+    for level in (["estimator", "car", "drive"], ["estimator", "car"]):
+        logs = logs.group_by(level, maintain_order=True).agg(pl.col("rmse_deg").mean())
+    mean = pl.col("rmse_deg").mean().exp().alias("mean_deg")
+    spread = pl.col("rmse_deg").std().fill_null(0.0).exp().alias("spread")
+    return logs.group_by("estimator", maintain_order=True).agg(mean, spread)
+
+
+def estimator_table(rows: pl.DataFrame) -> str:
+    """Return a line for each estimator, the lowest error of `zero` first."""
+    zero, means = rows.filter(estimator="zero").select("log", of_zero="rmse_deg"), car_means(rows)
+    lines = []
+    for (name,), own in rows.join(zero, on="log").group_by("estimator", maintain_order=True):
+        weights, values, others = (own[c].to_numpy() for c in ("scored_s", "rmse_deg", "of_zero"))
+        factors = {factor: own[factor].to_list() for factor in ("car", "drive")}
+        error = pooled(weights, values, None, squares=True, positive=True, level=0.95, factors=factors)
+        ratio = float(np.sqrt(np.average(values**2, weights=weights) / np.average(others**2, weights=weights)))
+        share, covers, winkler, cost = (
+            float(np.average(own[c].to_numpy(), weights=weights))
+            for c in ("available", "coverage95", "winkler_deg", "seconds_per_hour")
+        )
+        mean, spread = means.filter(estimator=name).row(0)[1:]
+        cells = [str(len(own)), number(error.value, 2), f"{number(error.low, 2)} to {number(error.high, 2)}"]
+        cells += [number(x, 2) for x in (ratio, mean, spread)]
+        cells += [f"{share:.0%}", number(covers, 2), number(winkler, 2), number(cost, 1)]
+        lines.append((ratio, [f"`{name}`", *cells]))
+    head = "estimator, drives, RMSE, 95 %, of zero, mean of cars, spread, available, covers, Winkler, s/h"
+    return table(head, [cells for _, cells in sorted(lines)], right_from=1)
+
+
+def drives_table(rows: pl.DataFrame) -> str:
+    """Return the errors, a line a drive; the lowest one is bold, one of an incomplete estimate marked."""
     body = []
-    for name in names:
-        cars = car_means(errors, name)
-        cells = [number(value, 2) for value in (*cars.values(), geometric([*cars.values()]), spread([*cars.values()]))]
-        body.append([f"`{name}`", *cells, str(lowest.count(name))])
-    head = ["estimator", *car_means(errors, names[0]), "geometric mean", "spread", "lowest"]
-    return table(head, body, right_from=1)
+    for (log,), own in rows.group_by("log", maintain_order=True):
+        found = {name: (error, share) for name, error, share in own["estimator", "rmse_deg", "available"].iter_rows()}
+        shown = [name for name in (*PUBLISHED, *OURS) if name in found]
+        lowest, cells = min(shown, key=lambda name: found[name][0]), []
+        for name in (*PUBLISHED, *OURS):
+            error, share = found.get(name, (math.nan, 1.0))
+            text = number(error, 2) + ("†" if 1.0 - share > MARKED else "")
+            cells.append(f"**{text}**" if name == lowest else text)
+        peers = sorted(found[name][0] for name in PUBLISHED if name in found)[:BEST_PEERS]
+        body.append([f"`{_stem(str(log))}`", *cells, number(found["pd-hef"][0] / float(np.median(peers)), 2)])
+    return table(["drive", *(f"`{name}`" for name in (*PUBLISHED, *OURS)), "ratio"], body, right_from=1)
 
 
-def intervals_table(errors: Sequence[DriveErrors]) -> str:
+def intervals_table(rows: pl.DataFrame) -> str:
     """Return coverage and half-width of the 95 % intervals, a line a drive."""
-    names = [name for name in OURS if name in errors[0].coverage]
-    body = [
-        [f"`{_name(e)}`", *(f"{e.coverage[name]:.0%}, {number(e.half_width_deg[name], 2)}" for name in names)]
-        for e in errors
-    ]
-    return table(["drive", *(f"`{name}`" for name in names)], body, right_from=1)
-
-
-def drives_table(errors: Sequence[DriveErrors]) -> str:
-    """Return the errors, a line a drive; the lowest one is bold."""
-    names = [*errors[0].rmse_deg]
     body = []
-    for e in errors:
-        cells = []
-        for name in names:
-            text = number(e.rmse_deg[name], 2) + ("†" if e.missing[name] > MARKED else "")
-            cells.append(f"**{text}**" if name == best_of(e, names) else text)
-        ratio = e.rmse_deg["pd-hef"] / best_peers_median(e, peer_names(e))
-        body.append([f"`{_name(e)}`", *cells, number(ratio, 2)])
-    return table(["drive", *(f"`{name}`" for name in names), "ratio"], body, right_from=1)
+    for (log,), own in rows.group_by("log", maintain_order=True):
+        found = {name: f"{share:.0%}, {number(half, 2)}"
+                 for name, share, half in own["estimator", "coverage95", "half_width_deg"].iter_rows()}  # fmt: skip
+        body.append([f"`{_stem(str(log))}`", *(found.get(name, "–") for name in OURS)])
+    return table(["drive", *(f"`{name}`" for name in OURS)], body, right_from=1)
+
+
+def pairs_table(documents: Sequence[dict[str, Any]]) -> str:
+    """Return how parameters of pairs of drives of one car agree, a line a parameter and one for all of them.
+
+    Two logs of the same drive are no pair.
+    """
+    fitted = {d["log"]: {p["name"]: p for p in d["parameters"]} for d in documents}
+    drives = [drive for drive in PEER_DRIVES if drive.log in fitted]
+    pairs = [(a, b) for a, b in combinations(drives, 2) if a.car == b.car and a.drive != b.drive]
+    every = {name: np.array([_difference(name, a, b, fitted) for a, b in pairs]) for name in OF_CAR}
+    body = []
+    for name, rows in [*every.items(), ("all", np.concatenate(list(every.values())))]:
+        within, rms = np.abs(rows) <= NORMAL_95, number(float(np.sqrt(np.mean(rows**2))), 2)
+        body.append([name, str(len(rows)), f"{np.mean(within):.0%}", rms])
+    return table(["parameter", "pairs", "within 1.96 σ", "RMS of difference / σ"], body, right_from=1)
+
+
+def _difference(name: str, a: PeerDrive, b: PeerDrive, fitted: Mapping[str, Mapping[str, dict[str, Any]]]) -> float:
+    """Return the difference over its 1-sigma; steering ratios are over the file's, for the channels differ."""
+    of_a, of_b = fitted[a.log][name], fitted[b.log][name]
+    files = [vehicle_of(drive).steering_ratio if name == STEERING else 1.0 for drive in (a, b)]
+    values = [of_one["value"] / file for of_one, file in zip((of_a, of_b), files, strict=True)]
+    values = [math.log(value) if of_a["log"] else value for value in values]
+    return float((values[0] - values[1]) / math.hypot(of_a["sd"], of_b["sd"]))

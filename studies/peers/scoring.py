@@ -1,116 +1,103 @@
-"""Sideslip errors of estimates with ground truth, and their means over drives and cars."""
+"""Scores of all estimators on a drive with ground truth."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Mapping as Table
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.evaluation.metrics import NORMAL_95
-from pdhef_logtool.evaluation.track_errors import scorable, truth_speed
+import pdhef_logtool as pdhef
+from pdhef_logtool.drive.options import AUTO
+from pdhef_logtool.evaluation.track_errors import NORMAL_95, scorable, truth_speed
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
-from studies.peers.drives import OFFSET, PEER_DRIVES, PeerDrive
+from pdhef_logtool.runs.estimating import estimate_drive
 
 SIDESLIP = "sideslip_rad"
+#: Factor of the part of an error outside a 95 % interval in its score: 2 / 0.05.
+PENALTY = 40.0
 #: The offset of ground truth is its median on straights: yaw rate in rad/s below, speed in m/s above.
 STRAIGHT_YAW_RATE_RAD_S, STRAIGHT_SPEED_M_S = 0.02, 5.0
-#: Peers that the limit for a single drive counts.
-BEST_PEERS = 3
 
 
-@dataclass(slots=True)
-class DriveErrors:
-    """Sideslip RMSE in degrees and share of missing estimates of a drive, by estimator, on ``scored`` stamps.
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A log to score.
 
-    ``coverage`` and ``half_width_deg`` (median) of the 95 % intervals are of valid estimates.
+    Attributes
+    ----------
+    group : heading of its tables. drive : name of the drive that it recorded. car_name : has one vote.
+    mapping : None: recognised. least_speed_m_s : sideslip is scored above it; None: the low-speed limit of the car.
+    has_offset : whether the offset of the ground truth is subtracted.
+    names : of estimators or their groups. labels : names in the tables, where they differ. model : as in a run.
+    truth : of the drive as it is read with another car, whose file has the position of the ground truth.
     """
 
-    drive: PeerDrive
-    scored: int
-    offset_deg: float
-    rmse_deg: dict[str, float] = field(default_factory=dict)
-    missing: dict[str, float] = field(default_factory=dict)
-    coverage: dict[str, float] = field(default_factory=dict)
-    half_width_deg: dict[str, float] = field(default_factory=dict)
-
-    def document(self) -> dict[str, Any]:
-        """Return it for JSON."""
-        return {
-            "log": self.drive.log,
-            "car": self.drive.car,
-            "least_speed_m_s": self.drive.least_speed_m_s,
-            "scored_stamps": self.scored,
-            "offset_removed_deg": round(self.offset_deg, 4),
-            "rmse_deg": {name: round(value, 4) for name, value in self.rmse_deg.items()},
-            "missing": {name: round(value, 4) for name, value in self.missing.items()},
-            "coverage95": {name: round(value, 4) for name, value in self.coverage.items()},
-            "half_width_deg": {name: round(value, 4) for name, value in self.half_width_deg.items()},
-        }
-
-    @classmethod
-    def of(cls, document: Mapping[str, Any]) -> DriveErrors:
-        """Return the errors of a document."""
-        drive = next(drive for drive in PEER_DRIVES if drive.log == document["log"])
-        offset_deg = document["offset_removed_deg"]
-        intervals = document["coverage95"], document["half_width_deg"]
-        return cls(drive, document["scored_stamps"], offset_deg, document["rmse_deg"], document["missing"], *intervals)
+    log: Path
+    group: str
+    drive: str
+    car_name: str
+    car: pdhef.Car
+    mapping: Mapping | None
+    least_speed_m_s: float | None = None
+    has_offset: bool = False
+    names: tuple[str, ...] = ("all", "peers")
+    labels: Table[str, str] = field(default_factory=dict)
+    model: Path = AUTO
+    truth: StateTrack | None = None
 
 
-def score(
-    drive: PeerDrive,
-    estimates: Mapping[str, FloatArray],
-    truth: StateTrack,
-    stds: Mapping[str, FloatArray] | None = None,
-) -> DriveErrors:
-    """Score sideslip [N] in rad at the stamps of the ground truth, and intervals where there are any.
-
-    A missing estimate (NaN) counts as 0 in errors and not at all in intervals.
-    """
-    scored = scorable(truth, SIDESLIP, drive.least_speed_m_s)
-    offset = 0.0
-    if drive.group == OFFSET:
-        straight = np.abs(truth.yaw_rate_rad_s) < STRAIGHT_YAW_RATE_RAD_S
-        offset = float(np.median(truth.sideslip_rad[scored & straight & (truth_speed(truth) > STRAIGHT_SPEED_M_S)]))
-    errors = DriveErrors(drive, int(np.count_nonzero(scored)), float(np.degrees(offset)))
-    for name, sideslip in estimates.items():
-        difference = wrap_angle(np.nan_to_num(sideslip, nan=0.0) - truth.sideslip_rad + offset)[scored]
-        if stds is not None and name in stds:
-            valid = np.isfinite(sideslip[scored])
-            half_width = NORMAL_95 * stds[name][scored][valid]
-            errors.coverage[name] = float(np.mean(np.abs(difference[valid]) <= half_width))
-            errors.half_width_deg[name] = float(np.degrees(np.median(half_width)))
-        errors.rmse_deg[name] = float(np.degrees(np.sqrt(np.mean(difference**2))))
-        errors.missing[name] = float(np.mean(~np.isfinite(sideslip[scored])))
-    return errors
+def scores(entry: Entry) -> tuple[list[dict[str, Any]], DriveModel, StateTrack | None]:
+    """Return the scores of the estimators on a log, with its car calibrated as in a run, model and ground truth."""
+    rows = []
+    with pdhef.read_drive(entry.log, entry.car, entry.mapping, pdhef.ReadOptions(model=entry.model)) as drive:
+        model, whole = DriveModel.fit(drive), drive.whole()
+        corrected, truth = model.apply(whole.signals), entry.truth or whole.truth
+        given = [e for name in entry.names for e in pdhef.choose(drive, [name], model.car)[0]]
+        for name, estimator in {e.name: e for e in given}.items():
+            begin = time.process_time()
+            intervals = drive_intervals(model.car, [estimator])
+            (track,) = estimate_drive(whole, corrected, [estimator], intervals=intervals).tracks.values()
+            seconds = time.process_time() - begin
+            if truth is None or track.name != name:
+                continue
+            length_s = float(np.ptp(track.stamps_ns) * 1e-9)
+            about = {"group": entry.group, "log": entry.log.name, "drive": entry.drive, "car": entry.car_name}
+            costs = {"length_s": length_s, "seconds_per_hour": 3600.0 * seconds / length_s}
+            least = entry.least_speed_m_s or entry.car.vehicle.low_speed_blend_m_s
+            figures = errors(track, truth, least, has_offset=entry.has_offset)
+            rows.append(about | {"estimator": entry.labels.get(name, name)} | figures | costs)
+    return [row for row in rows if row["scored_s"] > 0.0 and row["available"] > 0.0], model, truth
 
 
-def geometric(values: Sequence[float]) -> float:
-    """Return the geometric mean."""
-    return float(np.exp(np.mean(np.log(values))))
+def errors(track: StateTrack, truth: StateTrack, least_speed_m_s: float, *, has_offset: bool = False) -> dict[str, Any]:
+    """Return the figures of a track, angles in degrees; a missing estimate counts as 0, and not in intervals."""
+    scored, offset = scorable(truth, SIDESLIP, least_speed_m_s), 0.0
+    if has_offset:
+        straight = scored & (np.abs(truth.yaw_rate_rad_s) < STRAIGHT_YAW_RATE_RAD_S)
+        offset = float(np.median(truth.sideslip_rad[straight & (truth_speed(truth) > STRAIGHT_SPEED_M_S)]))
+    there = (track.valid & np.isfinite(track.sideslip_rad))[scored]
+    estimate = np.where(there, track.sideslip_rad[scored], 0.0)
+    error = np.degrees(np.abs(wrap_angle(estimate - truth.sideslip_rad[scored] + offset)))
+    half, with_interval = np.degrees(NORMAL_95 * track.sideslip_std_rad[scored][there]), error[there]
 
+    def mean(values: np.ndarray) -> float:
+        return float(np.mean(values)) if values.size else float("nan")
 
-def car_means(errors: Sequence[DriveErrors], name: str) -> dict[str, float]:
-    """Return the RMSE of an estimator by car: geometric mean over drives; logs of the same drive share its weight."""
-    cars: dict[str, dict[str, list[float]]] = {}
-    for e in errors:
-        cars.setdefault(e.drive.car, {}).setdefault(e.drive.drive, []).append(e.rmse_deg[name])
-    return {car: geometric([geometric(logs) for logs in drives.values()]) for car, drives in cars.items()}
-
-
-def spread(values: Sequence[float]) -> float:
-    """Return the geometric standard deviation, a factor."""
-    return float(np.exp(np.std(np.log(values), ddof=1))) if len(values) > 1 else 1.0
-
-
-def best_of(errors: DriveErrors, names: Sequence[str]) -> str:
-    """Return the estimator with the lowest error of a drive."""
-    return min(names, key=lambda name: errors.rmse_deg[name])
-
-
-def best_peers_median(errors: DriveErrors, peers: Sequence[str]) -> float:
-    """Return the median error of the best peers of a drive."""
-    return float(np.median(sorted(errors.rmse_deg[name] for name in peers)[:BEST_PEERS]))
+    has_interval = bool(np.isfinite(half).any())
+    return {
+        "offset_deg": float(np.degrees(offset)),
+        "scored_s": float(np.ptp(track.stamps_ns) * 1e-9) * mean(scored),
+        "rmse_deg": mean(error**2) ** 0.5,
+        "available": mean(there),
+        "coverage95": mean(with_interval <= half) if has_interval else float("nan"),
+        "half_width_deg": float(np.nanmedian(half)) if has_interval else float("nan"),
+        "winkler_deg": mean(2.0 * half + PENALTY * np.maximum(with_interval - half, 0.0)),
+    }

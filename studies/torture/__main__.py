@@ -11,12 +11,13 @@ something ended as it should not.
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,38 +26,22 @@ from pdhef_logtool.workers.supervisor import Limits
 from studies.pages import DOCS, ROOT, fill, options, table, write
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
-from studies.torture.formats import HANG_S, format_judge
 from studies.torture.hours import write_hours
-from studies.torture.logs import log_judge
+from studies.torture.mutants import HANG_S, format_judge, log_judge
 from studies.torture.outside import measured
-from studies.torture.table_seeds import FORMATS
+from studies.torture.seeds import FORMATS
 from studies.torture.workers import NO_VERDICT, Verdict, judge, run_cases
 
 _THREE = ("run", "--car", "saloon", "--annotate", "none", "--estimators", "zero,kinematic,phy-ukf")
 
 
-def mutations(work: Path, seed: int, jobs: int, logs: int) -> dict[str, Any]:
-    """Judge mutated logs."""
-    return {"logs": _judged(work, "logs", log_judge(work, seed), seed, logs, jobs)}
-
-
-def formats(work: Path, seed: int, jobs: int, count: int, names: Iterable[str]) -> dict[str, Any]:
-    """Judge mutated files of table and CAN formats, each by a separate command."""
-    limits = Limits(silence_s=3 * HANG_S)
-    return {name: _judged(work, name, format_judge(work, name, seed), seed, count, jobs, limits) for name in names}
-
-
-def _judged(
-    work: Path,
-    name: str,
-    judge: Callable[[int], Verdict],
-    seed: int,
-    count: int,
-    jobs: int,
-    limits: Limits | None = None,
-) -> dict[str, Any]:
-    begin = time.monotonic()
-    cases = run_cases(judge, count, work / f"{name}-{seed}.jsonl", jobs=jobs, tell=_say, limits=limits)
+def judged(given: argparse.Namespace, name: str) -> dict[str, Any]:
+    """Judge mutants of a format, each by a separate command; of ``logs``: recordings, in supervised processes."""
+    begin, work, seed = time.monotonic(), given.work, given.seed
+    is_log = name == "logs"
+    judge, count = (log_judge(work, seed), given.logs) if is_log else (format_judge(work, name, seed), given.count)
+    limits = None if is_log else Limits(silence_s=3 * HANG_S)
+    cases = run_cases(judge, count, work / f"{name}-{seed}.jsonl", jobs=given.jobs, tell=_say, limits=limits)
     return {
         "seed": seed,
         "wall_s": time.monotonic() - begin,
@@ -168,8 +153,8 @@ def main() -> int:
     todo: dict[str, Callable[[], Any]] = {
         "bombs": lambda: one_by_one("bombs", work, {b.name: partial(judge_bomb, b) for b in BOMBS}),
         "shared": lambda: one_by_one("shared", work, {bomb.name: partial(judge_bomb, bomb) for bomb in former_cases()}),
-        "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs),
-        "formats": lambda: formats(work, given.seed, given.jobs, given.count, given.format or FORMATS),
+        "mutations": lambda: {"logs": judged(given, "logs")},
+        "formats": lambda: {name: judged(given, name) for name in given.format or FORMATS},
         "crashes": lambda: one_by_one("crashes", work, crash_cases(work, given.drives, given.kills, given.seed)),
         "hours": lambda: one_by_one(
             "hours",

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from studies.pages import ROOT
+from studies.torture.mutating import MAGIC, Record, join_bag, join_mcap
 from studies.torture.outside import measured
 from studies.torture.seeds import SEEDS, START_NS
 from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Verdict, judge
 
-_MAGIC = b"\x89MCAP0\r\n"
 _NO_LOG, _EITHER, _SOUND, _ANY = (1,), (1, 3), (0, 3), (0, 1, 3)
 _PAST_NS = START_NS - 315_360_000 * 10**9
 
@@ -39,33 +39,27 @@ def _text(data: bytes) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-def _record(op: int, payload: bytes) -> bytes:
-    return struct.pack("<BQ", op, len(payload)) + payload
+def _schema(name: bytes, encoding: bytes, data: bytes) -> Record:
+    return b"\3", struct.pack("<H", 1) + _text(name) + _text(encoding) + _text(data)
 
 
-def _schema(id_: int, name: bytes, encoding: bytes, data: bytes) -> bytes:
-    return _record(3, struct.pack("<H", id_) + _text(name) + _text(encoding) + _text(data))
+def _channel(id_: int, topic: bytes, encoding: bytes) -> Record:
+    return b"\4", struct.pack("<HH", id_, 1) + _text(topic) + _text(encoding) + _text(b"")
 
 
-def _channel(id_: int, schema: int, topic: bytes, encoding: bytes) -> bytes:
-    return _record(4, struct.pack("<HH", id_, schema) + _text(topic) + _text(encoding) + _text(b""))
+def _message(channel: int, time_ns: int, payload: bytes) -> Record:
+    return b"\5", struct.pack("<HIQQ", channel, 0, time_ns, time_ns) + payload
 
 
-def _message(channel: int, time_ns: int, payload: bytes, claimed: int | None = None) -> bytes:
-    head = struct.pack("<HIQQ", channel, 0, time_ns, time_ns)
-    return struct.pack("<BQ", 5, (len(head) + len(payload)) if claimed is None else claimed) + head + payload
+def _chunk(compression: bytes, stored: bytes, size: int, crc: int = 0) -> Record:
+    head = struct.pack("<QQQI", START_NS, START_NS, size, crc)
+    return b"\6", head + _text(compression) + struct.pack("<Q", len(stored)) + stored
 
 
-def _chunk(
-    compression: bytes, stored: bytes, size: int, crc: int = 0, times: tuple[int, int] = (START_NS, START_NS)
-) -> bytes:
-    head = struct.pack("<QQQI", *times, size, crc)
-    return _record(6, head + _text(compression) + struct.pack("<Q", len(stored)) + stored)
-
-
-def _mcap(*records: bytes) -> bytes:
-    body = _record(1, _text(b"ros2") + _text(b"torture")) + b"".join(records)
-    return _MAGIC + body + _record(15, struct.pack("<I", 0)) + _record(2, struct.pack("<QQI", 0, 0, 0)) + _MAGIC
+def _mcap(*records: Record, behind: bytes = b"") -> bytes:
+    """Return a file of records, and some bytes behind them."""
+    end = [(b"\x0f", struct.pack("<I", 0)), (b"\2", struct.pack("<QQI", 0, 0, 0))]
+    return MAGIC + join_mcap([(b"\1", _text(b"ros2") + _text(b"torture")), *records]) + behind + join_mcap(end) + MAGIC
 
 
 def _file(name: str, content: Callable[[], bytes], folder: Path) -> Path:
@@ -75,8 +69,8 @@ def _file(name: str, content: Callable[[], bytes], folder: Path) -> Path:
 
 
 def _typed(name: bytes, encoding: bytes, schema: bytes, wire: bytes, payload: bytes, topic: bytes = b"/t") -> bytes:
-    declared = _schema(1, name, encoding, schema) + _channel(1, 1, topic, wire)
-    return _mcap(declared, *(_message(1, START_NS + i * 10**7, payload) for i in range(50)))
+    declared = _schema(name, encoding, schema), _channel(1, topic, wire)
+    return _mcap(*declared, *(_message(1, START_NS + i * 10**7, payload) for i in range(50)))
 
 
 def _zeros_zstd(size: int) -> bytes:
@@ -101,18 +95,11 @@ def _zeros(compressor: Any, size: int) -> bytes:
     return b"".join([*(bytes(compressor.compress(block)) for _ in range(size >> 20)), bytes(compressor.flush())])
 
 
-def _bag_record(fields: dict[bytes, bytes], data: bytes) -> bytes:
-    header = b"".join(_text(k + b"=" + v) for k, v in fields.items())
-    return _text(header) + _text(data)
-
-
-def _bag(*records: bytes) -> bytes:
-    head = {b"op": b"\x03", b"index_pos": bytes(8), b"conn_count": bytes(4), b"chunk_count": struct.pack("<I", 1)}
-    return b"#ROSBAG V2.0\n" + _bag_record(head, b" " * 4000) + b"".join(records)
-
-
 def _bag_chunk(compression: bytes, stored: bytes, size: int) -> bytes:
-    return _bag(_bag_record({b"op": b"\x05", b"compression": compression, b"size": struct.pack("<I", size)}, stored))
+    head = {b"op": b"\3", b"index_pos": bytes(8), b"conn_count": bytes(4), b"chunk_count": struct.pack("<I", 1)}
+    chunk = {b"op": b"\5", b"compression": compression, b"size": struct.pack("<I", size)}
+    headers = (b"".join(_text(k + b"=" + v) for k, v in fields.items()) for fields in (head, chunk))
+    return b"#ROSBAG V2.0\n" + join_bag(zip(headers, (b" " * 4000, stored), strict=True))
 
 
 def _nested(levels: int) -> bytes:
@@ -150,17 +137,13 @@ def _descriptors(levels: int, width: int) -> bytes:
 
 def _times(*extra: int) -> bytes:
     """Return a sound small log with messages at odd times among the others."""
-    schema, channel = _schema(1, b"std_msgs/msg/Float64", b"ros2msg", b"float64 data\n"), _channel(1, 1, b"/x", b"cdr")
-    payload = b"\0\1\0\0" + struct.pack("<d", 1.0)
     times = [START_NS + i * 10**7 for i in range(300)]
-    return _mcap(schema, channel, *(_message(1, t, payload) for t in (*times[:150], *extra, *times[150:])))
+    return _mcap(*_DECLARED, *(_message(1, t, _CDR) for t in (*times[:150], *extra, *times[150:])))
 
 
 def _claimed_counts() -> bytes:
-    payload = b"\0\1\0\0" + struct.pack("<d", 1.0)
-    inner = _schema(1, b"std_msgs/msg/Float64", b"ros2msg", b"float64 data\n") + _channel(1, 1, b"/x", b"cdr")
-    inner += _message(1, START_NS, payload)
-    index = _record(7, struct.pack("<HI", 1, 2**32 - 16) + bytes(64))
+    inner = join_mcap([*_DECLARED, _message(1, START_NS, _CDR)])
+    index = b"\7", struct.pack("<HI", 1, 2**32 - 16) + bytes(64)
     return _mcap(_chunk(b"", inner, len(inner), zlib.crc32(inner)), index)
 
 
@@ -221,13 +204,13 @@ _HUGE_ROW = (
     "INSERT INTO messages (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM rows"
 )
 _FLOAT, _CDR = b"float64 data\n", b"\0\1\0\0" + bytes(8)
+_DECLARED = _schema(b"std_msgs/msg/Float64", b"ros2msg", _FLOAT), _channel(1, b"/x", b"cdr")
 _ODD_NAME = b"/wheels[/red]\x1b[2J\nwarning: all is well\0\xe2\x80\xae"
 
 
 def _many_channels(n: int) -> bytes:
-    schema = _schema(1, b"std_msgs/msg/Float64", b"ros2msg", _FLOAT)
-    declared = b"".join(_channel(i, 1, b"/c%d" % i, b"cdr") for i in range(1, n))
-    return _mcap(schema, declared, *(_message(i, START_NS + i, _CDR) for i in range(1, n)))
+    channels = (_channel(i, b"/c%d" % i, b"cdr") for i in range(1, n))
+    return _mcap(_DECLARED[0], *channels, *(_message(i, START_NS + i, _CDR) for i in range(1, n)))
 
 
 def _made(name: str, codes: tuple[int, ...], content: Callable[[], bytes], suffix: str = ".mcap") -> Bomb:
@@ -270,16 +253,12 @@ def _declarations() -> tuple[Bomb, ...]:
         return _made(name, codes, lambda: _typed(b"S", b"jsonschema" if schema else b"", schema, b"json", data))
 
     idl = b"module m {" * 500 + b"struct A { double x; };" + b"};" * 500
-    ends = (
-        _schema(1, b"a/B", b"ros2msg", _FLOAT),
-        _channel(1, 1, b"/t", b"cdr"),
-        _message(1, START_NS, b"", 2**63 - 8),
-    )
+    endless = b"\5" + struct.pack("<QHIQQ", 2**63 - 8, 1, 0, START_NS, START_NS)
     markup = "a topic that is markup, terminal codes and a forged line"
     return (
         _made("65,534 channels", _ANY, lambda: _many_channels(65_535)),
         _made("an index that claims 268 million messages", _ANY, _claimed_counts),
-        _made("a message size near 2^63", _EITHER, lambda: _mcap(*ends)),
+        _made("a message size near 2^63", _EITHER, lambda: _mcap(*_DECLARED, behind=endless)),
         ros("ROS type of 10^12 leaves", _EITHER, b"p/msg/Root", _nested(12)),
         ros("ROS type that contains itself", _EITHER, b"p/msg/A", b"A a\n" + _MEMBERS + b"p/A\nA a\n"),
         ros("ROS array of 2^32", _ANY, b"p/msg/A", b"float64[4294967296] a\nfloat64 b\n"),

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import bz2
 import random
+import re
 import sqlite3
 import struct
 import zlib
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
 from pathlib import PurePath
 
 #: Numbers at which arithmetic, allocation and time go wrong.
@@ -127,68 +128,92 @@ def _with_text(payload: bytes, rng: random.Random) -> bytes:
     return payload[:offset] + struct.pack("<I", len(text)) + text + payload[offset + 4 + n :]
 
 
-# ------------------------------------------------------------------------------------------------ MCAP
+# ------------------------------------------------------------------------------------------------ MCAP and bags
 
-_MAGIC = b"\x89MCAP0\r\n"
-_CHUNK, _INDEX = 6, 7
+#: Head and body: operation and payload of MCAP, header and data of a bag.
+Record = tuple[bytes, bytes]
+MAGIC = b"\x89MCAP0\r\n"
+_CHUNK = b"\6"
+#: Records behind the data of a file, which are missing after its recorder was killed.
+_SUMMARY = (b"\7", b"\x08", b"\x0b", b"\x0d", b"\x0e")
 
 
 def damage_mcap(content: bytes, rng: random.Random) -> bytes:
     """Change top-level records, or records inside a chunk; then correct the chunk's size, compression and CRC."""
-    records = _mcap_records(content[8:-8])
+    records = _damaged(_split_mcap(content[8:-8]), _damage_mcap_chunk, rng)
+    if rng.random() < 0.2:
+        records = [r for r in records if r[0] not in _SUMMARY]
+    return MAGIC + join_mcap(records) + (MAGIC if rng.random() < 0.9 else b"")
+
+
+def damage_bag(content: bytes, rng: random.Random) -> bytes:
+    """Change headers and data of records, inside chunks as well; chunks are compressed again."""
+    head = content.index(b"\n") + 1
+    return content[:head] + join_bag(_damaged(_split_bag(content[head:]), _damage_bag_chunk, rng))
+
+
+def _damaged(
+    records: list[Record], damage_chunk: Callable[[Record, random.Random], Record | None], rng: random.Random
+) -> list[Record]:
+    """Return the records after one to three damages; most of them are inside a chunk if there is one."""
     for _ in range(rng.choice((1, 1, 2, 3))):
-        if not records:
-            break
-        chunks = [i for i, (op, _) in enumerate(records) if op == _CHUNK]
-        if chunks and rng.random() < 0.6:
-            i = rng.choice(chunks)
-            records[i] = (_CHUNK, _damage_chunk(records[i][1], rng))
-        else:
+        order = rng.sample(range(len(records)), len(records)) if rng.random() < 0.6 else ()
+        if found := next(((i, chunk) for i in order if (chunk := damage_chunk(records[i], rng))), None):
+            records[found[0]] = found[1]
+        elif records:
             _damage_list(records, rng)
-    if rng.random() < 0.2:  # as after a killed recorder
-        records = [r for r in records if r[0] not in (_INDEX, 8, 11, 13, 14)]
-    body = b"".join(struct.pack("<BQ", op, len(payload)) + payload for op, payload in records)
-    return _MAGIC + body + (_MAGIC if rng.random() < 0.9 else b"")
-
-
-def _mcap_records(body: bytes) -> list[tuple[int, bytes]]:
-    records, offset = [], 0
-    while offset + 9 <= len(body):
-        op, n = struct.unpack_from("<BQ", body, offset)
-        records.append((op, body[offset + 9 : offset + 9 + n]))
-        offset += 9 + n
     return records
 
 
-def _damage_list(records: list[tuple[int, bytes]], rng: random.Random) -> None:
+def _damage_list(records: list[Record], rng: random.Random) -> None:
+    """Remove, repeat, move or change a record."""
     i = rng.randrange(len(records))
-    op, payload = records[i]
-    match rng.randrange(8):
+    head, body = records[i]
+    match rng.randrange(9):
         case 0:
             del records[i]
         case 1:
             records.insert(rng.randrange(len(records) + 1), records[i])
         case 2:
             records.insert(rng.randrange(len(records)), records.pop(i))
-        case 3:
-            records[i] = (rng.choice((*range(16), 128, 255)), payload)
-        case 4:
-            records[i:i] = [(op, payload)] * rng.choice((2, 50, 1000))
+        case 3 | 4:
+            other = bytes([rng.choice((*range(16), 128, 255))])
+            records[i] = (other if len(head) == 1 else _damage_payload(head, rng), body)
+        case 5:
+            records[i:i] = [(head, body)] * rng.choice((2, 50, 500))
         case _:
-            records[i] = (op, _damage_payload(payload, rng))
+            records[i] = (head, _damage_payload(body, rng))
 
 
-def _damage_chunk(payload: bytes, rng: random.Random) -> bytes:
+def _split_mcap(body: bytes) -> list[Record]:
+    records, offset = [], 0
+    while offset + 9 <= len(body):
+        (n,) = struct.unpack_from("<Q", body, offset + 1)
+        records.append((body[offset : offset + 1], body[offset + 9 : offset + 9 + n]))
+        offset += 9 + n
+    return records
+
+
+def join_mcap(records: Iterable[Record]) -> bytes:
+    """Return the bytes of MCAP records."""
+    return b"".join(op + struct.pack("<Q", len(payload)) + payload for op, payload in records)
+
+
+def _damage_mcap_chunk(record: Record, rng: random.Random) -> Record | None:
+    """Return a chunk with a damaged record; None for other records."""
+    op, payload = record
+    if op != _CHUNK:
+        return None
     try:
         start, end, size, _ = struct.unpack_from("<QQQI", payload)
         (n,) = struct.unpack_from("<I", payload, 28)
         compression = payload[32 : 32 + n]
-        inner = _mcap_records(_unpacked(compression, payload[40 + n :], size))
+        inner = _split_mcap(_unpacked(compression, payload[40 + n :], size))
     except Exception:  # noqa: BLE001 (the decompressor raises any exception on an earlier fault)
-        return damage_bytes(payload, rng)
+        return op, damage_bytes(payload, rng)
     if inner:
         _damage_list(inner, rng)
-    body = b"".join(struct.pack("<BQ", op, len(p)) + p for op, p in inner)
+    body = join_mcap(inner)
     size, crc = len(body), zlib.crc32(body)
     if rng.random() < 0.1:
         compression = rng.choice((b"", b"lz4", b"zstd", b"xz", b"\xff"))
@@ -200,123 +225,63 @@ def _damage_chunk(payload: bytes, rng: random.Random) -> bytes:
     if rng.random() < 0.1:
         packed = damage_bytes(packed, rng)
     head = struct.pack("<QQQI", start, end, size, crc if rng.random() < 0.9 else 0)
-    return head + struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
+    return op, head + struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
 
 
-def _unpacked(compression: bytes, stored: bytes, size: int) -> bytes:
-    if compression == b"zstd":
-        import zstandard
-
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-    if compression == b"lz4":
-        import lz4.frame
-
-        return bytes(lz4.frame.decompress(stored))
-    return stored
-
-
-def _packed(compression: bytes, body: bytes) -> bytes:
-    if compression == b"zstd":
-        import zstandard
-
-        return zstandard.ZstdCompressor().compress(body)
-    if compression == b"lz4":
-        import lz4.frame
-
-        return bytes(lz4.frame.compress(body))
-    return body
-
-
-# ------------------------------------------------------------------------------------------------ bags
-
-
-@dataclass(slots=True)
-class BagRecord:
-    """A record of a ROS 1 bag: header fields and data; ``inner`` contains the records of a chunk."""
-
-    fields: list[tuple[bytes, bytes]]
-    data: bytes
-    inner: list[BagRecord] = field(default_factory=list)
-
-    @property
-    def chunk(self) -> bytes | None:
-        """Compression of a chunk; None for other records."""
-        named = dict(self.fields)
-        return named.get(b"compression") if named.get(b"op") == b"\x05" else None
-
-
-def damage_bag(content: bytes, rng: random.Random) -> bytes:
-    """Change header fields and data of records, inside chunks as well; chunks are compressed again."""
-    head = content.index(b"\n") + 1
-    records = _bag_records(content[head:])
-    for record in records:
-        if record.chunk is not None:
-            body = bz2.decompress(record.data) if record.chunk == b"bz2" else _unpacked(record.chunk, record.data, 0)
-            record.inner = _bag_records(body)
-    for _ in range(rng.choice((1, 1, 2, 3))):
-        chunks = [r for r in records if r.inner]
-        _damage_bag_list(rng.choice(chunks).inner if chunks and rng.random() < 0.6 else records, rng)
-    return content[:head] + b"".join(_bag_bytes(r, rng) for r in records)
-
-
-def _bag_records(body: bytes) -> list[BagRecord]:
+def _split_bag(body: bytes) -> list[Record]:
     records, offset = [], 0
     while offset + 8 <= len(body):
-        (n,) = struct.unpack_from("<I", body, offset)
-        header, offset = body[offset + 4 : offset + 4 + n], offset + 4 + n
-        (m,) = struct.unpack_from("<I", body, offset)
-        fields, inside = [], 0
-        while inside + 4 <= len(header):
-            (k,) = struct.unpack_from("<I", header, inside)
-            name, _, value = header[inside + 4 : inside + 4 + k].partition(b"=")
-            fields.append((name, value))
-            inside += 4 + k
-        records.append(BagRecord(fields, body[offset + 4 : offset + 4 + m]))
-        offset += 4 + m
+        parts = []
+        for _ in range(2):
+            (n,) = struct.unpack_from("<I", body, offset)
+            parts.append(body[offset + 4 : offset + 4 + n])
+            offset += 4 + n
+        records.append((parts[0], parts[1]))
     return records
 
 
-def _damage_bag_list(records: list[BagRecord], rng: random.Random) -> None:
-    if not records:
-        return
-    i = rng.randrange(len(records))
-    record = records[i]
-    match rng.randrange(9):
-        case 0:
-            del records[i]
-        case 1:
-            records.insert(rng.randrange(len(records) + 1), record)
-        case 2:
-            record.data = _damage_payload(record.data, rng)
-            record.inner = []
-        case 3 if record.fields:
-            del record.fields[rng.randrange(len(record.fields))]
-        case 4 if record.fields:
-            record.fields.append(rng.choice(record.fields))
-        case 5:
-            records[i:i] = [record] * rng.choice((2, 50, 500))
-        case _ if record.fields:
-            j = rng.randrange(len(record.fields))
-            name, value = record.fields[j]
-            changed = bytearray(value or b"\0")
-            if rng.random() < 0.4:
-                changed = bytearray(rng.choice(TEXTS))
-            else:
-                _overwrite(changed, rng.randrange(len(changed)), rng)
-            record.fields[j] = (name, bytes(changed))
-        case _:
-            del records[i]
+def join_bag(records: Iterable[Record]) -> bytes:
+    """Return the bytes of records of a bag."""
+    return b"".join(struct.pack("<I", len(part)) + part for record in records for part in record)
 
 
-def _bag_bytes(record: BagRecord, rng: random.Random) -> bytes:
-    data, fields = record.data, record.fields
-    if record.inner and record.chunk is not None:
-        body = b"".join(_bag_bytes(r, rng) for r in record.inner)
-        data = bz2.compress(body) if record.chunk == b"bz2" else _packed(record.chunk, body)
-        size = struct.pack("<I", len(body) if rng.random() < 0.95 else rng.choice(EDGES) % 2**32)
-        fields = [(n, size if n == b"size" else v) for n, v in fields]
-    header = b"".join(struct.pack("<I", len(n) + 1 + len(v)) + n + b"=" + v for n, v in fields)
-    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+def _damage_bag_chunk(record: Record, rng: random.Random) -> Record | None:
+    """Return a chunk with a damaged record; None for other records."""
+    header, data = record
+    found = re.search(rb"compression=(none|bz2|lz4)", header)
+    if found is None:
+        return None
+    try:
+        inner = _split_bag(_unpacked(found[1], data, 0))
+    except Exception:  # noqa: BLE001 (as above)
+        return header, damage_bytes(data, rng)
+    if inner:
+        _damage_list(inner, rng)
+    body = join_bag(inner)
+    size = struct.pack("<I", len(body) if rng.random() < 0.95 else rng.choice(EDGES) % 2**32)
+    return re.sub(rb"(?s)(?<=size=).{4}", lambda _: size, header), _packed(found[1], body)
+
+
+def _unpacked(compression: bytes, stored: bytes, size: int) -> bytes:
+    import lz4.frame
+    import zstandard
+
+    if compression == b"zstd":
+        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    if compression == b"lz4":
+        return bytes(lz4.frame.decompress(stored))
+    return bz2.decompress(stored) if compression == b"bz2" else stored
+
+
+def _packed(compression: bytes, body: bytes) -> bytes:
+    import lz4.frame
+    import zstandard
+
+    if compression == b"zstd":
+        return zstandard.ZstdCompressor().compress(body)
+    if compression == b"lz4":
+        return bytes(lz4.frame.compress(body))
+    return bz2.compress(body) if compression == b"bz2" else body
 
 
 # ------------------------------------------------------------------------------------------------ databases

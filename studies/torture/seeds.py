@@ -1,4 +1,4 @@
-"""Small sound recordings of every container and encoding, to be damaged: a second of one simulated drive each."""
+"""Small sound files of every container, encoding and format, to be damaged: seconds of one simulated drive each."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.writer import CompressionType, IndexType, Writer
 
 from pdhef_logtool.logs.definitions import message_definition
+from studies import mcap_logs
+from studies.strangers.containers import Topic, write
 
 START_NS = 1_767_225_600_000_000_000
 _RATE_HZ = 50
@@ -92,39 +95,24 @@ def _definition(name: str) -> bytes:
     return text.encode()
 
 
-def _mcap(compression: str, path: Path, *, chunks: bool = True, index: bool = True, encoding: str = "cdr") -> None:
-    from mcap.writer import CompressionType, IndexType, Writer
+def _mcap(encoding: str, path: Path, **options: Any) -> None:
+    def encoded() -> Iterator[mcap_logs.Message]:
+        for m in messages():
+            payload, schema = m.cdr, (m.type_name, "ros2msg", _definition(m.type_name))
+            if encoding == "json":
+                payload, schema = json.dumps(m.values).encode(), ("State", "jsonschema", json.dumps(_SCHEMA).encode())
+            elif encoding == "protobuf":
+                payload, schema = _protobuf(m.values), ("car.State", "protobuf", _descriptors())
+            yield mcap_logs.Message(m.time_ns, m.time_ns, m.topic, payload, encoding, schema)
 
-    kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-    with path.open("wb") as file:
-        writer = Writer(
-            file,
-            chunk_size=12_000,
-            compression=kinds[compression],
-            use_chunking=chunks,
-            index_types=IndexType.ALL if index else IndexType.NONE,
-        )
-        writer.start("ros2" if encoding == "cdr" else "")
-        channels: dict[str, int] = {}
-        for i, m in enumerate(messages()):
-            if m.topic not in channels:
-                name, kind, schema = {
-                    "cdr": (m.type_name, "ros2msg", _definition(m.type_name)),
-                    "json": ("State", "jsonschema", json.dumps(_JSON_SCHEMA).encode()),
-                    "protobuf": ("car.State", "protobuf", _descriptors()),
-                }[encoding]
-                channels[m.topic] = writer.register_channel(
-                    m.topic, encoding, writer.register_schema(name, kind, schema)
-                )
-            payload = {"cdr": m.cdr, "json": json.dumps(m.values).encode(), "protobuf": b""}[encoding]
-            payload = payload or _protobuf(m.values)
-            writer.add_message(channels[m.topic], m.time_ns, payload, m.time_ns, i)
+    def notes(writer: Writer) -> None:
         writer.add_metadata("drive", {"driver": "nobody", "tyres": "summer"})
         writer.add_attachment(START_NS, START_NS, "note.txt", "text/plain", b"a note")
-        writer.finish()  # type: ignore[no-untyped-call]
+
+    mcap_logs.write_log(path, encoded(), "ros2" if encoding == "cdr" else "", notes, chunk_size=12_000, **options)
 
 
-_JSON_SCHEMA = {
+_SCHEMA = {
     "type": "object",
     "properties": {
         "stamp": {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}},
@@ -175,11 +163,7 @@ def _bag(compression: str, path: Path) -> None:
         for m in messages():
             if m.topic not in connections:
                 connections[m.topic] = writer.add_connection(m.topic, m.type_name, typestore=store)
-            message = newest.deserialize_cdr(m.cdr, m.type_name)
-            if hasattr(message, "header"):
-                header = store.types["std_msgs/msg/Header"]
-                message.header = header(0, message.header.stamp, message.header.frame_id)
-            writer.write(connections[m.topic], m.time_ns, store.serialize_ros1(message, m.type_name))
+            writer.write(connections[m.topic], m.time_ns, newest.cdr_to_ros1(m.cdr, m.type_name))
 
 
 def _database(path: Path) -> None:
@@ -201,13 +185,13 @@ def _database(path: Path) -> None:
 
 #: Writer of each seed, by file name.
 SEEDS: dict[str, Callable[[Path], None]] = {
-    "zstd.mcap": partial(_mcap, "zstd"),
-    "lz4.mcap": partial(_mcap, "lz4"),
-    "plain.mcap": partial(_mcap, "none"),
-    "unchunked.mcap": partial(_mcap, "none", chunks=False),
-    "noindex.mcap": partial(_mcap, "zstd", index=False),
-    "json.mcap": partial(_mcap, "zstd", encoding="json"),
-    "protobuf.mcap": partial(_mcap, "zstd", encoding="protobuf"),
+    "zstd.mcap": partial(_mcap, "cdr"),
+    "lz4.mcap": partial(_mcap, "cdr", compression=CompressionType.LZ4),
+    "plain.mcap": partial(_mcap, "cdr", compression=CompressionType.NONE),
+    "unchunked.mcap": partial(_mcap, "cdr", compression=CompressionType.NONE, use_chunking=False),
+    "noindex.mcap": partial(_mcap, "cdr", index_types=IndexType.NONE),
+    "json.mcap": partial(_mcap, "json"),
+    "protobuf.mcap": partial(_mcap, "protobuf"),
     "plain.bag": partial(_bag, ""),
     "bz2.bag": partial(_bag, "BZ2"),
     "lz4.bag": partial(_bag, "LZ4"),
@@ -218,12 +202,50 @@ SEEDS: dict[str, Callable[[Path], None]] = {
 def write_seeds(folder: Path) -> dict[str, bytes]:
     """Write the seeds that are missing; return all by name."""
     folder.mkdir(parents=True, exist_ok=True)
-    return dict(_seeds(folder))
+    for name, write_seed in SEEDS.items():
+        if not (folder / name).is_file():
+            write_seed(folder / name)
+    return {name: (folder / name).read_bytes() for name in SEEDS}
 
 
-def _seeds(folder: Path) -> Iterator[tuple[str, bytes]]:
-    for name, write in SEEDS.items():
-        path = folder / name
-        if not path.is_file():
-            write(path)
-        yield name, path.read_bytes()
+# ------------------------------------------------------------------------------------------------ tables
+
+_STAMPS = START_NS + np.arange(150) * 20_000_000
+_RATE = 0.3 * np.sin(np.arange(150) * 0.06)
+_SPEED = 15.0 + np.arange(150) * 0.02
+TOPICS = (
+    Topic("/imu", "bus", _STAMPS, _STAMPS, {"accel_y [m/s^2]": _SPEED * _RATE, "yaw_rate [rad/s]": _RATE}),
+    Topic("/car", "bus", _STAMPS, _STAMPS, {"speed [m/s]": _SPEED, "steering_angle [rad]": 0.2 * _RATE}),
+)
+RECORDINGS = ("mcap", "bag", "db3")
+#: Suffix and layouts of each format; a number after a version of MDF is its compression.
+FORMATS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "csv": ("csv", ("csv", "csv-german", "csv-gps", "csv-lab", "csv-dated", "csv-sources", "csv-pipes", "csv-long")),
+    "vbo": ("vbo", ("vbo",)),
+    "parquet": ("parquet", ("parquet", "parquet-nested", "parquet-long")),
+    "mat5": ("mat", ("mat", "mat-series", "mat-pairs", "mat-recorder")),
+    "mat73": ("mat", ("mat-7.3",)),
+    "mdf3": ("mdf", ("3.30 0",)),
+    "mdf4": ("mf4", ("mdf", "4.11 2", "can-mdf")),
+    "blf": ("blf", ("can-blf",)),
+    "asc": ("asc", ("can-asc",)),
+    **{suffix: (suffix, tuple(name for name in SEEDS if name.endswith(suffix))) for suffix in RECORDINGS},
+}
+
+
+def table_seeds(name: str, folder: Path) -> list[bytes]:
+    """Return the sound files of a format; a folder takes files in between."""
+    if name in RECORDINGS:
+        return [content for seed, content in write_seeds(folder).items() if seed in FORMATS[name][1]]
+    return [_seed(layout, folder) for layout in FORMATS[name][1]]
+
+
+def _seed(layout: str, folder: Path) -> bytes:
+    version, _, compression = layout.partition(" ")
+    path = write(TOPICS, folder / "seed", "mdf" if compression else layout)
+    if compression:
+        import asammdf
+
+        with asammdf.MDF(path) as file, file.convert(version) as other:
+            path = Path(other.save(folder / "other", overwrite=True, compression=int(compression)))
+    return (next(path.glob("drive.*")) if path.is_dir() else path).read_bytes()

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from studies.torture.mutating import EDGES, TEXTS, damage_bytes
-from studies.torture.table_seeds import TOPICS
+from studies.torture.mutating import EDGES, TEXTS, damage_bag, damage_bytes, damage_database, damage_mcap
+from studies.torture.seeds import TOPICS
 
 #: Writes this file where a reader evaluates it.
 CALL = b"__import__('os').system('echo x > formula_was_run')"
@@ -326,6 +326,7 @@ def _arrow_values(rng: random.Random) -> Any:
 
 _DAMAGE: dict[str, Callable[..., bytes]] = {
     "parquet": damage_parquet, "mat5": damage_mat, "mdf3": damage_mdf3, "mdf4": damage_mdf4, "blf": damage_blf,
+    "mcap": damage_mcap, "bag": damage_bag, "db3": damage_database,
 }  # fmt: skip
 
 

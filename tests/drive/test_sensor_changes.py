@@ -19,7 +19,7 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import estimate_drive
-from studies.peers.drives import PEER_DRIVES, mapping_of, read_peer_drive, vehicle_of
+from studies.peers.drives import PEER_DRIVES, mapping_of, vehicle_of
 from tests.command_line import called
 from tests.run_report import follows
 
@@ -158,8 +158,9 @@ def test_a_recorded_steering_that_freezes_is_named(shared_dir: Path) -> None:
     """The steering repeats one value for the last 2 s, while the car comes out of a bend at 17 m/s."""
     (drive,) = (d for d in PEER_DRIVES if d.log == "stanford_wet_1.mcap")
     folder = shared_dir / "data" / "drives"
-    read = read_peer_drive(folder / drive.log, vehicle_of(drive, folder), mapping_of(drive, folder))
-    (change,) = read.changes
+    car = Car.of(vehicle_of(drive, folder))
+    with read_drive(folder / drive.log, car, mapping_of(drive, folder)) as opened:
+        (change,) = opened.whole().changes
     assert (change.sensor, change.kind) == ("steer_rad", "stuck")
     assert change.end_ns - change.start_ns == pytest.approx(1.98e9, abs=0.1e9)
 

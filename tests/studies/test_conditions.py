@@ -9,6 +9,7 @@ import pytest
 from pdhef_logtool import Car
 from studies import conditions
 from studies.drawn_cars import fit_vehicle
+from studies.pages import DOCS, RESULTS
 from truthsim.vehicle_choice import choose_vehicle
 
 
@@ -22,8 +23,8 @@ def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(sample_logs_dir
 
 
 def test_the_stored_page_is_that_of_the_stored_results(tmp_path: Path) -> None:
-    results = conditions.RESULTS / "conditions"
+    results = RESULTS / "conditions"
     for name in ("facts.json", "metrics.parquet"):
         (tmp_path / name).write_bytes((results / name).read_bytes())
-    assert conditions.main(["--render", "--results", str(tmp_path), "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "conditions.md").read_bytes() == (conditions.DOCS / "conditions.md").read_bytes()
+    assert conditions.main(["--stored", "--results", str(tmp_path), "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "conditions.md").read_bytes() == (DOCS / "conditions.md").read_bytes()

@@ -13,7 +13,7 @@ from reference_car import FRONT_TYRE, REAR_TYRE, Drive, drive, keep, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.records.tracks import make_track
-from studies.defaults.axle_forces import FitDrive, axle_samples, part_of
+from studies.defaults.axle_forces import FitDrive, axle_samples
 from studies.defaults.physics_fit import STARTS, build_car, drive_errors, fit_physics, make_priors
 
 STATIC = PhysicsParts()
@@ -92,11 +92,8 @@ OF_PARTS = {
 
 @pytest.mark.parametrize("names", [(), *((name,) for name in PhysicsParts.model_fields)], ids="+".join)
 def test_only_parameters_that_the_parts_use_are_fitted(names: tuple[str, ...]) -> None:
-    nothing = axle_samples([part_of(static_drive(1, 2.0), 0, 100)], guess())
+    nothing = axle_samples([static_drive(1, 2.0)], guess())
     priors = make_priors(guess(), parts(*names), nothing, 0.0)
     fitted = {p.name for p in priors if not p.tuning}
     constant = set() if "biases" in names else CONSTANT  # as states they are those of a drive
     assert fitted == {*CORE, *constant}.union(*(OF_PARTS.get(name, ()) for name in names))
-
-
-# ---- parts ----

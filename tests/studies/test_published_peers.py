@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,10 @@ import pytest
 
 from pdhef_logtool.records.tracks import make_track
 from studies.pages import DOCS, RESULTS
-from studies.peers import benchmark
-from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, PeerDrive
-from studies.peers.page import page
-from studies.peers.parameters import pairs_table
-from studies.peers.scoring import DriveErrors, score
+from studies.peers import __main__ as study
+from studies.peers.drives import FULL_SIZE, PEER_DRIVES
+from studies.peers.page import estimator_table
+from studies.peers.scoring import errors, scores
 
 
 def track(sideslip: np.ndarray, speed: float = 10.0):
@@ -29,25 +28,23 @@ def track(sideslip: np.ndarray, speed: float = 10.0):
 def test_a_missing_estimate_counts_as_0():
     truth = track(np.radians(np.full(10, 3.0)))
     half = np.where(np.arange(10) < 5, np.nan, truth.sideslip_rad)
-    errors = score(PEER_DRIVES[0], {"none": np.full(10, np.nan), "half": half}, truth)
-    assert errors.rmse_deg == pytest.approx({"none": 3.0, "half": 3.0 / np.sqrt(2.0)})
-    assert errors.missing == {"none": 1.0, "half": 0.5}
+    found = errors(replace(truth, sideslip_rad=half), truth, 3.0)
+    assert (found["rmse_deg"], found["available"]) == (pytest.approx(3.0 / np.sqrt(2.0)), 0.5)
 
 
 def test_slow_stamps_are_not_scored_and_an_offset_is_removed_where_it_is_declared():
-    assert score(PEER_DRIVES[0], {}, track(np.zeros(5), speed=2.9)).scored == 0
+    slow = track(np.zeros(5), speed=2.9)
+    assert errors(slow, slow, 3.0)["scored_s"] == 0.0
     truth = track(np.radians(np.array([2.0, 2.0, 2.0, 5.0])))
-    offset = score(PeerDrive("log", "car", OFFSET), {"zero": np.zeros(4)}, truth)
-    assert offset.offset_deg == pytest.approx(2.0)
-    assert offset.rmse_deg["zero"] == pytest.approx(1.5)
+    found = errors(track(np.zeros(4)), truth, 3.0, has_offset=True)
+    assert (found["offset_deg"], found["rmse_deg"]) == (pytest.approx(2.0), pytest.approx(1.5))
 
 
-def test_the_page_shows_the_stored_errors_of_every_drive():
-    documents = json.loads((RESULTS / "peers" / "errors.json").read_text(encoding="utf-8"))
-    assert [document["log"] for document in documents] == [drive.log for drive in PEER_DRIVES]
-    parameters = json.loads((RESULTS / "peers" / "parameters.json").read_text(encoding="utf-8"))
-    text = page([DriveErrors.of(d) for d in documents], pairs_table(parameters))
-    assert (DOCS / "peers.md").read_text(encoding="utf-8") == text
+def test_the_page_shows_the_stored_scores_of_every_drive(tmp_path: Path):
+    stored = pl.read_parquet(RESULTS / "peers" / "scores.parquet")
+    assert stored["log"].unique(maintain_order=True).to_list() == [drive.log for drive in PEER_DRIVES]
+    assert study.main(["--stored", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "peers.md").read_text(encoding="utf-8") == (DOCS / "peers.md").read_text(encoding="utf-8")
     assert sum(drive.group == FULL_SIZE for drive in PEER_DRIVES) == 9
 
 
@@ -72,9 +69,9 @@ def made_table(file: Path) -> Path:
 
 
 def test_a_published_table_is_a_log_for_each_run(tmp_path: Path):
-    entries = list(benchmark.published(made_table(tmp_path / "hoons_all_test.csv"), tmp_path))
+    entries = list(study.published(made_table(tmp_path / "hoons_all_test.csv"), tmp_path))
     assert [e.log.name for e in entries] == ["hoons_all_test_4.csv", "hoons_all_test_7.csv"]
-    rows = {row["estimator"]: row for row in benchmark.scores(entries[1])}
+    rows = {row["estimator"]: row for row in scores(entries[1])[0]}
     assert {"zero", "kinematic", "linear-kf"} <= rows.keys()
     sideslip = np.arctan2(0.015 * np.sin(2.0 * np.arange(1200) * 0.01), 2.0)
     assert rows["zero"]["rmse_deg"] == pytest.approx(np.degrees(np.sqrt(np.mean(sideslip**2))), rel=0.01)
@@ -88,14 +85,7 @@ def test_the_benchmark_weighs_drives_by_time_and_compares_with_zero_on_the_same_
         return names | {"scored_s": seconds, "rmse_deg": rmse} | figures
 
     rows = [row("a", "zero", 4.0, 30.0), row("b", "zero", 2.0, 10.0), row("b", "half", 1.0, 10.0)]
-    head, _, half, zero = benchmark.table_of(pl.DataFrame(rows)).splitlines()
+    head, _, half, zero = estimator_table(pl.DataFrame(rows)).splitlines()
     assert head.startswith("| estimator | drives | RMSE |")
-    assert half == "| `half` | 1 | 1.00 | – to – | 0.50 | 100% | – | – | 2.0 |"
+    assert half == "| `half` | 1 | 1.00 | – to – | 0.50 | 1.00 | 1.00 | 100% | – | – | 2.0 |"
     assert [cell.strip() for cell in zero.split("|")[2:4]] == ["2", f"{np.sqrt((30 * 16 + 10 * 4) / 40):.2f}"]
-
-
-def test_the_benchmark_shows_the_stored_scores():
-    stored = pl.DataFrame(json.loads((RESULTS / "peers" / "benchmark.json").read_text(encoding="utf-8")))
-    page_text = (DOCS / "benchmark.md").read_text(encoding="utf-8")
-    for (group,), rows in stored.group_by("group", maintain_order=True):
-        assert f"## {group}\n\n{benchmark.table_of(rows)}\n" in page_text

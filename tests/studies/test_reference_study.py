@@ -9,7 +9,7 @@ import numpy as np
 
 from pdhef_logtool import inspect_log
 from studies import reference as study
-from studies.pages import DOCS, RESULTS
+from studies.pages import DOCS, RESULTS, fill
 
 
 def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
@@ -17,8 +17,8 @@ def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
     assert len(set(names)) == len(names)
     stored = json.loads((RESULTS / "reference" / study.STORED).read_text(encoding="utf-8"))
     assert set(names) <= set(stored)
-    figures = {n: study.Figures(**{k: v for k, v in stored[n].items() if k != "key"}) for n in names}
-    assert study.page(figures) == (DOCS / "reference.md").read_text(encoding="utf-8")
+    page = (DOCS / "reference.md").read_text(encoding="utf-8")
+    assert page == fill(page, study.blocks(stored), "reference.md")
 
 
 def test_added_gnss_is_read_as_a_topic_of_the_log(sample_logs_dir: Path, tmp_path: Path) -> None:

@@ -1,0 +1,85 @@
+"""Every study runs on this version: each on a tiny set, with its page and results in a temporary folder."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from studies.pages import DRIVES, ROOT
+
+pytestmark = pytest.mark.slow
+
+SIMULATED = {
+    "conditions": ("conditions.md", "studies.conditions --rows in-domain paper-a --drives 1 --jobs 1"),
+    "calibration": ("calibration.md", "studies.calibration --cars 1"),
+    "comparing": ("calibration.md", "studies.comparing --times 20 --planted 20"),
+    "reference": ("reference.md", "studies.reference --cases step.steer,.100.km/h,.GNSS.RTK"),
+}
+RECORDED = {
+    "teaching": ("peers.md", "studies.teaching --cars TT-S"),
+    "reference": ("reference.md", "studies.reference --cases Volvo.V40,.slalom,.GNSS.recorded"),
+}
+NO_RESULTS = ("studies.calibration", "studies.comparing")
+
+
+def start(folder: Path, page: str, words: str) -> None:
+    module, *options = words.split()
+    command = [sys.executable, "-m", module, *(word.replace(".", " ") for word in options), "--out", str(folder)]
+    command += [] if module == "studies.comparing" else ["--work", str(folder / "work")]
+    command += [] if module in NO_RESULTS else ["--results", str(folder / "results")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "<!-- begin" in (folder / page).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_a_study_of_simulated_drives_starts(name: str, tmp_path: Path) -> None:
+    start(tmp_path, *SIMULATED[name])
+
+
+@pytest.mark.skipif(not DRIVES.is_dir(), reason="needs the recorded drives")
+@pytest.mark.parametrize("name", RECORDED)
+def test_a_study_of_recorded_drives_starts(name: str, tmp_path: Path) -> None:
+    start(tmp_path, *RECORDED[name])
+
+
+@pytest.mark.skipif(not DRIVES.is_dir(), reason="needs the recorded drives")
+def test_the_benchmark_of_own_logs_prints_a_table_without_a_vehicle_file(tmp_path: Path) -> None:
+    (tmp_path / "v40_slalom.mcap").symlink_to(DRIVES / "v40_slalom.mcap")
+    command = [sys.executable, "-m", "studies.peers", "--folder", str(tmp_path), "--work", str(tmp_path / "work")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "| `pd-hef` | 1 |" in done.stdout
+
+
+def test_the_torture_judges_mutants_of_every_container(tmp_path: Path) -> None:
+    words = [
+        "mutations",
+        "formats",
+        "--logs",
+        "11",
+        "--count",
+        "1",
+        "--format",
+        "csv",
+        "--format",
+        "bag",
+        "--jobs",
+        "1",
+    ]
+    command = [
+        sys.executable,
+        "-m",
+        "studies.torture",
+        *words,
+        "--work",
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "none"),
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert (tmp_path / "formats.json").is_file()
