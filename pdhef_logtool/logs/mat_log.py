@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
-from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, tables_of, unique
+from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
@@ -58,13 +58,26 @@ def open_mat(file: TableFile) -> Tables:
     losses: list[Loss] = []
     hdf5 = file.stream.read(len(_HDF5_MAT)) == _HDF5_MAT
     file.stream.seek(0)
-    read = _hdf5_variables if hdf5 else _mat5_variables
+    variables = (_hdf5_variables if hdf5 else _mat5_variables)(file, losses)
+    return Tables("mat-7.3" if hdf5 else "mat", tables_of_variables(variables, file, losses), losses)
+
+
+def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, losses: list[Loss]) -> list[Table]:
+    """Return the tables of named variables: arrays, structs (dictionaries) and lists of structs.
+
+    Raises
+    ------
+    LogError : no vector of times is as long as a signal.
+    """
     arrays: dict[str, dict[str, NDArray[Any]]] = {}
     units: dict[str, dict[str, str]] = {}
     unusable = []
-    leaves = (leaf for name, value in read(file, losses) for leaf in _leaves(name, value, 0))
+    leaves = (leaf for name, value in variables for leaf in _leaves(name, value, 0))
     for path, value, unit in leaves:
         struct_, _, name = path.rpartition(_SLASH)
+        if isinstance(value, np.ndarray) and _has_times(value):
+            arrays[path], units[path] = {"time": value[:, 0], field_name(name): value[:, 1]}, {field_name(name): unit}
+            continue
         vectors = _vectors(name, value) if isinstance(value, np.ndarray) else {}
         if isinstance(value, _Unusable):
             unusable.append(f"{path}: {value.why}")
@@ -84,7 +97,7 @@ def open_mat(file: TableFile) -> Tables:
             remedy="name the vector of times so; without one, state the samples per second: --set rate_hz=100, "
             "or rate_hz in the mapping file",
         )
-    return Tables("mat-7.3" if hdf5 else "mat", tables, losses)
+    return tables
 
 
 def _mat5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, Any]]:
@@ -319,9 +332,15 @@ def _clock_of(struct_: str, length: int, clocks: Mapping[tuple[str, int], Clock]
     return clocks[struct_, length]
 
 
+def _has_times(array: NDArray[Any]) -> bool:
+    """Return whether an array is a matrix of times and values."""
+    is_pair = array.ndim == 2 and array.shape[1] == 2 < array.shape[0] and array.dtype.kind in "iuf"
+    return is_pair and bool((np.diff(array[:, 0]) > 0.0).all()) and not bool((np.diff(array[:, 1]) > 0.0).all())
+
+
 def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Return a vector, or the columns of a matrix, by field names."""
-    if array.dtype.kind not in "iufb" or array.size < 2 or array.ndim > 2:
+    if array.dtype.kind not in "iufbM" or array.size < 2 or array.ndim > 2:
         return {}
     if array.ndim == 2 and min(array.shape) == 1:
         array = array.ravel()
@@ -344,9 +363,10 @@ def _leaves(path: str, value: Any, depth: int, unit: str = "") -> Iterator[tuple
         structs = [v for v in value if isinstance(v, dict)][:_MOST_COLUMNS]
         for number, inner in enumerate(structs):
             data = [v for v in inner.values() if isinstance(v, np.ndarray)]
-            label = _text_of(inner, "label", "name") or str(number)
+            label, unit = split_unit(_text_of(inner, "label", "name") or str(number))
             named = data[0] if len(data) == 1 else inner
-            yield from _leaves(f"{path}{_SLASH}{label}", named, depth + 1, _text_of(inner, "unit", "units"))
+            place = f"{path}{_SLASH}{field_name(label)}"
+            yield from _leaves(place, named, depth + 1, _text_of(inner, "unit", "units") or unit)
 
 
 def _text_of(struct_: Mapping[str, Any], *names: str) -> str:

@@ -67,9 +67,12 @@ _WEEK_TIME = re.compile(
 _SECOND_NS = TIME_UNITS_NS["seconds"]
 #: Columns of a table in long form, with a row for each value.
 _SIGNAL = re.compile(
-    r"(?:signal|channel|variable|field|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
+    r"_?(?:signal|channel|variable|field|parameter|sensor|tag|key|telemetry|metric|measure|measurement|quantity|series|pid|name)"
+    r"(?:_?(?:name|id))?"
 )
-_VALUE = re.compile(r"(?:physical_|signal_|phys_|telemetry_|metric_)?(?:value|val|wert)")
+_VALUE = re.compile(
+    r"_?(?:physical_|signal_|phys_|telemetry_|metric_|measure_|measurement_)?(?:value|val|wert)(?:_double)?"
+)
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 
 
@@ -93,7 +96,7 @@ def unique(names: Iterable[str]) -> list[str]:
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit, with or without brackets."""
-    return re.sub(r"[\s*\[\](){}]", "", text).lower() in _UNITS
+    return re.sub(r"^\s*units?:|[\s*\[\](){}]", "", text, flags=re.IGNORECASE).lower() in _UNITS
 
 
 def split_unit(text: str) -> tuple[str, str]:
