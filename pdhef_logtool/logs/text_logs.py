@@ -51,8 +51,8 @@ _VALUE = re.compile(
 )
 #: A number and its unit in one cell.
 _QUANTITY = re.compile(r"\s*[-+−]?\d[\d.,]*(?:e[-+]?\d+)?\s*([^\d\s.,][^\d]*)", re.IGNORECASE)
-#: A line behind the header of a file or of its channels.
-_END_OF_HEADER = re.compile(r"(?i)\W*(end[_ ]of[_ ]header|header[_ ]end|(channel |begin |start of )?data)\W*")
+#: The last line of the header of a file or of its channels.
+_END_OF_HEADER = re.compile(r"(?i)\W*(end[_ ]of[_ ]header|header[_ ]end)\W*")
 #: Marks of comments, and labels of the row of names where the first column contains no values.
 _COMMENT = re.compile(r"(?:[#%!;]|//)\s*")
 _LABELS = frozenset(
@@ -362,13 +362,12 @@ def open_json_lines(file: TableFile) -> Tables:
         with suppress(ValueError, RecursionError):
             document = json.load(file.stream)
         file.stream.seek(0)
-    if document is None:
-        return _tables_of_records(map(_record_of_json, file.stream), file, "json-lines")
     if records := max(_lists_of_records(document, _DEEPEST), key=len, default=[]):
         return _tables_of_records(records, file, "json")
+    if not isinstance(document, dict) or not any(isinstance(value, dict | list) for value in document.values()):
+        return _tables_of_records(map(_record_of_json, file.stream), file, "json-lines")
     losses: list[Loss] = []
-    structs = document.items() if isinstance(document, dict) else ()
-    variables = ((name, _array_of(value, _DEEPEST)) for name, value in structs)
+    variables = ((name, _array_of(value, _DEEPEST)) for name, value in document.items())
     return Tables("json", tables_of_variables(variables, file, losses), losses)
 
 

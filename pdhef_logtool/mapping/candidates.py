@@ -23,15 +23,20 @@ from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumer
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import (
     COUNTING,
+    KNOWN,
+    NOT_VALUES,
     STATES,
     UNIT_TEXTS,
+    UNITS,
     VOCABULARY,
     Meaning,
     is_command,
     meaning_among,
+    plain_unit,
+    unit_of,
     words_of,
 )
-from pdhef_logtool.mapping.proposals import MOST_PROPOSED, propose
+from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
@@ -223,25 +228,70 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 
 
 def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> Iterator[Named]:
-    """Yield the fields without a usable name that the drive's motion explains, if no name gives a quantity."""
-    if {"speed", "rate", "acceleration", "steering"} & {n[3].quantity for n in named}:
-        return
+    """Yield the fields without a usable name that the drive's motion explains, for quantities that no name gives."""
+    there = {(n[3].quantity, part) for n in named for part in (n[3].part, "") if n[1] != "command"}
+    wanted = [
+        role
+        for role in (*ROLES, ("steering", ""))
+        if role not in there and (role[0], "") not in there - {("acceleration", "")}
+    ]
     sensors = {t.name: t for t, role in topics if role == "sensor"}
-    requests = {
-        name: [
-            f.path.removesuffix("[]")
-            for f in log.fields(name, quiet=True)
-            if f.kind == "number" and all(len(w) == 1 or w.isdigit() or w in COUNTING for w in words_of(f.path))
-        ][:MOST_PROPOSED]
-        for name in sensors
-    }
+    columns: dict[
+        tuple[str, str], tuple[FieldInfo, Mapping[str, Sequence[tuple[str, float]]], tuple[str, str] | None]
+    ] = {}
+    for topic, role, info, meaning, documented in sorted(named, key=lambda n: -n[3].strength):
+        its = next((r for r in ROLES if r[0] == meaning.quantity and meaning.part in (r[1], "")), None)
+        units = HYPOTHESES.get(meaning.quantity, ()) if meaning.scale is None else ((meaning.unit, meaning.scale),)
+        if (
+            its in (c[2] for c in columns.values())
+            or its is None
+            or documented
+            or role == "command"
+            or "[]" in info.path
+        ):
+            continue
+        columns[topic.name, info.path] = info, {its[0]: units}, its
+    by_name = {(n[0].name, n[2].path) for n in named}
+    for name in sensors if wanted else ():
+        for info in log.fields(name, quiet=True):
+            is_column = info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
+            units = _units_without_name(info) if is_column and (name, info.path) not in by_name else {}
+            if units and len(columns) < MOST_PROPOSED:
+                columns[name, info.path.removesuffix("[]")] = info, units, None
+    if not wanted or all(c[2] is not None for c in columns.values()):
+        return
+    requests: dict[str, list[str]] = {}
+    for topic_name, path in columns:
+        requests.setdefault(topic_name, []).append(path)
     pieces = Pieces(log)
-    seen = pieces.read({name: paths for name, paths in requests.items() if paths})
-    keys, why = [*seen], "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
-    for place, (quantity, part, unit) in propose(pieces, [*seen.values()]).items():
-        topic, path = keys[place]
-        meaning = Meaning(quantity, part, PROPOSED, unit, dict(HYPOTHESES[quantity]).get(unit), why)
-        yield sensors[topic], "sensor", FieldInfo(path, "number"), meaning, False
+    seen = pieces.read(requests)
+    keys = [key for key in seen if seen[key].changes]
+    given = [columns.get(key) or columns[key[0], key[1].partition("[")[0]] for key in keys]
+    why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
+    proposals = propose(
+        pieces, [Column(seen[k], units, its) for k, (_, units, its) in zip(keys, given, strict=True)], wanted
+    )
+    for place, (quantity, part, unit) in proposals.items():
+        topic_name, path = keys[place]
+        scale = dict(given[place][1][quantity]).get(unit)
+        meaning = Meaning(quantity, part, PROPOSED, unit if scale else "", scale, why)
+        yield sensors[topic_name], "sensor", FieldInfo(path, "number"), meaning, False
+
+
+def _units_without_name(info: FieldInfo) -> dict[str, Sequence[tuple[str, float]]]:
+    """Return the possible units of a field by quantity, if its name contains no word with another meaning."""
+    words = set(words_of(info.path))
+    unit = plain_unit(info.unit)
+    named = f"{info.path.rpartition('.')[2]}_{unit}"
+    kinds = {"speed": "speed", "acceleration": "acceleration", "rate": "rate", "steering": "angle"}
+    given = {q: ((u, s),) for q, kind in kinds.items() for u, s in [unit_of(named, kind)] if s is not None}
+    if "acceleration" in given:  # its unit contains that of a speed, and that of a rate that of an angle
+        given.pop("speed", None)
+    given.pop("steering" if "rate" in given and given["rate"][0][0] not in UNITS["angle"] else "rate", None)
+    if given and not words & NOT_VALUES and not is_command(info.path):
+        return given
+    unknown = all(len(w) == 1 or w.isdigit() or w in COUNTING or w not in KNOWN for w in words)
+    return {q: HYPOTHESES[q][:2] for q in kinds} if unknown and not unit and not words & NOT_VALUES else {}
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
