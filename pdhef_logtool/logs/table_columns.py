@@ -50,9 +50,18 @@ _ASCENDING_SHARE = 0.99
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
 _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS_NS}
+#: Products and quotients of units, with exponents.
+_SYMBOL = rf"(?:{'|'.join(map(re.escape, CONSTANTS['table_units']['symbols'].split()))})(?:\^?\**[-+]?\d|[⁻¹²³]+)?"
+_COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/·.]|\bper\b|\s)\s*{_SYMBOL})+")
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 #: Letters in ASCII.
 LATIN = str.maketrans(CONSTANTS["latin"])
+_ALPHABETS = {name: dict(pair.split("=") for pair in pairs.split()) for name, pairs in CONSTANTS["alphabets"].items()}
+_LETTERS = str.maketrans(
+    {u: latin for a in _ALPHABETS.values() for letter, latin in a.items() for u in (letter, letter.upper())}
+)
+#: Words, and single letters as symbols, of the Greek alphabet; a dot above the symbol of a quantity.
+_GREEK_WORD, _GREEK, _DOT = re.compile("[Ͱ-Ͽ]{3,}"), re.compile("[Ͱ-Ͽ]"), re.compile("(?<=[xyvψβ])\u0307")
 
 #: Words of titles in other alphabets, and their English.
 _TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
@@ -79,7 +88,10 @@ _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
     text = _OTHER_ALPHABET.sub(lambda match: f" {_TRANSLATIONS[match[0]]} ", text)
-    text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(LATIN)).encode("ascii", "ignore").decode()
+    text = _GREEK_WORD.sub(lambda match: match[0].translate(_LETTERS), text.partition("\\")[0].translate(LATIN))
+    text = _DOT.sub("_dot", unicodedata.normalize("NFKD", text))
+    text = _GREEK.sub(lambda match: f"_{unicodedata.name(match[0]).split()[3].lower()}_", text).translate(_LETTERS)
+    text = text.encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
     return f"n_{name}" if name[0].isdigit() else name
 
@@ -96,7 +108,8 @@ def unique(names: Iterable[str]) -> list[str]:
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit, with or without brackets."""
-    return re.sub(r"^\s*units?:|[\s*\[\](){}]", "", text, flags=re.IGNORECASE).lower() in _UNITS
+    text = re.sub(r"^\s*units?\s*:|[\[\](){}]", "", text, flags=re.IGNORECASE).strip().lower()
+    return text.replace(" ", "") in _UNITS or bool(_COMPOUND.fullmatch(text))
 
 
 def split_unit(text: str) -> tuple[str, str]:
@@ -255,7 +268,12 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     if (given[1:] >= given[:-1]).sum() < _ASCENDING_SHARE * (len(given) - 1) or len(column) == 1:
         return 2 if column.dtype.kind == "M" else None
     is_unit_of_time = sheet.units.get(name, "").lower() in TIME_UNITS_NS or text.startswith("t_")
-    return 1 if _TIME_LIKE.search(text) else 2 if column.dtype.kind == "M" else 3 if is_unit_of_time else None
+    if _TIME_LIKE.search(text) or column.dtype.kind == "M" or is_unit_of_time:
+        return 1 if _TIME_LIKE.search(text) else 2 if column.dtype.kind == "M" else 3
+    steps = np.diff(given)
+    is_count = bool((steps == steps[0]).all()) and steps[0] == 1
+    is_regular = np.quantile(np.abs(steps - np.median(steps)), _ENOUGH_ROWS) <= _ALIKE * np.median(steps)
+    return 4 if is_regular and not is_count and name == next(iter(sheet.columns)) else None
 
 
 def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float | None) -> Clock:
