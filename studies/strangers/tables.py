@@ -132,6 +132,17 @@ def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     return sorted(rows)
 
 
+def _measures_parquet(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a fleet's events: a row for each value, in the column of its type."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    stamps, names, values, _ = (list(column) for column in zip(*_long_rows(topics), strict=True))
+    table = {"eventId": ["7f"] * len(names), "vehicleName": ["car-7"] * len(names), "name": names}
+    table |= {"time": [stamp // 10**6 for stamp in stamps], "measure_value_BOOLEAN": [None] * len(names)}
+    pq.write_table(pa.table({**table, "measure_value_DOUBLE": values}), path)
+
+
 def _long_parquet(path: Path, topics: Sequence[Topic]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -291,6 +302,32 @@ def _json_signals(path: Path, topics: Sequence[Topic]) -> None:
     path.write_text(json.dumps(signals), encoding="utf-8")
 
 
+def _json_columns(path: Path, topics: Sequence[Topic]) -> None:
+    """Write one document: an object for each topic, with a list for each column."""
+    start = topics[0].arrival_ns[0]
+    columns = {
+        t.name.strip("/"): {
+            "time": ((t.arrival_ns - start) * 1e-9).tolist(),
+            **{n: v.tolist() for n, v in t.fields.items()},
+        }
+        for t in topics
+    }
+    path.write_text(json.dumps(columns), encoding="utf-8")
+
+
+def _hdf5(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a group for each topic: a dataset of times in ns, and datasets with their units as attributes."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for topic in topics:
+            group = file.create_group(topic.name.strip("/"))
+            group["timestamp"] = topic.arrival_ns
+            for title, values in topic.fields.items():
+                name, unit = _split(title)
+                group.create_dataset(name, data=values, compression="gzip").attrs["unit"] = unit
+
+
 def _mat_hdf5(path: Path, topics: Sequence[Topic]) -> None:
     """Write version 7.3: each variable is a row vector, which HDF5 stores as a column."""
     import h5py
@@ -352,6 +389,9 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "mat-columns": (".mat", _mat_columns),
     "mat-groups": (".mat", _mat_groups),
     "json-signals": (".json", _json_signals),
+    "json-columns": (".json", _json_columns),
+    "hdf5": (".h5", _hdf5),
+    "parquet-measures": (".parquet", _measures_parquet),
     "mdf": (".mf4", _mdf),
 }
 
