@@ -97,6 +97,10 @@ FORMATS = (
         is_general=True, libraries=("h5py",),
     ),
     LogFormat(
+        "an HDF5 file", f"{__package__}.mat_log:open_mat", (".h5", ".hdf5"), b"\x89HDF",
+        is_general=True, libraries=("h5py",),
+    ),
+    LogFormat(
         "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "),
         libraries=("asammdf",),
     ),

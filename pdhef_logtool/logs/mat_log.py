@@ -28,7 +28,7 @@ from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import IntArray, Loss
 
-_HDF5_MAT = b"MATLAB 7.3"
+_HDF5_MAT, _HDF5 = b"MATLAB 7.3", b"\x89HDF\r\n\x1a\n"
 _MAT = CONSTANTS["mat"]
 #: Tag of an element: type and size.
 _TAG_BYTES = struct.calcsize("II")
@@ -56,10 +56,11 @@ class _Unusable:
 def open_mat(file: TableFile) -> Tables:
     """Read a MAT file; a variable that cannot be read is a loss."""
     losses: list[Loss] = []
-    hdf5 = file.stream.read(len(_HDF5_MAT)) == _HDF5_MAT
+    head = file.stream.read(len(_HDF5_MAT))
     file.stream.seek(0)
-    variables = (_hdf5_variables if hdf5 else _mat5_variables)(file, losses)
-    return Tables("mat-7.3" if hdf5 else "mat", tables_of_variables(variables, file, losses), losses)
+    kind = {_HDF5_MAT: "mat-7.3", _HDF5 + head[len(_HDF5) :]: "hdf5"}.get(head, "mat")
+    variables = (_mat5_variables if kind == "mat" else _hdf5_variables)(file, losses)
+    return Tables(kind, tables_of_variables(variables, file, losses), losses)
 
 
 def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, losses: list[Loss]) -> list[Table]:
@@ -74,7 +75,9 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
     unusable = []
     leaves = (leaf for name, value in variables for leaf in _leaves(name, value, 0))
     for path, value, unit in leaves:
-        struct_, _, name = path.rpartition(_SLASH)
+        struct_, _, title = path.rpartition(_SLASH)
+        name, given = split_unit(title)
+        unit = unit or given
         if isinstance(value, np.ndarray) and _has_times(value):
             arrays[path], units[path] = {"time": value[:, 0], field_name(name): value[:, 1]}, {field_name(name): unit}
             continue
@@ -230,7 +233,9 @@ def _hdf5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, 
                 size = 8 * math.prod(item.shape or ())
                 file.limits.check_table(claimed + size, file.size, file.name)
                 claimed += size
-                yield name, _dataset(h5py, item, file)
+                texts = (str(item.attrs[n]) for n in ("unit", "units", "Unit", "Units") if n in item.attrs)
+                unit = next(texts, "").replace(_SLASH, " per ")
+                yield f"{name} [{unit}]" if unit else name, _dataset(h5py, item, file)
             except Exception as error:  # noqa: BLE001  any error of a damaged object
                 what = f"{place} cannot be read: {describe_damage(error)[1]}"
                 losses.append(Loss("bad-variable", what, file.name))

@@ -43,6 +43,8 @@ _REGULAR = 1.5
 _ENOUGH_ROWS = 0.9
 #: Lengths of two clocks of a table differ by less than this share.
 _ALIKE = 0.01
+#: A regular first column without a unit contains times beside so many columns.
+_FEWEST_COLUMNS = 3
 #: Share of steps that are not negative, of a column that may contain times.
 _ASCENDING_SHARE = 0.99
 
@@ -118,7 +120,8 @@ def split_unit(text: str) -> tuple[str, str]:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
     match = _BRACKETED.match(text.strip())
-    return (match[1], match[2].strip()) if match and match[1] and is_unit(match[2]) else (text.strip(), "")
+    is_given = match and match[1] and is_unit(match[2]) and not match[2].isdigit()  # [1] is an index
+    return (match[1], match[2].strip()) if match and is_given else (text.strip(), "")
 
 
 def snake(name: str) -> str:
@@ -273,7 +276,8 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     steps = np.diff(given)
     is_count = bool((steps == steps[0]).all()) and steps[0] == 1
     is_regular = np.quantile(np.abs(steps - np.median(steps)), _ENOUGH_ROWS) <= _ALIKE * np.median(steps)
-    return 4 if is_regular and not is_count and name == next(iter(sheet.columns)) else None
+    is_alone = len(sheet.columns) < _FEWEST_COLUMNS or name != next(iter(sheet.columns)) or name in sheet.units
+    return 4 if is_regular and not (is_count or is_alone) else None
 
 
 def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float | None) -> Clock:

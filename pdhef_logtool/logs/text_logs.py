@@ -27,14 +27,16 @@ import numpy as np
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.mat_log import tables_of_variables
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
-from pdhef_logtool.logs.table_clocks import NO_TIME, placed, unwrapped, whole_days
-from pdhef_logtool.logs.table_columns import Sheet, by_times, is_unit, read_head, tables_of
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, placed, unwrapped, whole_days
+from pdhef_logtool.logs.table_columns import Sheet, by_times, field_name, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from polars import Series
+
+    from pdhef_logtool.logs.table_log import Table
 
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
@@ -54,6 +56,11 @@ _QUANTITY = re.compile(r"\s*[-+−]?\d[\d.,]*(?:e[-+]?\d+)?\s*([^\d\s.,][^\d]*)"
 #: The last line of the header of a file or of its channels.
 _END_OF_HEADER = re.compile(r"(?i)\W*(end[_ ]of[_ ]header|header[_ ]end)\W*")
 #: Marks of comments, and labels of the row of names where the first column contains no values.
+#: Labels of a rate, and of the time between rows.
+_RATES = {
+    "rate": r"(?:(?:sampl\w*|data|log\w*)[ _]?(?:rate|freq\w*)|freq\w*|abtast(?:rate|frequenz)|fs)(?: ?[[(]k?hz[])])?",
+    "step": r"(?:sampl\w*[ _]?(?:interval|period|time|step)|h_?resolution|delta_?[xt]|dt|abtastzeit)(?: ?[[(]\w+[])])?",
+}
 _COMMENT = re.compile(r"(?:[#%!;]|//)\s*")
 _LABELS = frozenset(
     {"name", "names", "signal", "signals", "channel", "channels", "variable", "variables", "title", "label"}
@@ -91,14 +98,60 @@ def open_csv(file: TableFile) -> Tables:
         text.seek(0)
         rows = _rows(text, separator)
         head = [*islice(rows, _HEAD_LINES)]
+        if titles_of := _titles_of_kinds([row for _, row in head]):
+            return _tables_of_kinds(chain(head, rows), titles_of, file)
         titles, units, first = _layout([row for _, row in head], file.name)
+        stated_hz = _stated_rate(row for _, row in head[:first])
         fields, given = read_head(titles)
         given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
-    sheets, rate_hz = by_times("csv", columns, given), file.settings.rate_hz
+    sheets, rate_hz = by_times("csv", columns, given), file.settings.rate_hz or stated_hz
     tables = [table for sheet in sheets for table in tables_of(sheet, file.name, losses, rate_hz=rate_hz)]
+    return Tables("csv", tables, losses)
+
+
+def _stated_rate(head: Iterable[Sequence[str]]) -> float | None:
+    """Return the rows per second that a line above the columns states; None without one."""
+    for label, *values in (row for row in head if len(row) > 1):
+        number = next((cell for cell in values if cell.strip()), "")
+        value = re.match(r"\s*(\d+(?:[.,]\d*)?(?:e[-+]?\d+)?)\s*(\w*)", number, re.IGNORECASE)
+        of = next((kind for kind, pattern in _RATES.items() if re.fullmatch(pattern, label.strip(" \t:#").lower())), "")
+        if value and of and (amount := float(value[1].replace(",", "."))) > 0.0:
+            unit = (value[2] or re.sub(r".*\W(\w+)\W*", r"\1", label)).lower()
+            seconds = TIME_UNITS_NS.get(unit, TIME_UNITS_NS["s"]) / TIME_UNITS_NS["s"]
+            return amount * (1000.0 if unit == "khz" else 1.0) if of == "rate" else 1.0 / (amount * seconds)
+    return None
+
+
+def _titles_of_kinds(head: Sequence[Sequence[str]]) -> dict[str, list[str]]:
+    """Return the titles of the columns of each kind of row, by the first cell of the rows; empty for other files.
+
+    Remarks give the titles (``# Fix,Latitude,...``), or rows ``FMT`` of an autopilot (type, length, name, format, ...).
+    """
+    titles_of = {
+        row[0].lstrip("#% "): [c.strip() for c in row[1:]] for row in head if row and row[0].startswith(("#", "%"))
+    }
+    titles_of |= {row[3].strip(): [c.strip() for c in row[5:]] for row in head if len(row) > 5 and row[0] == "FMT"}
+    kinds = {row[0].strip() for row in head if len(row) > 1 and row[0][:1].isalpha() and row[0] != "FMT"}
+    return {k: titles for k, titles in titles_of.items() if k in kinds and len(titles) > 1}
+
+
+def _tables_of_kinds(
+    rows: Iterable[tuple[int, Sequence[str]]], titles_of: Mapping[str, Sequence[str]], file: TableFile
+) -> Tables:
+    """Return a table for each kind of row with times."""
+    lines: dict[str, list[tuple[int, list[str]]]] = {}
+    for number, (kind, *cells) in ((n, row) for n, row in rows if row and row[0].strip() in titles_of):
+        lines.setdefault(kind.strip(), []).append((number, [cell.strip() for cell in cells]))
+    losses: list[Loss] = []
+    tables: list[Table] = []
+    for kind, its in lines.items():
+        fields, given = read_head(titles_of[kind])
+        columns = _columns(its, fields, file, losses, ".", given)
+        with suppress(LogError):  # parameters and messages have no times
+            tables += tables_of(Sheet(field_name(kind), columns, given), file.name, losses)
     return Tables("csv", tables, losses)
 
 
@@ -163,9 +216,11 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
     header = max((i for i, row in enumerate(rows) if row and _END_OF_HEADER.fullmatch(row[0])), default=-1)
-    numbers = [
-        i for i, row in enumerate(rows) if i > header and len(row) == width > 1 and _share(row, _is_value) >= 0.5
-    ]
+    starts = [row[0].strip() for row in rows[-20:] if len(row) == width]
+    has_labels = _share(starts, _is_value) >= 0.9 or not any(starts)
+    # A text in a first column of numbers labels a line of the head: a sample rate, a block size.
+    data = [i for i, row in enumerate(rows) if row and not (has_labels and row[0].strip() and not _is_value(row[0]))]
+    numbers = [i for i in data if i > header and len(rows[i]) == width > 1 and _share(rows[i], _is_value) >= 0.5]
     # Above the titles there may be a row with the numbers of the channels.
     full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width, header))), (0, []))
     if not above:
@@ -177,7 +232,8 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     is_labelled = not any(row[0].strip() for row in rows[full : full + 3])
     names = next((i for i in above if is_labelled and rows[i][0].strip().lower() in _LABELS), names)
     below = range(names + 1, full + 1)
-    first = next(i for i in below if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
+    below_data = (i for i in below if i == full or i in data)
+    first = next(i for i in below_data if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
     of_units = next((i for i in above if i != names and _share(rows[i], is_unit) >= 0.5), -1)
     groups = rows[names - 1] if names - 1 in above and not is_labelled and of_units != names - 1 else []
     under = [rows[i] for i in above if names < i < first]

@@ -36,7 +36,7 @@ from pdhef_logtool.mapping.naming import (
     unit_of,
     words_of,
 )
-from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, propose
+from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
@@ -229,56 +229,48 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 
 def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> Iterator[Named]:
     """Yield the fields without a usable name that the drive's motion explains, for quantities that no name gives."""
-    there = {(n[3].quantity, part) for n in named for part in (n[3].part, "") if n[1] != "command"}
-    wanted = [
-        role
-        for role in (*ROLES, ("steering", ""))
-        if role not in there and (role[0], "") not in there - {("acceleration", "")}
-    ]
+    there = {(n[3].quantity, part) for n in named if n[1] != "command" for part in (n[3].part, "any")}
+    wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
+    wanted += [] if ("steering", "any") in there else [("steering", "")]
+    columns = dict(_named_columns(named)) if wanted else {}
     sensors = {t.name: t for t, role in topics if role == "sensor"}
-    columns: dict[
-        tuple[str, str], tuple[FieldInfo, Mapping[str, Sequence[tuple[str, float]]], tuple[str, str] | None]
-    ] = {}
-    for topic, role, info, meaning, documented in sorted(named, key=lambda n: -n[3].strength):
-        its = next((r for r in ROLES if r[0] == meaning.quantity and meaning.part in (r[1], "")), None)
-        units = HYPOTHESES.get(meaning.quantity, ()) if meaning.scale is None else ((meaning.unit, meaning.scale),)
-        if (
-            its in (c[2] for c in columns.values())
-            or its is None
-            or documented
-            or role == "command"
-            or "[]" in info.path
-        ):
-            continue
-        columns[topic.name, info.path] = info, {its[0]: units}, its
     by_name = {(n[0].name, n[2].path) for n in named}
     for name in sensors if wanted else ():
         for info in log.fields(name, quiet=True):
             is_column = info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
             units = _units_without_name(info) if is_column and (name, info.path) not in by_name else {}
             if units and len(columns) < MOST_PROPOSED:
-                columns[name, info.path.removesuffix("[]")] = info, units, None
-    if not wanted or all(c[2] is not None for c in columns.values()):
+                columns[name, info.path.removesuffix("[]")] = units, None
+    if all(role is not None for _, role in columns.values()):
         return
     requests: dict[str, list[str]] = {}
     for topic_name, path in columns:
         requests.setdefault(topic_name, []).append(path)
     pieces = Pieces(log)
-    seen = pieces.read(requests)
-    keys = [key for key in seen if seen[key].changes]
-    given = [columns.get(key) or columns[key[0], key[1].partition("[")[0]] for key in keys]
+    read = {key: seen for key, seen in pieces.read(requests).items() if seen.changes}
+    given = [columns.get(key) or columns[key[0], key[1].partition("[")[0]] for key in read]
+    compared = [Column(seen, *its) for seen, its in zip(read.values(), given, strict=True)]
     why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
-    proposals = propose(
-        pieces, [Column(seen[k], units, its) for k, (_, units, its) in zip(keys, given, strict=True)], wanted
-    )
-    for place, (quantity, part, unit) in proposals.items():
-        topic_name, path = keys[place]
-        scale = dict(given[place][1][quantity]).get(unit)
+    for place, (quantity, part, unit) in propose(pieces, compared, wanted).items():
+        topic_name, path = [*read][place]
+        scale = dict(given[place][0][quantity]).get(unit)
         meaning = Meaning(quantity, part, PROPOSED, unit if scale else "", scale, why)
         yield sensors[topic_name], "sensor", FieldInfo(path, "number"), meaning, False
 
 
-def _units_without_name(info: FieldInfo) -> dict[str, Sequence[tuple[str, float]]]:
+def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tuple[Units, tuple[str, str]]]]:
+    """Yield the field that has each of :data:`ROLES` by its name, without a speed that of a wheel, and its units."""
+    usable = [n for n in named if n[1] != "command" and not n[4] and "[]" not in n[2].path]
+    for role in ROLES:
+        its = [n for n in usable if n[3].quantity == role[0] and n[3].part in (role[1], "")]
+        its = its or [n for n in usable if role[0] == "speed" and n[3].quantity == "wheel speed"]
+        if its:
+            topic, _, info, meaning, _ = max(its, key=lambda n: n[3].strength)
+            units = HYPOTHESES[meaning.quantity] if meaning.scale is None else ((meaning.unit, meaning.scale),)
+            yield (topic.name, info.path), ({role[0]: units}, role)
+
+
+def _units_without_name(info: FieldInfo) -> Units:
     """Return the possible units of a field by quantity, if its name contains no word with another meaning."""
     words = set(words_of(info.path))
     unit = plain_unit(info.unit)
@@ -454,7 +446,7 @@ def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
 
 def triad_of(item: Field) -> str:
     """Return the key shared by the three axes of a vector: topic and struct, or the words without the axis."""
-    struct, _, leaf = re.sub(r"\[\d+\]$", "", item.path).rpartition(".")
+    struct, _, leaf = re.sub(r"\[\d+\]$|_?[0-4]$", "", item.path).rpartition(".")
     return f"{item.topic.name}.{struct or '_'.join(w.rstrip('xyz') for w in words_of(leaf))}"
 
 

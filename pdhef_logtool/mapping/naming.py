@@ -64,6 +64,8 @@ def words_of(name: str) -> tuple[str, ...]:
 
 #: Last words of names of enumerations, and of what is measured.
 STATES = frozenset({"state", "states", "status"})
+#: An element of a vector, and words of vectors.
+_NUMBERED, _VECTORS = re.compile(r"(.*?)_?([0-4])"), _WORDS["vectors"]
 #: A wheel as ``FrL``, ``BckRi`` or ``LeFrnt`` in the capitals of a name.
 _END, _SIDE = "(Fro?n?t|Fr|Front|Bck|Back|Rear|Rr|Re)", "(Lft|Left|Le|Lt|L|Rght|Right|Ri|Rt|R)"
 _SIDES = re.compile(rf"(?<=[a-z_]){_END}{_SIDE}(?![a-z])|(?<=[a-z_]){_SIDE}{_END}(?![a-z])")
@@ -120,7 +122,9 @@ class Meaning:
 
 def is_command(*names: str) -> bool:
     """Return whether the name of a topic, type or field describes a command, not a measurement."""
-    return any(_WORDS["commands"] & set(words_of(n)) for n in names)
+    words = [set(words_of(n)) for n in names]
+    # The reference of a stability controller is the speed of the vehicle.
+    return any(_WORDS["commands"] & w and not {"v", "vehicle", "ref"} <= w for w in words)
 
 
 def plain_unit(text: str) -> str:
@@ -174,6 +178,10 @@ def _spelled_out(path: str, there: Collection[str]) -> str:
         return f"{gyro[1]}gyro_{gyro[2]}"
     leaf = path.rpartition(".")[2]
     struct = path.removesuffix(leaf)
+    if (numbered := _NUMBERED.fullmatch(leaf)) and _VECTORS & set(words_of(numbered[1])):
+        numbers = {m[2] for p in there if (m := _NUMBERED.fullmatch(p.removeprefix(struct))) and m[1] == numbered[1]}
+        if numbers in ({"0", "1", "2"}, {"1", "2", "3"}):
+            return f"{struct}{numbered[1]}_{'xyz'[sorted(numbers).index(numbered[2])]}"
     beside = {p.removeprefix(struct).lower() for p in there if p.startswith(struct)}
     short = (names[leaf.lower()] for needed, names in _SHORT_NAMES if leaf.lower() in names and needed <= beside)
     return struct + next(short, _with_wheel(leaf, beside))
@@ -204,7 +212,7 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
         return None
     # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
     kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
-    kept |= {w for w in leaf_words[-1:] if w not in STATES or len(leaf_words) == 1}
+    kept |= {w for w in leaf_words[-1:] if (w not in STATES and leaf_words[-2:-1] != ("per",)) or len(leaf_words) == 1}
     if NOT_VALUES & kept or NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None
     index = re.search(r"\[(\d+)\]$", leaf)

@@ -21,6 +21,8 @@ _LARGEST = {"speed": (4.0, 90.0), "acceleration": (0.7, 16.0), "rate": (0.04, 2.
 #: Most columns that are compared; least correlation of a relation; 1-sigma of the logarithm of its gain; how much surer
 #: the best proposal must be.
 MOST_PROPOSED, LEAST, SIGMA, MARGIN = 24, 0.8, 0.15, 1.0
+#: Possible units and their factors to SI, by quantity.
+Units: TypeAlias = Mapping[str, Sequence[tuple[str, float]]]
 #: Column of each role, None without one.
 _Places: TypeAlias = tuple[int | None, ...]
 
@@ -29,7 +31,7 @@ class Column(NamedTuple):
     """Values of a column, and its possible units with their factors by quantity; ``role``: by its name, else None."""
 
     seen: Seen
-    units: Mapping[str, Sequence[tuple[str, float]]]
+    units: Units
     role: tuple[str, str] | None = None
 
 
@@ -87,7 +89,7 @@ def _ways(
             free = {p for p in places if p is not None and columns[p].role is None}
             related = {v, x} if ahead is not None else set()
             related |= {v, y, r} if left is not None else set()
-            if not free or not free <= related or len({*places} - {None}) < len(places) - places.count(None):
+            if not free <= related or len({*places} - {None}) < len(places) - places.count(None):
                 continue
             evidence = sum(math.atanh(min(abs(f.correlation), 0.999)) for f in (ahead, left) if f is not None)
             every = (

@@ -47,7 +47,7 @@ PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
 #: Subject of a choice between runs, and formats of files that may contain several.
-RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3"})
+RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3", "hdf5"})
 #: Largest difference of the mean acceleration from 1 for accelerations in g.
 NEAR_1_G = 0.08
 
