@@ -21,8 +21,6 @@ _LARGEST = {"speed": (4.0, 90.0), "acceleration": (0.7, 16.0), "rate": (0.04, 2.
 #: Most columns that are compared; least correlation of a relation; 1-sigma of the logarithm of its gain; how much surer
 #: the best proposal must be.
 MOST_PROPOSED, LEAST, SIGMA, MARGIN = 24, 0.8, 0.15, 1.0
-#: Correlation from which an acceleration is computed from the speed.
-DERIVED = 0.9995
 #: Possible units and their factors to SI, by quantity.
 Units: TypeAlias = Mapping[str, Sequence[tuple[str, float]]]
 #: Column of each role, None without one.
@@ -80,20 +78,23 @@ def _ways(
     for v in (i for i in of_v if i is not None and np.fmin.reduce(cells[i]) > -0.05 * columns[i].seen.largest):
         change = pieces.rate_of(columns[v].seen.cells)
         along = {x: _related(cells[x], change) for x in of_x if x is not None}
-        # A derivative of the speed is no measurement.
-        derived = {x for x, f in along.items() if f is not None and f.correlation > DERIVED and not columns[x].role}
         turns = {
             (y, r): _related(cells[y], cells[r] * cells[v])
             for y, r in product(of_y, of_r)
             if y is not None and r is not None and y != r
         }
-        xs = [x for x in of_x if x not in derived and ((f := along.get(x)) is None or f.correlation > 0.0)]
+        xs = [x for x in of_x if (f := along.get(x)) is None or f.correlation > 0.0]
         for x, (y, r) in product(xs, product(of_y, of_r)):
             ahead, left, places = along.get(x), turns.get((y, r)), (v, x, y, r)
             free = {p for p in places if p is not None and columns[p].role is None}
             related = {v, x} if ahead is not None else set()
             related |= {v, y, r} if left is not None else set()
-            if not free <= related or len({*places} - {None}) < len(places) - places.count(None):
+            # An acceleration without a lateral one may be the derivative of the speed.
+            if (
+                not free <= related
+                or (x in free and y is None)
+                or len({*places} - {None}) < len(places) - places.count(None)
+            ):
                 continue
             evidence = sum(math.atanh(min(abs(f.correlation), 0.999)) for f in (ahead, left) if f is not None)
             every = (
