@@ -51,7 +51,8 @@ def _times(stamp: int, start: int, i: int) -> dict[str, Any]:
     since = {"s": 1e9, "ms": 1e6, "us": 1e3}
     units = {"": 1e9, "_ms": 1e6, "_us": 1e3}
     return {
-        "i": i, "at": at, "second": stamp // 10**9, "micro": at.microsecond, "milli": at.microsecond // 1000, "nano": stamp % 10**9, "week": week, "tow": tow / 1e9,
+        "i": i, "at": at, "second": stamp // 10**9, "milli": at.microsecond // 1000, "micro": at.microsecond,
+        "nano": stamp % 10**9, "week": week, "tow": tow / 1e9, "fine": (stamp - start) // 100_000,
         "day": stamp % _DAY_NS / 1e9, "days": stamp / _DAY_NS, "unix_ns": stamp,
         **{name: (stamp - start) / ns for name, ns in since.items()},
         **{f"unix{name}": stamp / ns for name, ns in units.items()},
