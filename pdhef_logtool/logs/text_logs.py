@@ -44,7 +44,7 @@ _HEAD_LINES = 200
 _CELLS_OF_HEAD = 10_000
 #: Cells that are in memory as texts at the same time.
 _CELLS_AT_ONCE = 1 << 23
-_CELL_END = "\x1f"
+_CELL_END, _SPACES = "\x1f", r"\s{2,}"
 #: Numbers, in any spelling, and times.
 _VALUE = re.compile(
     r"\s*([-+−]?(0x[\da-f]+|[\d.,'’\s]*\d[.,]?(e[-+]?\d+)?)|true|false|"
@@ -61,6 +61,8 @@ _RATES = {
     "rate": r"(?:(?:sampl\w*|data|log\w*)[ _]?(?:rate|freq\w*)|freq\w*|abtast(?:rate|frequenz)|fs)(?: ?[[(]k?hz[])])?",
     "step": r"(?:sampl\w*[ _]?(?:interval|period|time|step)|h_?resolution|delta_?[xt]|dt|abtastzeit)(?: ?[[(]\w+[])])?",
 }
+#: A channel in a list above the rows.
+_LISTED = re.compile(r"(?i)(?:channel|signal|name)(?: ?name)?\s*[:=]\s*(.+)")
 _COMMENT = re.compile(r"(?:[#%!;]|//)\s*")
 _LABELS = frozenset(
     {"name", "names", "signal", "signals", "channel", "channels", "variable", "variables", "title", "label"}
@@ -93,7 +95,7 @@ def open_csv(file: TableFile) -> Tables:
     with _text(file) as text:
         lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
         given_separator = re.match(r"(?i)\ufeff?\"?sep=(.)", lines[0]) if lines else None
-        separator = given_separator[1] if given_separator else _separator(lines[-20:])
+        separator = given_separator[1] if given_separator else _separator(lines)
         file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
         text.seek(0)
         rows = _rows(text, separator)
@@ -192,6 +194,9 @@ def _text(file: TableFile) -> io.TextIOWrapper:
 
 def _rows(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of the last line and the cells of each row; a row with an endless cell has one cell."""
+    if separator == _SPACES:
+        yield from ((i, re.split(separator, line.strip())) for i, line in enumerate(lines, 1))
+        return
     reader = csv.reader((" ".join(n.split()) for n in lines) if separator == " " else lines, delimiter=separator)
     while True:
         try:
@@ -202,12 +207,19 @@ def _rows(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return the delimiter that every line contains equally often, otherwise the most frequent one, or a space."""
-    lines = [re.sub(r'"[^"]*"', "", line) for line in lines]
+    """Return the delimiter that every line contains equally often, otherwise the most frequent one, or spaces.
+
+    Several spaces are the delimiter if one of them is in a title.
+    """
+    every = [re.sub(r'"[^"]*"', "", line) for line in lines]
+    lines = every[-20:]
     counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",")}
     regular = next((s for s, n in counts.items() if n and min(n) > 0 and max(n) == min(n)), "")
     frequent = max(counts, key=lambda s: sum(counts[s]))
-    return regular or (frequent if any(counts[frequent]) else " ")
+    widths = [len(re.split(_SPACES, line.strip())) for line in every]
+    titles = (line for line, n in zip(every, widths, strict=True) if n == widths[-1] > 1)
+    is_aligned = len({*widths[-20:]}) == 1 and any(re.search(r"[a-z.] [a-z(]", t, re.IGNORECASE) for t in titles)
+    return regular or (frequent if any(counts[frequent]) else _SPACES if is_aligned else " ")
 
 
 def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], Sequence[str], int]:
@@ -223,6 +235,9 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     numbers = [i for i in data if i > header and len(rows[i]) == width > 1 and _share(rows[i], _is_value) >= 0.5]
     # Above the titles there may be a row with the numbers of the channels.
     full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width, header))), (0, []))
+    listed = [m[1] for row in rows if (m := _LISTED.fullmatch(", ".join(row))) is not None]
+    if not above and numbers and width - len(listed) in (0, 1):
+        return ["Time", *listed][-width:], [], numbers[0]
     if not above:
         got = "none" if numbers else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)

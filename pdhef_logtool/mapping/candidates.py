@@ -25,6 +25,7 @@ from pdhef_logtool.mapping.naming import (
     COUNTING,
     KNOWN,
     NOT_VALUES,
+    OTHER_QUANTITIES,
     STATES,
     UNIT_TEXTS,
     UNITS,
@@ -279,6 +280,8 @@ def _units_without_name(info: FieldInfo) -> Units:
     given = {q: ((u, s),) for q, kind in kinds.items() for u, s in [unit_of(named, kind)] if s is not None}
     if "acceleration" in given:  # its unit contains that of a speed, and that of a rate that of an angle
         given.pop("speed", None)
+    if OTHER_QUANTITIES & words:
+        given.pop("steering", None)
     given.pop("steering" if "rate" in given and given["rate"][0][0] not in UNITS["angle"] else "rate", None)
     if given and not words & NOT_VALUES and not is_command(info.path):
         return given
