@@ -86,7 +86,7 @@ FORMATS = (
     LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), libraries=("polars",)),
     LogFormat(
         "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
-        is_general=True, named=(".txt",), libraries=("polars",),
+        is_general=True, named=(".txt", ".dat", ".tab", ".prn", ".ascii", ".lvm", ".msl"), libraries=("polars",),
     ),
     LogFormat(
         "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",
@@ -94,6 +94,10 @@ FORMATS = (
     ),
     LogFormat(
         "a MAT file", f"{__package__}.mat_log:open_mat", (".mat",), b"MATLAB ",
+        is_general=True, libraries=("h5py",),
+    ),
+    LogFormat(
+        "an HDF5 file", f"{__package__}.mat_log:open_mat", (".h5", ".hdf5"), b"\x89HDF",
         is_general=True, libraries=("h5py",),
     ),
     LogFormat(
@@ -105,6 +109,10 @@ FORMATS = (
     LogFormat(
         "a candump log", f"{__package__}.can_logs:open_candump", (".log",),
         is_general=True, is_text=True, libraries=(),
+    ),
+    LogFormat(
+        "a file of line protocol", f"{__package__}.text_logs:open_line_protocol", (".lp", ".line", ".influx"),
+        is_general=True, is_text=True, libraries=("polars",),
     ),
     LogFormat(
         "a file of JSON lines", f"{__package__}.text_logs:open_json_lines", (".jsonl", ".ndjson"),

@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
-from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, tables_of, unique
+from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import IntArray, Loss
 
-_HDF5_MAT = b"MATLAB 7.3"
+_HDF5_MAT, _HDF5 = b"MATLAB 7.3", b"\x89HDF\r\n\x1a\n"
 _MAT = CONSTANTS["mat"]
 #: Tag of an element: type and size.
 _TAG_BYTES = struct.calcsize("II")
@@ -56,15 +56,31 @@ class _Unusable:
 def open_mat(file: TableFile) -> Tables:
     """Read a MAT file; a variable that cannot be read is a loss."""
     losses: list[Loss] = []
-    hdf5 = file.stream.read(len(_HDF5_MAT)) == _HDF5_MAT
+    head = file.stream.read(len(_HDF5_MAT))
     file.stream.seek(0)
-    read = _hdf5_variables if hdf5 else _mat5_variables
+    kind = {_HDF5_MAT: "mat-7.3", _HDF5 + head[len(_HDF5) :]: "hdf5"}.get(head, "mat")
+    variables = (_mat5_variables if kind == "mat" else _hdf5_variables)(file, losses)
+    return Tables(kind, tables_of_variables(variables, file, losses), losses)
+
+
+def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, losses: list[Loss]) -> list[Table]:
+    """Return the tables of named variables: arrays, structs (dictionaries) and lists of structs.
+
+    Raises
+    ------
+    LogError : no vector of times is as long as a signal.
+    """
     arrays: dict[str, dict[str, NDArray[Any]]] = {}
     units: dict[str, dict[str, str]] = {}
     unusable = []
-    leaves = (leaf for name, value in read(file, losses) for leaf in _leaves(name, value, 0))
+    leaves = (leaf for name, value in variables for leaf in _leaves(name, value, 0))
     for path, value, unit in leaves:
-        struct_, _, name = path.rpartition(_SLASH)
+        struct_, _, title = path.rpartition(_SLASH)
+        name, given = split_unit(title)
+        unit = unit or given
+        if isinstance(value, np.ndarray) and _has_times(value):
+            arrays[path], units[path] = {"time": value[:, 0], field_name(name): value[:, 1]}, {field_name(name): unit}
+            continue
         vectors = _vectors(name, value) if isinstance(value, np.ndarray) else {}
         if isinstance(value, _Unusable):
             unusable.append(f"{path}: {value.why}")
@@ -84,7 +100,7 @@ def open_mat(file: TableFile) -> Tables:
             remedy="name the vector of times so; without one, state the samples per second: --set rate_hz=100, "
             "or rate_hz in the mapping file",
         )
-    return Tables("mat-7.3" if hdf5 else "mat", tables, losses)
+    return tables
 
 
 def _mat5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, Any]]:
@@ -217,7 +233,9 @@ def _hdf5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, 
                 size = 8 * math.prod(item.shape or ())
                 file.limits.check_table(claimed + size, file.size, file.name)
                 claimed += size
-                yield name, _dataset(h5py, item, file)
+                texts = (str(item.attrs[n]) for n in ("unit", "units", "Unit", "Units") if n in item.attrs)
+                unit = next(texts, "").replace(_SLASH, " per ")
+                yield f"{name} [{unit}]" if unit else name, _dataset(h5py, item, file)
             except Exception as error:  # noqa: BLE001  any error of a damaged object
                 what = f"{place} cannot be read: {describe_damage(error)[1]}"
                 losses.append(Loss("bad-variable", what, file.name))
@@ -319,9 +337,15 @@ def _clock_of(struct_: str, length: int, clocks: Mapping[tuple[str, int], Clock]
     return clocks[struct_, length]
 
 
+def _has_times(array: NDArray[Any]) -> bool:
+    """Return whether an array is a matrix of times and values."""
+    is_pair = array.ndim == 2 and array.shape[1] == 2 < array.shape[0] and array.dtype.kind in "iuf"
+    return is_pair and bool((np.diff(array[:, 0]) > 0.0).all()) and not bool((np.diff(array[:, 1]) > 0.0).all())
+
+
 def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Return a vector, or the columns of a matrix, by field names."""
-    if array.dtype.kind not in "iufb" or array.size < 2 or array.ndim > 2:
+    if array.dtype.kind not in "iufbM" or array.size < 2 or array.ndim > 2:
         return {}
     if array.ndim == 2 and min(array.shape) == 1:
         array = array.ravel()
@@ -344,9 +368,10 @@ def _leaves(path: str, value: Any, depth: int, unit: str = "") -> Iterator[tuple
         structs = [v for v in value if isinstance(v, dict)][:_MOST_COLUMNS]
         for number, inner in enumerate(structs):
             data = [v for v in inner.values() if isinstance(v, np.ndarray)]
-            label = _text_of(inner, "label", "name") or str(number)
+            label, unit = split_unit(_text_of(inner, "label", "name") or str(number))
             named = data[0] if len(data) == 1 else inner
-            yield from _leaves(f"{path}{_SLASH}{label}", named, depth + 1, _text_of(inner, "unit", "units"))
+            place = f"{path}{_SLASH}{field_name(label)}"
+            yield from _leaves(place, named, depth + 1, _text_of(inner, "unit", "units") or unit)
 
 
 def _text_of(struct_: Mapping[str, Any], *names: str) -> str:

@@ -46,12 +46,14 @@ _SUBUNITS = tuple(ns for ns in _UNITS if ns <= _SECONDS and not {*NAMED_UNITS.va
 RELATIVE_NS = _DAY_NS
 #: 1970-01-01 in the days of Excel, and of MATLAB's ``datenum``.
 _DAYS_TO_1970: dict[int, str] = numbered(_CLOCKS["days_to_1970"])
+#: Names of other epochs by the ns of a unit, and the units from the epoch to 1970.
+_EPOCHS = {(ns, units): name for name, (ns, units) in _CLOCKS["epochs"].items()}
 _GPS_EPOCH_NS, _WEEK_S = _GPS["epoch_s"] * _SECONDS, _GPS["week_s"]
 
 #: A date, a time of day (of 12 hours with AM or PM) or ``minutes:seconds``, and an offset from UTC.
 _TIME_TEXT = (
     r"^(?:(?P<a>\d{1,4})(?P<mark>[-./])(?P<b>\d{1,2})[-./](?P<c>\d{1,4}),?[T ]*)?"
-    r"(?:(?:(?P<hour>\d{1,3}):)?(?P<minute>\d{1,3}):(?P<second>\d{1,2})(?:[.,](?P<fraction>\d{1,9})\d*)?)?"
+    r"(?:(?:(?P<hour>\d{1,3}):)?(?P<minute>\d{1,3}):(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d{1,9})\d*)?)?"
     r"\s*(?:(?P<half>[AaPp])\.?[Mm]\.?)?\s*(?:[Zz]|UTC|(?P<sign>[-+])(?P<zone_hour>\d\d):?(?P<zone_minute>\d\d)?)?$"
 )
 
@@ -122,11 +124,29 @@ def number_clock(
         factor = TIME_UNITS_NS[np.datetime_data(values.dtype)[0].lower()]
         return Clock(placed(_scaled(values.astype(np.int64), factor, 0, ~np.isnat(values))))
     finite = np.isfinite(values)
+    if (of_day := seconds_of_day(values[finite])) is not None:
+        stamps = np.full(len(values), NO_TIME, np.int64)
+        stamps[finite] = np.round(of_day * 1e6).astype(np.int64) * 1000
+        return Clock(placed(stamps))
     stated = TIME_UNITS_NS.get(re.sub(r"[\s\[\](){}.]", "", unit).lower(), 0)
     factor, epoch, note = _reading(values[finite], stated, others, rate_hz)
     stamps = placed(_scaled(values, factor, epoch, finite))
     clock = Clock(stamps, (f"{name}: {note}",) if note else (), bool(stated or epoch or rate_hz) or _is_dated(stamps))
     return clock if epoch else _of_gps(clock, name, others)
+
+
+def seconds_of_day(values: FloatArray) -> FloatArray | None:
+    """Return the seconds since midnight of numbers ``hhmmss.sss`` [N]; None of other numbers.
+
+    They step by 40 more at a full minute.
+    """
+    hours, rest = np.divmod(values, 1e4)
+    minutes, seconds = np.divmod(rest, 1e2)
+    if not ((values >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)).all():
+        return None
+    of_day = unwrapped(3600.0 * hours + 60.0 * minutes + seconds)
+    jumps = np.diff(values) - np.diff(of_day)
+    return of_day if (jumps > 39.0).any() and np.diff(of_day).max() < _MINUTE_NS / _SECONDS else None
 
 
 def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz: float | None) -> tuple[int, int, str]:
@@ -148,6 +168,8 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz
         return float(slow + _outside(length_s, _CLOCKS["usual_length_s"]) + apart)
 
     dates = [(factor, 0) for factor in _SUBUNITS if _is_date(middle * factor / _SECONDS)]
+    elsewhere = ((f, epoch) for f, epoch in _EPOCHS if middle > _CLOCKS["least_of_epochs"])
+    dates = dates or [(f, epoch) for f, epoch in elsewhere if _is_date((middle - epoch) * f / _SECONDS)]
     days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * _DAY_S)]
     if stated:
         as_stated = next((r for r in (*dates, *days) if r[0] == stated), (stated, 0))
@@ -157,7 +179,7 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz
         return *better, f"the unit makes no plausible times, read as {_named(*better)}" if changed else ""
     dates = [reading for reading in dates if fits(reading[0])]
     if dates:
-        return *dates[0], ""
+        return *dates[0], f"read as {_named(*dates[0])}" if dates[0] in _EPOCHS else ""
     if rate_hz and step:
         return _as_rate_states(rate_hz, step)
     factor, epoch = min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
@@ -195,7 +217,7 @@ def _of_gps(clock: Clock, name: str, others: Sequence[Clock]) -> Clock:
 
 
 def _named(factor: int, epoch: int) -> str:
-    return _DAYS_TO_1970.get(epoch, _UNITS[factor][-1])
+    return _EPOCHS.get((factor, epoch)) or _DAYS_TO_1970.get(epoch, _UNITS[factor][-1])
 
 
 def _is_date(unix_s: float) -> bool:
@@ -336,13 +358,23 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
 _WORDS = frozenset({"mark", "half", "sign", "fraction"})
 _MONTHS = [names.replace(" ", "|") for names in CONSTANTS["asc"]["months"]]
 _NAMED_MONTH = r"(?i)^(\d{{1,2}})[-./ ](?:{})[a-z]*[-./, ]+(\d{{2,4}})"
+#: ``Mon, Nov 24, 2025 2:05:12 PM``, or with the year at the end.
+_MONTH_FIRST = (
+    r"(?i)^(?:[a-z]{{3,9}},? )?(?:{})[a-z]*\.? +(\d{{1,2}}),? (?:(\d{{4}}),? )?"
+    r"(\d+:\d+(?::\d+(?:[.,]\d+)?)?(?: ?[ap]m)?)(?: (?:[a-z]{{3,4}})?(?:[-+]\d\d:?\d\d)?)?(?: (\d{{4}}))?$"
+)
+_COMPACT = r"^(\d{4})(\d\d)(\d\d)[T _-]?(\d\d)(\d\d)(\d\d)"
 
 
 def _numbered_months(texts: Series) -> Series:
-    """Return texts [N] in which a month between day and year is a number: ``24-Nov-2025`` becomes ``24.11.2025``."""
-    if texts.drop_nulls().head(1).str.contains(_NAMED_MONTH.format("|".join(_MONTHS))).any():
-        for number, names in enumerate(_MONTHS, 1):
-            texts = texts.str.replace(_NAMED_MONTH.format(names), f"${{1}}.{number}.${{2}}")
+    """Return texts [N] in which a named month is a number between day and year, and dates of digits have marks."""
+    if texts.drop_nulls().head(1).str.contains(_COMPACT).any():
+        return texts.str.replace(_COMPACT, "${1}-${2}-${3} ${4}:${5}:${6}")
+    every = "|".join(_MONTHS)
+    for form, result in ((_NAMED_MONTH, "${{1}}.{}.${{2}}"), (_MONTH_FIRST, "${{1}}.{}.${{2}}${{4}} ${{3}}")):
+        if texts.drop_nulls().head(1).str.contains(form.format(every)).any():
+            for number, names in enumerate(_MONTHS, 1):
+                texts = texts.str.replace(form.format(names), result.format(number))
     return texts
 
 

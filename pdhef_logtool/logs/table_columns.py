@@ -43,6 +43,8 @@ _REGULAR = 1.5
 _ENOUGH_ROWS = 0.9
 #: Lengths of two clocks of a table differ by less than this share.
 _ALIKE = 0.01
+#: A regular first column without a unit contains times beside so many columns.
+_FEWEST_COLUMNS = 3
 #: Share of steps that are not negative, of a column that may contain times.
 _ASCENDING_SHARE = 0.99
 
@@ -50,9 +52,18 @@ _ASCENDING_SHARE = 0.99
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
 _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS_NS}
+#: Products and quotients of units, with exponents.
+_SYMBOL = rf"(?:{'|'.join(map(re.escape, CONSTANTS['table_units']['symbols'].split()))})(?:\^?\**[-+]?\d|[⁻¹²³]+)?"
+_COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/·.]|\bper\b|\s)\s*{_SYMBOL})+")
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 #: Letters in ASCII.
 LATIN = str.maketrans(CONSTANTS["latin"])
+_ALPHABETS = {name: dict(pair.split("=") for pair in pairs.split()) for name, pairs in CONSTANTS["alphabets"].items()}
+_LETTERS = str.maketrans(
+    {u: latin for a in _ALPHABETS.values() for letter, latin in a.items() for u in (letter, letter.upper())}
+)
+#: Words, and single letters as symbols, of the Greek alphabet; a dot above the symbol of a quantity.
+_GREEK_WORD, _GREEK, _DOT = re.compile("[Ͱ-Ͽ]{3,}"), re.compile("[Ͱ-Ͽ]"), re.compile("(?<=[xyvψβ])\u0307")
 
 #: Words of titles in other alphabets, and their English.
 _TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
@@ -67,16 +78,22 @@ _WEEK_TIME = re.compile(
 _SECOND_NS = TIME_UNITS_NS["seconds"]
 #: Columns of a table in long form, with a row for each value.
 _SIGNAL = re.compile(
-    r"(?:signal|channel|variable|field|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
+    r"_?(?:signal|channel|variable|field|parameter|sensor|tag|key|telemetry|metric|measure|measurement|quantity|series|pid|name)"
+    r"(?:_?(?:name|id))?"
 )
-_VALUE = re.compile(r"(?:physical_|signal_|phys_|telemetry_|metric_)?(?:value|val|wert)")
+_VALUE = re.compile(
+    r"_?(?:physical_|signal_|phys_|telemetry_|metric_|measure_|measurement_)?(?:value|val|wert)(?:_double)?"
+)
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 
 
 def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
     text = _OTHER_ALPHABET.sub(lambda match: f" {_TRANSLATIONS[match[0]]} ", text)
-    text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(LATIN)).encode("ascii", "ignore").decode()
+    text = _GREEK_WORD.sub(lambda match: match[0].translate(_LETTERS), text.partition("\\")[0].translate(LATIN))
+    text = _DOT.sub("_dot", unicodedata.normalize("NFKD", text))
+    text = _GREEK.sub(lambda match: f"_{unicodedata.name(match[0]).split()[3].lower()}_", text).translate(_LETTERS)
+    text = text.encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
     return f"n_{name}" if name[0].isdigit() else name
 
@@ -93,7 +110,8 @@ def unique(names: Iterable[str]) -> list[str]:
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit, with or without brackets."""
-    return re.sub(r"[\s*\[\](){}]", "", text).lower() in _UNITS
+    text = re.sub(r"^\s*units?\s*:|[\[\](){}]", "", text, flags=re.IGNORECASE).strip().lower()
+    return text.replace(" ", "") in _UNITS or bool(_COMPOUND.fullmatch(text))
 
 
 def split_unit(text: str) -> tuple[str, str]:
@@ -102,7 +120,8 @@ def split_unit(text: str) -> tuple[str, str]:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
     match = _BRACKETED.match(text.strip())
-    return (match[1], match[2].strip()) if match and match[1] and is_unit(match[2]) else (text.strip(), "")
+    is_given = match and match[1] and is_unit(match[2]) and not match[2].isdigit()  # [1] is an index
+    return (match[1], match[2].strip()) if match and is_given else (text.strip(), "")
 
 
 def snake(name: str) -> str:
@@ -252,7 +271,13 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     if (given[1:] >= given[:-1]).sum() < _ASCENDING_SHARE * (len(given) - 1) or len(column) == 1:
         return 2 if column.dtype.kind == "M" else None
     is_unit_of_time = sheet.units.get(name, "").lower() in TIME_UNITS_NS or text.startswith("t_")
-    return 1 if _TIME_LIKE.search(text) else 2 if column.dtype.kind == "M" else 3 if is_unit_of_time else None
+    if _TIME_LIKE.search(text) or column.dtype.kind == "M" or is_unit_of_time:
+        return 1 if _TIME_LIKE.search(text) else 2 if column.dtype.kind == "M" else 3
+    steps = np.diff(given)
+    is_count = bool((steps == steps[0]).all()) and steps[0] == 1
+    is_regular = np.quantile(np.abs(steps - np.median(steps)), _ENOUGH_ROWS) <= _ALIKE * np.median(steps)
+    is_alone = len(sheet.columns) < _FEWEST_COLUMNS or name != next(iter(sheet.columns)) or name in sheet.units
+    return 4 if is_regular and not (is_count or is_alone) else None
 
 
 def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float | None) -> Clock:

@@ -25,9 +25,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.logs.mat_log import tables_of_variables
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
-from pdhef_logtool.logs.table_clocks import NO_TIME, placed, unwrapped, whole_days
-from pdhef_logtool.logs.table_columns import Sheet, by_times, is_unit, read_head, tables_of
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, placed, unwrapped, whole_days
+from pdhef_logtool.logs.table_columns import Sheet, by_times, field_name, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
@@ -35,18 +36,36 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 if TYPE_CHECKING:
     from polars import Series
 
+    from pdhef_logtool.logs.table_log import Table
+
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
 #: Cells below the header that show the decimal mark of the file.
 _CELLS_OF_HEAD = 10_000
 #: Cells that are in memory as texts at the same time.
 _CELLS_AT_ONCE = 1 << 23
-_CELL_END = "\x1f"
+_CELL_END, _SPACES = "\x1f", r"\s{2,}"
 #: Numbers, in any spelling, and times.
 _VALUE = re.compile(
     r"\s*([-+−]?(0x[\da-f]+|[\d.,'’\s]*\d[.,]?(e[-+]?\d+)?)|true|false|"
     r"\d{1,4}[./-]\d\d?[./-]\d{2,4}([T ].*)?|(\d\d?:)?\d\d?:\d\d([.,]\d+)?Z?(\s?[AP]M)?)\s*",
     re.IGNORECASE,
+)
+#: A number and its unit in one cell.
+_QUANTITY = re.compile(r"\s*[-+−]?\d[\d.,]*(?:e[-+]?\d+)?\s*([^\d\s.,][^\d]*)", re.IGNORECASE)
+#: The last line of the header of a file or of its channels.
+_END_OF_HEADER = re.compile(r"(?i)\W*(end[_ ]of[_ ]header|header[_ ]end)\W*")
+#: Marks of comments, and labels of the row of names where the first column contains no values.
+#: Labels of a rate, and of the time between rows.
+_RATES = {
+    "rate": r"(?:(?:sampl\w*|data|log\w*)[ _]?(?:rate|freq\w*)|freq\w*|abtast(?:rate|frequenz)|fs)(?: ?[[(]k?hz[])])?",
+    "step": r"(?:sampl\w*[ _]?(?:interval|period|time|step)|h_?resolution|delta_?[xt]|dt|abtastzeit)(?: ?[[(]\w+[])])?",
+}
+#: A channel in a list above the rows.
+_LISTED = re.compile(r"(?i)(?:channel|signal|name)(?: ?name)?\s*[:=]\s*(.+)")
+_COMMENT = re.compile(r"(?:[#%!;]|//)\s*")
+_LABELS = frozenset(
+    {"name", "names", "signal", "signals", "channel", "channels", "variable", "variables", "title", "label"}
 )
 codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
 
@@ -61,6 +80,8 @@ _RECEIVER = re.compile(
 _ALONG_HEADING = 0.95
 _CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
 
+#: Objects inside one another in a document.
+_DEEPEST = 8
 _MOST_ELEMENTS, _LARGEST = CONSTANTS["json"]["elements"], CONSTANTS["json"]["largest"]
 #: Values of a column and their rows.
 _Cells: TypeAlias = "tuple[array[int], list[Any]]"
@@ -73,19 +94,66 @@ def open_csv(file: TableFile) -> Tables:
     losses: list[Loss] = []
     with _text(file) as text:
         lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
-        separator = _separator(lines[-20:])
+        given_separator = re.match(r"(?i)\ufeff?\"?sep=(.)", lines[0]) if lines else None
+        separator = given_separator[1] if given_separator else _separator(lines)
         file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
         text.seek(0)
         rows = _rows(text, separator)
         head = [*islice(rows, _HEAD_LINES)]
+        if titles_of := _titles_of_kinds([row for _, row in head]):
+            return _tables_of_kinds(chain(head, rows), titles_of, file)
         titles, units, first = _layout([row for _, row in head], file.name)
+        stated_hz = _stated_rate(row for _, row in head[:first])
         fields, given = read_head(titles)
         given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
-    sheets, rate_hz = by_times("csv", columns, given), file.settings.rate_hz
+    sheets, rate_hz = by_times("csv", columns, given), file.settings.rate_hz or stated_hz
     tables = [table for sheet in sheets for table in tables_of(sheet, file.name, losses, rate_hz=rate_hz)]
+    return Tables("csv", tables, losses)
+
+
+def _stated_rate(head: Iterable[Sequence[str]]) -> float | None:
+    """Return the rows per second that a line above the columns states; None without one."""
+    for label, *values in (row for row in head if len(row) > 1):
+        number = next((cell for cell in values if cell.strip()), "")
+        value = re.match(r"\s*(\d+(?:[.,]\d*)?(?:e[-+]?\d+)?)\s*(\w*)", number, re.IGNORECASE)
+        of = next((kind for kind, pattern in _RATES.items() if re.fullmatch(pattern, label.strip(" \t:#").lower())), "")
+        if value and of and (amount := float(value[1].replace(",", "."))) > 0.0:
+            unit = (value[2] or re.sub(r".*\W(\w+)\W*", r"\1", label)).lower()
+            seconds = TIME_UNITS_NS.get(unit, TIME_UNITS_NS["s"]) / TIME_UNITS_NS["s"]
+            return amount * (1000.0 if unit == "khz" else 1.0) if of == "rate" else 1.0 / (amount * seconds)
+    return None
+
+
+def _titles_of_kinds(head: Sequence[Sequence[str]]) -> dict[str, list[str]]:
+    """Return the titles of the columns of each kind of row, by the first cell of the rows; empty for other files.
+
+    Remarks give the titles (``# Fix,Latitude,...``), or rows ``FMT`` of an autopilot (type, length, name, format, ...).
+    """
+    titles_of = {
+        row[0].lstrip("#% "): [c.strip() for c in row[1:]] for row in head if row and row[0].startswith(("#", "%"))
+    }
+    titles_of |= {row[3].strip(): [c.strip() for c in row[5:]] for row in head if len(row) > 5 and row[0] == "FMT"}
+    kinds = {row[0].strip() for row in head if len(row) > 1 and row[0][:1].isalpha() and row[0] != "FMT"}
+    return {k: titles for k, titles in titles_of.items() if k in kinds and len(titles) > 1}
+
+
+def _tables_of_kinds(
+    rows: Iterable[tuple[int, Sequence[str]]], titles_of: Mapping[str, Sequence[str]], file: TableFile
+) -> Tables:
+    """Return a table for each kind of row with times."""
+    lines: dict[str, list[tuple[int, list[str]]]] = {}
+    for number, (kind, *cells) in ((n, row) for n, row in rows if row and row[0].strip() in titles_of):
+        lines.setdefault(kind.strip(), []).append((number, [cell.strip() for cell in cells]))
+    losses: list[Loss] = []
+    tables: list[Table] = []
+    for kind, its in lines.items():
+        fields, given = read_head(titles_of[kind])
+        columns = _columns(its, fields, file, losses, ".", given)
+        with suppress(LogError):  # parameters and messages have no times
+            tables += tables_of(Sheet(field_name(kind), columns, given), file.name, losses)
     return Tables("csv", tables, losses)
 
 
@@ -126,6 +194,9 @@ def _text(file: TableFile) -> io.TextIOWrapper:
 
 def _rows(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of the last line and the cells of each row; a row with an endless cell has one cell."""
+    if separator == _SPACES:
+        yield from ((i, re.split(separator, line.strip())) for i, line in enumerate(lines, 1))
+        return
     reader = csv.reader((" ".join(n.split()) for n in lines) if separator == " " else lines, delimiter=separator)
     while True:
         try:
@@ -136,12 +207,19 @@ def _rows(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return the delimiter that every line contains equally often, otherwise the most frequent one, or a space."""
-    lines = [re.sub(r'"[^"]*"', "", line) for line in lines]
+    """Return the delimiter that every line contains equally often, otherwise the most frequent one, or spaces.
+
+    Several spaces are the delimiter if one of them is in a title.
+    """
+    every = [re.sub(r'"[^"]*"', "", line) for line in lines]
+    lines = every[-20:]
     counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",")}
     regular = next((s for s, n in counts.items() if n and min(n) > 0 and max(n) == min(n)), "")
     frequent = max(counts, key=lambda s: sum(counts[s]))
-    return regular or (frequent if any(counts[frequent]) else " ")
+    widths = [len(re.split(_SPACES, line.strip())) for line in every]
+    titles = (line for line, n in zip(every, widths, strict=True) if n == widths[-1] > 1)
+    is_aligned = len({*widths[-20:]}) == 1 and any(re.search(r"[a-z.] [a-z(]", t, re.IGNORECASE) for t in titles)
+    return regular or (frequent if any(counts[frequent]) else _SPACES if is_aligned else " ")
 
 
 def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], Sequence[str], int]:
@@ -149,26 +227,52 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     lengths = Counter(len(row) for row in rows[-20:])
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
-    numbers = [i for i, row in enumerate(rows) if len(row) == width > 1 and _share(row, _VALUE.fullmatch) >= 0.5]
+    header = max((i for i, row in enumerate(rows) if row and _END_OF_HEADER.fullmatch(row[0])), default=-1)
+    starts = [row[0].strip() for row in rows[-20:] if len(row) == width]
+    has_labels = _share(starts, _is_value) >= 0.9 or not any(starts)
+    # A text in a first column of numbers labels a line of the head: a sample rate, a block size.
+    data = [i for i, row in enumerate(rows) if row and not (has_labels and row[0].strip() and not _is_value(row[0]))]
+    numbers = [i for i in data if i > header and len(rows[i]) == width > 1 and _share(rows[i], _is_value) >= 0.5]
     # Above the titles there may be a row with the numbers of the channels.
-    full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width))), (0, []))
+    full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width, header))), (0, []))
+    listed = [m[1] for row in rows if (m := _LISTED.fullmatch(", ".join(row))) is not None]
+    if not above and numbers and width - len(listed) in (0, 1):
+        return ["Time", *listed][-width:], [], numbers[0]
     if not above:
         got = "none" if numbers else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
-    # Titles, above them those of groups, below them units, sources and the name of an index.
-    names = max(reversed(above[-3:]), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
+    # Titles, above them those of groups, around them units, below them sources and the name of an index.
+    last = [i for i in above if i > header][-3:]
+    names = max(reversed(last), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
+    is_labelled = not any(row[0].strip() for row in rows[full : full + 3])
+    names = next((i for i in above if is_labelled and rows[i][0].strip().lower() in _LABELS), names)
     below = range(names + 1, full + 1)
-    first = next(i for i in below if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
-    units = next((rows[i] for i in above if names < i < first and _share(rows[i], is_unit) >= 0.5), [])
-    groups = rows[names - 1] if names - 1 in above else []
+    below_data = (i for i in below if i == full or i in data)
+    first = next(i for i in below_data if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
+    of_units = next((i for i in above if i != names and _share(rows[i], is_unit) >= 0.5), -1)
+    groups = rows[names - 1] if names - 1 in above and not is_labelled and of_units != names - 1 else []
     under = [rows[i] for i in above if names < i < first]
-    return _joined(rows[names], groups, under), units, first
+    titles = _joined(rows[names][:width], groups, under)
+    if len(titles) < width and rows[full][-1].strip():  # names of the rows without a title, as R writes them
+        titles = ["row", *titles]
+    return titles, rows[of_units] if of_units >= 0 else [], first
 
 
-def _titles(rows: Sequence[Sequence[str]], width: int) -> list[int]:
-    """Return the rows of texts above the last row; rows may end with a separator."""
+def _titles(rows: Sequence[Sequence[str]], width: int, header: int) -> list[int]:
+    """Return the rows of texts above the last row.
+
+    Rows may end with a separator; titles behind a header may have one for a comment.
+    """
     widths = {width, width - 1} if not rows[-1][-1].strip() else {width}
-    return [i for i, row in enumerate(rows[:-1]) if len(row) in widths and _share(row, _VALUE.fullmatch) < 0.5]
+    texts = [i for i, row in enumerate(rows[:-1]) if _share(row, _is_value) < 0.5]
+    exact = [i for i in texts if len(rows[i]) in widths]
+    return exact if any(i > header for i in exact) else [i for i in texts if abs(len(rows[i]) - width) == 1 < width]
+
+
+def _is_value(cell: str) -> bool:
+    """Return whether a cell is a number, a time, or a number with its unit."""
+    with_unit = _QUANTITY.fullmatch(cell)
+    return bool(_VALUE.fullmatch(cell) or (with_unit and is_unit(with_unit[1])))
 
 
 def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
@@ -180,8 +284,8 @@ def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequen
 
 def _uncommented(row: Sequence[str], width: int) -> Sequence[str]:
     """Return a row of ``width`` cells, without the mark of a comment and an empty cell at its end."""
-    if row and row[0].startswith("#"):
-        title = row[0].lstrip("# ")
+    if row and (mark := _COMMENT.match(row[0])):
+        title = row[0][mark.end() :].lstrip("# ")
         row = [title, *row[1:]] if title or len(row) <= width else row[1:]
     return row[:-1] if len(row) == width + 1 and not row[-1].strip() else row
 
@@ -321,15 +425,89 @@ def _vbo_stamps(columns: Mapping[str, Any], created: Iterable[tuple[str, str, st
 
 
 def open_json_lines(file: TableFile) -> Tables:
-    """Read JSON lines; raises LogError if no line is an object, or no key contains times."""
+    """Read JSON lines, or one document; raises LogError if there is no object, or no key contains times."""
+    head, following = file.stream.readline(), file.stream.readline()
+    file.stream.seek(0)
+    document: Any = None
+    if not following or _record_of_json(head) is None:
+        with suppress(ValueError, RecursionError):
+            document = json.load(file.stream)
+        file.stream.seek(0)
+    if records := max(_lists_of_records(document, _DEEPEST), key=len, default=[]):
+        return _tables_of_records(records, file, "json")
+    if not isinstance(document, dict) or not any(isinstance(value, dict | list) for value in document.values()):
+        return _tables_of_records(map(_record_of_json, file.stream), file, "json-lines")
+    losses: list[Loss] = []
+    variables = ((name, _array_of(value, _DEEPEST)) for name, value in document.items())
+    return Tables("json", tables_of_variables(variables, file, losses), losses)
+
+
+def open_line_protocol(file: TableFile) -> Tables:
+    """Read lines of a measurement, its tags, its fields and a time in ns, as databases of time series take them."""
+    return _tables_of_records(map(_record_of_line, file.stream), file, "lines")
+
+
+def _record_of_json(line: bytes) -> dict[str, Any] | None:
+    """Return the object of a line: empty for an empty line, None for a line without one."""
+    try:
+        record = json.loads(line) if line.strip() else {}
+    except (ValueError, RecursionError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def _record_of_line(line: bytes) -> dict[str, Any] | None:
+    """Return the fields of a line by measurement and name; empty for a comment, None for another text."""
+    text = line.decode("utf-8", errors="replace").strip()
+    if not text or text.startswith("#"):
+        return {}
+    parts = re.fullmatch(r"((?:[^\s,\\]|\\.)+)(?:,(?:[^\s\\]|\\.)*)?\s+(\S.*?)\s+(\d+)", text)
+    fields = {} if parts is None else dict(re.findall(r"((?:[^,=\\]|\\.)+)=([-+.\deE]+)[iu]?(?:,|$)", parts[2]))
+    return {"time": int(parts[3]), parts[1]: {n: float(v) for n, v in fields.items()}} if parts and fields else None
+
+
+def _lists_of_records(value: Any, depth: int) -> Iterator[list[dict[str, Any]]]:
+    """Yield the lists of objects in a document, and tables of their columns' names and rows."""
+    if isinstance(value, dict) and depth:
+        names = next((value[key] for key in ("columns", "fields", "header") if isinstance(value.get(key), list)), None)
+        rows = next((value[key] for key in ("data", "values", "rows") if isinstance(value.get(key), list)), None)
+        if names and rows and all(isinstance(row, list) and len(row) == len(names) for row in rows):
+            titles = [str(name.get("name", name) if isinstance(name, dict) else name) for name in names]
+            yield [dict(zip(titles, row, strict=True)) for row in rows]
+            return
+        if value and all(key.isdigit() and isinstance(inner, dict) for key, inner in value.items()):
+            value = [[*value.values()]]
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _lists_of_records(inner, depth - 1)
+    elif isinstance(value, list) and depth:
+        if len(value) > _MOST_ELEMENTS and all(isinstance(inner, dict) for inner in value):
+            yield value
+        else:
+            for inner in value[:_MOST_ELEMENTS]:
+                yield from _lists_of_records(inner, depth - 1)
+
+
+def _array_of(value: Any, depth: int) -> Any:
+    """Return objects with lists of numbers, or of dates, as arrays; keys that count rows are a list."""
+    if isinstance(value, dict) and depth:
+        if len(value) > 1 and all(key.isdigit() for key in value):
+            return _array_of([*value.values()], depth)
+        return {name: _array_of(inner, depth - 1) for name, inner in value.items()}
+    if isinstance(value, list):
+        with suppress(ValueError, TypeError):
+            is_text = any(isinstance(v, str) for v in value[:2])
+            return (
+                np.array([v.rstrip("Z") for v in value], "datetime64[ns]") if is_text else np.array(value, np.float64)
+            )
+    return value if isinstance(value, str) else None
+
+
+def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str) -> Tables:
+    """Return the tables of objects in the order of time; None counts as a damaged line."""
     losses: list[Loss] = []
     lines, wrong = array("q"), array("q")
     cells: dict[str, _Cells] = {}
-    for number, line in enumerate(file.stream, 1):
-        try:
-            record = json.loads(line) if line.strip() else {}
-        except (ValueError, RecursionError):
-            record = None
+    for number, record in enumerate(records, 1):
         if not isinstance(record, dict):
             wrong.append(number)
             continue
@@ -340,18 +518,18 @@ def open_json_lines(file: TableFile) -> Tables:
         file.limits.check("array_width", len(cells), file.name)
         lines.append(number)
     if not cells:
-        remedy = "jq -c '.[]' FILE writes the objects of an array as lines"
+        remedy = "each line, or each element of an array, is one object with a time"
         raise LogError(expected="a JSON object a line", got="none", where=file.name, remedy=remedy)
     if wrong:
         place = f"{file.name}, from line {wrong[0]} on"
-        losses.append(Loss("bad-row", "line that is no JSON object", place, count=len(wrong)))
+        losses.append(Loss("bad-row", "line without an object", place, count=len(wrong)))
     file.limits.check_table(8 * len(lines) * len(cells), file.size, file.name)
     fields, units = read_head([*cells])
     columns = {
         name: _json_column(name, cells[path], lines, file, losses) for name, path in zip(fields, cells, strict=True)
     }
-    sheet = Sheet("json", columns, units)
-    return Tables("json-lines", list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
+    sheet = Sheet("json" if kind != "lines" else "lines", columns, units)
+    return Tables(kind, list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
 
 
 def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:

@@ -23,15 +23,21 @@ from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumer
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import (
     COUNTING,
+    KNOWN,
+    NOT_VALUES,
+    OTHER_QUANTITIES,
     STATES,
     UNIT_TEXTS,
+    UNITS,
     VOCABULARY,
     Meaning,
     is_command,
     meaning_among,
+    plain_unit,
+    unit_of,
     words_of,
 )
-from pdhef_logtool.mapping.proposals import MOST_PROPOSED, propose
+from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
@@ -223,25 +229,64 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 
 
 def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> Iterator[Named]:
-    """Yield the fields without a usable name that the drive's motion explains, if no name gives a quantity."""
-    if {"speed", "rate", "acceleration", "steering"} & {n[3].quantity for n in named}:
-        return
+    """Yield the fields without a usable name that the drive's motion explains, for quantities that no name gives."""
+    there = {(n[3].quantity, part) for n in named if n[1] != "command" for part in (n[3].part, "any")}
+    wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
+    wanted += [] if ("steering", "any") in there else [("steering", "")]
+    columns = dict(_named_columns(named)) if wanted else {}
     sensors = {t.name: t for t, role in topics if role == "sensor"}
-    requests = {
-        name: [
-            f.path.removesuffix("[]")
-            for f in log.fields(name, quiet=True)
-            if f.kind == "number" and all(len(w) == 1 or w.isdigit() or w in COUNTING for w in words_of(f.path))
-        ][:MOST_PROPOSED]
-        for name in sensors
-    }
+    by_name = {(n[0].name, n[2].path) for n in named}
+    for name in sensors if wanted else ():
+        for info in log.fields(name, quiet=True):
+            is_column = info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
+            units = _units_without_name(info) if is_column and (name, info.path) not in by_name else {}
+            if units and len(columns) < MOST_PROPOSED:
+                columns[name, info.path.removesuffix("[]")] = units, None
+    if all(role is not None for _, role in columns.values()):
+        return
+    requests: dict[str, list[str]] = {}
+    for topic_name, path in columns:
+        requests.setdefault(topic_name, []).append(path)
     pieces = Pieces(log)
-    seen = pieces.read({name: paths for name, paths in requests.items() if paths})
-    keys, why = [*seen], "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
-    for place, (quantity, part, unit) in propose(pieces, [*seen.values()]).items():
-        topic, path = keys[place]
-        meaning = Meaning(quantity, part, PROPOSED, unit, dict(HYPOTHESES[quantity]).get(unit), why)
-        yield sensors[topic], "sensor", FieldInfo(path, "number"), meaning, False
+    read = {key: seen for key, seen in pieces.read(requests).items() if seen.changes}
+    given = [columns.get(key) or columns[key[0], key[1].partition("[")[0]] for key in read]
+    compared = [Column(seen, *its) for seen, its in zip(read.values(), given, strict=True)]
+    why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
+    for place, (quantity, part, unit) in propose(pieces, compared, wanted).items():
+        topic_name, path = [*read][place]
+        scale = dict(given[place][0][quantity]).get(unit)
+        meaning = Meaning(quantity, part, PROPOSED, unit if scale else "", scale, why)
+        yield sensors[topic_name], "sensor", FieldInfo(path, "number"), meaning, False
+
+
+def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tuple[Units, tuple[str, str]]]]:
+    """Yield the field that has each of :data:`ROLES` by its name, without a speed that of a wheel, and its units."""
+    usable = [n for n in named if n[1] != "command" and not n[4] and "[]" not in n[2].path]
+    for role in ROLES:
+        its = [n for n in usable if n[3].quantity == role[0] and n[3].part in (role[1], "")]
+        its = its or [n for n in usable if role[0] == "speed" and n[3].quantity == "wheel speed"]
+        if its:
+            topic, _, info, meaning, _ = max(its, key=lambda n: n[3].strength)
+            units = HYPOTHESES[meaning.quantity] if meaning.scale is None else ((meaning.unit, meaning.scale),)
+            yield (topic.name, info.path), ({role[0]: units}, role)
+
+
+def _units_without_name(info: FieldInfo) -> Units:
+    """Return the possible units of a field by quantity, if its name contains no word with another meaning."""
+    words = set(words_of(info.path))
+    unit = plain_unit(info.unit)
+    named = f"{info.path.rpartition('.')[2]}_{unit}"
+    kinds = {"speed": "speed", "acceleration": "acceleration", "rate": "rate", "steering": "angle"}
+    given = {q: ((u, s),) for q, kind in kinds.items() for u, s in [unit_of(named, kind)] if s is not None}
+    if "acceleration" in given:  # its unit contains that of a speed, and that of a rate that of an angle
+        given.pop("speed", None)
+    if OTHER_QUANTITIES & words:
+        given.pop("steering", None)
+    given.pop("steering" if "rate" in given and given["rate"][0][0] not in UNITS["angle"] else "rate", None)
+    if given and not words & NOT_VALUES and not is_command(info.path):
+        return given
+    unknown = all(len(w) == 1 or w.isdigit() or w in COUNTING or w not in KNOWN for w in words)
+    return {q: HYPOTHESES[q][:2] for q in kinds} if unknown and not unit and not words & NOT_VALUES else {}
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
@@ -404,7 +449,7 @@ def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
 
 def triad_of(item: Field) -> str:
     """Return the key shared by the three axes of a vector: topic and struct, or the words without the axis."""
-    struct, _, leaf = re.sub(r"\[\d+\]$", "", item.path).rpartition(".")
+    struct, _, leaf = re.sub(r"\[\d+\]$|_?[0-4]$", "", item.path).rpartition(".")
     return f"{item.topic.name}.{struct or '_'.join(w.rstrip('xyz') for w in words_of(leaf))}"
 
 

@@ -36,7 +36,7 @@ UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
 CERTAIN = 0.9
 #: Energies of rare units.
-RARE = {"mph": 1.5, "mg": 1.5}
+RARE = {"mph": 1.5, "mg": 1.5, "ft/s²": 3.0}
 
 
 @dataclass(slots=True)

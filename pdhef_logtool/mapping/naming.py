@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
 
@@ -36,10 +37,10 @@ _UNIT_PHRASES: tuple[tuple[str, str], ...] = tuple(VOCABULARY["unit_phrases"].it
 _SPELLED_UNITS = tuple((re.compile(pattern), sign) for pattern, sign in VOCABULARY["unit_parts"].items())
 _SYNONYMS: dict[str, str] = VOCABULARY["synonyms"]
 _WORDS = {name: frozenset(words.split()) for name, words in VOCABULARY["words"].items()}
-COUNTING = _WORDS["counting"]
+COUNTING, NOT_VALUES, OTHER_QUANTITIES = (_WORDS[name] for name in ("counting", "not_values", "other_quantities"))
 #: Words by which names that are written as one word are cut.
-_KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
-_WHOLE, _BARE = _KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS
+KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
+_WHOLE, _BARE = KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS
 _CORNERS: dict[str, str] = VOCABULARY["corners"]
 _GERMAN: dict[str, str] = VOCABULARY["german_corners"]
 #: Names of the wheels in the order of WHEELS, and a name of a wheel in the name of a field.
@@ -53,7 +54,7 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
-    name = _SIDES.sub(lambda m: f"_{m[1][0]}{m[2]}", name.translate(LATIN))
+    name = _SIDES.sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
     name = _CORNER_AT_END.sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
         for piece in [part] if part.lower() in _WHOLE else _CAMEL.findall(part):
@@ -63,8 +64,11 @@ def words_of(name: str) -> tuple[str, ...]:
 
 #: Last words of names of enumerations, and of what is measured.
 STATES = frozenset({"state", "states", "status"})
-#: A wheel as ``FrL`` after letters of a speed.
-_SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
+#: An element of a vector, and words of vectors.
+_NUMBERED, _VECTORS = re.compile(r"(.*?)_?([0-4])"), _WORDS["vectors"]
+#: A wheel as ``FrL``, ``BckRi`` or ``LeFrnt`` in the capitals of a name.
+_END, _SIDE = "(Fro?n?t|Fr|Front|Bck|Back|Rear|Rr|Re)", "(Lft|Left|Le|Lt|L|Rght|Right|Ri|Rt|R)"
+_SIDES = re.compile(rf"(?<=[a-z_]){_END}{_SIDE}(?![a-z])|(?<=[a-z_]){_SIDE}{_END}(?![a-z])")
 #: A wheel before or after a word without a capital between: ``LFspeed``, ``WHEELSPEEDFL``.
 _CORNER_AT_END = re.compile(
     r"(?<![A-Za-z])(?:[LR][FR]|[FR][LR])(?=[a-z]{2})|(?<=SPEED|speed)(?:[FR][LR]|[fr][lr])(?![A-Za-z])"
@@ -73,20 +77,21 @@ _CORNER_AT_END = re.compile(
 _CORNER_SPEED = re.compile(
     r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)|(?:acc|accel|gyro?|vel|speed)(?=[xyz]$)"
     r"|(?:lat|lateral|long?|longitudinal|lineal|inline|vert|vertical)(?=g$)"
+    r"|[avgn](?=(?:lat|long?|lateral|longitudinal|quer|laengs|steer|steering|yaw|car|veh|wheel|gps)$)"
 )
 
 
 def _unglued(piece: str) -> list[str]:
     """Split a piece into known words; return the piece itself if it contains other letters."""
-    if piece not in _KNOWN and (letters := _CORNER_SPEED.match(piece)):
+    if piece not in KNOWN and (letters := _CORNER_SPEED.match(piece)):
         return [letters[0], piece[letters.end() :]]
-    if piece in _KNOWN or len(piece) < 5:
+    if piece in KNOWN or len(piece) < 5:
         return [piece]
     best: list[list[str] | None] = [[]] + [None] * len(piece)
     for end in range(1, len(piece) + 1):
         for start in range(max(0, end - 16), end):
             before = best[start]
-            if before is not None and piece[start:end] in _KNOWN:
+            if before is not None and piece[start:end] in KNOWN:
                 best[end] = [*before, piece[start:end]]
                 break
     return best[-1] or [piece]
@@ -117,7 +122,9 @@ class Meaning:
 
 def is_command(*names: str) -> bool:
     """Return whether the name of a topic, type or field describes a command, not a measurement."""
-    return any(_WORDS["commands"] & set(words_of(n)) for n in names)
+    words = [set(words_of(n)) for n in names]
+    # The reference of a stability controller is the speed of the vehicle.
+    return any(_WORDS["commands"] & w and not {"v", "vehicle", "ref"} <= w for w in words)
 
 
 def plain_unit(text: str) -> str:
@@ -171,6 +178,10 @@ def _spelled_out(path: str, there: Collection[str]) -> str:
         return f"{gyro[1]}gyro_{gyro[2]}"
     leaf = path.rpartition(".")[2]
     struct = path.removesuffix(leaf)
+    if (numbered := _NUMBERED.fullmatch(leaf)) and _VECTORS & set(words_of(numbered[1])):
+        numbers = {m[2] for p in there if (m := _NUMBERED.fullmatch(p.removeprefix(struct))) and m[1] == numbered[1]}
+        if numbers in ({"0", "1", "2"}, {"1", "2", "3"}):
+            return f"{struct}{numbered[1]}_{'xyz'[sorted(numbers).index(numbered[2])]}"
     beside = {p.removeprefix(struct).lower() for p in there if p.startswith(struct)}
     short = (names[leaf.lower()] for needed, names in _SHORT_NAMES if leaf.lower() in names and needed <= beside)
     return struct + next(short, _with_wheel(leaf, beside))
@@ -201,8 +212,8 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
         return None
     # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
     kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
-    kept |= {w for w in leaf_words[-1:] if w not in STATES or len(leaf_words) == 1}
-    if _WORDS["not_values"] & kept or _WORDS["not_values"] & set(inner) - {"state", "status", "orientation"}:
+    kept |= {w for w in leaf_words[-1:] if (w not in STATES and leaf_words[-2:-1] != ("per",)) or len(leaf_words) == 1}
+    if NOT_VALUES & kept or NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None
     index = re.search(r"\[(\d+)\]$", leaf)
     column = None if index is None else int(index[1])
@@ -306,7 +317,7 @@ def _quantity(
         "@around": strength < 1.0,
         "@delta": "delta" in leaf <= _WORDS["of_delta"],
         "@letters": leaf <= set("xyz"),
-        "@v_axis": leaf_words[0] == "v" and leaf_words[1:2] != () and leaf_words[1] in _AXES,
+        "@v_axis": any(first == "v" and second in _AXES for first, second in pairwise(leaf_words)),
         "@bare_v": "v" in leaf <= _WORDS["of_v"],
         **{f"@unit_{kind.replace(' ', '_')}": bool(unit_of(named, kind)[0]) for kind in UNITS},
         **{f"@place_{w}": leaf - {w} <= _PLACE_OR_UNIT for w in leaf - _PLACE_WORDS},

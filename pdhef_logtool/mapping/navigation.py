@@ -225,7 +225,8 @@ class _Instrument:
             units = {p: replace(self.meanings[p], scale=mapped.scale) for p in mapped.paths if p in self.meanings}
             self.meanings |= units
         first = {m.quantity: path for path, m in reversed(self.meanings.items())}
-        self.places = {name: self.source(name, first[q]) for name, q in _PLACES.items() if q in first}
+        places = {name: first[q] for name, q in _PLACES.items() if q in first}
+        self.places = {name: self.source(name, p, self.meanings[p].scale or 1.0) for name, p in places.items()}
         self.velocities = [*_horizontal(self.meanings)]
         angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
         self.angles = {path: meaning for meaning, path in angles}
@@ -251,7 +252,8 @@ class _Instrument:
     def has_place(self) -> bool:
         """Return whether there are degrees of latitude and longitude of a moving car."""
         limits = zip(_PLACES, (90.0, 180.0), strict=True)
-        return all(n in self.places and _is_place(self.seen.get(self.places[n].paths[0]), most) for n, most in limits)
+        its = ((self.places.get(n), most) for n, most in limits)
+        return all(s is not None and _is_place(self.seen.get(s.paths[0]), most, s.scale) for s, most in its)
 
     @property
     def course(self) -> FloatArray:
@@ -399,11 +401,11 @@ def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
     return math.copysign(1.0, relation.slope)
 
 
-def _is_place(seen: Seen | None, most: float) -> bool:
-    """Return whether values can be degrees of latitude or longitude of a moving car."""
-    if seen is None or not seen.changes or not 0.01 < seen.largest <= most:
+def _is_place(seen: Seen | None, most: float, scale: float | tuple[float, ...]) -> bool:
+    """Return whether values times ``scale`` can be degrees of latitude or longitude of a moving car."""
+    if seen is None or not seen.changes or not isinstance(scale, float) or not 0.01 < seen.largest * scale <= most:
         return False
-    return float(np.nanmax(seen.cells) - np.nanmin(seen.cells)) < WIDEST_DEG
+    return float(np.nanmax(seen.cells) - np.nanmin(seen.cells)) * scale < WIDEST_DEG
 
 
 def _direction(north: FloatArray, east: FloatArray) -> FloatArray:

@@ -1,62 +1,120 @@
-"""Quantities of columns without names, by physics: a_x ≈ v̇, a_y ≈ v r, and steering against the path's curvature."""
+"""Quantities of columns whose names give none, by physics: a_x ≈ v̇, a_y ≈ v r, and steering against curvature.
+
+Columns with a named quantity take part in the relations; units, where a column has one, exclude quantities.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from itertools import permutations, product
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.mapping.evidence import Pieces, Seen, fit
-from pdhef_logtool.mapping.naming import VOCABULARY
+from pdhef_logtool.mapping.evidence import Fit, Pieces, Seen, fit
 from pdhef_logtool.records.signals import FloatArray
 
 #: Quantities and parts that a proposal consists of, and the range of the largest value of each in a drive, SI.
-_QUANTITIES = (("speed", "x"), ("acceleration", "x"), ("acceleration", "y"), ("rate", "z"))
+ROLES = (("speed", "x"), ("acceleration", "x"), ("acceleration", "y"), ("rate", "z"))
 _LARGEST = {"speed": (4.0, 90.0), "acceleration": (0.7, 16.0), "rate": (0.04, 2.5)}
 #: Most columns that are compared; least correlation of a relation; 1-sigma of the logarithm of its gain; how much surer
 #: the best proposal must be.
 MOST_PROPOSED, LEAST, SIGMA, MARGIN = 24, 0.8, 0.15, 1.0
+#: Possible units and their factors to SI, by quantity.
+Units: TypeAlias = Mapping[str, Sequence[tuple[str, float]]]
+#: Column of each role, None without one.
+_Places: TypeAlias = tuple[int | None, ...]
 
 
-def propose(pieces: Pieces, columns: Sequence[Seen]) -> dict[int, tuple[str, str, str]]:
-    """Return quantity, part and unit by the place of a column: speed, accelerations, yaw rate and a steering angle.
+class Column(NamedTuple):
+    """Values of a column, and its possible units with their factors by quantity; ``role``: by its name, else None."""
+
+    seen: Seen
+    units: Units
+    role: tuple[str, str] | None = None
+
+
+def propose(pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[str, str]]) -> dict[int, tuple[str, ...]]:
+    """Return quantity, part and unit by the place of a column without a role, for the wanted ones of :data:`ROLES`.
 
     Only one assignment may explain the drive: without speeding up, a yaw rate, a_y and a steering angle are alike. The
     unit of a steering angle stays open (empty).
     """
-    cells = [pieces.smooth(c.cells) for c in columns[:MOST_PROPOSED]]
-    ways = sorted(_ways(pieces, columns, cells), reverse=True)
+    cells = [pieces.smooth(c.seen.cells) for c in columns]
+    options = [_options(columns, role, wanted) for role in ROLES]
+    ways = sorted(_ways(pieces, columns, cells, options), key=lambda way: -way[0])
     if not ways or any(score > ways[0][0] - MARGIN and places != ways[0][1] for score, places, _ in ways):
         return {}
     _, places, units = ways[0]
-    speed, rate = (cells[places[i]] * VOCABULARY["possible_units"][_QUANTITIES[i][0]][units[i]] for i in (0, -1))
+    chosen = {p: (*q, u) for p, q, u in zip(places, ROLES, units, strict=True) if p is not None}
+    factor = {p: dict(columns[p].units[q])[u] for p, (q, _, u) in chosen.items()}
+    proposed = {p: meaning for p, meaning in chosen.items() if columns[p].role is None}
+    v, _, y, r = places
+    if v is None or (r is None and y is None) or ("steering", "") not in wanted:
+        return proposed
+    speed = cells[v] * factor[v]
     with np.errstate(invalid="ignore", divide="ignore"):
+        rate = cells[r] * factor[r] if r is not None else cells[y or 0] * factor[y or 0] / speed
         curvature = np.where(speed > 1.0, rate / speed, np.nan)
-    relations = ((i, fit(c, curvature)) for i, c in enumerate(cells) if i not in places)
-    surest, steering = max(((abs(r.correlation), i) for i, r in relations if r is not None), default=(0.0, 0))
-    proposed = {p: (*q, u) for p, q, u in zip(places, _QUANTITIES, units, strict=True)}
+    free = [i for i, c in enumerate(columns) if i not in chosen and c.role is None and "steering" in c.units]
+    relations = ((i, fit(cells[i], curvature)) for i in free)
+    surest, steering = max(((abs(f.correlation), i) for i, f in relations if f is not None), default=(0.0, 0))
     return proposed | ({steering: ("steering", "", "")} if surest > LEAST else {})
 
 
+def _options(columns: Sequence[Column], role: tuple[str, str], wanted: Sequence[tuple[str, str]]) -> list[int | None]:
+    """Return the columns that may have a role: the named ones, else those without a name if the role is wanted."""
+    named = [i for i, c in enumerate(columns) if c.role == role]
+    free = [i for i, c in enumerate(columns) if c.role is None and role[0] in c.units] if role in wanted else []
+    return named[:1] or [*free, None]
+
+
 def _ways(
-    pieces: Pieces, columns: Sequence[Seen], cells: Sequence[FloatArray]
-) -> Iterator[tuple[float, tuple[int, ...], tuple[str, ...]]]:
+    pieces: Pieces, columns: Sequence[Column], cells: Sequence[FloatArray], options: Sequence[Sequence[int | None]]
+) -> Iterator[tuple[float, _Places, tuple[str, ...]]]:
     """Yield evidence, columns and units of the assignments that the drive's motion supports."""
-    units = [[*VOCABULARY["possible_units"][q].items()][:2] for q in _LARGEST]  # the others are rare
-    for v in (i for i, c in enumerate(cells) if np.fmin.reduce(c) > -0.05 * columns[i].largest):
-        others = [i for i in range(len(cells)) if i != v]
-        along = ((x, fit(cells[x], pieces.rate_of(columns[v].cells))) for x in others)
-        for x, ahead in [(x, f) for x, f in along if f is not None and f.correlation > LEAST]:
-            for y, r in permutations([i for i in others if i != x], 2):
-                left = fit(cells[y], cells[r] * cells[v])
-                if left is None or abs(left.correlation) < LEAST:
-                    continue
-                evidence = sum(math.atanh(min(abs(f.correlation), 0.999)) for f in (ahead, left))
-                for (su, s), (au, a), (ru, w) in product(*units):
-                    off = sum((math.log(g) / SIGMA) ** 2 for g in (ahead.slope * a / s, abs(left.slope) * a / (s * w)))
-                    sizes = (columns[i].largest * u for i, u in zip((v, x, y, r), (s, a, a, w), strict=True))
-                    limits = (_LARGEST[quantity] for quantity, _ in _QUANTITIES)
-                    if all(low < size < high for size, (low, high) in zip(sizes, limits, strict=True)):
-                        yield evidence - 0.5 * off, (v, x, y, r), (su, au, au, ru)
+    of_v, of_x, of_y, of_r = options
+    for v in (i for i in of_v if i is not None and np.fmin.reduce(cells[i]) > -0.05 * columns[i].seen.largest):
+        change = pieces.rate_of(columns[v].seen.cells)
+        along = {x: _related(cells[x], change) for x in of_x if x is not None}
+        turns = {
+            (y, r): _related(cells[y], cells[r] * cells[v])
+            for y, r in product(of_y, of_r)
+            if y is not None and r is not None and y != r
+        }
+        xs = [x for x in of_x if (f := along.get(x)) is None or f.correlation > 0.0]
+        for x, (y, r) in product(xs, product(of_y, of_r)):
+            ahead, left, places = along.get(x), turns.get((y, r)), (v, x, y, r)
+            free = {p for p in places if p is not None and columns[p].role is None}
+            related = {v, x} if ahead is not None else set()
+            related |= {v, y, r} if left is not None else set()
+            # An acceleration without a lateral one may be the derivative of the speed.
+            if (
+                not free <= related
+                or (x in free and y is None)
+                or len({*places} - {None}) < len(places) - places.count(None)
+            ):
+                continue
+            evidence = sum(math.atanh(min(abs(f.correlation), 0.999)) for f in (ahead, left) if f is not None)
+            every = (
+                columns[p].units[q] if p is not None else (("", 1.0),) for p, (q, _) in zip(places, ROLES, strict=True)
+            )
+            for units in product(*every):
+                s, ax, ay, w = (factor for _, factor in units)
+                gains = [] if ahead is None else [ahead.slope * ax / s]
+                gains += [] if left is None else [abs(left.slope) * ay / (s * w)]
+                sizes = [
+                    (columns[p].seen.largest * u, _LARGEST[q])
+                    for p, (_, u), (q, _) in zip(places, units, ROLES, strict=True)
+                    if p in free and p is not None
+                ]
+                if all(low < size < high for size, (low, high) in sizes):
+                    off = sum((math.log(gain) / SIGMA) ** 2 for gain in gains)
+                    yield evidence - 0.5 * off, places, tuple(name for name, _ in units)
+
+
+def _related(y: FloatArray, x: FloatArray) -> Fit | None:
+    """Fit a relation; None if it is not clear."""
+    relation = fit(y, x)
+    return relation if relation is not None and abs(relation.correlation) > LEAST else None

@@ -47,7 +47,7 @@ PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
 #: Subject of a choice between runs, and formats of files that may contain several.
-RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3"})
+RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3", "hdf5"})
 #: Largest difference of the mean acceleration from 1 for accelerations in g.
 NEAR_1_G = 0.08
 
@@ -56,10 +56,7 @@ BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
 WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
-#: Required fields of known types; an IMU needs any of them, the others need all.
-_IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
-_GRAVITY_PATHS = (*_IMU_PATHS[:2], "linear_acceleration.z")
-_TILT_RATE_PATHS = ("angular_velocity.x", "angular_velocity.y")
+_GRAVITY_PATHS = tuple(f"linear_acceleration.{axis}" for axis in "xyz")
 
 
 #: Sources by signal.
@@ -517,12 +514,7 @@ def _twist(topic: TopicInfo, part: str, axis: str) -> str:
 
 def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     """Return whether a topic has the fields of its type; the name of the type alone is no proof."""
-    kind = _type(topic)
-    needed = ["latitude", "longitude"] if kind in FIX_TYPES else []
-    needed += [table[kind] for table in (_FIELDS["steering"], _FIELDS["speed"]) if kind in table][:1]
-    either = list(_IMU_PATHS) if kind in IMU_TYPES else []
-    either += [_twist(topic, "linear", "x")] if kind in TWIST_FIELDS else []
-    either += [_pose(topic, "position.x")] if kind in _FIELDS["pose"] else []
+    needed, either = (_FIELDS[which].get(_type(topic), "").split() for which in ("needed", "either"))
     fields = log.fields(topic.name) if needed or either else ()
     return all(has_path(fields, p) for p in needed) and (not either or any(has_path(fields, p) for p in either))
 
@@ -558,19 +550,7 @@ def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen
 
 def _probed_paths(topic: TopicInfo) -> list[str]:
     """Return the paths of a well-known type that may contain constant fillers."""
-    kind = _type(topic)
-    paths: list[str] = []
-    if kind in IMU_TYPES:
-        paths += [*_IMU_PATHS, *_TILT_RATE_PATHS, _GRAVITY_PATHS[2]]
-        paths += [f"{name}_covariance[0]" for name in ("linear_acceleration", "angular_velocity")]
-    if kind in TWIST_FIELDS:
-        paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
-    if kind in _FIELDS["pose"]:
-        parts = [*(f"position.{a}" for a in "xy"), *(f"orientation.{a}" for a in "xyzw")]
-        paths += [_pose(topic, part) for part in parts]
-    if kind in FIX_TYPES:
-        paths += ["latitude", "longitude", "altitude", "status.status", "heading", "course"]
-    return [*paths, *(table[kind] for table in (TWIST_COVARIANCES, _FIELDS["pose_covariance"]) if kind in table)]
+    return _FIELDS["probed"].get(_type(topic), "").split()
 
 
 # ------------------------------------------------------------------------------------------------ sensors

@@ -161,6 +161,7 @@ class Weighing:
             if name not in have and not (wheels and quantity == "speed"):
                 self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
         self._turn_about()
+        self._turn_level()
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
@@ -226,6 +227,32 @@ class Weighing:
             best.sign = math.copysign(1.0, slope)
             self.taken["yaw_rate_rad_s"] = best
             self.notes.append(f"yaw_rate_rad_s is {best.path} of {best.topic.name}, with its sign: it follows a_y / v")
+
+    def _turn_level(self) -> None:
+        """Turn the axes of a level device by quarters of a turn if its names are letters, as speed or path shows."""
+        ax, speed = self.taken.get("ax_m_s2"), self._speed()
+        across = [f for f in self.fields.candidates if ax and triad_of(f) == triad_of(ax) and f.meaning.part == "y"]
+        across = [f for f in across if f.meaning.quantity == "acceleration"]
+        if ax is None or speed is None or ax.fixed or not ax.is_axis or len(across) != 1:
+            return
+        ay, pieces, path = across[0], self.fields.pieces, path_velocity(self.fields)
+        change = pieces.rate_of(speed.si)
+        ahead = [_correlation(pieces.smooth(f.si), change) for f in (ax, ay)]
+        turning = np.full_like(change, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
+        left = [_correlation(pieces.smooth(f.si), pieces.smooth(turning * speed.si)) for f in (ax, ay)]
+        if abs(ahead[1]) > CLEAR and abs(ahead[0]) < FOLLOWS:
+            ahead_sign = math.copysign(1.0, ahead[1])
+        elif abs(left[0]) > CLEAR and abs(left[1]) < FOLLOWS:
+            ahead_sign = -math.copysign(1.0, left[0])
+        elif ahead[0] < -CLEAR:
+            ahead_sign = 0.0
+        else:
+            return
+        turned = ((ay, ahead_sign), (ax, -ahead_sign)) if ahead_sign else ((ax, -1.0), (ay, -1.0))
+        for name, (item, factor) in zip(("ax_m_s2", "ay_m_s2"), turned, strict=True):
+            item.sign, item.is_turned = item.sign * factor, True
+            item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
+            self.taken[name] = item
 
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
@@ -425,6 +452,12 @@ class Weighing:
             if name and item.role in ("truth", "navigation") and not self.true:
                 candidates.append(item.candidate(name, "truth", taken=False))
         return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
+
+
+def _correlation(y: FloatArray, x: FloatArray) -> float:
+    """Return the correlation of two fields on the grid [M]; 0 without enough cells."""
+    relation = fit(y, x)
+    return 0.0 if relation is None else relation.correlation
 
 
 def _has_open_sign(item: Field) -> bool:

@@ -1,4 +1,4 @@
-"""Topics as columns into files of tables: CSV in three dialects, VBO, Parquet, MAT and MDF.
+"""Topics as columns into files of tables: texts (``dialects.toml``), VBO, Parquet, MAT and MDF.
 
 A field is named as its column, with the unit in brackets: ``Lateral Acc. [g]``.
 """
@@ -6,6 +6,8 @@ A field is named as its column, with the unit in brackets: ``Lateral Acc. [g]``.
 from __future__ import annotations
 
 import datetime as dt
+import json
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
     from studies.strangers.containers import Topic
 
 #: GPS time is ahead of UTC by 18 leap seconds, and began 315964800 s after 1970.
-_GPS_NS, _WEEK_NS = (18 - 315_964_800) * 10**9, 604_800 * 10**9
+_GPS_NS, _WEEK_NS, _DAY_NS = (18 - 315_964_800) * 10**9, 604_800 * 10**9, 86_400 * 10**9
+#: Text files, documented in their file.
+_DIALECTS = tomllib.loads(Path(__file__).with_name("dialects.toml").read_text(encoding="utf-8"))
 
 
 def _columns(topics: Sequence[Topic]) -> tuple[IntArray, dict[str, NDArray[np.float64]]]:
@@ -40,203 +44,70 @@ def _split(title: str) -> tuple[str, str]:
     return name, unit.rstrip("]")
 
 
-def _iso(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    clock = [f"{stamp}Z" for stamp in np.datetime_as_string(stamps.astype("datetime64[ns]"), "us")]
-    path.write_bytes(b"\xef\xbb\xbf" + _text(clock, columns, ["timestamp", *columns], ",").encode())
+def _times(stamp: int, start: int, i: int) -> dict[str, Any]:
+    """Return the spellings of a time in ns, by the names of ``dialects.toml``."""
+    at = dt.datetime.fromtimestamp(stamp // 10**9, tz=dt.UTC) + dt.timedelta(microseconds=stamp % 10**9 // 1000)
+    week, tow = divmod(stamp + _GPS_NS, _WEEK_NS)
+    since = {"s": 1e9, "ms": 1e6, "us": 1e3}
+    units = {"": 1e9, "_ms": 1e6, "_us": 1e3}
+    return {
+        "i": i, "at": at, "second": stamp // 10**9, "milli": at.microsecond // 1000, "micro": at.microsecond,
+        "nano": stamp % 10**9, "week": week, "tow": tow / 1e9, "fine": (stamp - start) // 100_000,
+        "day": stamp % _DAY_NS / 1e9, "days": stamp / _DAY_NS, "unix_ns": stamp,
+        **{name: (stamp - start) / ns for name, ns in since.items()},
+        **{f"unix{name}": stamp / ns for name, ns in units.items()},
+    }  # fmt: skip
 
 
-def _german(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    names = [_split(title) for title in columns]
-    head = ["Messung;7", "", ";".join(["Zeit", *(n for n, _ in names)]), ";".join(["ms", *(u for _, u in names)])]
-    rows = _text([f"{s / 1e6:.3f}" for s in stamps.tolist()], columns, [], ";").replace(".", ",")
-    path.write_bytes("\r\n".join([*head, *rows.split("\n")]).encode("latin-1"))
+def _text(dialect: str, path: Path, topics: Sequence[Topic]) -> None:
+    """Write a text file."""
+    form = _DIALECTS["default"] | _DIALECTS[dialect]
+    titles = [title for topic in topics for title in topic.fields]
+    parts = [_parts(title) for title in titles]
+    cells = {f"{key}s": [p[key] for p in parts] for key in ("title", "source", "group")}
+    cells |= {f"{key}s": [form[key].format(**p) for p in parts] for key in ("name", "unit")}
+    cells["numbers"] = [str(i) for i in range(12, 12 + len(titles))]
+    start = min(int(t.arrival_ns[0]) for t in topics)
+    above = {name: form["separator"].join(row) for name, row in cells.items()} | _times(start, start, 0)
+    rows = {"table": _table_rows, "samples": _sample_rows}.get(form["rows"], _value_rows)(form, topics, start)
+    rows = (row.replace(".", form["decimal"]) for row in rows)
+    lines = [*(line.format(**above) for line in form["head"]), *rows, *form["tail"], ""]
+    path.write_bytes(form["newline"].join(lines).encode(form["encoding"]))
 
 
-def _gps(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    weeks = [divmod(stamp + _GPS_NS, _WEEK_NS) for stamp in stamps.tolist()]
-    clock = [f"{week}\t{rest / 1e9:.4f}" for week, rest in weeks]
-    path.write_text(_text(clock, columns, ["GPS week", "TOW [s]", *columns], "\t"))
+def _parts(title: str) -> dict[str, str]:
+    """Return the parts of a title: ``name [unit|source]`` or ``group|name``."""
+    name, unit = _split(title)
+    group, _, name = name.rpartition("|")
+    unit, _, source = unit.partition("|")
+    return {"title": title, "name": name, "unit": unit, "source": source, "group": group}
 
 
-def _text(clock: Sequence[str], columns: dict[str, Any], titles: Sequence[str], separator: str) -> str:
-    cells = [["" if np.isnan(v) else f"{v:.9g}" for v in values.tolist()] for values in columns.values()]
-    rows = [separator.join(row) for row in zip(clock, *cells, strict=True)]
-    return "\n".join([separator.join(titles), *rows, ""] if titles else [*rows, ""])
+def _table_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
+    stamps, columns = _columns(topics)
+    parts = [_parts(title) for title in columns]
+    for i, (stamp, row) in enumerate(zip(stamps.tolist(), np.stack([*columns.values()], 1).tolist(), strict=True)):
+        at = _times(stamp, start, i)
+        cells = zip(row, parts, strict=True)
+        values = (form["empty"] if np.isnan(v) else form["number"].format(value=v, **p) for v, p in cells)
+        quoted = (
+            f"{form['quote']}{cell}{form['quote']}" for cell in (*(c.format(**at) for c in form["clock"]), *values)
+        )
+        yield form["separator"].join(quoted)
 
 
-def _lab(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a laboratory system's export: test metadata above the names, units in brackets below them."""
-    names = [_split(title) for title in columns]
-    head = ["Measurement:;Test 12;;", "Recorder:;17,5 V;car 3;", "Start:;24.11.2025;14:05:12,125;", ""]
-    head += [";".join(["Time", *(n for n, _ in names)]), ";".join(["[s]", *(f"[{u}]" for _, u in names)])]
-    rows = _text([f"{s / 1e9:.4f}" for s in (stamps - stamps[0]).tolist()], columns, [], ";").replace(".", ",")
-    path.write_text("\n".join([*head, rows]), encoding="utf-8")
+def _value_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
+    rows = sorted(_long_rows(topics), key=lambda row: row[1] if form["rows"] == "series" else "")
+    for i, (stamp, name, value, unit) in enumerate(rows):
+        yield form["row"].format(name=name, value=value, unit=unit, **_times(stamp, start, i))
 
 
-def _dated(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write day and time of day in two columns."""
-    texts = np.datetime_as_string(stamps.astype("datetime64[ns]"), "ms")
-    clock = [f"{t[8:10]}.{t[5:7]}.{t[:4]},{t[11:]}" for t in texts]
-    path.write_text(_text(clock, columns, ["Date", "Time", *columns], ","))
-
-
-def _bare(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write names without units."""
-    clock = [f"{s / 1e9:.4f}" for s in (stamps - stamps[0]).tolist()]
-    path.write_text(_text(clock, columns, ["Time", *columns], ","))
-
-
-def _plain(path: Path, _: IntArray, columns: dict[str, Any], separator: str = ",") -> None:
-    """Write the columns as they are; one of them is the time."""
-    rows = (separator.join(f"{v:.15g}" for v in row) for row in np.stack(list(columns.values()), 1).tolist())
-    path.write_text("\n".join([separator.join(columns), *rows, ""]), encoding="utf-8")
-
-
-def _sources(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a lap timer's export: remarks, names of which some are equal, units, sources."""
-    names = [_split(title) for title in columns]
-    above = ["This file is created using a lap timer", "Format,3", 'Track name,"Test"', "Created,24/11/2025,14:05", ""]
-    above.append(",".join(["timestamp", "fragment_id", *(n for n, _ in names)]))
-    above.append(",".join(["unix time", "", *(u.partition("|")[0] for _, u in names)]))
-    above.append(",".join(["", "", *(u.partition("|")[2] for _, u in names)]))
-    rows = _text([f"{s / 1e9:.3f},0" for s in stamps.tolist()], columns, [], ",")
-    path.write_text("\n".join([*above, rows]), encoding="utf-8")
-
-
-def _pipes(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write titles of name, unit, limits and rate between bars."""
-    titles = [f'"{n}"|"{u}"|0.0|0.0|100' for n, u in map(_split, columns)]
-    clock = [f"{(s - int(stamps[0])) // 10**6},{s // 10**6}" for s in stamps.tolist()]
-    path.write_text(_text(clock, columns, ['"Interval"|"ms"|0|0|1', '"Utc"|"ms"|0|0|1', *titles], ","))
-
-
-def _units_row(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a row of units below the names, and a count before the time."""
-    names = [_split(title) for title in columns]
-    head = [",".join(["FRAME", "TIME", *(n for n, _ in names)]), ",".join(["n/a", "s", *(u for _, u in names)])]
-    clock = [f"{11630 + 10 * i}.00000,{s / 1e9:.5f}" for i, s in enumerate((stamps - stamps[0]).tolist())]
-    path.write_text("\n".join([*head, _text(clock, columns, [], ",")]), encoding="utf-8")
-
-
-def _keyed(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a logger's export: quoted keys and values above the titles, units and an empty line below them."""
-    names = [_split(title) for title in columns]
-    head = [["Format", "Logger CSV File"], ["Vehicle", "car 3"], ["Date", "Monday, November 24, 2025"]]
-    head += [["Time", "2:05 PM"], ["Sample Rate", "100"], ["Duration", "90.000"], ["Segment Times", "1:30.000"], []]
-    head += [["Time", *(n for n, _ in names)], ["sec", *(u for _, u in names)], []]
-    rows = [",".join(f'"{cell}"' for cell in row) for row in head]
-    clock = [f"{s / 1e9:.3f}" for s in (stamps - stamps[0]).tolist()]
-    path.write_text("\r\n".join([*rows, *_text(clock, columns, [], ",").split("\n")]), encoding="utf-8")
-
-
-def _remarks(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write an inertial sensor's export: remarks, and columns between tabulators."""
-    remarks = ["// General information:", "//  ProductCode: INS", "// Coordinate system: ENU"]
-    clock = [f"{i % 65536}\t{(s // 100_000) % 2**32}" for i, s in enumerate(stamps.tolist())]
-    text = _text(clock, columns, ["PacketCounter", "SampleTimeFine", *columns], "\t")
-    path.write_text("\n".join([*remarks, text]), encoding="utf-8")
-
-
-def _frame(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a data frame with its index, which has no title, and times as texts."""
-    texts = np.datetime_as_string(stamps.astype("datetime64[ns]"), "us").tolist()
-    clock = [f"{i},{text.replace('T', ' ')}" for i, text in enumerate(texts)]
-    path.write_text(_text(clock, columns, ["", "Zeitstempel", *columns], ","), encoding="utf-8")
-
-
-def _logger(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a manufacturer's logger: tabulators, a row of names and one of units in parentheses, time in µs."""
-    names = [_split(title) for title in columns]
-    head = ["\t".join(["timestamp", "status", *(n for n, _ in names)])]
-    head += ["\t".join(["(us)", "(na)", *(f"({u})" for _, u in names)])]
-    clock = [f"{(s - int(stamps[0])) // 1000}\t0" for s in stamps.tolist()]
-    path.write_text("\n".join([*head, _text(clock, columns, [], "\t")]), encoding="utf-8")
-
-
-def _levels(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a data frame whose titles have two levels, ``device|signal``, below them the name of the index."""
-    names = [title.split("|") for title in columns]
-    head = [",".join(["device", *(n[0] for n in names)]), ",".join(["signal", *(n[1] for n in names)])]
-    head.append(",".join(["time", *("" for _ in names)]))
-    clock = [f"{s / 1e9:.3f}" for s in (stamps - stamps[0]).tolist()]
-    path.write_text("\n".join([*head, _text(clock, columns, [], ",")]), encoding="utf-8")
-
-
-def _duration(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a timetable whose times are durations with their unit."""
-    clock = [f"{s / 1e9:.6g} sec" for s in (stamps - stamps[0]).tolist()]
-    path.write_text(_text(clock, columns, ["Time", *columns], ","), encoding="utf-8")
-
-
-def _race_export(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a race analysis program's export: pairs of keys above the titles, units and empty lines, quoted cells."""
-    names = [_split(title) for title in columns]
-    head = [
-        ["Format", "MoTeC CSV File", "", "", "Workbook", ""],
-        ["Log Date", "24/11/2025", "", "", "Origin Time", "0.000", "s"],
-    ]
-    head += [["Log Time", "14:05:12", "", "", "Start Time", "0.000", "s"], ["Sample Rate", "100.000", "Hz"], []]
-    head += [["Time", *(n for n, _ in names)], ["s", *(u for _, u in names)], [], []]
-    table = [
-        [f"{s / 1e9:.3f}" for s in (stamps - stamps[0]).tolist()],
-        *([f"{v:.9g}" for v in c] for c in columns.values()),
-    ]
-    rows = [",".join(f'"{cell}"' for cell in row) for row in (*head, *zip(*table, strict=True))]
-    path.write_text("\r\n".join([*rows, ""]), encoding="utf-8")
-
-
-def _sections(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write an engine tuner's log: sections in brackets, numbers of the channels above their names and units."""
-    names = [_split(title) for title in columns]
-    head = ["Log File", "Version: 1.0", "", "[Log Information]", "Creation Time: 11/24/2025 2:05:12 PM", "Notes: ", ""]
-    head += ["[Channel Information]", ",".join(str(i) for i in (0, *range(12, 12 + len(names))))]
-    head += [
-        ",".join(["Offset", *(n for n, _ in names)]),
-        ",".join(["s", *(u for _, u in names)]),
-        "",
-        "[Channel Data]",
-    ]
-    clock = [f"{s / 1e9:.3f}" for s in (stamps - stamps[0]).tolist()]
-    path.write_text("\n".join([*head, _text(clock, columns, [], ",")]), encoding="utf-8")
-
-
-def _time_of_day(
-    path: Path, stamps: IntArray, columns: dict[str, Any], title: str, encoding: str, comma: bool = True
-) -> None:
-    """Write names and units in two rows and the time of day, in the encoding and with the decimal sign of a country."""
-    names = [_split(column) for column in columns]
-    clock = [t[11:] for t in np.datetime_as_string(stamps.astype("datetime64[ns]"), "ms")]
-    head = [";".join([title, *(n for n, _ in names)]), ";".join(["", *(u for _, u in names)])]
-    text = "\n".join([*head, _text(clock, columns, [], ";")])
-    path.write_bytes((text.replace(".", ",") if comma else text.replace(";", ",")).encode(encoding))
-
-
-def _calendar(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write an inertial sensor's export: remarks, and the time from year to nanosecond in seven columns."""
-    titles = [
-        "PacketCounter",
-        *(f"UTC_{n}" for n in ("Nano", "Year", "Month", "Day", "Hour", "Minute", "Second")),
-        "UTC_Valid",
-    ]
-    clock = []
-    for i, stamp in enumerate(stamps.tolist()):
-        at = dt.datetime.fromtimestamp(stamp // 10**9, tz=dt.UTC)
-        clock.append(f"{i % 65536}\t{stamp % 10**9}\t{at:%Y\t%m\t%d\t%H\t%M\t%S}\t5")
-    remarks = [
-        "// Start Time: Unknown",
-        "// Update Rate: 100.0Hz",
-        "// Filter Profile: automotive",
-        "// Option Flags: none",
-    ]
-    path.write_text("\n".join([*remarks, _text(clock, columns, [*titles, *columns], "\t")]), encoding="utf-8")
-
-
-def _hashes(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a phone's lap timer: remarks after #, quoted titles, seconds since the start beside those of the epoch."""
-    head = ["# RaceRender Data: lap timer on a phone", "# Vehicle: car 3", "# Device Free Space: 12345 MB"]
-    titles = [f'"{title}"' for title in ("Time", "UTC Time", "Lap", *columns)]
-    clock = [f"{(s - int(stamps[0])) / 1e9:.3f},{s / 1e9:.3f},1" for s in stamps.tolist()]
-    path.write_text("\n".join([*head, _text(clock, columns, titles, ","), "# Session End"]), encoding="utf-8")
+def _sample_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
+    samples = ((int(stamp), topic, i) for topic in topics for i, stamp in enumerate(topic.arrival_ns))
+    for stamp, topic, i in sorted(samples, key=lambda sample: sample[0]):
+        named = ((_parts(title), values[i]) for title, values in topic.fields.items())
+        fields = form["separator"].join(form["field"].format(value=v, **parts) for parts, v in named)
+        yield form["row"].format(topic=topic.name.strip("/"), fields=fields, **_times(stamp, start, i))
 
 
 def _own_times(path: Path, topics: Sequence[Topic]) -> None:
@@ -251,15 +122,6 @@ def _own_times(path: Path, topics: Sequence[Topic]) -> None:
     path.write_text("\n".join([*map(";".join, rows), ""]), encoding="utf-8")
 
 
-def _parameters(path: Path, topics: Sequence[Topic]) -> None:
-    """Write an app's long form: quoted seconds of the day, parameter, value and unit, with a semicolon at the end."""
-    rows = [
-        (f"{stamp % (86_400 * 10**9) / 1e9:.6f}", name, f"{v:.9g}", unit) for stamp, name, v, unit in _long_rows(topics)
-    ]
-    cells = [("SECONDS", "PID", "VALUE", "UNITS"), *rows]
-    path.write_text("\n".join([*("".join(f'"{cell}";' for cell in row) for row in cells), ""]), encoding="utf-8")
-
-
 def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     """Return a row for each value: time in ns, signal, value, unit."""
     rows = [
@@ -271,20 +133,15 @@ def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     return sorted(rows)
 
 
-def _long_csv(path: Path, topics: Sequence[Topic]) -> None:
-    rows = [f"{stamp / 1e9:.6f},{name},{value:.9g}" for stamp, name, value, _ in _long_rows(topics)]
-    path.write_text("\n".join(["timestamp,signal,value", *rows, ""]))
+def _measures_parquet(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a fleet's events: a row for each value, in the column of its type."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-
-def _records_csv(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a stream of values with columns on the session beside them."""
-    about = "expire_at,lap,meta_event,meta_session,meta_source,meta_time,original_vehicle_id,outing"
-    rows = [f"{about},telemetry_name,telemetry_value,timestamp,vehicle_id,vehicle_number"]
-    for stamp, name, value, _ in _long_rows(topics):
-        clock, late = np.datetime_as_string(np.array([stamp, stamp + 10**14], "datetime64[ns]"), "ms")
-        about = f",1,I_R04_2025-11-24,R1,kafka:raw,{late}Z,CAR-002-2,0"
-        rows.append(f"{about},{name},{value:.6g},{clock}Z,CAR-002-2,2")
-    path.write_text("\n".join([*rows, ""]))
+    stamps, names, values, _ = (list(column) for column in zip(*_long_rows(topics), strict=True))
+    table = {"eventId": ["7f"] * len(names), "vehicleName": ["car-7"] * len(names), "name": names}
+    table |= {"time": [stamp // 10**6 for stamp in stamps], "measure_value_BOOLEAN": [None] * len(names)}
+    pq.write_table(pa.table({**table, "measure_value_DOUBLE": values}), path)
 
 
 def _long_parquet(path: Path, topics: Sequence[Topic]) -> None:
@@ -399,6 +256,79 @@ def _mat_recorder(path: Path, topics: Sequence[Topic]) -> None:
     savemat(path, {"rec1_001": record})
 
 
+def _mat_scope(path: Path, topics: Sequence[Topic]) -> None:
+    """Write what a scope logged: a struct for each topic, with the time and a struct array of signals."""
+    from scipy.io import savemat
+
+    kind = [("values", object), ("dimensions", object), ("label", object)]
+    scopes = {}
+    for topic in topics:
+        signals = [(values.reshape(-1, 1), 1.0, title) for title, values in topic.fields.items()]
+        seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
+        scopes[topic.name.strip("/")] = {
+            "time": seconds,
+            "signals": np.array(signals, kind),
+            "blockName": "model/Scope",
+        }
+    savemat(path, scopes)
+
+
+def _mat_columns(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a matrix of times and values for each signal."""
+    from scipy.io import savemat
+
+    start = topics[0].arrival_ns[0]
+    signals = ((name, (t.arrival_ns - start) * 1e-9, values) for t in topics for name, values in t.fields.items())
+    savemat(path, {name: np.stack([seconds, values], 1) for name, seconds, values in signals})
+
+
+def _mat_groups(path: Path, topics: Sequence[Topic]) -> None:
+    """Write vectors named by the data groups of a measurement file, and those of their masters."""
+    from scipy.io import savemat
+
+    vectors: dict[str, Any] = {}
+    for i, topic in enumerate(topics):
+        vectors[f"DGM{i}_time"] = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
+        vectors |= {f"DG{i}_{name}": values for name, values in topic.fields.items()}
+    savemat(path, vectors)
+
+
+def _json_signals(path: Path, topics: Sequence[Topic]) -> None:
+    """Write one document: for each signal its unit, and pairs of a time in µs and a value."""
+    signals = {
+        _split(title)[0]: {"unit": _split(title)[1] or None, "values": np.stack([t.arrival_ns // 1000, v], 1).tolist()}
+        for t in topics
+        for title, v in t.fields.items()
+    }
+    path.write_text(json.dumps(signals), encoding="utf-8")
+
+
+def _json_columns(path: Path, topics: Sequence[Topic]) -> None:
+    """Write one document: an object for each topic, with a list for each column."""
+    start = topics[0].arrival_ns[0]
+    columns = {
+        t.name.strip("/"): {
+            "time": ((t.arrival_ns - start) * 1e-9).tolist(),
+            **{n: v.tolist() for n, v in t.fields.items()},
+        }
+        for t in topics
+    }
+    path.write_text(json.dumps(columns), encoding="utf-8")
+
+
+def _hdf5(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a group for each topic: a dataset of times in ns, and datasets with their units as attributes."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for topic in topics:
+            group = file.create_group(topic.name.strip("/"))
+            group["timestamp"] = topic.arrival_ns
+            for title, values in topic.fields.items():
+                name, unit = _split(title)
+                group.create_dataset(name, data=values, compression="gzip").attrs["unit"] = unit
+
+
 def _mat_hdf5(path: Path, topics: Sequence[Topic]) -> None:
     """Write version 7.3: each variable is a row vector, which HDF5 stores as a column."""
     import h5py
@@ -441,39 +371,14 @@ def _mdf(path: Path, topics: Sequence[Topic]) -> None:
 
 
 _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]] = {
-    "csv": (".csv", _iso),
-    "csv-german": (".csv", _german),
-    "csv-gps": (".csv", _gps),
-    "csv-lab": (".csv", _lab),
-    "csv-dated": (".csv", _dated),
-    "csv-bare": (".csv", _bare),
-    "csv-plain": (".csv", _plain),
-    "csv-tabs": (".txt", partial(_plain, separator="\t")),
-    "csv-sources": (".csv", _sources),
-    "csv-pipes": (".csv", _pipes),
-    "csv-units": (".csv", _units_row),
-    "csv-keyed": (".csv", _keyed),
-    "csv-remarks": (".txt", _remarks),
-    "csv-frame": (".csv", _frame),
-    "csv-logger": (".txt", _logger),
-    "csv-levels": (".csv", _levels),
-    "csv-duration": (".csv", _duration),
-    "csv-race": (".csv", _race_export),
-    "csv-sections": (".csv", _sections),
-    "csv-japanese": (".csv", partial(_time_of_day, title="時刻", encoding="cp932", comma=False)),
-    "csv-swedish": (".csv", partial(_time_of_day, title="Tid", encoding="utf-8")),
-    "csv-calendar": (".txt", _calendar),
-    "csv-hashes": (".csv", _hashes),
     "parquet-nested": (".parquet", _nested_parquet),
     "parquet": (".parquet", _parquet),
     "vbo": (".vbo", _vbo),
     "vbo-fewer": (".vbo", partial(_vbo, fewer=1)),
 }
 _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
-    "csv-long": (".csv", _long_csv),
-    "csv-records": (".csv", _records_csv),
+    **{n: (d.get("suffix", ".csv"), partial(_text, n)) for n, d in _DIALECTS.items()},
     "csv-times": (".csv", _own_times),
-    "csv-parameters": (".csv", _parameters),
     "parquet-long": (".parquet", _long_parquet),
     "mat": (".mat", _mat),
     "mat-runs": (".mat", _mat_runs),
@@ -481,6 +386,13 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "mat-recorder": (".mat", _mat_recorder),
     "mat-7.3": (".mat", _mat_hdf5),
     "mat-pairs": (".mat", _mat_pairs),
+    "mat-scope": (".mat", _mat_scope),
+    "mat-columns": (".mat", _mat_columns),
+    "mat-groups": (".mat", _mat_groups),
+    "json-signals": (".json", _json_signals),
+    "json-columns": (".json", _json_columns),
+    "hdf5": (".h5", _hdf5),
+    "parquet-measures": (".parquet", _measures_parquet),
     "mdf": (".mf4", _mdf),
 }
 

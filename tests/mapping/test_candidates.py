@@ -109,7 +109,7 @@ def test_a_unit_that_nothing_tells_is_taken_by_convention_and_told() -> None:
         ("steeringAngle", STEER, "steer_rad", 1.0),
         ("steer_ang", STEER / DEG, "steer_rad", DEG),
         ("steering_angle", STEER * 16.0 / DEG, "steering_wheel_rad", DEG),
-        ("front_tire_angle_deg", -STEER / DEG, "", 0.0),
+        ("front_tire_angle_deg", -STEER / DEG, "steer_rad", -DEG),
         ("roadwheel_angle_deg", STEER / DEG, "steer_rad", DEG),
         ("steering_deg", -STEER * 16.0 / DEG, "steering_wheel_rad", -DEG),
     ],
