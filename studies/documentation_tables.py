@@ -17,8 +17,8 @@ from pdhef_logtool.drive.check_table import TABLE
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.evaluation.metrics import metric as metrics
 from pdhef_logtool.logs.resource_limits import ResourceLimits
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.opened_run import TABLES
+from pdhef_logtool.results.parquet_sink import load_schema
 from pdhef_logtool.runs.config import RunConfig
 from studies.pages import DOCS, write
 from truthsim.manoeuvres import MANOEUVRES

@@ -12,7 +12,7 @@ from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.results.arrow_schema import load_schema
+from pdhef_logtool.results.parquet_sink import load_schema
 from pdhef_logtool.results.run_report import build_report, estimator_entry, tool_versions
 from pdhef_logtool.results.selected_estimate import MainFacts
 

@@ -1,4 +1,4 @@
-"""Output of ``pdhef compare``: history, other differences, verdicts, and their drives."""
+"""Output of ``pdhef events``, and of ``compare``: history, other differences, verdicts, and their drives."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from rich.text import Text
 
 from pdhef_logtool.cli.console import print_indented, table, three_lines
 from pdhef_logtool.cli.plan_tables import plan_line, render_plan
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import read_unit
+from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results import comparing
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
+from pdhef_logtool.results.events import FoundEvents
 from pdhef_logtool.results.junit import Case, cases_bytes, plan_cases
 from pdhef_logtool.storage.files import write_bytes
 
@@ -113,3 +116,31 @@ def _figure_case(row: ComparedFigure, comparison: Comparison) -> Case:
         f"{row.verdict}: median {median} (95 %: {comparing.interval_text(row)}) of {row.change.drives} drives, {limit}"
     )
     return Case("compare", row.requirement.estimator or comparing.MAIN, name, row.verdict, closed, text, text)
+
+
+#: Largest number of events in the output.
+_MOST_EVENTS = 50
+
+
+def render_events(events: FoundEvents, console: Console) -> None:
+    """Print the events, and the drives that were not searched."""
+    total_s = sum(e.end_s - e.start_s for e in events.events)
+    drives, count = len({e.drive for e in events.events}), len(events.events)
+    summary = f"{count} event{'s' * (count != 1)} in {drives} of {events.searched} drives, {total_s:.2f} s in all"
+    left_out = f"; {len(events.left_out)} drives are not searched, see below" if events.left_out else ""
+    following = "no action needed" if not count or events.clips else "--clip writes one MCAP file per event"
+    console.print(three_lines(summary, f"{events.where} of {events.of}{left_out}", following))
+    console.print()
+    if events.events:
+        made = table("drive", ">from, s", ">to, s", ">for, s", ">peak", fold=1)
+        for event in events.events[:_MOST_EVENTS]:
+            peak = "-" if event.peak is None else f"{event.peak:.4g}"
+            lasts = f"{event.end_s - event.start_s:.2f}"
+            made.add_row(event.drive, f"{event.start_s:.2f}", f"{event.end_s:.2f}", lasts, peak)
+        console.print(made)
+        if (more := len(events.events) - _MOST_EVENTS) > 0:
+            console.print(f"  and {more} more: --json")
+    for reason, names in gathered((reason, drive) for drive, reason in events.left_out.items()).items():
+        console.print(f"not searched, {reason}: {listed(names)}")
+    for clip in events.clips:
+        console.print(f"clip: {clip}", soft_wrap=True)

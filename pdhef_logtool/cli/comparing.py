@@ -64,7 +64,7 @@ def events(
     source: Path | None = None,
 ) -> None:
     """Find the times at which a condition is true, and cut clips there."""
-    from pdhef_logtool.cli.event_tables import render_events
+    from pdhef_logtool.cli.compare_tables import render_events
     from pdhef_logtool.results.events import event_condition, find_events
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.storage.object_store import is_url

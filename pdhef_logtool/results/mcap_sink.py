@@ -24,8 +24,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.log_lines import LogLine, log_lines, log_message
-from pdhef_logtool.results.plotted import plotted_fields
+from pdhef_logtool.results.plotted import LogLine, log_lines, log_message, plotted_fields
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots, rounded
 from pdhef_logtool.storage.documents import jsonable
 

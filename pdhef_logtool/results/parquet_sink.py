@@ -1,7 +1,8 @@
-"""estimates.parquet (wide, a row per stamp and estimator) and metrics.parquet (long, a row per figure)."""
+"""estimates.parquet (wide, a row per stamp and estimator), and Arrow schemas from the schema files of the package."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,12 +13,58 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pdhef_logtool.logs.definitions import schema_file
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
-from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.sink import TRUTH, rounded
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
+
+
+def load_schema(name: str) -> dict[str, Any]:
+    """Return one of the JSON documents of ``schemas/`` by file name."""
+    document: dict[str, Any] = json.loads(schema_file(name).read_text(encoding="utf-8"))
+    return document
+
+
+def arrow_schema(name: str) -> pa.Schema:
+    """Return the Arrow schema that ``schemas/<name>`` describes.
+
+    Each field carries its unit; the schema's own metadata carry format, version and all units once more, because
+    only Arrow readers see metadata of fields.
+    """
+
+    def type_of(name: str) -> pa.DataType:
+        is_dictionary = name == "dictionary<int32, string>"
+        return pa.dictionary(pa.int32(), pa.string()) if is_dictionary else pa.type_for_alias(name)
+
+    document = load_schema(name)
+    columns = document["columns"]
+    units = {column["name"]: column["unit"] for column in columns}
+    fields = [
+        pa.field(c["name"], type_of(c["type"]), nullable=c["nullable"], metadata={"unit": c["unit"]}) for c in columns
+    ]
+    stated = document | {"version": str(document["version"]), "units": json.dumps(units)}
+    return pa.schema(fields, metadata={key: stated[key] for key in ("format", "version", "units", "missing")})
+
+
+def arrow_array(values: Any, kind: pa.DataType) -> pa.Array:
+    """Return numbers or strings [N], null for NaN and None; ``pa.array`` would import an installed pandas."""
+    if isinstance(values, np.ndarray) and values.dtype.kind != "U":
+        is_there = ~np.isnan(values)
+    else:
+        is_there = np.array([v is not None and v == v for v in values], dtype=np.bool_)  # NaN differs from itself
+        filler = "" if pa.types.is_string(kind) else 0
+        values = [v if there else filler for v, there in zip(values, is_there, strict=True)]
+    validity = None if is_there.all() else pa.py_buffer(np.packbits(is_there, bitorder="little"))
+    if pa.types.is_string(kind):
+        texts = [str(v).encode("utf-8", "backslashreplace") for v in values]
+        offsets = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        return pa.Array.from_buffers(kind, len(texts), [validity, pa.py_buffer(offsets), pa.py_buffer(b"".join(texts))])
+    values = np.ascontiguousarray(values, dtype=kind.to_pandas_dtype())
+    data = np.packbits(values, bitorder="little") if values.dtype == np.bool_ else values
+    return pa.Array.from_buffers(kind, len(values), [validity, pa.py_buffer(data)])
+
 
 #: Rows of a row group: 10 h at 100 Hz make 110 row groups an estimator.
 ROWS_A_GROUP = 32768

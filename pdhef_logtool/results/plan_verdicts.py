@@ -13,8 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.metrics.independence import NOT_INDEPENDENT
-from pdhef_logtool.evaluation.metrics.sensors import SENSORS
+from pdhef_logtool.evaluation.metrics.sensors import NOT_INDEPENDENT, SENSORS
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
 from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, RequirementVerdict, gates, judge
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES

@@ -18,8 +18,7 @@ from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.log_lines import LEVEL_NAMES, log_lines
-from pdhef_logtool.results.plotted import ERRORS, STATES, Plot, colour_rgb, drawn, errors
+from pdhef_logtool.results.plotted import ERRORS, LEVEL_NAMES, STATES, Plot, colour_rgb, drawn, errors, log_lines
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots
 from pdhef_logtool.storage.files import open_new, writing

@@ -18,9 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.opened_run import TABLES
-from pdhef_logtool.results.parquet_sink import parquet_writer, reading
+from pdhef_logtool.results.parquet_sink import arrow_array, arrow_schema, parquet_writer, reading
 from pdhef_logtool.results.run_report import LogOutcome
 
 #: Parts that are read before a row group of theirs is written.

@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool.learning.network.dataset import Dataset
-from pdhef_logtool.learning.network.fit import Recipe
-from pdhef_logtool.learning.network.train_command import dataset_for, gap_free_runs, train_on, weights_of
+from pdhef_logtool.learning.network.train_command import Recipe, dataset_for, gap_free_runs, train_on, weights_of
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import (

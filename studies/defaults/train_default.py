@@ -34,8 +34,7 @@ from pdhef_logtool.car.car import (
 )
 from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file, vehicle_toml
 from pdhef_logtool.learning.drives import DriveSet, LearnSettings
-from pdhef_logtool.learning.network.fit import PAPER_RECIPE, Recipe
-from pdhef_logtool.learning.network.train_command import dataset_for, train_on
+from pdhef_logtool.learning.network.train_command import PAPER_RECIPE, Recipe, dataset_for, train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL

@@ -16,7 +16,7 @@ from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValue
 from pdhef_logtool.car.toml_files import VehicleEntries, part_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation.validation_plan import PlanTable
-from pdhef_logtool.results.arrow_schema import load_schema
+from pdhef_logtool.results.parquet_sink import load_schema
 
 FOLDER = Path(__file__).parents[2] / "schemas"
 #: By the name of the schema.

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.learning.network.fit import (
+from pdhef_logtool.learning.network.train_command import (
     CHECKPOINT,
     PAPER_RECIPE,
     FeatureSequence,
     Recipe,
+    mean_square,
     train,
 )
-from pdhef_logtool.learning.network.train_command import mean_square
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.features import FEATURES
 

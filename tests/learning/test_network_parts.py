@@ -11,9 +11,16 @@ import pytest
 import torch
 from reference_car import START_NS
 
-from pdhef_logtool.learning.network.fit import FeatureSequence, Recipe, normalisation_of
 from pdhef_logtool.learning.network.residuals import ResidualRows
-from pdhef_logtool.learning.network.train_command import LEAD_STEPS, gap_free_runs, make_recipe, weights_of
+from pdhef_logtool.learning.network.train_command import (
+    LEAD_STEPS,
+    FeatureSequence,
+    Recipe,
+    gap_free_runs,
+    make_recipe,
+    normalisation_of,
+    weights_of,
+)
 from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
 

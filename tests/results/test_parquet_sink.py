@@ -13,8 +13,7 @@ from written import as_written
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, SHARE_COLUMNS
-from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.results.parquet_sink import list_estimators, read_track, write_estimates
+from pdhef_logtool.results.parquet_sink import list_estimators, load_schema, read_track, write_estimates
 from pdhef_logtool.results.tables import write_metrics
 
 KINDS = {

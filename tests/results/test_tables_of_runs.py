@@ -13,8 +13,8 @@ import pytest
 import pdhef_logtool as pdhef
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.opened_run import TABLES, table_file
+from pdhef_logtool.results.parquet_sink import load_schema
 from pdhef_logtool.results.querying import query
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_part, write_tables

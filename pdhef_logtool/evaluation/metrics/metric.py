@@ -234,7 +234,6 @@ MODULES = (
     "yaw_consistency",
     "reference",
     "sensors",
-    "independence",
     "handling",
 )
 

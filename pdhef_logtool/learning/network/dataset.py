@@ -28,9 +28,8 @@ from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
-from pdhef_logtool.results.parquet_sink import parquet_writer
+from pdhef_logtool.results.parquet_sink import arrow_array, arrow_schema, parquet_writer
 from pdhef_logtool.results.run_report import tool_versions, write_json
 from pdhef_logtool.storage.documents import DIGEST, digest, file_sha256, is_sealed, read_sealed, seal, validated
 
