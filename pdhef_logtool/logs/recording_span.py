@@ -212,7 +212,7 @@ def _kept_epoch(
 
 
 #: A piece of a recording: messages of a channel in a span, [start, end); ``row`` in the span is -1 for all of them.
-_NO_PIECE = np.empty(0, [(name, np.int64) for name in ("start", "end", "count", "topic", "file", "span", "row")])
+_NO_PIECE = np.array([], [(name, np.int64) for name in ("start", "end", "count", "topic", "file", "span", "row")])
 
 
 def _of_messages(times_ns: IntArray, topic: int, file: int, span: int) -> NDArray[np.void]:
