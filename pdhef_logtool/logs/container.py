@@ -108,20 +108,13 @@ class Block:
     def without_large(self, most: int) -> Block:
         """Return the block without payloads above ``most`` bytes."""
         large = self.length > most
-        if not large.any() or (np.diff(self.offset) < 0).any():
+        if not large.any():
             return self
-        # Copy each run of messages between two large ones as a whole.
-        small = np.flatnonzero(~large)
-        first = small[np.diff(small, prepend=-2) > 1]
-        last = small[np.diff(small, append=len(self) + 1) > 1]
-        begin, end = self.offset[first], self.offset[last] + self.length[last]
-        view = memoryview(self.buffer)
-        buffer = b"".join([view[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)])
-        offset, length = np.zeros_like(self.offset), np.where(large, 0, self.length)
-        moved = begin - (np.cumsum(end - begin) - (end - begin))
-        offset[small] = self.offset[small] - np.repeat(moved, last - first + 1)
+        view, length = memoryview(self.buffer), np.where(large, 0, self.length)
+        extents = zip(self.offset[~large].tolist(), self.length[~large].tolist(), strict=True)
+        buffer = b"".join([view[start : start + n] for start, n in extents])
         dropped = frozenset(np.unique(self.channel[large]).tolist())
-        return replace(self, buffer=buffer, offset=offset, length=length, dropped=dropped)
+        return replace(self, buffer=buffer, offset=np.cumsum(length) - length, length=length, dropped=dropped)
 
     def message(self, row: int) -> bytes:
         """Return the payload of a message."""

@@ -44,7 +44,6 @@ from pdhef_logtool.records.signals import IntArray
 
 #: Value of a time column if the message has no time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
-_MOST_SECONDS = 9e9
 #: Messages that are decoded singly at the same time.
 _BYTES_AT_ONCE = 4 << 20
 _LAYOUTS_PER_CHANNEL = 8
@@ -177,7 +176,7 @@ class ChannelDecoder:
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self.single_decoder()
-        found: dict[str, list[list[Any]]] = {s.path: [[] for _ in s.components] for s in self.selections}
+        parts_by_path: dict[str, list[list[Any]]] = {s.path: [[] for _ in s.components] for s in self.selections}
         most = min(self.schema.limits.array_width, _most_columns(len(rows)))
         batch = np.cumsum(block.length[rows]) // _BYTES_AT_ONCE
         for its in np.split(rows, np.flatnonzero(np.diff(batch)) + 1):
@@ -187,9 +186,9 @@ class ChannelDecoder:
                 parts = [values_at(messages, steps) for steps in s.components]
                 if s.shape in ("array", "dynamic"):
                     parts = [[self._bounded(s, *item, most) for item in zip(its.tolist(), parts[0], strict=True)]]
-                for values, more in zip(found[s.path], parts, strict=True):
+                for values, more in zip(parts_by_path[s.path], parts, strict=True):
                     values += more
-        return {s.path: self._single_column(s, found[s.path]) for s in self.selections}
+        return {s.path: self._single_column(s, parts_by_path[s.path]) for s in self.selections}
 
     def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> Any:
         """Return the elements of an array, or the value of a place that the schema leaves open; none if too wide."""
@@ -312,10 +311,10 @@ def _column(selection: Selection, parts: Sequence[NDArray[Any] | None], n: int) 
     if selection.shape != "time":
         return given[0].astype(np.float64)
     seconds, nanoseconds = given
-    known = (np.abs(seconds) < _MOST_SECONDS) & (np.abs(nanoseconds) < _MOST_SECONDS)
+    is_time = np.abs(seconds * 1e9 + nanoseconds) < 2.0**63
     with np.errstate(invalid="ignore"):
         total = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
-    return np.where(known, total, NO_TIME_NS)
+    return np.where(is_time, total, NO_TIME_NS)
 
 
 def _number(value: object) -> float:

@@ -212,7 +212,7 @@ def _kept_epoch(
 
 
 #: A piece of a recording: messages of a channel in a span, [start, end); ``row`` in the span is -1 for all of them.
-_NO_PIECE = np.empty(0, [(name, np.int64) for name in ("start", "end", "count", "topic", "file", "span", "row")])
+_NO_PIECE = np.array([], [(name, np.int64) for name in ("start", "end", "count", "topic", "file", "span", "row")])
 
 
 def _of_messages(times_ns: IntArray, topic: int, file: int, span: int) -> NDArray[np.void]:
@@ -251,11 +251,12 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> tuple[NDArray[np
                 bounds = span.start_ns, span.end_ns
                 whole = [(*bounds, n, topics[id_], c, span.index, -1) for id_, n in span.counts.items()]
                 looked.append(np.array(whole, _NO_PIECE.dtype))
-                stamps = dict.fromkeys(span.counts, np.array([span.end_ns - 1]))
+                last = dict.fromkeys(span.counts, span.end_ns - 1)
             else:
                 looked += [_of_messages(its, topics[id_], c, span.index) for id_, its in stamps.items()]
-            for id_, its in stamps.items():
-                newest[topics[id_]] = max(newest.get(topics[id_], 0), int(its.max(initial=0)))
+                last = {id_: int(its.max(initial=0)) for id_, its in stamps.items()}
+            for id_, last_ns in last.items():
+                newest[topics[id_]] = max(newest.get(topics[id_], 0), last_ns)
     return np.concatenate(looked), [*names]
 
 

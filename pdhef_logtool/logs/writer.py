@@ -223,8 +223,8 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         Raw chunks are written as they are. Raw messages and batches are in separate chunks, which are sorted by their
         first log times; of equal times raw messages come first.
         """
-        own = self._chunks_of_batches([self._encode(batch) for batch in batches if len(batch.log_time_ns)])
-        for chunk in heapq.merge(self._chunks_of_raws(raws), own, key=lambda chunk: chunk.start_ns):
+        of_batches = self._chunks_of_batches([self._encode(batch) for batch in batches if len(batch.log_time_ns)])
+        for chunk in heapq.merge(self._chunks_of_raws(raws), of_batches, key=lambda chunk: chunk.start_ns):
             self._emit_chunk(chunk)
 
     def _chunks_of_raws(self, raws: Iterable[RawMessage | RawChunk]) -> Iterator[RawChunk]:
