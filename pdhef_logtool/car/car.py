@@ -131,10 +131,6 @@ class Car:
         fitted = self.fitted_physics
         return self.vehicle if fitted is None else fitted.values.applied_to(self.datasheet)
 
-    def physics_of(self, name: str) -> str:
-        """Return the digest of the physics that a filter uses and its noise belongs to."""
-        return physics_sha256(self.physics_vehicle if name == PHYSICS else self.vehicle)
-
     @property
     def residual_network(self) -> ModelBundle | PlugInModel | None:
         """The network if its residual is of ``physics``; the paper's network predicts the residual of ``phy-ukf``."""
@@ -145,7 +141,7 @@ class Car:
         """Residual gain of ``pd-hef`` with the network of this car (docs/method.md#gain)."""
         if self.network_gain is not None:
             return self.network_gain
-        return float(self.network is not None and self.network.physics_sha256 == self.physics_of(PHYSICS))
+        return float(self.network is not None and self.network.physics_sha256 == physics_sha256(self.physics_vehicle))
 
     @property
     def taught_prior(self) -> tuple[TaughtParameter, ...]:

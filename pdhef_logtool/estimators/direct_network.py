@@ -1,6 +1,7 @@
-"""``pure-lstm``: a network that outputs v_y directly, with the inputs of the hybrid filter's network.
+"""``pure-lstm`` and ``linear-regression``: models that output v_y, with the inputs of the hybrid filter's network.
 
-The paper's Pure-LSTM with the same information as PD-HEF: sensors, outputs of the parallel physics filter, friction.
+The paper's Pure-LSTM with the same information as PD-HEF: sensors, outputs of the parallel physics filter, friction;
+and a baseline with sideslip as a linear function of the low-passed features.
 v_x is the parallel filter's, the yaw rate the gyro's. Over the latency, v_x and v_y are extrapolated to the scored
 stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 """
@@ -63,8 +64,21 @@ class DirectNetwork:
         return Steps(values, rates, usable), (after, carried)
 
 
+class LinearRegression(DirectNetwork):
+    """Sideslip by a linear regression on the network's features, through a low pass: v_y = v_x tan β."""
+
+    algorithm = "linear-regression"
+    weights: ClassVar[str] = "coefficients"
+
+
 def build(name: str, car: Car, options: Options) -> DirectNetwork:
     """Return ``pure-lstm`` for a car with such a network."""
     del name
     assert car.network is not None and car.network.pure_lstm is not None
     return DirectNetwork(car.vehicle, NetworkService(car.network.pure_lstm), use_speed=options.use_speed)
+
+
+def build_regression(name: str, car: Car, options: Options) -> LinearRegression:
+    """Return ``linear-regression`` for a car with such a model."""
+    assert car.network is not None and car.network.linear_regression is not None
+    return LinearRegression(car.vehicle, car.network.linear_regression, use_speed=options.use_speed, name=name)

@@ -11,7 +11,7 @@ and on the whitened distance d² = zᵀ (Σ + ρ I)⁻¹ z, divided by its 98 % 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -36,13 +36,6 @@ LARGEST = 1.5
 
 Row = Annotated[tuple[float, ...], Field(strict=False)]
 Rows = Annotated[tuple[Row, ...], Field(strict=False)]
-
-
-class Correction(NamedTuple):
-    """Residual rate of v_y per step [K], m/s², before the gain; and the gain, 0 to 1."""
-
-    rate_m_s2: FloatArray
-    gain: FloatArray
 
 
 class LadderModel(BaseModel):
@@ -110,19 +103,18 @@ class LadderModel(BaseModel):
     def residual(self, features: FloatArray, dt_s: FloatArray, state: FloatArray | None) -> tuple[Residual, FloatArray]:
         """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
         slow, memory = slow_features(features, dt_s, state)
-        correction = self.evaluate(slow)
-        rate = np.stack([correction.rate_m_s2, np.zeros(len(features))], axis=1)
-        return Residual(rate, correction.gain), memory
+        return self.evaluate(slow), memory
 
-    def evaluate(self, features: SlowFeatures) -> Correction:
-        """Return the residual at each step; residual and gain are 0 where a feature is NaN."""
+    def evaluate(self, features: SlowFeatures) -> Residual:
+        """Return the residual at each step; rate and gain are 0 where a feature is NaN."""
         from pdhef_logtool.residual_model.ladder_kernels import evaluate
 
         count = len(features.odd)
-        residual, distance2 = np.empty(count), np.empty(count)
-        evaluate(features.odd, features.even, *self._arrays, residual, distance2)
+        of_vy, distance2 = np.empty(count), np.empty(count)
+        evaluate(features.odd, features.even, *self._arrays, of_vy, distance2)
         limit = LARGEST * self.largest_m_s2
-        return Correction(np.clip(residual, -limit, limit), self._gain(distance2, features.even[:, SPEED_COLUMN]))
+        rate = np.stack([np.clip(of_vy, -limit, limit), np.zeros(count)], axis=1)
+        return Residual(rate, self._gain(distance2, features.even[:, SPEED_COLUMN]))
 
     def _gain(self, distance2: FloatArray, speed: FloatArray) -> FloatArray:
         """Return the gain of the region of validity [K]."""

@@ -75,7 +75,7 @@ def test_a_linear_error_is_found_on_a_drive_that_was_not_taught() -> None:
     fit, other = linear_fit(), taught(60.0, 7, linear)
     assert fit.rung == "linear" and fit.model is not None
     correction = fit.model.evaluate(other.features)
-    response = other.response((correction.gain * correction.rate_m_s2)[:, None])[:, 0]
+    response = other.response((correction.gain * correction.rate[:, 0])[:, None])[:, 0]
     before, after = (np.std((other.lacking_rad - part)[other.usable]) for part in (0.0, response))
     assert after < 0.75 * before
     assert np.mean(correction.gain > 0.0) > 0.8

@@ -32,6 +32,6 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
     model, car = open_model(None), Car.load("saloon")
     assert model is not None
     assert car.network is not None and car.network.sha256 == model.sha256
-    assert (car.residual_gain, model.physics_sha256) == (0.75, car.physics_of("physics"))
+    assert (car.residual_gain, model.physics_sha256) == (0.75, physics_sha256(car.physics_vehicle))
     assert car.notes == ()
     assert {"phy-ukf:tuned", "physics"} == set(car.noise)
