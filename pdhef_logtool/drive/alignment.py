@@ -341,16 +341,9 @@ def _choose_sources(
     alternatives = {"steering_wheel_rad": ("steer_rad", 1.0 / vehicle.steering_ratio)}
     for w in WHEELS:
         alternatives[f"wheel_speed_{w}_rad_s"] = (f"wheel_speed_{w}_m_s", vehicle.wheel_radius_m)
-    chosen: dict[str, tuple[str, float]] = {}
-    unused: dict[str, str] = {}
-    for name in survey:
-        if name not in alternatives:
-            chosen[name] = (name, 1.0)
-        elif alternatives[name][0] in survey:
-            unused[name] = f"{alternatives[name][0]} is mapped too"
-        else:
-            chosen[name] = alternatives[name]
-    return chosen, unused
+    replaced = {name: target for name, (target, _) in alternatives.items() if {name, target} <= survey.keys()}
+    chosen = {name: alternatives.get(name, (name, 1.0)) for name in survey if name not in replaced}
+    return chosen, {name: f"{target} is mapped too" for name, target in replaced.items()}
 
 
 def _speed_source(columns: set[str]) -> str:

@@ -440,7 +440,6 @@ def check_drive(
     *,
     latency: LatencyEstimate | None = None,
     late: Sequence[LateSensor] = (),
-    mounting_is_known: bool = False,
 ) -> tuple[Check, ...]:
     """Return the checks of mapped signals, of ground truth and of the vehicle file.
 
@@ -448,9 +447,8 @@ def check_drive(
     ----------
     vehicle : from a file; None or the default car without a file.
     latency : of ground truth against the gyro, or of the gyro. late : late sensors, detected without ground truth.
-    mounting_is_known : the mounting of the IMU is confirmed.
     """
-    related = relation_checks(measured, mounting_is_known=mounting_is_known)
+    related = relation_checks(measured)
     file, has_file = vehicle or default_vehicle(), vehicle not in (None, default_vehicle())
     drive = CheckedDrive(measured, file, has_file, latency, late, related)
     unique: dict[str, Check] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -35,7 +36,7 @@ _PATH = ("gnss_path.east", "gnss_path.north")
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Measured:
     """Columns of the grid by name and the relations between them; names of ground truth begin with ``truth.``.
 
@@ -43,7 +44,7 @@ class Measured:
     ----------
     speed_name : the column used as the speed. topics : topics of the signals, by name.
     scales : scales of the mapping, by name. open_signs : groups of signals with an undocumented common sign.
-    has_truth : whether ground truth at the CG is available.
+    has_truth : whether ground truth at the CG is available. is_mounted : whether the drive confirms the IMU's mounting.
     """
 
     columns: Mapping[str, FloatArray]
@@ -53,7 +54,7 @@ class Measured:
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     open_signs: tuple[tuple[str, ...], ...] = ()
     has_truth: bool = False
-    _posteriors: dict[bool, Posterior] = field(default_factory=dict, init=False, repr=False)
+    is_mounted: bool = False
 
     @property
     def positions(self) -> tuple[str, str]:
@@ -74,19 +75,18 @@ class Measured:
         columns = {n: c for n, c in self.columns.items() if n not in gone}
         return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
 
-    def posterior(self, *, mounting_is_known: bool) -> Posterior:
-        """Return the probabilities of the mistakes that mappings make with these signals."""
-        if mounting_is_known not in self._posteriors:
-            groups = tuple(self.groups(mounting_is_known=mounting_is_known))
-            mistakes = known_hypotheses((*self.columns,), groups, self.open_signs)
-            self._posteriors[mounting_is_known] = posterior(self.relations, mistakes, self.scales)
-        return self._posteriors[mounting_is_known]
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Probabilities of the mistakes that mappings make with these signals."""
+        mistakes = known_hypotheses((*self.columns,), tuple(self.groups), self.open_signs)
+        return posterior(self.relations, mistakes, self.scales)
 
-    def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
-        """Return groups of signals with a common error of sign or unit: per topic, and of ground truth."""
+    @property
+    def groups(self) -> list[tuple[str, ...]]:
+        """Groups of signals with a common error of sign or unit: per topic, and of ground truth."""
         columns = self.columns
         topics: dict[str, list[str]] = {}
-        for name, topic in () if mounting_is_known else self.topics.items():
+        for name, topic in () if self.is_mounted else self.topics.items():
             if name in columns and not name.startswith(("wheel_speed_", GNSS)):
                 topics.setdefault(topic, []).append(name)
         wheels = [n for n in columns if n.startswith("wheel_speed")]

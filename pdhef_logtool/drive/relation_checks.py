@@ -24,12 +24,12 @@ _JUDGED_TRUTH = {f"truth.{name}" for name in _JUDGED}
 SIGN, UNIT = "SIGNAL.sign", "SIGNAL.unit"
 
 
-def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
+def explained_factors(measured: Measured, *, most: int = 2) -> dict[str, tuple[float, str]]:
     """Return by signal the certain correction factor of its wrong unit or sign, with the evidence.
 
     ``most``: largest number of simultaneous mistakes.
     """
-    probability, chosen = measured.posterior(mounting_is_known=mounting_is_known).sets[0]
+    probability, chosen = measured.posterior.sets[0]
     if probability < CERTAIN or len(chosen) > most or not all(h.is_exact for h in chosen):
         return {}
     bad = [r for r in measured.relations if r.tells and not r.accepts()]
@@ -41,14 +41,14 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
     return factor_by_name
 
 
-def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:
+def relation_checks(measured: Measured) -> tuple[Check, ...]:
     """Check sign, unit and field of every signal with a relation."""
     columns, relations = measured.columns, measured.relations
     # GNSS velocity is excluded: the sideslip reference compares it with gyro and speed.
     names = [n for n in columns if (n in measured.topics and not n.startswith(GNSS)) or n in _JUDGED_TRUTH]
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # v_y is v_x times tan(sideslip)
         names.remove("truth.vy_m_s")
-    probable = measured.posterior(mounting_is_known=mounting_is_known)
+    probable = measured.posterior
     checks: list[Check] = []
     for name in names:
         # A wrong wheel contradicts other signals through the mean of the wheels, which is the speed.

@@ -80,11 +80,6 @@ class Survey:
         upright = upright_check(named_rows(self.mapping, *self.triads), self.force) if is_open else None
         return (*by_drive, *([] if upright is None else [upright]))
 
-    @property
-    def is_mounted(self) -> bool:
-        """Whether the drive confirms that the IMU is read from the right axes."""
-        return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
-
     @cached_property
     def checks(self) -> tuple[Check, ...]:
         """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
@@ -96,7 +91,8 @@ class Survey:
         """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
         if not self.channels.truth:
             return self.checks
-        return (*self.mounted, *self._of(measure(self.channels.signals, {}, None, self.vehicle, self.mapping), None))
+        measured = measure(self.channels.signals, {}, None, self.vehicle, self.mapping)
+        return (*self.mounted, *self._of(replace(measured, is_mounted=self.measured.is_mounted), None))
 
     def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
         """Return the channels that must not be used, with the reason. Ground truth does not decide about sensors.
@@ -110,7 +106,7 @@ class Survey:
         return refused if is_causal else refused | misread_channels(self.sensor_checks, waived)
 
     def _of(self, measured: Measured, latency: LatencyEstimate | None) -> tuple[Check, ...]:
-        return check_drive(measured, self.vehicle, latency=latency, late=self.late, mounting_is_known=self.is_mounted)
+        return check_drive(measured, self.vehicle, latency=latency, late=self.late)
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
@@ -178,7 +174,8 @@ def survey_log(
         channels = read_signals(log, mapping, clocks, *span_ns)
         mounting = replace(mounting, named=mounting.rows)
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
-    latency = truth_latency(channels.signals, channels.truth, truth)
+    is_mounted = mounting is not None and mounting.confident and mounting.is_as_named
+    measured, latency = replace(measured, is_mounted=is_mounted), truth_latency(channels.signals, channels.truth, truth)
     survey = Survey(
         mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, force, tuple(corrected)
     )
@@ -197,13 +194,12 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
     A correction must be certain. Documented units and signs are corrected
     without ground truth, and each such correction is a failed check.
     """
-    mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
-    probable = measured.posterior(mounting_is_known=is_mounted)
-    turned = [n for g in measured.open_signs if probable.turned(g[0]) >= CERTAIN for n in g]
+    mapping, measured = survey.mapping, survey.measured
+    turned = [n for g in measured.open_signs if measured.posterior.turned(g[0]) >= CERTAIN for n in g]
     factors = dict.fromkeys(turned, (-1.0, "its sign is not documented, and the drive shows it"))
     if not turned:
         measured = replace(measured, open_signs=()).without_truth()
-        factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
+        factors = explained_factors(measured, most=1)
     said = {n: (f, f"read with {f:.6g} times its scale: {evidence}") for n, (f, evidence) in factors.items()}
     if not (proposals := _rescaled(mapping, said)):
         return survey
@@ -271,7 +267,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
         turned, said = turned_signals(mapping, mounting, survey.triads), f"{mounting.text}: {mounting.evidence}"
         proposals += [Proposal(n, said, s) for n, s in turned.items() if s != mapping.signals[n]]
     else:
-        factors = explained_factors(survey.measured, mounting_is_known=survey.is_mounted)
+        factors = explained_factors(survey.measured)
         proposals += _rescaled(mapping, factors) if factors else _of_a_turned_truth(survey)
     sources = mapping.by_subject | {p.subject: p.source for p in proposals}
     for name, (delay_s, evidence) in _delays(survey).items():

@@ -121,7 +121,6 @@ def plan_truth(
     channels: Mapping[str, Channel],
     *,
     truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    max_gap_s: float | None = None,
     roll_gradient_rad_per_m_s2: float = 0.0,
 ) -> TruthPlan | None:
     """Decide clock, derivation, local frame and the convention of the quaternion.
@@ -129,7 +128,7 @@ def plan_truth(
     Parameters
     ----------
     channels : truth channels by name, quality gate applied (samples that failed are absent).
-    truth_position_m : measurement point from the CG. max_gap_s : default three median periods.
+    truth_position_m : measurement point from the CG.
     roll_gradient_rad_per_m_s2 : of the car; separates body roll from the bank of the road.
 
     Returns
@@ -143,7 +142,7 @@ def plan_truth(
     origin = _find_origin(survey)
     source, base = _velocity_source(has, survey, origin)
     periods = {name: float(np.median(np.diff(c.stamps_ns))) * 1e-9 for name, c in survey.items()}
-    gaps = {name: GAP_PERIODS * p if max_gap_s is None else max_gap_s for name, p in periods.items()}
+    gaps = {name: GAP_PERIODS * p for name, p in periods.items()}
     half_window = max(2, round(DIFFERENTIATION_HALF_S / periods[base]))
     place, gradient = truth_position_m, roll_gradient_rad_per_m_s2
     plan = TruthPlan(base, source, has, periods[base], gaps, half_window, origin, None, place, gradient)
@@ -156,7 +155,6 @@ def derive_truth(
     truth_channels: Mapping[str, Channel],
     *,
     truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    max_gap_s: float | None = None,
     plan: TruthPlan | None = None,
 ) -> TruthTrack:
     """Derive body velocity, yaw rate, sideslip, a_y and pose at the CG from the mapped truth channels.
@@ -164,7 +162,7 @@ def derive_truth(
     Parameters
     ----------
     truth_channels : quality gate applied.
-    truth_position_m, max_gap_s : as for :func:`plan_truth`; not used with a ``plan``.
+    truth_position_m : as for :func:`plan_truth`; not used with a ``plan``.
     plan : from :func:`plan_truth` over the log's beginning; computed from these channels by default.
 
     Returns
@@ -174,7 +172,7 @@ def derive_truth(
         at the CG, or the mapped sideslip without velocities. ``yaw_rad`` is wrapped.
     """
     if plan is None:
-        plan = plan_truth(truth_channels, truth_position_m=truth_position_m, max_gap_s=max_gap_s)
+        plan = plan_truth(truth_channels, truth_position_m=truth_position_m)
     if plan is None:
         return TruthTrack(track=make_track("truth", np.empty(0, dtype=np.int64)), max_gap_s=0.0)
     source = _Source(truth_channels, plan)

@@ -6,13 +6,12 @@ differ in steering ratio and offset, biases, and gain of the gyro.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import corrected_anew
 from pdhef_logtool.estimators.presets import uses_calibration
-from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
+from pdhef_logtool.records.signals import Signals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +24,7 @@ class DriveSignals:
     @classmethod
     def of(cls, signals: Signals, car: Car) -> DriveSignals:
         """Return the read-only tables of signals [N] that were read with the vehicle file of a car."""
-        return cls(_read_only(signals), _read_only(calibrated_signals(signals, car)))
+        return cls(signals.read_only(), calibrated_signals(signals, car).read_only())
 
     def of_estimator(self, name: str) -> Signals:
         """Return the table for the vehicle that an estimator uses."""
@@ -35,10 +34,3 @@ class DriveSignals:
 def calibrated_signals(signals: Signals, car: Car) -> Signals:
     """Return signals [N] that were read with a car's file as its calibrated or identified vehicle corrects them."""
     return corrected_anew(signals, car.vehicle, car.calibrated_car.physics_vehicle)
-
-
-def _read_only(signals: Signals) -> Signals:
-    columns: dict[str, Any] = {name: getattr(signals, name).view() for name in SIGNAL_COLUMNS}
-    for column in columns.values():
-        column.setflags(write=False)
-    return replace(signals, **columns)

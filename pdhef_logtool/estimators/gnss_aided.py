@@ -28,12 +28,12 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import kinematic_filter as f
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.base import notes_of, predict_track
+from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.reference.gnss import LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import RATE_HZ, ROLL_PER_AY_RAD_S2_M, SLOW_S
 from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, sideslip_std
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, ExtendedSteps, Extrapolation
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
 #: Columns of a queued row after those of the kinematic filter: v_y of the wrapped filter, time of the row, arrival of
@@ -246,9 +246,11 @@ def _aid(columns, grip_m_s2, start, start_variance, memory, out):  # type: ignor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AidedSteps(ExtendedSteps):
+class AidedSteps(StepColumns):
     """Steps of the filter, and for each step the correction of v_y, the filter's weight and more variance, [K, 3]."""
 
+    steps: Any
+    valid: BoolArray
     aid: FloatArray
 
 
@@ -285,9 +287,7 @@ class GnssAided:
         """Process one window (see :class:`~.base.Estimator`)."""
         steps, after = self.estimator.run(signals, None if state is None else state.filter)
         stamps_ns, count, n = signals.stamps_ns, len(signals), f.WITH_GNSS
-        everywhere = np.ones(count, dtype=np.bool_)
-        at_steps = Extrapolation(np.arange(count), everywhere, np.zeros(count), np.asarray(steps.valid))
-        track = predict_track(self.estimator, steps, at_steps, stamps_ns)
+        track = self.estimator.predict(steps, Extrapolation.none(steps.valid), stamps_ns)
         vehicle = self.estimator.physics.vehicle
         ay_m_s2 = signals.ay_m_s2 / (1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2)
         columns = (
@@ -308,7 +308,7 @@ class GnssAided:
             start[f.ANTENNA_X], start_std[f.ANTENNA_X] = antenna[0], KNOWN_ANTENNA_STD_M
         out = np.empty((count, 3))
         _aid(columns, GRAVITY_M_S2 * vehicle.assumed_friction, start, start_std**2, aiding, out)
-        return AidedSteps(steps, out), AidedState(after, aiding)
+        return AidedSteps(steps, steps.valid, out), AidedState(after, aiding)
 
     def predict(self, steps: AidedSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate the filter's steps and add the GNSS correction (see :class:`~.base.ModelPredictor`)."""

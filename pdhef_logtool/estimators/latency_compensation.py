@@ -16,7 +16,7 @@ import numpy as np
 
 from pdhef_logtool.estimators.base import Estimator, Smoother, StepEstimator, Steps, predict_track
 from pdhef_logtool.estimators.causality_check import CausalityCheck, step_columns
-from pdhef_logtool.estimators.plug_ins import contained, package_of, read_only
+from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import IntArray, Signals
 from pdhef_logtool.records.steps import Release, StepColumns, extrapolation, release
@@ -74,7 +74,7 @@ def _run_piece(
     estimator: StepEstimator, signals: Signals, state: Any, causality: CausalityCheck | None
 ) -> tuple[Any, Any]:
     """Return the checked steps of an estimator over a piece of a drive, and the state for the next one."""
-    given = read_only(signals) if package_of(estimator) else signals
+    given = signals.copy().read_only() if package_of(estimator) else signals
     copied = None if causality is None else causality.state_before(estimator, state)
     returned = estimator.run(given, state)
     if not isinstance(returned, tuple) or len(returned) != 2:
@@ -90,7 +90,7 @@ def _smoothed(smoother: Smoother, signals: Signals) -> StateTrack:
     """Return the track of a smoother, which has one row per sample."""
     name, package = smoother.name, package_of(smoother)
     with contained(name, package):
-        track = smoother.smooth(read_only(signals) if package else signals.copy())
+        track = smoother.smooth(signals.copy().read_only() if package else signals.copy())
         if not isinstance(track, StateTrack) or len(track) != len(signals):
             got = f"{len(track)} rows" if isinstance(track, StateTrack) else type(track).__name__
             raise EstimatorError(expected=f"a StateTrack, one row per sample ({len(signals)})", got=got, where=name)

@@ -11,7 +11,6 @@ from traceback import extract_tb
 from typing import Any
 
 from pdhef_logtool.records.errors import EstimatorError, PdhefError
-from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
 
 _PACKAGE = __name__.partition(".")[0]
 
@@ -51,11 +50,3 @@ def contained(name: str, package: str) -> Iterator[None]:
     finally:
         with suppress(OSError):
             os.chdir(folder)
-
-
-def read_only(signals: Signals) -> Signals:
-    """Return copies with read-only columns."""
-    copies = signals.copy()
-    for name in SIGNAL_COLUMNS:
-        getattr(copies, name).setflags(write=False)
-    return copies

@@ -163,9 +163,8 @@ def smoothed_track(physics: VehicleUkf, steps: ForwardSteps, following: ForwardS
     """Return the smoothed track of steps, with those that follow them."""
     x, P = smooth_steps(steps if following is None else steps.joined(following))
     posterior = steps.posterior
-    count = len(posterior.stamps_ns)
-    at_steps = Extrapolation(np.arange(count), np.ones(count, np.bool_), np.zeros(count), posterior.valid)
-    return physics.predict(replace(posterior, x=x[:count], P=P[:count]), at_steps, posterior.stamps_ns)
+    count, in_place = len(posterior.stamps_ns), Extrapolation.none(posterior.valid)
+    return physics.predict(replace(posterior, x=x[:count], P=P[:count]), in_place, posterior.stamps_ns)
 
 
 def blocks(stamps_ns: IntArray, block_s: float) -> Iterator[slice]:

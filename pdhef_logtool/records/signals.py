@@ -220,6 +220,13 @@ class Signals:
         """Return the same signals in arrays that may be written."""
         return replace(self, **{c: getattr(self, c).copy() for c in SIGNAL_COLUMNS})
 
+    def read_only(self) -> Signals:
+        """Return the same signals in views that cannot be written."""
+        columns: dict[str, Any] = {c: getattr(self, c).view() for c in SIGNAL_COLUMNS}
+        for column in columns.values():
+            column.setflags(write=False)
+        return replace(self, **columns)
+
 
 SIGNAL_COLUMNS = tuple(f.name for f in fields(Signals) if f.name not in ("available", "before_ns"))
 

@@ -36,19 +36,6 @@ class StepColumns:
         return type(self)(*(_cut(getattr(self, f.name), part) for f in fields(self)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ExtendedSteps(StepColumns):
-    """Base of the steps of an estimator with further columns."""
-
-    steps: Any
-
-    @property
-    def valid(self) -> BoolArray:
-        """Whether there is an estimate, [K]."""
-        valid: BoolArray = self.steps.valid
-        return valid
-
-
 def _joined(a: Any, b: Any) -> Any:
     if isinstance(a, tuple):
         return tuple(_joined(x, y) for x, y in zip(a, b, strict=True))
@@ -106,6 +93,12 @@ class Extrapolation:
     arrived: BoolArray
     horizon_s: FloatArray
     usable: BoolArray
+
+    @classmethod
+    def none(cls, valid: BoolArray) -> Extrapolation:
+        """Return no extrapolation: the stamps are those of the steps [K]."""
+        count = len(valid)
+        return cls(np.arange(count), np.ones(count, np.bool_), np.zeros(count), valid)
 
 
 def extrapolation(steps_ns: IntArray, chosen: Release, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:

@@ -367,7 +367,7 @@ def test_signs_that_nothing_decides_are_undecided(sign: float) -> None:
     channels = {n: replace(c, values=sign * c.values) if n in names else c for n, c in drive(3).items()}
     channels = {n: c for n, c in channels.items() if n in (*names, "speed_m_s")}
     measured = measure(channels, mapping=Mapping(open_signs=tuple((n,) for n in names)))
-    verdicts = {c.name: c.verdict for c in relation_checks(measured, mounting_is_known=False)}
+    verdicts = {c.name: c.verdict for c in relation_checks(measured)}
     assert {verdicts[f"{n}.sign"] for n in names} == {"undecided"}
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, model_folder, open_model
 from pdhef_logtool.residual_model.features import FEATURES
