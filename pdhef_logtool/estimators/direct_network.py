@@ -18,9 +18,9 @@ from pdhef_logtool.estimators.base import VX, VY, Steps
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, nominal_filter
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
-from pdhef_logtool.residual_model.service import NetworkService
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -38,7 +38,7 @@ class DirectNetwork:
     weights: ClassVar[str] = "network"
 
     vehicle: VehicleParameters
-    network: NetworkService | LinearModel
+    network: ModelBundle | LinearModel
     use_speed: bool = True
     name: str = "pure-lstm"
     causal: bool = True
@@ -75,7 +75,7 @@ def build(name: str, car: Car, options: Options) -> DirectNetwork:
     """Return ``pure-lstm`` for a car with such a network."""
     del name
     assert car.network is not None and car.network.pure_lstm is not None
-    return DirectNetwork(car.vehicle, NetworkService(car.network.pure_lstm), use_speed=options.use_speed)
+    return DirectNetwork(car.vehicle, car.network.pure_lstm, use_speed=options.use_speed)
 
 
 def build_regression(name: str, car: Car, options: Options) -> LinearRegression:

@@ -34,8 +34,8 @@ from pdhef_logtool.estimators.vehicle_model import NOMINAL, PLACES, READINGS, VX
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
-from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -81,7 +81,7 @@ class PaperState:
     """States of the parallel filter, the network and this filter between windows; ``adapted`` [1] is β and C."""
 
     physics: ukf.FilterState
-    network: NetworkCarry
+    network: Any
     filtered: ukf.FilterState
     adapted: np.ndarray[Any, Any]
 
@@ -192,7 +192,7 @@ class PaperHybridUkf:
     options = ("constants",)
 
     vehicle: VehicleParameters
-    network: NetworkService
+    network: ModelBundle
     q_std: tuple[float, float, float, float] = ukf.PHY_UKF_Q_STD
     use_speed: bool = True
     name: str = "pd-hef-paper"
@@ -202,7 +202,7 @@ class PaperHybridUkf:
     @property
     def notes(self) -> tuple[str, ...]:
         """State where this is not the paper's filter: its network may have other features than the paper's six."""
-        names = self.network.bundle.feature_names
+        names = self.network.feature_names
         if names == PAPER_FEATURES:
             return ()
         return (f"the network has {len(names)} features, not the paper's {len(PAPER_FEATURES)}: {', '.join(names)}",)
@@ -269,7 +269,6 @@ class PaperHybridUkf:
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:
     """Return ``pd-hef-paper`` of a car: with the paper's network where there is one beside the car's."""
     del name
-    paper = None if car.network is None else car.network.paper_network
-    network = options.service(car) if paper is None else NetworkService(paper)
-    assert isinstance(network, NetworkService), "the table lets no other residual model in"
+    network = car.network if car.network is None or car.network.paper_network is None else car.network.paper_network
+    assert isinstance(network, ModelBundle), "the table lets no other residual model in"
     return PaperHybridUkf(car.vehicle, network, use_speed=options.use_speed)

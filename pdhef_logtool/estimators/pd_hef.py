@@ -44,7 +44,7 @@ def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     gain, note = _gain(name, car)
     return AdaptivePhysics(
         of_car(car, use_speed=options.use_speed),
-        options.service(car) if gain > 0.0 else None,
+        car.network.residual_model if gain > 0.0 and car.network is not None else None,
         gain,
         adaptive="fixed-r" not in options_of(name),
         name=name,

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.car.posterior import Posterior
-    from pdhef_logtool.residual_model.interface import ResidualModel
 
 #: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
@@ -40,17 +39,10 @@ class Options:
     ----------
     use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only initializes them.
     gnss : whether GNSS velocity corrects :data:`AIDED` if the log has it.
-    network : the car's network, shared by several estimators; None: each estimator loads it.
     """
 
     use_speed: bool = True
-    network: ResidualModel | None = field(default=None, compare=False)
     gnss: bool = False
-
-    def service(self, car: Car) -> ResidualModel:
-        """Return the car's network."""
-        assert car.network is not None, "the table lets no estimator run without the network that it needs"
-        return self.network or car.network.service()
 
 
 def preset_of(name: str) -> str:

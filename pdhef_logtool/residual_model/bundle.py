@@ -5,19 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES
-from pdhef_logtool.residual_model.interface import ResidualModel
+from pdhef_logtool.residual_model.interface import LIMITS, Residual, ResidualModel
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 from pdhef_logtool.storage.documents import read_json
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
+
+if TYPE_CHECKING:
+    from pdhef_logtool.residual_model.forward_pass import ForwardPass, NetworkState
 
 FORMAT = "pdhef.residual-model"
 FORMAT_VERSION = 2
@@ -42,6 +46,8 @@ MODELS = (PHYSICS_MODEL, NOMINAL_MODEL)
 RESIDUAL = "residual_rates"
 LATERAL_VELOCITY = "lateral_velocity"
 OUTPUT_COUNT = {RESIDUAL: 2, LATERAL_VELOCITY: 1}
+#: Limits of the outputs; of v_y in m/s.
+_LIMITS_OF = {RESIDUAL: LIMITS, LATERAL_VELOCITY: (30.0,)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +59,9 @@ class Normalisation:
     target_std: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ModelBundle:
-    """A trained network for service.
+    """A trained network, which predicts step by step.
 
     Attributes
     ----------
@@ -124,11 +130,66 @@ class ModelBundle:
         limited: FloatArray = np.clip(scaled, -8.0, 8.0)
         return limited
 
-    def service(self) -> ResidualModel:
-        """Return the network as a residual model."""
-        from pdhef_logtool.residual_model.service import NetworkService  # compiled code is imported on demand
+    @property
+    def residual_model(self) -> ResidualModel:
+        """The network as a residual model."""
+        return self
 
-        return NetworkService(self)
+    @cached_property
+    def _network(self) -> ForwardPass:
+        from pdhef_logtool.residual_model.forward_pass import ForwardPass  # compiled code is imported on demand
+
+        return ForwardPass.of(self.weights, self.layers, self.head)
+
+    def run(
+        self, features: FloatArray, starts: BoolArray, carry: NetworkState | None
+    ) -> tuple[FloatArray, NetworkState | None]:
+        """Return residual rates [N, 2] in m/s² and rad/s² after each step, or v_y [N, 1] in m/s; and the state.
+
+        The state is None at the start of a sequence (docs/method.md#network).
+
+        Parameters
+        ----------
+        features : [N, 15] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
+        starts : [N], True at the start of a sequence.
+        """
+        out = np.zeros((features.shape[0], OUTPUT_COUNT[self.target]))
+        usable = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
+        breaks = np.logical_or(starts, ~usable).astype(np.bool_)
+        breaks[1:] |= ~usable[:-1]
+        edges = [0, *(np.flatnonzero(breaks[1:]) + 1).tolist(), features.shape[0]]
+        for a, b in pairwise(edges):
+            if a == b:
+                continue
+            if breaks[a]:
+                carry = None
+            if usable[a]:
+                out[a:b], carry = self._sequence(self.normalise(features[a:b]), carry)
+        limits = np.array(_LIMITS_OF[self.target])
+        return np.clip(out * np.array(self.normalisation.target_std), -limits, limits), carry
+
+    def residual(
+        self, features: FloatArray, dt_s: FloatArray, state: NetworkState | None
+    ) -> tuple[Residual, NetworkState | None]:
+        """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
+        rate, after = self.run(features, np.isnan(dt_s), state)
+        return Residual(rate, np.ones(len(rate))), after
+
+    def lateral_velocity(
+        self, features: FloatArray, dt_s: FloatArray, state: NetworkState | None
+    ) -> tuple[FloatArray, NetworkState | None]:
+        """Return v_y [N] of such a network and the state after; ``dt_s`` [N] is NaN where a sequence starts."""
+        output, after = self.run(features, np.isnan(dt_s), state)
+        return output[:, 0], after
+
+    def _sequence(self, scaled: FloatArray, carry: NetworkState | None) -> tuple[FloatArray, NetworkState]:
+        """Run a sequence of normalised features [N, k] and, for an ``odd`` network, its mirror image."""
+        # Features that change their sign have a mean of 0, so that normalised values change it too.
+        mirror = scaled * self.signs if self.odd else np.zeros_like(scaled)
+        both = np.stack([scaled, mirror], axis=1).astype(np.float32)
+        said, after = self._network.run(both, self._network.initial_state() if carry is None else carry)
+        straight, mirrored = said[:, 0].astype(np.float64), said[:, 1]
+        return 0.5 * (straight - mirrored) if self.odd else straight, after
 
     def _document(self) -> dict[str, Any]:
         other = {} if self.target == RESIDUAL else {"target": self.target}
@@ -163,25 +224,9 @@ class ModelBundle:
                     file.write(data)
 
 
-def open_model(model: Path | None) -> ModelBundle | None:
-    """Return the network of a run: a shipped one by name (None is ``default``) or of a folder; None for ``none``.
-
-    Raises
-    ------
-    ModelError
-        The folder contains no model.
-    """
-    folder = model_folder(model)
-    if folder is None or (model is None and not (folder / DOCUMENT_FILE).is_file()):
-        return None
-    return load_bundle(folder)
-
-
-def model_folder(model: Path | None) -> Path | None:
-    """Return the folder of a run's model, None without one; ``model`` as :func:`open_model` takes it."""
-    if model is not None and str(model) == NO_MODEL:
-        return None
-    return SHIPPED_FOLDERS.get(SHIPPED if model is None else str(model), model)
+def network_folder(network: Path) -> Path | None:
+    """Return the folder of a network: of a shipped one by name, or the folder itself; None for ``none``."""
+    return None if str(network) == NO_MODEL else SHIPPED_FOLDERS.get(str(network), network)
 
 
 def load_bundle(folder: Path) -> ModelBundle:

@@ -110,8 +110,9 @@ class PlugInModel:
         """Digest of the model."""
         return self.plug_in.sha256
 
-    def service(self) -> ResidualModel:
-        """Return the model."""
+    @property
+    def residual_model(self) -> ResidualModel:
+        """The model itself, whose package it belongs to."""
         return self.plug_in
 
 

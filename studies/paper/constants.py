@@ -28,7 +28,6 @@ from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, nominal_filter
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.residual_model.service import NetworkService
 from studies.defaults.paper_drives import plan_drives
 from studies.pages import RESULTS, options, write
 from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, as_logged, on_the_road
@@ -74,10 +73,10 @@ class Case:
         return whole.signals, whole.truth.sideslip_rad, steps, rate
 
     @property
-    def _network(self) -> NetworkService:
+    def _network(self) -> ModelBundle:
         assert isinstance(self.car.network, ModelBundle)
         assert self.car.network.paper_network is not None
-        return NetworkService(self.car.network.paper_network)
+        return self.car.network.paper_network
 
     def rmse_deg(self, constants: Constants) -> float:
         """Return the RMSE of the sideslip after each update."""

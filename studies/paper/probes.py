@@ -11,7 +11,6 @@ from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.learning.network.residuals import residual_rows
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.residual_model.service import NetworkService
 from studies.paper.experiment import GRAVITY_M_S2, Experiment, ReadDrive
 
 #: Rows of the residual, with their units.
@@ -52,7 +51,7 @@ def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
     parallel = filter_of(car, network.model)
     rows = residual_rows(whole.signals, whole.truth, parallel, period_s=period_s)
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
-    output, _ = NetworkService(network).run(rows.features, starts, None)
+    output, _ = network.run(rows.features, starts, None)
     use = rows.weight > 0.0
     time_s = (rows.stamps_ns[use] - rows.stamps_ns[0]) * 1e-9
     target = rows.targets[use] / rows.step_s[use, None]

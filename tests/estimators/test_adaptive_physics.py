@@ -16,7 +16,7 @@ from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.residual_model.service import NetworkService
+from pdhef_logtool.residual_model.bundle import ModelBundle
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +25,7 @@ VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0
 COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2", "covariance", "nis", "valid", "r_scale")
 
 
-SILENT = NetworkService(random_network(constant=(0.0, 0.0)))
+SILENT = random_network(constant=(0.0, 0.0))
 
 
 #: As a car that was identified: a single track with the cures and the noise that it was found with.
@@ -39,11 +39,11 @@ PHYSICS = VehicleUkf(
 PLAIN = replace(PHYSICS, vehicle=VEHICLE)
 
 
-def adaptive(network: NetworkService = SILENT, **options) -> AdaptivePhysics:
+def adaptive(network: ModelBundle = SILENT, **options) -> AdaptivePhysics:
     return AdaptivePhysics(**{"physics": PHYSICS, "network": network, "trust": 1.0, **options})
 
 
-def fixed(network: NetworkService = SILENT, **options) -> AdaptivePhysics:
+def fixed(network: ModelBundle = SILENT, **options) -> AdaptivePhysics:
     given = {"physics": PLAIN, "network": network, "trust": 1.0, **options}
     return AdaptivePhysics(adaptive=False, name="pd-hef:fixed-r", **given)
 

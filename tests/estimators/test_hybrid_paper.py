@@ -18,7 +18,6 @@ from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
-from pdhef_logtool.residual_model.service import NetworkService
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +34,7 @@ CONSTANTS = Constants(0.95, 3.0, *TOPS, 0.1)
 
 
 def paper_filter(**options: object) -> PaperHybridUkf:
-    return PaperHybridUkf(VEHICLE, NetworkService(make_bundle()), **{"constants": CONSTANTS, **options})
+    return PaperHybridUkf(VEHICLE, make_bundle(), **{"constants": CONSTANTS, **options})
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +61,7 @@ def test_the_undisturbed_norm_is_the_papers():
 def numpy_reference(signals: Signals, bundle: ModelBundle, constants: Constants) -> dict[str, np.ndarray]:
     """Compute Eq 19-26 in plain numpy, predicted to the stamps, from the package's parallel filter and network."""
     features, dt_s, physics, _ = run_features(nominal_filter(VEHICLE), signals, None)
-    rate, _ = NetworkService(bundle).run(features, np.isnan(dt_s), None)
+    rate, _ = bundle.run(features, np.isnan(dt_s), None)
     signals = without_impossible(signals)
     q = np.array([0.089, 0.31, 0.062, 0.021])
     theta, gamma, deviation_tops, intensity_tops, ay_variance = constants
@@ -149,7 +148,7 @@ def numpy_reference(signals: Signals, bundle: ModelBundle, constants: Constants)
 def test_it_is_the_papers_equations_in_plain_numpy(weaving, constants):
     bundle = make_bundle()
     want = numpy_reference(weaving, bundle, constants)
-    track = run_estimator(PaperHybridUkf(VEHICLE, NetworkService(bundle), constants=constants), weaving)
+    track = run_estimator(PaperHybridUkf(VEHICLE, bundle, constants=constants), weaving)
     got = {
         "vx": track.vx_m_s, "vy": track.vy_m_s, "r": track.yaw_rate_rad_s, "beta": track.network_trust,
         "r_scale": track.r_scale, "ay": track.ay_m_s2, "vy_var": track.vy_std_m_s**2,
@@ -162,7 +161,7 @@ def test_it_is_the_papers_equations_in_plain_numpy(weaving, constants):
 
 def test_it_says_when_the_network_is_not_the_papers():
     assert paper_filter().notes == ()
-    other = PaperHybridUkf(VEHICLE, NetworkService(make_bundle(FEATURES)))
+    other = PaperHybridUkf(VEHICLE, make_bundle(FEATURES))
     assert "not the paper's 6" in other.notes[0]
     assert "physics_vy_m_s" in other.notes[0]
 

@@ -17,7 +17,6 @@ from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.residual_model.service import NetworkService
 
 pytestmark = pytest.mark.slow
 
@@ -38,14 +37,14 @@ def _same(a: StateTrack, b: StateTrack) -> bool:
 
 def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) -> AdaptivePhysics:
     vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(parts, True))})
-    return AdaptivePhysics(VehicleUkf(vehicle), NetworkService(network or random_network()), trust)
+    return AdaptivePhysics(VehicleUkf(vehicle), network or random_network(), trust)
 
 
 @pytest.mark.parametrize("parts", [(), ("lag", "roll", "biases", "bank"), tuple(PhysicsParts.model_fields)])
 def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...], signals: Signals) -> None:
     trusted = hybrid(*parts)
     physics = run_estimator(AdaptivePhysics(trusted.physics, name="physics"), signals)
-    for change in ({"trust": 0.0}, {"network": NetworkService(random_network(constant=(0.0, 0.0)))}):
+    for change in ({"trust": 0.0}, {"network": random_network(constant=(0.0, 0.0))}):
         track = run_estimator(replace(trusted, **change), signals)
         for f in fields(StateTrack):
             if f.name not in ("name", "network_trust"):
@@ -76,7 +75,7 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
     made = Pushed(oracle.has).drive(lambda t: 0.02 * np.sin(2.0 * t), 8.0)
     # A force, so that the accelerometer feels it.
     signals = replace(made.signals, ay_m_s2=made.signals.ay_m_s2 + 0.8, friction=np.full(len(made.signals), FRICTION))
-    network = NetworkService(random_network(constant=(0.8, 0.15)))
+    network = random_network(constant=(0.8, 0.15))
     errors = []
     for trust in (0.0, 1.0, 0.5):
         track = run_estimator(AdaptivePhysics(VehicleUkf(oracle.as_vehicle()), network, trust), signals)

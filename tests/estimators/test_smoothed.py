@@ -19,7 +19,6 @@ from pdhef_logtool.estimators.smoothed import BLOCK_S, SmoothedPhysics
 from pdhef_logtool.estimators.table import SPECS, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.residual_model.service import NetworkService
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +29,7 @@ BUNDLE = random_network(2)
 
 def smoother(block_s: float = ALL, *, trust: float = 1.0, parts: tuple[str, ...] = ("lag", "biases")):
     vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(parts, True))})
-    return SmoothedPhysics(AdaptivePhysics(VehicleUkf(vehicle), NetworkService(BUNDLE), trust), block_s=block_s)
+    return SmoothedPhysics(AdaptivePhysics(VehicleUkf(vehicle), BUNDLE, trust), block_s=block_s)
 
 
 def flat_smoother(*parts: str) -> SmoothedPhysics:

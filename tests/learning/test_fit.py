@@ -18,7 +18,6 @@ from pdhef_logtool.learning.network.fit import (
 from pdhef_logtool.learning.network.train_command import mean_square
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.service import NetworkService
 
 pytestmark = pytest.mark.slow
 
@@ -48,7 +47,7 @@ def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path: Path) -> 
     bundle, history = train(training, validation, replace(SMALL, epochs=12), tmp_path)
     assert history[-1].validation_loss < 0.15 * history[0].validation_loss or history[-1].validation_loss < 0.05
     test = make_sequences(2, 1)[0]
-    rates, _ = NetworkService(bundle).run(test.features, np.zeros(len(test.weight), dtype=np.bool_), None)
+    rates, _ = bundle.run(test.features, np.zeros(len(test.weight), dtype=np.bool_), None)
     error = np.sqrt(np.mean((rates - test.target) ** 2, axis=0))
     assert np.all(error < 0.35 * np.sqrt(np.mean(test.target**2, axis=0)))
 

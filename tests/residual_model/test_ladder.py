@@ -96,7 +96,7 @@ def test_a_constant_of_the_ground_truth_is_not_learned(offset_rad: float) -> Non
     assert moved is not None
     found = drive.features
     expected, got = linear_model().evaluate(found), moved.evaluate(found)
-    assert np.allclose(got.rate_m_s2, expected.rate_m_s2, atol=1e-9)
+    assert np.allclose(got.rate, expected.rate, atol=1e-9)
     assert np.array_equal(got.gain, expected.gain)
 
 
@@ -107,7 +107,7 @@ def test_the_mirrored_drive_has_the_mirrored_residual(seed: int, size: float) ->
     mirrored = SlowFeatures(-found.odd, found.even)
     for model in (linear_model(), random_model()):
         straight, turned = model.evaluate(found), model.evaluate(mirrored)
-        assert np.array_equal(turned.rate_m_s2, -straight.rate_m_s2)
+        assert np.array_equal(turned.rate, -straight.rate)
         assert np.array_equal(turned.gain, straight.gain)
 
 
@@ -142,8 +142,8 @@ def test_unknown_features_have_gain_zero_and_the_next_ones_go_on() -> None:
     signals = driving(8.0, 3)
     signals[50:60, 2] = np.nan
     found = linear_model().evaluate(features(signals))
-    assert np.all(found.gain[50:60] == 0.0) and np.all(found.rate_m_s2[50:60] == 0.0)
-    assert np.all(np.isfinite(found.rate_m_s2)) and np.mean(found.gain[60:] > 0.0) > 0.5
+    assert np.all(found.gain[50:60] == 0.0) and np.all(found.rate[50:60] == 0.0)
+    assert np.all(np.isfinite(found.rate)) and np.mean(found.gain[60:] > 0.0) > 0.5
 
 
 def test_a_model_survives_its_document_and_damage_is_refused() -> None:

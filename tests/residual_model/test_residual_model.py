@@ -23,8 +23,8 @@ from pdhef_logtool.residual_model.bundle import (
     load_bundle,
 )
 from pdhef_logtool.residual_model.features import FEATURES, make_features
+from pdhef_logtool.residual_model.interface import LIMITS
 from pdhef_logtool.residual_model.network import ResidualNetwork
-from pdhef_logtool.residual_model.service import LIMITS, NetworkService
 
 make_bundle = partial(random_network, hidden=16, layers=2, head=(8,), scales=(2.0, 0.7))
 
@@ -50,13 +50,13 @@ def test_an_odd_network_is_odd_to_the_last_digits() -> None:
     rng = np.random.default_rng(5)
     features = rng.normal(size=(300, len(FEATURES)))
     starts = np.zeros(300, dtype=np.bool_)
-    out, _ = NetworkService(bundle).run(features, starts, None)
-    mirrored, _ = NetworkService(bundle).run(features * bundle.signs, starts, None)
+    out, _ = bundle.run(features, starts, None)
+    mirrored, _ = bundle.run(features * bundle.signs, starts, None)
     np.testing.assert_allclose(mirrored, -out, atol=1e-6)
-    other, _ = NetworkService(replace(bundle, odd=False)).run(features, starts, None)
+    other, _ = replace(bundle, odd=False).run(features, starts, None)
     assert np.abs(other - out).max() > 1e-4
-    first, carry = NetworkService(bundle).run(features[:77], starts[:77], None)
-    second, _ = NetworkService(bundle).run(features[77:], starts[77:], carry)
+    first, carry = bundle.run(features[:77], starts[:77], None)
+    second, _ = bundle.run(features[77:], starts[77:], carry)
     np.testing.assert_array_equal(np.concatenate([first, second]), out)
 
 
@@ -103,7 +103,7 @@ def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
 def test_service_equals_torch(hidden: int) -> None:
     bundle = make_bundle(hidden=hidden)
     features = np.random.default_rng(0).normal(size=(300, len(FEATURES)))
-    rates, _ = NetworkService(bundle).run(features, np.zeros(len(features), dtype=np.bool_), None)
+    rates, _ = bundle.run(features, np.zeros(len(features), dtype=np.bool_), None)
     expected = said_by_torch(bundle, bundle.normalise(features)) * np.array(bundle.normalisation.target_std)
     np.testing.assert_allclose(rates, expected, atol=2e-6)
 
@@ -118,7 +118,7 @@ def test_shipped_networks_say_what_torch_makes_of_them() -> None:
             features = np.zeros((400, len(FEATURES)))
             spread = 2.0 * rng.normal(size=(400, len(n.feature_std)))
             features[:, bundle.columns] = np.array(n.feature_mean) + np.array(n.feature_std) * spread
-            said, _ = NetworkService(bundle).run(features, np.zeros(400, dtype=np.bool_), None)
+            said, _ = bundle.run(features, np.zeros(400, dtype=np.bool_), None)
             scaled = bundle.normalise(features)
             expected = said_by_torch(bundle, scaled)
             if bundle.odd:
@@ -134,7 +134,7 @@ def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
-    service = NetworkService(make_bundle())
+    service = make_bundle()
     rng = np.random.default_rng(2)
     features = rng.normal(size=(300, len(FEATURES)))
     starts = np.zeros(300, dtype=np.bool_)
@@ -150,7 +150,7 @@ def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
 
 def test_causality_and_limits() -> None:
     bundle = make_bundle()
-    service = NetworkService(bundle)
+    service = bundle
     features = np.random.default_rng(3).normal(size=(400, len(FEATURES)))
     starts = np.zeros(400, dtype=np.bool_)
     before, _ = service.run(features, starts, None)

@@ -9,19 +9,18 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, model_folder, open_model
+from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, load_bundle, network_folder
 from pdhef_logtool.residual_model.features import FEATURES
 
 
 def test_models_are_found_by_name() -> None:
-    default = open_model(None)
-    assert default is not None
+    default = load_bundle(SHIPPED_FOLDERS["default"])
     assert default.feature_names == FEATURES
     assert None not in (default.pure_lstm, default.linear_regression, default.paper_network)
-    assert open_model(Path("none")) is None
-    assert model_folder(Path("elsewhere")) == Path("elsewhere")
+    folders = [network_folder(Path(name)) for name in ("default", "none", "elsewhere")]
+    assert folders == [SHIPPED_FOLDERS["default"], None, Path("elsewhere")]
     with pytest.raises(ModelError):
-        open_model(Path("elsewhere"))
+        load_bundle(Path("elsewhere"))
 
 
 def test_all_of_it_is_below_three_megabytes() -> None:
@@ -30,8 +29,7 @@ def test_all_of_it_is_below_three_megabytes() -> None:
 
 
 def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
-    model, car = open_model(None), Car.load("saloon")
-    assert model is not None
+    model, car = load_bundle(SHIPPED_FOLDERS["default"]), Car.load("saloon")
     assert car.network is not None and car.network.sha256 == model.sha256
     assert (car.residual_gain, model.physics_sha256) == (0.75, physics_sha256(car.physics_vehicle))
     assert car.notes == ()

@@ -24,8 +24,8 @@ from pdhef_logtool.residual_model.bundle import (
     RESIDUAL,
     WEIGHTS_FILE,
     ModelBundle,
-    model_folder,
-    open_model,
+    load_bundle,
+    network_folder,
 )
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.storage.files import write_bytes
@@ -93,10 +93,10 @@ def run_training(
     init = None if init is None else Path(init)
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
     data = dataset_for(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
-    bundle = None if init is None else open_model(init)
+    start = None if init is None else network_folder(init)
+    bundle = None if start is None else load_bundle(start)
     if bundle is not None and bundle.model != data.model:
         raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=str(init))
-    start = None if init is None else model_folder(init)
     check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
     with OutputFolder(output):
         return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
@@ -174,12 +174,9 @@ def train_on(
 
 def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> float:
     """Return the weighted mean square error of the normalised targets, computed as in operation."""
-    from pdhef_logtool.residual_model.service import NetworkService
-
-    service = NetworkService(bundle)
     total, weight = 0.0, 0.0
     for s in sequences:
-        rates, _ = service.run(s.features, np.zeros(len(s.weight), dtype=np.bool_), None)
+        rates, _ = bundle.run(s.features, np.zeros(len(s.weight), dtype=np.bool_), None)
         error = (rates - s.target) / np.array(bundle.normalisation.target_std)
         total += float((np.mean(error**2, axis=1) * s.weight).sum())
         weight += float(s.weight.sum())
