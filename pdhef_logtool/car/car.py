@@ -109,10 +109,8 @@ class Car:
         car = cls(vehicle, vehicle, network_gain=file.network_gain, assumed=file.assumed, source=source)
         if folder is not None:
             car = _with_parts(car, folder)
-        name, home = _network_of(folder, network)
-        plugged = load_plug_in(name) if home is None and name != NO_MODEL else None
-        bundle = plugged if home is None else load_bundle(home)
-        return replace(car, network=bundle, network_name=name)
+        name, used = _network_of(folder, network)
+        return replace(car, network=used, network_name=name)
 
     @property
     def file_name(self) -> str | None:
@@ -240,20 +238,21 @@ def read_fit(path: Path) -> Fit:
     )
 
 
-def _network_of(folder: Path | None, chosen: Place) -> tuple[str, Path | None]:
-    """Return name and folder of the network in force; the folder is None for a plug-in and without a network."""
+def _network_of(folder: Path | None, chosen: Place) -> tuple[str, ModelBundle | PlugInModel | None]:
+    """Return name and network in force; raises ModelError."""
     name = SHIPPED if chosen is None else str(chosen)
     if name == NO_MODEL:
         return NO_MODEL, None
     inside = None if folder is None or folder in SHIPPED_CARS.values() else folder / NETWORK_FOLDER
     if chosen is None and inside is not None and (inside / DOCUMENT_FILE).is_file():
-        return NETWORK_FOLDER, inside
+        return NETWORK_FOLDER, load_bundle(inside)
     if name in SHIPPED_FOLDERS:
         home = SHIPPED_FOLDERS[name]
         # A source tree without shipped networks still runs the estimators that need none.
-        return (NO_MODEL, None) if chosen is None and not (home / DOCUMENT_FILE).is_file() else (name, home)
+        is_absent = chosen is None and not (home / DOCUMENT_FILE).is_file()
+        return (NO_MODEL, None) if is_absent else (name, load_bundle(home))
     if name in plug_in_names():
-        return name, None
-    home = Path(name)
+        return name, load_plug_in(name)
     # The path may be a car's folder that contains the network.
-    return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home
+    home = Path(name)
+    return name, load_bundle(home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home)

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
 from pdhef_logtool.records.student import student_quantile
 
@@ -115,14 +116,10 @@ def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:
     filled_cells = np.flatnonzero(count > 0.0)
     if filled_cells.shape[0] < 2:
         return nothing
-    cell = np.arange(cells)
-    filled = np.interp(cell, filled_cells, total[filled_cells] / count[filled_cells])
-    before = filled_cells[np.maximum(np.searchsorted(filled_cells, cell, side="right") - 1, 0)]
-    after = filled_cells[np.minimum(np.searchsorted(filled_cells, cell), filled_cells.shape[0] - 1)]
     period_s = float(np.median(np.diff(channel.stamps_ns))) * 1e-9
-    good = (after - before) * GRID_S <= min(max(MAX_GAP_S, MAX_GAP_PERIODS * period_s), LONGEST_GAP_S)
-    good &= (cell >= filled_cells[0]) & (cell <= filled_cells[-1])
-    return _low_pass(filled, good)
+    gap_s = min(max(MAX_GAP_S, MAX_GAP_PERIODS * period_s), LONGEST_GAP_S)
+    bracket = Bracket(filled_cells, np.arange(cells), int(gap_s / GRID_S + 1e-9))
+    return _low_pass(bracket.linear(total[filled_cells] / count[filled_cells]), bracket.inside)
 
 
 def _low_pass(values: FloatArray, good: BoolArray) -> FloatArray:

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdhef_logtool.estimators.base import Estimator, StepEstimator
 from pdhef_logtool.records.signals import Signals
@@ -70,9 +69,9 @@ def _cuts(count: int, number: int, full: bool) -> Iterator[int]:
         yield int(random.integers(1, most))
 
 
-def largest_change(a: Any, b: Any) -> float:
+def largest_change(a: StepColumns, b: StepColumns) -> float:
     """Return the largest difference of two records of steps, relative to each column's largest value; inf for NaN."""
-    return max((_change(x, y) for x, y in zip(step_columns(a), step_columns(b), strict=True)), default=0.0)
+    return max((_change(x, y) for x, y in zip(a.arrays, b.arrays, strict=True)), default=0.0)
 
 
 def _change(a: Any, b: Any) -> float:
@@ -86,15 +85,3 @@ def _change(a: Any, b: Any) -> float:
     difference = np.abs(a[is_finite].astype(float) - b[is_finite].astype(float))
     size = max(float(np.abs(a[is_finite]).max(initial=0.0)), np.finfo(float).tiny)
     return float(difference.max(initial=0.0)) / size
-
-
-def step_columns(record: Any) -> Iterator[NDArray[Any]]:
-    """Yield the arrays of a record of steps."""
-    if isinstance(record, StepColumns):
-        for entry in fields(record):
-            yield from step_columns(getattr(record, entry.name))
-    elif isinstance(record, tuple):
-        for part in record:
-            yield from step_columns(part)
-    else:
-        yield np.asarray(record)

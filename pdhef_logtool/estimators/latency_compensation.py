@@ -15,11 +15,11 @@ from typing import Any, cast
 import numpy as np
 
 from pdhef_logtool.estimators.base import Estimator, Smoother, StepEstimator, Steps, predict_track
-from pdhef_logtool.estimators.causality_check import CausalityCheck, step_columns
+from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.records.signals import IntArray, Signals
-from pdhef_logtool.records.steps import Release, StepColumns, extrapolation, release
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.steps import StepColumns, extrapolation, release
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Steps that an estimator makes at a time; an hour of steps with covariances would take 350 MB per filter.
@@ -51,7 +51,9 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
             steps, state = _run_piece(cast("StepEstimator", estimator), piece, state, causality)
             if due.start == due.stop and len(signals):
                 continue
-            track = compensate(estimator, piece, steps, arrivals.rows(due, first), signals.stamps_ns[due].copy())
+            stamps_ns = signals.stamps_ns[due].copy()
+            ahead = extrapolation(piece.stamps_ns, arrivals.rows(due, first), steps.valid, stamps_ns)
+            track = predict_track(estimator, steps, ahead, stamps_ns)
         if len(track) == len(signals):
             return track
         for name in (f.name for f in fields(track) if f.name != "name"):
@@ -60,14 +62,6 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
                 columns[name] = np.empty((len(signals) if len(part) else 0, *part.shape[1:]), part.dtype)
             columns[name][due] = part
     return replace(track, **columns)
-
-
-def compensate(
-    estimator: Estimator, signals: Signals, steps: Any, arrivals: Release, stamps_ns: IntArray
-) -> StateTrack:
-    """Return the track of an estimator at stamps [M], from its steps of signals [K] that had arrived there."""
-    ahead = extrapolation(signals.stamps_ns, arrivals, steps.valid, stamps_ns)
-    return predict_track(estimator, steps, ahead, stamps_ns)
 
 
 def _run_piece(
@@ -101,7 +95,7 @@ def _check_steps(estimator: Estimator, signals: Signals, steps: Any) -> None:
     expected = f"steps, one per sample ({len(signals)})"
     if not isinstance(steps, StepColumns):
         raise _wrong_steps(estimator, expected, type(steps).__name__)
-    for column in step_columns(steps):
+    for column in map(np.asarray, steps.arrays):
         if column.shape[:1] != (len(signals),):
             raise _wrong_steps(estimator, expected, f"{len(column) if column.ndim else 'no'} steps")
         if column.dtype.kind not in "biuf":

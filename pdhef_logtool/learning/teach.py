@@ -19,7 +19,7 @@ from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.checked_inputs import without_bursts
-from pdhef_logtool.estimators.latency_compensation import compensate
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import FEATURES, make_estimator
@@ -127,9 +127,8 @@ def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:
     car = model.car
     physics, signals = make_estimator(PHYSICS, car), model.apply(drive.whole.signals).calibrated
     assert isinstance(physics, AdaptivePhysics)
-    steps, _ = physics.run(signals, None)
     arrived = release(signals.ready_ns, signals.stamps_ns)
-    track = compensate(physics, signals, steps, arrived, signals.stamps_ns)
+    track = run_estimator(physics, signals)
     features = features_of(physics, signals)
     error = signal_error(track, drive.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
     settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS

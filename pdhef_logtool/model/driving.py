@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.drive.sensor_changes import samples_and_sums
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.model.equations import AY, FRICTION, SPEED, STEER, YAW_RATE
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -87,10 +89,8 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
         FRICTION: signals.friction,
     }
     for row, values in sources.items():
-        is_finite = np.isfinite(values)
-        count = np.bincount(place, is_finite, cells.size)
-        total = np.bincount(place, np.where(is_finite, values, 0.0), cells.size)
-        means[row] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+        count, total = samples_and_sums(values, place, cells.size)
+        means[row] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     ends_ns = start_ns + (cells + 1) * round(STEP_S * 1e9)
     # A pause, however long, is a gap: it takes no more room than that.
     cells = np.concatenate([[0], np.cumsum(np.minimum(np.diff(cells), _PAUSE_CELLS))])
@@ -110,14 +110,8 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
 
 def _bridged(values: FloatArray, most: int) -> FloatArray:
     """Return values [N] with gaps of at most ``most`` steps interpolated; longer ones stay NaN."""
-    finite_index = np.flatnonzero(np.isfinite(values))
-    if finite_index.size < 2:
-        return values
-    grid = np.arange(values.size)
-    filled = np.interp(grid, finite_index, values[finite_index], left=np.nan, right=np.nan)
-    after = np.searchsorted(finite_index, grid)
-    gap = finite_index[np.minimum(after, finite_index.size - 1)] - finite_index[np.maximum(after - 1, 0)]
-    return np.where(np.isfinite(values) | (gap <= most), filled, np.nan)
+    known = np.flatnonzero(np.isfinite(values))
+    return Bracket(known, np.arange(values.size), most).linear(values[known])
 
 
 def _stretches(columns: FloatArray, least_speed_m_s: float) -> IntArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
@@ -21,31 +22,36 @@ class StepColumns:
 
     def joined(self, other: Self) -> Self:
         """Append the steps of the next window."""
-        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
-        return type(self)(*(_joined(a, b) for a, b in pairs))
+        joined: Self = _mapped(lambda a, b: np.concatenate([a, b]), self, other)
+        return joined
 
     def since(self, index: int) -> Self:
         """Return the steps from ``index``."""
-        return self._cut(slice(index, None))
+        rest: Self = _mapped(lambda column: column[index:], self)
+        return rest
 
     def until(self, index: int) -> Self:
         """Return the steps before ``index``."""
-        return self._cut(slice(index))
+        first: Self = _mapped(lambda column: column[:index], self)
+        return first
 
-    def _cut(self, part: slice) -> Self:
-        return type(self)(*(_cut(getattr(self, f.name), part) for f in fields(self)))
+    @property
+    def arrays(self) -> list[Any]:
+        """All arrays of the record."""
+        arrays: list[Any] = []
+        _mapped(arrays.append, self)
+        return arrays
 
 
-def _joined(a: Any, b: Any) -> Any:
-    if isinstance(a, tuple):
-        return tuple(_joined(x, y) for x, y in zip(a, b, strict=True))
-    return a.joined(b) if isinstance(a, StepColumns) else np.concatenate([a, b])
-
-
-def _cut(column: Any, part: slice) -> Any:
-    if isinstance(column, tuple):
-        return tuple(_cut(x, part) for x in column)
-    return column._cut(part) if isinstance(column, StepColumns) else column[part]
+def _mapped(function: Callable[..., Any], *columns: Any) -> Any:
+    """Return a function of the arrays of a record, a tuple or an array, and of others with the same entries."""
+    first = columns[0]
+    if isinstance(first, tuple):
+        return tuple(_mapped(function, *parts) for parts in zip(*columns, strict=True))
+    if isinstance(first, StepColumns):
+        names = [f.name for f in fields(first)]
+        return type(first)(*(_mapped(function, *(getattr(c, name) for c in columns)) for name in names))
+    return function(*columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
