@@ -150,7 +150,7 @@ class ModelBundle:
 
         Parameters
         ----------
-        features : [N, 15] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
+        features : [N, 15] over :data:`~.features.FEATURES`; rows with NaN give 0 and end the sequence.
         starts : [N], True at the start of a sequence.
         """
         out = np.zeros((features.shape[0], OUTPUT_COUNT[self.target]))

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
 
 #: Name and order of the features. The paper's six come first.
@@ -41,59 +40,6 @@ PAPER_FEATURES = FEATURES[:6]
 NOMINAL_FEATURES = FEATURES[:10]
 #: Features that change their sign when left and right are exchanged.
 ODD_FEATURES = frozenset(FEATURES) - {"vx_m_s", "friction", "ax_m_s2", "utilisation"}
-
-# Entries of the filter's state, as in estimators.vehicle_model.
-_VX, _VY, _YAW_RATE = 0, 1, 2
-
-
-# positional: one array a sensor or state, in the order of the features
-def make_features(
-    steer_rad: FloatArray,
-    ay_m_s2: FloatArray,
-    yaw_rate_rad_s: FloatArray,
-    posterior: FloatArray,
-    prior: FloatArray,
-    predicted_ay_m_s2: FloatArray,
-    friction: FloatArray,
-    ax_m_s2: FloatArray,
-    body: FloatArray,
-) -> FloatArray:
-    """Return the features [K, 15] at each step, finite where the filter's state is finite.
-
-    A missing measurement is replaced by the prediction of the physics filter.
-
-    Parameters
-    ----------
-    steer_rad : [K], held where missing. ay_m_s2, yaw_rate_rad_s : [K], NaN where missing.
-    posterior, prior : states of the physics filter, [K, ≥3] over v_x, v_y, r; the prior is NaN at its start.
-    predicted_ay_m_s2 : [K], the filter's a_y at the posterior.
-    friction : [K]. ax_m_s2 : [K], NaN where missing.
-    body : [K, 4], roll, roll rate and the axles' forces.
-    """
-    prior = np.where(np.isfinite(prior), prior, posterior)
-    vx = posterior[:, _VX]
-    rate = np.where(np.isfinite(yaw_rate_rad_s), yaw_rate_rad_s, prior[:, _YAW_RATE])
-    ay = np.where(np.isfinite(ay_m_s2), ay_m_s2, predicted_ay_m_s2)
-    beta_after = np.arctan2(posterior[:, _VY], np.maximum(vx, 0.1))
-    beta_before = np.arctan2(prior[:, _VY], np.maximum(prior[:, _VX], 0.1))
-    columns = np.stack(
-        [
-            vx,
-            ay,
-            steer_rad,
-            rate,
-            rate - prior[:, _YAW_RATE],
-            beta_after - beta_before,
-            posterior[:, _VY],
-            posterior[:, _YAW_RATE],
-            friction,
-            np.where(np.isfinite(ax_m_s2), ax_m_s2, 0.0),
-            np.abs(ay) / (friction * GRAVITY_M_S2),
-        ],
-        axis=1,
-    )
-    return np.concatenate([columns, body], axis=1)
-
 
 ODD = ("steer_rad", "yaw_rate_rad_s", "ay_m_s2", "sideslip_rad")
 EVEN = ("speed_m_s", "ax_m_s2")

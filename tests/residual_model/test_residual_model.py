@@ -12,8 +12,12 @@ import pytest
 import torch
 from made_models import random_network
 
+from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
+from pdhef_logtool.estimators.parallel_physics import make_features
+from pdhef_logtool.estimators.vehicle_model import FRONT, REAR
+from pdhef_logtool.estimators.vehicle_ukf import U_FRICTION, U_STEER, VehicleUkf, no_posterior
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
     OUTPUT_COUNT,
@@ -22,7 +26,7 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     load_bundle,
 )
-from pdhef_logtool.residual_model.features import FEATURES, make_features
+from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.interface import LIMITS
 from pdhef_logtool.residual_model.network import ResidualNetwork
 
@@ -30,15 +34,23 @@ make_bundle = partial(random_network, hidden=16, layers=2, head=(8,), scales=(2.
 
 
 def test_features_by_hand() -> None:
-    posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
-    prior = np.array([[19.0, 0.2, 0.08, 0.0]])
-    measured = (np.array([0.02]), np.array([1.5]), np.array([0.11]))
-    body = np.arange(1.0, 5.0)[None]
-    given = (np.array([1.4]), np.array([0.8]), np.array([-0.5]), body)
-    features = make_features(*measured, posterior, prior, *given)
+    physics, stamps = (
+        VehicleUkf(default_vehicle().model_copy(update={"physics": PhysicsParts(roll=True)})),
+        np.arange(1),
+    )
+    body = {physics.layout.roll: 1.0, physics.layout.roll + 1: 2.0, FRONT: 3.0, REAR: 4.0}
+    steps = no_posterior(stamps, physics.layout.size, np.zeros((1, 2)))
+    steps.x[:], steps.inputs[:], steps.valid[:] = 0.0, 0.0, True
+    steps.x[:, :3], steps.prior[:] = (20.0, 0.4, 0.1), 0.0
+    steps.x[:, [*body]], steps.prior[:, :3] = [*body.values()], (19.0, 0.2, 0.08)
+    steps.inputs[:, [U_STEER, U_FRICTION]] = 0.02, 0.8
+    ay, rate, ax = (np.array([value]) for value in (1.5, 0.11, -0.5))
+    nothing = np.full(1, np.nan)
+    seen = Signals(stamps, stamps, nothing, ax, ay, rate, nothing, nothing, np.full((1, 4), np.nan))
+    features = make_features(physics, steps, seen)
     beta = np.arctan2(0.4, 20.0) - np.arctan2(0.2, 19.0)
     used = 1.5 / (0.8 * 9.80665)
-    expected = [20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, used, *body[0]]
+    expected = [20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, used, *body.values()]
     np.testing.assert_allclose(features, [expected], rtol=1e-12)
     assert len(FEATURES) == len(expected)
 
