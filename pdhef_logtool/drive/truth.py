@@ -73,22 +73,13 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
-    """Origin of the local ENU frame: ECEF position in m, latitude and longitude in rad."""
-
-    ecef_m: tuple[float, float, float]
-    lat_rad: float
-    lon_rad: float
-
-
-@dataclass(frozen=True, slots=True)
 class TruthPlan:
     """Derivation of one log's ground truth, decided once from the first ten minutes.
 
     Attributes
     ----------
     base : channel that provides the stamps of the ground truth. period_s : its median period.
-    velocity : derivation of the body velocity.
+    velocity : derivation of the body velocity. origin : of the local ENU frame, ECEF in m.
     max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
     position_m : measurement point of the ground truth from the CG, ISO 8855. roll_gradient_rad_per_m_s2 : of the car.
     """
@@ -99,7 +90,7 @@ class TruthPlan:
     period_s: float
     max_gap_s: Mapping[str, float]
     half_window: int
-    origin: Origin | None
+    origin: tuple[float, float, float] | None
     attitude: Attitude | None
     position_m: tuple[float, float, float]
     roll_gradient_rad_per_m_s2: float = 0.0
@@ -278,7 +269,7 @@ def _first(has: frozenset[str], *names: str) -> str | None:
     return next((n for n in names if n in has), None)
 
 
-def _velocity_source(has: frozenset[str], survey: Mapping[str, Channel], origin: Origin | None) -> tuple[str, str]:
+def _velocity_source(has: frozenset[str], survey: Mapping[str, Channel], origin: object) -> tuple[str, str]:
     velocity = _first(has, "enu_velocity_m_s", "ecef_velocity_m_s")
     # Without a position on Earth, east and north of an ECEF velocity are unknown, and a yaw cannot be applied.
     placeless = velocity == "ecef_velocity_m_s" and origin is None
@@ -304,7 +295,8 @@ def _pairs(has: frozenset[str]) -> frozenset[str]:
     return frozenset().union(*(p for p in pairs if p <= has))
 
 
-def _find_origin(survey: Mapping[str, Channel]) -> Origin | None:
+def _find_origin(survey: Mapping[str, Channel]) -> tuple[float, float, float] | None:
+    """Return the first position on Earth, ECEF in m; None without positions."""
     if "ecef_position_m" in survey:
         ecef = survey["ecef_position_m"].values[:1]
     elif {"lat_deg", "lon_deg"} <= set(survey):
@@ -312,9 +304,8 @@ def _find_origin(survey: Mapping[str, Channel]) -> Origin | None:
         ecef = ecef_from_geodetic(survey["lat_deg"].values[:1], survey["lon_deg"].values[:1], alt)
     else:
         return None
-    lat, lon, _ = geodetic_from_ecef(ecef)[0]
-    x, y, z = ecef[0]
-    return Origin(ecef_m=(float(x), float(y), float(z)), lat_rad=float(lat), lon_rad=float(lon))
+    x, y, z = map(float, ecef[0])
+    return x, y, z
 
 
 def _find_attitude(source: _Source) -> Attitude:
@@ -390,8 +381,10 @@ class _Source:
         return "ECEF" if only_ecef else "ENU"
 
     def _from_ecef(self) -> FloatArray:
-        origin = self.plan.origin
-        return np.eye(3) if origin is None else enu_from_ecef_rotation(origin.lat_rad, origin.lon_rad)
+        if self.plan.origin is None:
+            return np.eye(3)
+        lat_rad, lon_rad, _ = map(float, geodetic_from_ecef(np.array([self.plan.origin]))[0])
+        return enu_from_ecef_rotation(lat_rad, lon_rad)
 
     def position(self) -> FloatArray:
         """Return [N, 3] in the local ENU frame; an unknown height is 0."""
@@ -405,7 +398,7 @@ class _Source:
         else:
             lat, lon = self.column("lat_deg"), self.column("lon_deg")
             ecef = ecef_from_geodetic(lat, lon, self.column("alt_m") if "alt_m" in self else np.zeros_like(lat))
-        return _turn(self._from_ecef(), ecef - np.array(self.plan.origin.ecef_m))
+        return _turn(self._from_ecef(), ecef - np.array(self.plan.origin))
 
     def reference_velocity(self) -> FloatArray:
         """Return [N, 3] in the reference frame, differentiated from the position if there is no velocity."""

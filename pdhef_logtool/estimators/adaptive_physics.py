@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs, r_scale
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs
 from pdhef_logtool.estimators.vehicle_model import VX
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, VehicleUkf, of_car, sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -56,13 +56,11 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MixtureSteps(StepColumns):
-    """Steps of all filters [H], and by step, [K]: weights [K, H], factor on R, detector's bit mask, residual gain."""
+    """Steps of all filters [H], their weights [K, H], and faults and residual of the steps."""
 
     filters: tuple[PosteriorSteps, ...]
     weights: FloatArray
-    r_scale: FloatArray
-    reason: IntArray
-    gain: FloatArray
+    inputs: CheckedInputs
 
     @property
     def valid(self) -> BoolArray:
@@ -223,9 +221,7 @@ class AdaptivePhysics:
         steps = tuple(filter_steps for filter_steps, _ in runs)
         evidence = state.evidence.copy() if state else np.zeros(len(filters))
         weights = weights_of(steps, signals.steps_s, evidence)
-        raised = r_scale(checked.extra_r, self.physics.measurement_std)
-        after = AdaptiveState(inputs, tuple(state for _, state in runs), evidence)
-        return MixtureSteps(steps, weights, raised, checked.reason, self.trust * checked.gain), after
+        return MixtureSteps(steps, weights, checked), AdaptiveState(inputs, tuple(s for _, s in runs), evidence)
 
     def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate each filter's steps and mix them (see :class:`~.base.ModelPredictor`)."""
@@ -234,19 +230,18 @@ class AdaptivePhysics:
             weighed = of_one.valid[step] & (steps.weights[step, h] > 0.0)
             tracks.append(physics_filter.predict(of_one, replace(ahead, usable=ahead.usable & weighed), stamps_ns))
         track = mix(steps.weights[step], tracks) if len(tracks) > 1 else tracks[0]
-        reason = np.where(ahead.arrived, steps.reason[step], 0)
-        return self.described(track, steps.weights[step], steps.gain[step], steps.r_scale[step], reason)
+        return self.described(track, steps.weights[step], steps.inputs.at(step), ahead.arrived)
 
-    # positional: the columns of a track.
     def described(
-        self, track: StateTrack, weights: FloatArray, gain: FloatArray, raised: FloatArray, reason: IntArray
+        self, track: StateTrack, weights: FloatArray, inputs: CheckedInputs, arrived: BoolArray | bool = True
     ) -> StateTrack:
-        """Return a track [N] with residual gain, weight of the cures (weights [N, H]), factor on R and reasons [N]."""
-        columns: dict[str, Any] = {"network_trust": np.where(track.valid, gain, np.nan)}
+        """Return a track [N] with residual gain, weight of the cures (weights [N, H]), factor on R and reasons."""
+        columns: dict[str, Any] = {"network_trust": np.where(track.valid, self.trust * inputs.gain, np.nan)}
         if self.adaptive:
+            raised = 1.0 + (inputs.extra_r / self.physics.measurement_std[:2] ** 2).max(axis=1, initial=0.0)
             columns["r_scale"] = np.where(track.valid, raised, 1.0)
             columns["mixture_weight"] = np.where(track.valid, 1.0 - weights[:, 0], np.nan)
-            columns["reason"] = reason
+            columns["reason"] = np.where(arrived, inputs.reason, 0)
         return replace(track, name=self.name, **columns)
 
 

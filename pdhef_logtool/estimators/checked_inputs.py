@@ -71,9 +71,3 @@ def check_inputs(
                 residual = checked_residual(residual, len(signals))
         after = InputState(of_filter, of_model)
     return CheckedInputs(extra_r, reason, residual.gain[:, None] * residual.rate, residual.gain), after
-
-
-def r_scale(extra_r: FloatArray, r_std: FloatArray) -> FloatArray:
-    """Return the larger factor on R of a_y or yaw rate by the detector, [N], for a filter's 1-sigmas [≥2]."""
-    factor: FloatArray = 1.0 + (extra_r / np.square(r_std[:2])).max(axis=1, initial=0.0)
-    return factor

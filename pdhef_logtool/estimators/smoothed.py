@@ -29,7 +29,7 @@ import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import FORGET_S, AdaptivePhysics, gather_evidence, mix, weigh
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs, r_scale
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs
 from pdhef_logtool.estimators.rts import smooth_covariances, smooth_states
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, StepLinks, VehicleUkf
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -104,11 +104,10 @@ class SmoothedPhysics:
 
     def smooth(self, signals: Signals) -> StateTrack:
         """Return the track of a drive (see :class:`~.base.Smoother`)."""
-        checked, trust = self._inputs(signals), self.filtered.trust
-        tracks, weights = self._filtered(signals, trust * checked.rate, checked.extra_r)
+        checked = self._inputs(signals)
+        tracks, weights = self._filtered(signals, self.filtered.trust * checked.rate, checked.extra_r)
         track = mix(weights, tracks) if len(tracks) > 1 else tracks[0]
-        raised = r_scale(checked.extra_r, self.filtered.physics.measurement_std)
-        track = self.filtered.described(track, weights, trust * checked.gain, raised, checked.reason)
+        track = self.filtered.described(track, weights, checked)
         return replace(
             track,
             name=self.name,

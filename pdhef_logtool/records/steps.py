@@ -25,15 +25,10 @@ class StepColumns:
         joined: Self = _mapped(lambda a, b: np.concatenate([a, b]), self, other)
         return joined
 
-    def since(self, index: int) -> Self:
-        """Return the steps from ``index``."""
-        rest: Self = _mapped(lambda column: column[index:], self)
-        return rest
-
-    def until(self, index: int) -> Self:
-        """Return the steps before ``index``."""
-        first: Self = _mapped(lambda column: column[:index], self)
-        return first
+    def at(self, rows: slice | IntArray) -> Self:
+        """Return the steps of a slice or of indices."""
+        chosen: Self = _mapped(lambda column: column[rows], self)
+        return chosen
 
     @property
     def arrays(self) -> list[Any]:

@@ -74,7 +74,7 @@ def signals() -> Signals:
         (end_process, "expected an estimator that runs, got SystemExit: 0"),
         (write_through_view, "got ValueError: assignment destination is read-only"),
         (lambda s, _: 3, "expected a pair of steps and state, got int"),
-        (lambda s, _: (sound(s).until(7), None), r"expected steps, one per sample \(401\), got 7 steps"),
+        (lambda s, _: (sound(s).at(slice(7)), None), r"expected steps, one per sample \(401\), got 7 steps"),
         (lambda s, _: (None, None), r"expected steps, one per sample \(401\), got NoneType"),
         (lambda s, _: (replace(sound(s), values=np.zeros((len(s), 3))), None), r"shape \(401, 4\), got \(401, 3\)"),
         (lambda s, _: (replace(sound(s), rates=np.zeros((9, 4))), None), r"one per sample \(401\), got 9 steps"),

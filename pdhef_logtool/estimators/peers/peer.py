@@ -105,5 +105,5 @@ class Peer:
         rates[:, VY] = (values[:, VY] - values[before, VY]) / span_s
         valid = np.isfinite(values[:, : YAW_RATE + 1]).all(axis=1)
         kept = int(np.searchsorted(stamps_ns, stamps_ns[-1] - HISTORY_NS)) if len(stamps_ns) else 0
-        steps = Steps(values, np.nan_to_num(rates), valid).since(first)
-        return steps, PeerState(speed, samples.since(kept), memory)
+        steps = Steps(values, np.nan_to_num(rates), valid).at(slice(first, None))
+        return steps, PeerState(speed, samples.at(slice(kept, None)), memory)
