@@ -110,8 +110,8 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
 
 def _bridged(values: FloatArray, most: int) -> FloatArray:
     """Return values [N] with gaps of at most ``most`` steps interpolated; longer ones stay NaN."""
-    known = np.flatnonzero(np.isfinite(values))
-    return Bracket(known, np.arange(values.size), most).linear(values[known])
+    finite = np.flatnonzero(np.isfinite(values))
+    return Bracket(finite, np.arange(values.size), most).linear(values[finite])
 
 
 def _stretches(columns: FloatArray, least_speed_m_s: float) -> IntArray:

@@ -22,13 +22,11 @@ class StepColumns:
 
     def joined(self, other: Self) -> Self:
         """Append the steps of the next window."""
-        joined: Self = _mapped(lambda a, b: np.concatenate([a, b]), self, other)
-        return joined
+        return _mapped(lambda a, b: np.concatenate([a, b]), self, other)  # type: ignore[no-any-return]
 
     def at(self, rows: slice | IntArray) -> Self:
         """Return the steps of a slice or of indices."""
-        chosen: Self = _mapped(lambda column: column[rows], self)
-        return chosen
+        return _mapped(lambda column: column[rows], self)  # type: ignore[no-any-return]
 
     @property
     def arrays(self) -> list[Any]:
