@@ -30,8 +30,9 @@ from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import CURES
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.latency_compensation import run_estimator
+from pdhef_logtool.estimators.latency_compensation import PIECE_STEPS
 from pdhef_logtool.estimators.presets import ON_FILE, preset_of, uses_calibration
+from pdhef_logtool.estimators.vehicle_model import VY
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car, physics_filter
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
@@ -105,12 +106,18 @@ class Interval:
     def _lateral_velocity(self, physics: VehicleUkf, signals: Signals, number: int) -> FloatArray:
         """Return v_y [N] of a filter, on means of ``number`` samples as its vehicle corrects them.
 
-        A friction of the log is relative.
+        It is v_y of the newest step that has arrived: over the latency the differences change little. A friction of
+        the log is relative.
         """
         physics = replace(physics, r_std=tuple(physics.measurement_std / math.sqrt(number)))
         friction = physics.vehicle.assumed_friction / self.filters[0].vehicle.assumed_friction
         read = corrected_anew(signals, self.read_with, physics.vehicle)
-        return run_estimator(physics, replace(read, friction=friction * read.friction)).vy_m_s
+        read, state, vy = replace(read, friction=friction * read.friction), None, np.empty(len(signals))
+        for piece in (slice(k, k + PIECE_STEPS) for k in range(0, len(signals), PIECE_STEPS)):
+            steps, state = physics.run(read.rows(piece.start, piece.stop).copy(), state)
+            vy[piece] = np.where(steps.valid, steps.x[:, VY], np.nan)
+        released = release(signals.ready_ns, signals.stamps_ns)
+        return np.where(released.arrived, vy[released.row], np.nan)
 
 
 @dataclass(slots=True)
