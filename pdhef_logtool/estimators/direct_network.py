@@ -9,22 +9,20 @@ stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.base import VX, VY, Steps
 from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, nominal_filter
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
 

@@ -6,10 +6,9 @@ and the baselines, which are frozen.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.estimators import vehicle_ukf as ukf
 from pdhef_logtool.estimators.vehicle_model import AX_BIAS, FRONT, REAR, VX, VY, YAW_RATE
@@ -17,9 +16,6 @@ from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL
 from pdhef_logtool.residual_model.features import FEATURES
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
 
 
 def filter_of(car: Car, model: str, *, use_speed: bool = True) -> ukf.VehicleUkf:

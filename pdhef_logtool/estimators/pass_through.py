@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.estimators.base import Steps, make_steps
-from pdhef_logtool.estimators.presets import options_of
+from pdhef_logtool.estimators.presets import Options, options_of
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.signals import Signals
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,21 +7,17 @@ The network acts on the car that it was trained for; without such a network the 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.presets import options_of
+from pdhef_logtool.estimators.presets import Options, options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 from pdhef_logtool.estimators.vehicle_ukf import of_car
 
 #: The preset that uses the taught part of a car.
 PRESET = "pd-hef"
 FILTER_ALONE = "taught residual not used: it was fitted to the error of the filter, which differs from the smoother's"
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 
 def build(name: str, car: Car, options: Options) -> AdaptivePhysics:

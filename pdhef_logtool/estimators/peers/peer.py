@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import VX, VY, YAW_RATE, Steps
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S
+from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, step_durations_s
 from pdhef_logtool.records.steps import StepColumns, last_known
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 #: Rate of the published filters, Hz. Their noise per sample is converted from it to the step between two samples.
 PUBLISHED_HZ = 100.0
