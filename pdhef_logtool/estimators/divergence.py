@@ -79,7 +79,7 @@ def wrong_branch(track: StateTrack, signals: Signals, vehicle: VehicleParameters
     )  # fmt: skip
     _watch(motion, car, np.zeros(MEMORY_SIZE), flags)
     released = release(signals.ready_ns, signals.stamps_ns)
-    return np.asarray(flags[released.row] & released.arrived, dtype=np.bool_)
+    return np.asarray(flags[released.step] & released.arrived, dtype=np.bool_)
 
 
 @njit(cache=True)

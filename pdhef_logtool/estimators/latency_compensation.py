@@ -46,7 +46,7 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     for first in range(0, max(len(signals), 1), PIECE_STEPS):
         # Numba compiles a kernel again for read-only arrays: the estimator gets a copy.
         piece = signals.rows(first, first + PIECE_STEPS).copy()
-        due = slice(*np.searchsorted(arrivals.row, (first, first + PIECE_STEPS)).tolist())
+        due = slice(*np.searchsorted(arrivals.step, (first, first + PIECE_STEPS)).tolist())
         with contained(estimator.name, package_of(estimator)):
             steps, state = _run_piece(cast("StepEstimator", estimator), piece, state, causality)
             if due.start == due.stop and len(signals):

@@ -18,7 +18,7 @@ import numpy as np
 
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, weights_of
 from pdhef_logtool.estimators.vehicle_model import VX, VY
-from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, StepLinks
+from pdhef_logtool.estimators.vehicle_ukf import LinkedSteps, PosteriorSteps
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 
 #: Constant rate of the run for b, m/s²: small against the forces of a tyre.
@@ -56,9 +56,9 @@ def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray)
     probe[:, 0] = PROBE_M_S2
     runs, transitions, drives = [], [], []
     for physics_filter, share in zip(physics.filters, physics.residual_shares, strict=True):
-        steps, _, links = physics_filter.linked_steps(signals, None, None, checked.extra_r)
+        links, _ = physics_filter.linked_steps(signals, None, None, checked.extra_r)
         moved, _ = physics_filter.run(signals, None, share * probe, checked.extra_r)
-        transition = _transition(steps, links)
+        steps, transition = links.posterior, _transition(links)
         change = np.nan_to_num((moved.x - steps.x) / PROBE_M_S2)
         drive = np.zeros_like(change)
         drive[1:] = change[1:] - np.einsum("kij,kj->ki", transition[1:], change[:-1])
@@ -71,8 +71,9 @@ def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray)
     return ResidualResponse(transitions, drives, sideslip, row)
 
 
-def _transition(steps: PosteriorSteps, links: StepLinks) -> FloatArray:
+def _transition(links: LinkedSteps) -> FloatArray:
     """Return A [K, n, n], 0 where a step does not follow the one before it."""
+    steps = links.posterior
     out = np.zeros_like(steps.P)
     linked = np.flatnonzero(links.linked)
     linked = linked[linked > 0]

@@ -31,9 +31,9 @@ from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import FORGET_S, AdaptivePhysics, gather_evidence, mix, weigh
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs
 from pdhef_logtool.estimators.rts import smooth_covariances, smooth_states
-from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, StepLinks, VehicleUkf
+from pdhef_logtool.estimators.vehicle_ukf import FilterState, LinkedSteps, VehicleUkf
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 #: Minimum look-ahead of a step; the maximum is twice as much. Sensor biases have time constants of minutes: compared
@@ -43,21 +43,12 @@ BLOCK_S = 60.0
 NOT_CAUSAL = "not causal: estimates use later measurements; to be ranked apart from causal estimators"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ForwardSteps(StepColumns):
-    """Steps of a filter's forward pass: posteriors and the links between them."""
-
-    posterior: PosteriorSteps
-    links: StepLinks
-
-
-def smooth_steps(forward: ForwardSteps) -> tuple[FloatArray, FloatArray]:
+def smooth_steps(forward: LinkedSteps) -> tuple[FloatArray, FloatArray]:
     """Return the smoothed states [K, n] and covariances [K, n, n] of steps."""
-    steps, links = forward.posterior, forward.links
-    linked = links.linked[:, None]
+    steps, linked = forward.posterior, forward.linked[:, None]
     predicted_x = np.where(linked, steps.prior, steps.x)
-    predicted_P = np.where(linked[:, :, None], links.predicted_P, steps.P)
-    cross = np.where(linked[:, :, None], links.cross, 0.0)
+    predicted_P = np.where(linked[:, :, None], forward.predicted_P, steps.P)
+    cross = np.where(linked[:, :, None], forward.cross, 0.0)
     return smooth_states(steps.x, predicted_x, predicted_P, cross), smooth_covariances(steps.P, predicted_P, cross)
 
 
@@ -143,13 +134,12 @@ class SmoothedPhysics:
         """Filter a drive and smooth it block by block; return its track, log-likelihood and starts, [N]."""
         before: FilterState | None = None
         tracks, likelihood, starts = [], [], []
-        pending: ForwardSteps | None = None
+        pending: LinkedSteps | None = None
         for part in blocks(signals.stamps_ns, self.block_s):
             given = (signals.rows(part.start, part.stop), before, rate[part], extra_r[part])
-            steps, before, links = physics.linked_steps(*given)
-            likelihood.append(steps.log_likelihood)
-            starts.append(~np.isfinite(steps.prior[:, 0]))
-            forward = ForwardSteps(steps, links)
+            forward, before = physics.linked_steps(*given)
+            likelihood.append(forward.posterior.log_likelihood)
+            starts.append(~np.isfinite(forward.posterior.prior[:, 0]))
             if pending is not None:
                 tracks.append(smoothed_track(physics, pending, forward))
             pending = forward
@@ -158,7 +148,7 @@ class SmoothedPhysics:
         return concatenate(tracks), np.concatenate(likelihood), np.concatenate(starts)
 
 
-def smoothed_track(physics: VehicleUkf, steps: ForwardSteps, following: ForwardSteps | None) -> StateTrack:
+def smoothed_track(physics: VehicleUkf, steps: LinkedSteps, following: LinkedSteps | None) -> StateTrack:
     """Return the smoothed track of steps, with those that follow them."""
     x, P = smooth_steps(steps if following is None else steps.joined(following))
     posterior = steps.posterior

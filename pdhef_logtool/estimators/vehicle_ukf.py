@@ -675,14 +675,15 @@ class FilterState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StepLinks(StepColumns):
-    """Further inputs of a smoother, one row per step; length 0 if not requested.
+class LinkedSteps(StepColumns):
+    """Posteriors of a forward pass, and the links between them for a smoother; of length 0 if not requested.
 
     ``linked`` [K]: the state follows from that of the step before; not at a start, a failure or a standstill.
     ``predicted_P`` [K, n, n] is the covariance before the update, with the inflation by an opened gate; ``cross``
     [K, n, n] the covariance between the state of the step before (rows) and the predicted state (columns).
     """
 
+    posterior: PosteriorSteps
     linked: BoolArray
     predicted_P: FloatArray
     cross: FloatArray
@@ -867,8 +868,8 @@ class VehicleUkf:
         ``residual_rate`` [N, 2] is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
         """
-        steps, after, _ = self.linked_steps(signals, state, residual_rate, extra_r, linked=False)
-        return steps, after
+        steps, after = self.linked_steps(signals, state, residual_rate, extra_r, linked=False)
+        return steps.posterior, after
 
     def linked_steps(
         self,
@@ -878,15 +879,15 @@ class VehicleUkf:
         extra_r: FloatArray | None = None,
         *,
         linked: bool = True,
-    ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
-        """Return the result of :meth:`run`, bit for bit, and the links between the steps if they are ``linked``."""
+    ) -> tuple[LinkedSteps, FilterState]:
+        """Return the result of :meth:`run`, bit for bit, with the links between the steps if they are ``linked``."""
         signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None)
         window, count, n = make_window(signals, residual_rate, extra_r), len(signals), self.layout.size
         steps, belief = no_posterior(signals.stamps_ns, n, window.residual_rate), resume(state, n)
         rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
         _filter(window, self.tuning, self.parameters, belief, steps.written, links)
-        return steps, FilterState(belief, slip), StepLinks(*links)
+        return LinkedSteps(steps, *links), FilterState(belief, slip)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the filter's model (see :class:`~.base.ModelPredictor`)."""

@@ -133,7 +133,7 @@ def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:
     error = signal_error(track, drive.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
     settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS
     error = np.where(arrived.arrived & settled, error, np.nan)
-    response = residual_response(physics, signals, arrived.row)
+    response = residual_response(physics, signals, arrived.step)
     weight = weight_of(np.nan_to_num(drive.truth.sideslip_std_rad))
     return TaughtDrive(drive.drive.name, signals.stamps_ns, features, -error, response, weight)
 

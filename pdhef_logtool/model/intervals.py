@@ -117,7 +117,7 @@ class Interval:
             steps, state = physics.run(read.rows(piece.start, piece.stop).copy(), state)
             vy[piece] = np.where(steps.valid, steps.x[:, VY], np.nan)
         released = release(signals.ready_ns, signals.stamps_ns)
-        return np.where(released.arrived, vy[released.row], np.nan)
+        return np.where(released.arrived, vy[released.step], np.nan)
 
 
 @dataclass(slots=True)
@@ -236,7 +236,7 @@ def running_consistency(track: StateTrack, signals: Signals, roll_gradient_rad_p
     running = np.empty(len(track))
     _run(read.steps_s, rising, track.vy_m_s, running)
     released = release(read.ready_ns, read.stamps_ns)
-    return np.where(released.arrived, running[released.row], 0.0)
+    return np.where(released.arrived, running[released.step], 0.0)
 
 
 @njit(cache=True)

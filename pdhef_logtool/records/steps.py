@@ -49,14 +49,14 @@ def _mapped(function: Callable[..., Any], *columns: Any) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Release:
-    """Newest available step at each scored stamp, [M]: ``arrived`` is False without any, and ``row`` is then 0."""
+    """Newest available step at each scored stamp, [M]: ``arrived`` is False without any, and ``step`` is then 0."""
 
+    step: IntArray
     arrived: BoolArray
-    row: IntArray
 
     def rows(self, part: slice, first_step: int) -> Release:
         """Return the stamps of a slice, with steps counted from ``first_step``."""
-        return Release(self.arrived[part], self.row[part] - first_step)
+        return Release(self.step[part] - first_step, self.arrived[part])
 
 
 def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
@@ -65,7 +65,7 @@ def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
     ``ready_ns`` [K] is non-decreasing.
     """
     index = np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
-    return Release(index >= 0, np.maximum(index, 0))
+    return Release(np.maximum(index, 0), index >= 0)
 
 
 def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
@@ -77,19 +77,15 @@ def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Extrapolation:
+class Extrapolation(Release):
     """Start step and duration of the extrapolation to each scored stamp, [M].
 
     Attributes
     ----------
-    step : int64, newest step with all data arrived by the stamp; 0 without one.
-    arrived : whether there is one.
     horizon_s : time from the step to the stamp; NaN without one.
     usable : whether the step is valid and at most ``MAX_PREDICTION_S`` old.
     """
 
-    step: IntArray
-    arrived: BoolArray
     horizon_s: FloatArray
     usable: BoolArray
 
@@ -102,6 +98,6 @@ class Extrapolation:
 
 def extrapolation(steps_ns: IntArray, chosen: Release, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
     """Return the extrapolation to scored stamps [M] from the chosen ones of steps [K] with stamps and validity."""
-    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.row]) * 1e-9, np.nan)
-    usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.row]
-    return Extrapolation(chosen.row, chosen.arrived, horizon_s, usable)
+    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.step]) * 1e-9, np.nan)
+    usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.step]
+    return Extrapolation(chosen.step, chosen.arrived, horizon_s, usable)

@@ -106,7 +106,7 @@ def force_models(*names: str) -> tuple[VehicleUkf, Motion, Sensor]:
 
 
 def filterpy_run(signals, estimator, motion, sensor, residual_rate, extra_r):
-    """Return the columns of PosteriorSteps and StepLinks by filterpy.
+    """Return the columns of LinkedSteps by filterpy.
 
     An entry without variance is no state of filterpy. Its two sigma points are at the first one, to which κ gives their
     weights.
@@ -195,7 +195,8 @@ def test_it_is_the_unscented_kalman_filter_of_filterpy(made, irregular):
     t = (irregular.stamps_ns - irregular.stamps_ns[0]) * 1e-9
     rate = np.column_stack([0.3 * np.sin(t), 0.1 * np.cos(3.0 * t)])
     extra_r = np.where(t[:, None] < 4.0, 0.0, [0.1, 1e-4])
-    steps, _, links = estimator.linked_steps(irregular, None, rate, extra_r)
+    links, _ = estimator.linked_steps(irregular, None, rate, extra_r)
+    steps = links.posterior
     assert steps.x[0, :3] == pytest.approx(
         [irregular.speed_m_s[0], *(irregular.yaw_rate_rad_s[0] * np.array([REAR_M, 1]))]
     )
