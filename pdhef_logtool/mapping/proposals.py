@@ -58,8 +58,9 @@ def propose(pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[st
         rate = cells[r] * factor[r] if r is not None else cells[y or 0] * factor[y or 0] / speed
         curvature = np.where(speed > 1.0, rate / speed, np.nan)
     free = [i for i, c in enumerate(columns) if i not in chosen and c.role is None and "steering" in c.units]
-    relations = ((i, fit(cells[i], curvature)) for i in free)
-    surest, steering = max(((abs(f.correlation), i) for i, f in relations if f is not None), default=(0.0, 0))
+    # A roll angle follows the lateral acceleration better than the curvature.
+    surest, steering = max(((_strength(cells[i], curvature), i) for i in free), default=(0.0, 0))
+    surest = 0.0 if surest < _strength(cells[steering], rate * speed) else surest
     return proposed | ({steering: ("steering", "", "")} if surest > LEAST else {})
 
 
@@ -112,6 +113,12 @@ def _ways(
                 if all(low < size < high for size, (low, high) in sizes):
                     off = sum((math.log(gain) / SIGMA) ** 2 for gain in gains)
                     yield evidence - 0.5 * off, places, tuple(name for name, _ in units)
+
+
+def _strength(y: FloatArray, x: FloatArray) -> float:
+    """Return the magnitude of a correlation; 0 without enough cells."""
+    relation = fit(y, x)
+    return 0.0 if relation is None else abs(relation.correlation)
 
 
 def _related(y: FloatArray, x: FloatArray) -> Fit | None:
