@@ -61,6 +61,7 @@ _RATES = {
     "rate": r"(?:(?:sampl\w*|data|log\w*)[ _]?(?:rate|freq\w*)|freq\w*|abtast(?:rate|frequenz)|fs)(?: ?[[(]k?hz[])])?",
     "step": r"(?:sampl\w*[ _]?(?:interval|period|time|step)|h_?resolution|delta_?[xt]|dt|abtastzeit)(?: ?[[(]\w+[])])?",
 }
+_UNIT_LABEL = re.compile(r"(?i)^\s*units?\s*:")
 #: A channel in a list above the rows.
 _LISTED = re.compile(r"(?i)(?:channel|signal|name)(?: ?name)?\s*[:=]\s*(.+)")
 _COMMENT = re.compile(r"(?:[#%!;]|//)\s*")
@@ -105,7 +106,11 @@ def open_csv(file: TableFile) -> Tables:
         titles, units, first = _layout([row for _, row in head], file.name)
         stated_hz = _stated_rate(row for _, row in head[:first])
         fields, given = read_head(titles)
-        given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
+        given |= {
+            name: _UNIT_LABEL.sub("", unit).strip("[](){} ")
+            for name, unit in zip(fields, units, strict=False)
+            if unit.strip()
+        }
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
@@ -266,7 +271,7 @@ def _titles(rows: Sequence[Sequence[str]], width: int, header: int) -> list[int]
     widths = {width, width - 1} if not rows[-1][-1].strip() else {width}
     texts = [i for i, row in enumerate(rows[:-1]) if _share(row, _is_value) < 0.5]
     exact = [i for i in texts if len(rows[i]) in widths]
-    return exact if any(i > header for i in exact) else [i for i in texts if abs(len(rows[i]) - width) == 1 < width]
+    return exact if any(i > header for i in exact) else [i for i in texts if abs(len(rows[i]) - width) <= 1 < width]
 
 
 def _is_value(cell: str) -> bool:

@@ -233,7 +233,8 @@ def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], nam
     there = {(n[3].quantity, part) for n in named if n[1] != "command" for part in (n[3].part, "any")}
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
-    columns = dict(_named_columns(named)) if wanted else {}
+    columns: dict[tuple[str, str], tuple[Units, tuple[str, str] | None]] = {}
+    columns |= _named_columns(named) if wanted else ()
     sensors = {t.name: t for t, role in topics if role == "sensor"}
     by_name = {(n[0].name, n[2].path) for n in named}
     for name in sensors if wanted else ():

@@ -35,7 +35,9 @@ class Column(NamedTuple):
     role: tuple[str, str] | None = None
 
 
-def propose(pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[str, str]]) -> dict[int, tuple[str, ...]]:
+def propose(
+    pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[str, str]]
+) -> dict[int, tuple[str, str, str]]:
     """Return quantity, part and unit by the place of a column without a role, for the wanted ones of :data:`ROLES`.
 
     Only one assignment may explain the drive: without speeding up, a yaw rate, a_y and a steering angle are alike. The
@@ -66,7 +68,7 @@ def propose(pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[st
 
 def _options(columns: Sequence[Column], role: tuple[str, str], wanted: Sequence[tuple[str, str]]) -> list[int | None]:
     """Return the columns that may have a role: the named ones, else those without a name if the role is wanted."""
-    named = [i for i, c in enumerate(columns) if c.role == role]
+    named: list[int | None] = [i for i, c in enumerate(columns) if c.role == role]
     free = [i for i, c in enumerate(columns) if c.role is None and role[0] in c.units] if role in wanted else []
     return named[:1] or [*free, None]
 
@@ -77,51 +79,41 @@ def _ways(
     """Yield evidence, columns and units of the assignments that the drive's motion supports."""
     of_v, of_x, of_y, of_r = options
     for v in (i for i in of_v if i is not None and np.fmin.reduce(cells[i]) > -0.05 * columns[i].seen.largest):
+        ahead, left = dict[int | None, Fit](), dict[tuple[int | None, int | None], Fit]()
         change = pieces.rate_of(columns[v].seen.cells)
-        along = {x: _related(cells[x], change) for x in of_x if x is not None}
-        turns = {
-            (y, r): _related(cells[y], cells[r] * cells[v])
-            for y, r in product(of_y, of_r)
-            if y is not None and r is not None and y != r
-        }
-        xs = [x for x in of_x if (f := along.get(x)) is None or f.correlation > 0.0]
-        for x, (y, r) in product(xs, product(of_y, of_r)):
-            ahead, left, places = along.get(x), turns.get((y, r)), (v, x, y, r)
-            free = {p for p in places if p is not None and columns[p].role is None}
-            related = {v, x} if ahead is not None else set()
-            related |= {v, y, r} if left is not None else set()
+        for i in (i for i in of_x if i is not None):
+            if (relation := fit(cells[i], change)) is not None and relation.correlation > LEAST:
+                ahead[i] = relation
+        for i, j in ((i, j) for i, j in product(of_y, of_r) if i is not None and j is not None and i != j):
+            if (relation := fit(cells[i], cells[j] * cells[v])) is not None and abs(relation.correlation) > LEAST:
+                left[i, j] = relation
+        for x, y, r in product(of_x, of_y, of_r):
+            used = [p for p in (v, x, y, r) if p is not None]
+            free = {p for p in used if columns[p].role is None}
+            related = {v, x} if x in ahead else set()
+            related |= {v, y, r} if (y, r) in left else set()
             # An acceleration without a lateral one may be the derivative of the speed.
-            if (
-                not free <= related
-                or (x in free and y is None)
-                or len({*places} - {None}) < len(places) - places.count(None)
-            ):
-                continue
-            evidence = sum(math.atanh(min(abs(f.correlation), 0.999)) for f in (ahead, left) if f is not None)
-            every = (
-                columns[p].units[q] if p is not None else (("", 1.0),) for p, (q, _) in zip(places, ROLES, strict=True)
-            )
-            for units in product(*every):
-                s, ax, ay, w = (factor for _, factor in units)
-                gains = [] if ahead is None else [ahead.slope * ax / s]
-                gains += [] if left is None else [abs(left.slope) * ay / (s * w)]
-                sizes = [
-                    (columns[p].seen.largest * u, _LARGEST[q])
-                    for p, (_, u), (q, _) in zip(places, units, ROLES, strict=True)
-                    if p in free and p is not None
-                ]
-                if all(low < size < high for size, (low, high) in sizes):
-                    off = sum((math.log(gain) / SIGMA) ** 2 for gain in gains)
-                    yield evidence - 0.5 * off, places, tuple(name for name, _ in units)
+            if free <= related and len({*used}) == len(used) and not (x in free and y is None):
+                relations = [(f, i) for i, f in enumerate((ahead.get(x), left.get((y, r)))) if f is not None]
+                yield from _with_units(columns, (v, x, y, r), relations)
+
+
+def _with_units(
+    columns: Sequence[Column], places: _Places, relations: Sequence[tuple[Fit, int]]
+) -> Iterator[tuple[float, _Places, tuple[str, ...]]]:
+    """Yield an assignment with its possible units; relations are a_x ≈ v̇ (0) and a_y ≈ v r (1)."""
+    of_roles = [*zip(places, ROLES, strict=True)]
+    surety = sum(math.atanh(min(abs(f.correlation), 0.999)) for f, _ in relations)
+    for units in product(*(columns[p].units[q] if p is not None else (("", 1.0),) for p, (q, _) in of_roles)):
+        v, x, y, r = (factor for _, factor in units)
+        off = sum((math.log(abs(f.slope) * (x / v, y / (r * v))[i]) / SIGMA) ** 2 for f, i in relations)
+        new = [(columns[p], u, q) for (p, (q, _)), (_, u) in zip(of_roles, units, strict=True) if p is not None]
+        sizes = ((c.seen.largest * u, _LARGEST[q]) for c, u, q in new if c.role is None)
+        if all(low < size < high for size, (low, high) in sizes):
+            yield surety - 0.5 * off, places, tuple(name for name, _ in units)
 
 
 def _strength(y: FloatArray, x: FloatArray) -> float:
     """Return the magnitude of a correlation; 0 without enough cells."""
     relation = fit(y, x)
     return 0.0 if relation is None else abs(relation.correlation)
-
-
-def _related(y: FloatArray, x: FloatArray) -> Fit | None:
-    """Fit a relation; None if it is not clear."""
-    relation = fit(y, x)
-    return relation if relation is not None and abs(relation.correlation) > LEAST else None
