@@ -42,6 +42,8 @@ _DEEPEST = 8
 _FILTERS = frozenset({1, 2, 3})
 #: Columns of a matrix that become fields.
 _MOST_COLUMNS = 16
+#: Names of the values of a struct that has the name of the signal.
+_DATA = frozenset({"data", "value", "values"})
 #: Separates the parts of a path.
 _SLASH = "/"
 
@@ -79,6 +81,7 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
         name, given = split_unit(title)
         unit = unit or given
         if isinstance(value, np.ndarray) and _has_times(value):
+            name = (struct_.rpartition(_SLASH)[2] or name) if name.lower() in _DATA else name
             arrays[path], units[path] = {"time": value[:, 0], field_name(name): value[:, 1]}, {field_name(name): unit}
             continue
         vectors = _vectors(name, value) if isinstance(value, np.ndarray) else {}

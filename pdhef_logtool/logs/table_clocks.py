@@ -167,9 +167,7 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz
         slow = _CLOCKS["weight_of_steps"] * _outside(step_s, _CLOCKS["usual_step_s"])
         return float(slow + _outside(length_s, _CLOCKS["usual_length_s"]) + apart)
 
-    dates = [(factor, 0) for factor in _SUBUNITS if _is_date(middle * factor / _SECONDS)]
-    elsewhere = ((f, epoch) for f, epoch in _EPOCHS if middle > _CLOCKS["least_of_epochs"])
-    dates = dates or [(f, epoch) for f, epoch in elsewhere if _is_date((middle - epoch) * f / _SECONDS)]
+    dates = _dates_of(middle)
     days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * _DAY_S)]
     if stated:
         as_stated = next((r for r in (*dates, *days) if r[0] == stated), (stated, 0))
@@ -184,6 +182,13 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz
         return _as_rate_states(rate_hz, step)
     factor, epoch = min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
     return factor, epoch, _assumption(values, factor, epoch, others)
+
+
+def _dates_of(middle: float) -> list[tuple[int, int]]:
+    """Return the units and epochs in which a number is a date, since 1970 if there are such ones."""
+    dates = [(factor, 0) for factor in _SUBUNITS if _is_date(middle * factor / _SECONDS)]
+    elsewhere = ((f, epoch) for f, epoch in _EPOCHS if middle > _CLOCKS["least_of_epochs"])
+    return dates or [(f, epoch) for f, epoch in elsewhere if _is_date((middle - epoch) * f / _SECONDS)]
 
 
 def _assumption(values: NDArray[Any], factor: int, epoch: int, others: Sequence[Clock]) -> str:

@@ -43,8 +43,6 @@ _REGULAR = 1.5
 _ENOUGH_ROWS = 0.9
 #: Lengths of two clocks of a table differ by less than this share.
 _ALIKE = 0.01
-#: A regular first column without a unit contains times beside so many columns.
-_FEWEST_COLUMNS = 3
 #: Share of steps that are not negative, of a column that may contain times.
 _ASCENDING_SHARE = 0.99
 
@@ -268,15 +266,26 @@ def _grade(sheet: Sheet, name: str) -> int | None:
         return None
     if is_time:
         return 0
+    return _grade_of_numbers(sheet, name, given)
+
+
+def _grade_of_numbers(sheet: Sheet, name: str, given: NDArray[Any]) -> int | None:
+    """Return :func:`_grade` of finite numbers or dates by their order, name, unit and steps."""
+    column, text = sheet.columns[name], snake(name)
+    is_date = given is not column and isinstance(column, np.ndarray) and column.dtype.kind == "M"
     if (given[1:] >= given[:-1]).sum() < _ASCENDING_SHARE * (len(given) - 1) or len(column) == 1:
-        return 2 if column.dtype.kind == "M" else None
+        return 2 if is_date else None
     is_unit_of_time = sheet.units.get(name, "").lower() in TIME_UNITS_NS or text.startswith("t_")
-    if _TIME_LIKE.search(text) or column.dtype.kind == "M" or is_unit_of_time:
-        return 1 if _TIME_LIKE.search(text) else 2 if column.dtype.kind == "M" else 3
+    if _TIME_LIKE.search(text) or is_date or is_unit_of_time:
+        return 1 if _TIME_LIKE.search(text) else 2 if is_date else 3
     steps = np.diff(given)
     is_count = bool((steps == steps[0]).all()) and steps[0] == 1
     is_regular = np.quantile(np.abs(steps - np.median(steps)), _ENOUGH_ROWS) <= _ALIKE * np.median(steps)
-    is_alone = len(sheet.columns) < _FEWEST_COLUMNS or name != next(iter(sheet.columns)) or name in sheet.units
+    is_alone = (
+        len(sheet.columns) < CONSTANTS["clocks"]["fewest_columns"]
+        or name != next(iter(sheet.columns))
+        or name in sheet.units
+    )
     return 4 if is_regular and not (is_count or is_alone) else None
 
 

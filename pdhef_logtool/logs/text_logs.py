@@ -61,6 +61,7 @@ _RATES = {
     "rate": r"(?:(?:sampl\w*|data|log\w*)[ _]?(?:rate|freq\w*)|freq\w*|abtast(?:rate|frequenz)|fs)(?: ?[[(]k?hz[])])?",
     "step": r"(?:sampl\w*[ _]?(?:interval|period|time|step)|h_?resolution|delta_?[xt]|dt|abtastzeit)(?: ?[[(]\w+[])])?",
 }
+_UNIT_LABEL = re.compile(r"(?i)^\s*units?\s*:")
 #: A channel in a list above the rows.
 _LISTED = re.compile(r"(?i)(?:channel|signal|name)(?: ?name)?\s*[:=]\s*(.+)")
 _COMMENT = re.compile(r"(?:[#%!;]|//)\s*")
@@ -80,9 +81,7 @@ _RECEIVER = re.compile(
 _ALONG_HEADING = 0.95
 _CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
 
-#: Objects inside one another in a document.
-_DEEPEST = 8
-_MOST_ELEMENTS, _LARGEST = CONSTANTS["json"]["elements"], CONSTANTS["json"]["largest"]
+_MOST_ELEMENTS, _LARGEST, _DEEPEST = (CONSTANTS["json"][name] for name in ("elements", "largest", "deepest"))
 #: Values of a column and their rows.
 _Cells: TypeAlias = "tuple[array[int], list[Any]]"
 
@@ -105,7 +104,11 @@ def open_csv(file: TableFile) -> Tables:
         titles, units, first = _layout([row for _, row in head], file.name)
         stated_hz = _stated_rate(row for _, row in head[:first])
         fields, given = read_head(titles)
-        given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
+        given |= {
+            name: _UNIT_LABEL.sub("", unit).strip("[](){} ")
+            for name, unit in zip(fields, units, strict=False)
+            if unit.strip()
+        }
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
@@ -228,10 +231,7 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
     header = max((i for i, row in enumerate(rows) if row and _END_OF_HEADER.fullmatch(row[0])), default=-1)
-    starts = [row[0].strip() for row in rows[-20:] if len(row) == width]
-    has_labels = _share(starts, _is_value) >= 0.9 or not any(starts)
-    # A text in a first column of numbers labels a line of the head: a sample rate, a block size.
-    data = [i for i, row in enumerate(rows) if row and not (has_labels and row[0].strip() and not _is_value(row[0]))]
+    data = _data_rows(rows, width)
     numbers = [i for i in data if i > header and len(rows[i]) == width > 1 and _share(rows[i], _is_value) >= 0.5]
     # Above the titles there may be a row with the numbers of the channels.
     full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width, header))), (0, []))
@@ -241,21 +241,38 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     if not above:
         got = "none" if numbers else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
-    # Titles, above them those of groups, around them units, below them sources and the name of an index.
-    last = [i for i in above if i > header][-3:]
-    names = max(reversed(last), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
+    return _head(rows, above, [i for i in above if i > header][-3:], full, data)
+
+
+def _head(
+    rows: Sequence[Sequence[str]], above: Sequence[int], last: Sequence[int], full: int, data: Sequence[int]
+) -> tuple[Sequence[str], Sequence[str], int]:
+    """Return :func:`_layout` by the rows of texts ``above`` the first row of numbers ``full``; ``last`` has titles."""
+    width = len(rows[full])
     is_labelled = not any(row[0].strip() for row in rows[full : full + 3])
-    names = next((i for i in above if is_labelled and rows[i][0].strip().lower() in _LABELS), names)
-    below = range(names + 1, full + 1)
-    below_data = (i for i in below if i == full or i in data)
-    first = next(i for i in below_data if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
+    names = _names_row(rows, last, above if is_labelled else [])
+    below = (i for i in range(names + 1, full) if i in data)
+    first = next((i for i in below if any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i])), full)
     of_units = next((i for i in above if i != names and _share(rows[i], is_unit) >= 0.5), -1)
-    groups = rows[names - 1] if names - 1 in above and not is_labelled and of_units != names - 1 else []
+    has_groups = names - 1 in above and not is_labelled and of_units != names - 1
     under = [rows[i] for i in above if names < i < first]
-    titles = _joined(rows[names][:width], groups, under)
+    titles = _joined(rows[names][:width], rows[names - 1] if has_groups else [], under)
     if len(titles) < width and rows[full][-1].strip():  # names of the rows without a title, as R writes them
         titles = ["row", *titles]
     return titles, rows[of_units] if of_units >= 0 else [], first
+
+
+def _data_rows(rows: Sequence[Sequence[str]], width: int) -> list[int]:
+    """Return the rows without a label: below a text in a first column of numbers is a sample rate, or a block size."""
+    starts = [row[0].strip() for row in rows[-20:] if len(row) == width]
+    has_labels = _share(starts, _is_value) >= 0.9 or not any(starts)
+    return [i for i, row in enumerate(rows) if row and not (has_labels and row[0].strip() and not _is_value(row[0]))]
+
+
+def _names_row(rows: Sequence[Sequence[str]], last: Sequence[int], labelled: Sequence[int]) -> int:
+    """Return the row of titles: labelled so, or with most texts that are no units."""
+    names = max(reversed(last), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
+    return next((i for i in labelled if rows[i][0].strip().lower() in _LABELS), names)
 
 
 def _titles(rows: Sequence[Sequence[str]], width: int, header: int) -> list[int]:
@@ -266,7 +283,7 @@ def _titles(rows: Sequence[Sequence[str]], width: int, header: int) -> list[int]
     widths = {width, width - 1} if not rows[-1][-1].strip() else {width}
     texts = [i for i, row in enumerate(rows[:-1]) if _share(row, _is_value) < 0.5]
     exact = [i for i in texts if len(rows[i]) in widths]
-    return exact if any(i > header for i in exact) else [i for i in texts if abs(len(rows[i]) - width) == 1 < width]
+    return exact if any(i > header for i in exact) else [i for i in texts if abs(len(rows[i]) - width) <= 1 < width]
 
 
 def _is_value(cell: str) -> bool:
@@ -469,11 +486,8 @@ def _record_of_line(line: bytes) -> dict[str, Any] | None:
 def _lists_of_records(value: Any, depth: int) -> Iterator[list[dict[str, Any]]]:
     """Yield the lists of objects in a document, and tables of their columns' names and rows."""
     if isinstance(value, dict) and depth:
-        names = next((value[key] for key in ("columns", "fields", "header") if isinstance(value.get(key), list)), None)
-        rows = next((value[key] for key in ("data", "values", "rows") if isinstance(value.get(key), list)), None)
-        if names and rows and all(isinstance(row, list) and len(row) == len(names) for row in rows):
-            titles = [str(name.get("name", name) if isinstance(name, dict) else name) for name in names]
-            yield [dict(zip(titles, row, strict=True)) for row in rows]
+        if table := _named_rows(value):
+            yield table
             return
         if value and all(key.isdigit() and isinstance(inner, dict) for key, inner in value.items()):
             value = [[*value.values()]]
@@ -485,6 +499,18 @@ def _lists_of_records(value: Any, depth: int) -> Iterator[list[dict[str, Any]]]:
         else:
             for inner in value[:_MOST_ELEMENTS]:
                 yield from _lists_of_records(inner, depth - 1)
+
+
+def _named_rows(value: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows of an object with the names of columns and a list for each row; empty for another one."""
+    names, rows = (
+        next((value[key] for key in keys if isinstance(value.get(key), list)), list[Any]())
+        for keys in (("columns", "fields", "header"), ("data", "values", "rows"))
+    )
+    if not names or not all(isinstance(row, list) and len(row) == len(names) for row in rows):
+        return []
+    titles = [str(name.get("name", name) if isinstance(name, dict) else name) for name in names]
+    return [dict(zip(titles, row, strict=True)) for row in rows]
 
 
 def _array_of(value: Any, depth: int) -> Any:

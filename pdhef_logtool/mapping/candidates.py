@@ -233,15 +233,8 @@ def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], nam
     there = {(n[3].quantity, part) for n in named if n[1] != "command" for part in (n[3].part, "any")}
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
-    columns = dict(_named_columns(named)) if wanted else {}
     sensors = {t.name: t for t, role in topics if role == "sensor"}
-    by_name = {(n[0].name, n[2].path) for n in named}
-    for name in sensors if wanted else ():
-        for info in log.fields(name, quiet=True):
-            is_column = info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
-            units = _units_without_name(info) if is_column and (name, info.path) not in by_name else {}
-            if units and len(columns) < MOST_PROPOSED:
-                columns[name, info.path.removesuffix("[]")] = units, None
+    columns = _compared(log, [*sensors], named) if wanted else {}
     if all(role is not None for _, role in columns.values()):
         return
     requests: dict[str, list[str]] = {}
@@ -259,8 +252,22 @@ def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], nam
         yield sensors[topic_name], "sensor", FieldInfo(path, "number"), meaning, False
 
 
+def _compared(
+    log: DriveLog, topics: Sequence[str], named: Sequence[Named]
+) -> dict[tuple[str, str], tuple[Units, tuple[str, str] | None]]:
+    """Return units and quantity by name, or None, of the fields that take part in a comparison, by topic and path."""
+    columns: dict[tuple[str, str], tuple[Units, tuple[str, str] | None]] = {**dict(_named_columns(named))}
+    by_name = {(n[0].name, n[2].path) for n in named}
+    for topic, info in ((t, info) for t in topics for info in log.fields(t, quiet=True)):
+        is_column = info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
+        units = _units_without_name(info) if is_column and (topic, info.path) not in by_name else {}
+        if units and len(columns) < MOST_PROPOSED:
+            columns[topic, info.path.removesuffix("[]")] = units, None
+    return columns
+
+
 def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tuple[Units, tuple[str, str]]]]:
-    """Yield the field that has each of :data:`ROLES` by its name, without a speed that of a wheel, and its units."""
+    """Yield the field named as each of :data:`ROLES` with its units; a wheel speed replaces a missing speed."""
     usable = [n for n in named if n[1] != "command" and not n[4] and "[]" not in n[2].path]
     for role in ROLES:
         its = [n for n in usable if n[3].quantity == role[0] and n[3].part in (role[1], "")]
@@ -278,7 +285,7 @@ def _units_without_name(info: FieldInfo) -> Units:
     named = f"{info.path.rpartition('.')[2]}_{unit}"
     kinds = {"speed": "speed", "acceleration": "acceleration", "rate": "rate", "steering": "angle"}
     given = {q: ((u, s),) for q, kind in kinds.items() for u, s in [unit_of(named, kind)] if s is not None}
-    if "acceleration" in given:  # its unit contains that of a speed, and that of a rate that of an angle
+    if "acceleration" in given:  # m/s is a part of m/s², and deg of deg/s
         given.pop("speed", None)
     if OTHER_QUANTITIES & words:
         given.pop("steering", None)

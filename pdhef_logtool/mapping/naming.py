@@ -210,10 +210,7 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _WORDS["other_devices"] & set(outer):
         return None
-    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
-    kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
-    kept |= {w for w in leaf_words[-1:] if (w not in STATES and leaf_words[-2:-1] != ("per",)) or len(leaf_words) == 1}
-    if NOT_VALUES & kept or NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
+    if NOT_VALUES & _described(leaf_words) or NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None
     index = re.search(r"\[(\d+)\]$", leaf)
     column = None if index is None else int(index[1])
@@ -231,6 +228,14 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
         if quantity is not None:
             return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
     return None
+
+
+def _described(leaf_words: tuple[str, ...]) -> set[str]:
+    """Return the words of a leaf that describe its quantity."""
+    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
+    kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
+    kept |= {w for w in leaf_words[-1:] if (w not in STATES and leaf_words[-2:-1] != ("per",)) or len(leaf_words) == 1}
+    return kept
 
 
 def _meaning_of_topic(topic: str, path: str, unit_text: str) -> Meaning | None:

@@ -1,4 +1,4 @@
-"""Quantities of columns whose names give none, by physics: a_x ≈ v̇, a_y ≈ v r, and steering against curvature.
+"""Quantities of columns without a meaning by name, by physics: a_x ≈ v̇, a_y ≈ v r, and steering against curvature.
 
 Columns with a named quantity take part in the relations; units, where a column has one, exclude quantities.
 """
@@ -23,20 +23,22 @@ _LARGEST = {"speed": (4.0, 90.0), "acceleration": (0.7, 16.0), "rate": (0.04, 2.
 MOST_PROPOSED, LEAST, SIGMA, MARGIN = 24, 0.8, 0.15, 1.0
 #: Possible units and their factors to SI, by quantity.
 Units: TypeAlias = Mapping[str, Sequence[tuple[str, float]]]
-#: Column of each role, None without one.
+#: Column of each quantity, None without one.
 _Places: TypeAlias = tuple[int | None, ...]
 
 
 class Column(NamedTuple):
-    """Values of a column, and its possible units with their factors by quantity; ``role``: by its name, else None."""
+    """Values of a column, and its possible units by quantity; ``role``: its quantity by name, or None."""
 
     seen: Seen
     units: Units
     role: tuple[str, str] | None = None
 
 
-def propose(pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[str, str]]) -> dict[int, tuple[str, ...]]:
-    """Return quantity, part and unit by the place of a column without a role, for the wanted ones of :data:`ROLES`.
+def propose(
+    pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[str, str]]
+) -> dict[int, tuple[str, str, str]]:
+    """Return quantity, part and unit by the place of a column without a name, for the wanted ones of :data:`ROLES`.
 
     Only one assignment may explain the drive: without speeding up, a yaw rate, a_y and a steering angle are alike. The
     unit of a steering angle stays open (empty).
@@ -50,22 +52,31 @@ def propose(pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[st
     chosen = {p: (*q, u) for p, q, u in zip(places, ROLES, units, strict=True) if p is not None}
     factor = {p: dict(columns[p].units[q])[u] for p, (q, _, u) in chosen.items()}
     proposed = {p: meaning for p, meaning in chosen.items() if columns[p].role is None}
+    steering = _steering(columns, cells, places, factor) if ("steering", "") in wanted else None
+    return proposed if steering is None else {**proposed, steering: ("steering", "", "")}
+
+
+def _steering(
+    columns: Sequence[Column], cells: Sequence[FloatArray], places: _Places, factor: Mapping[int, float]
+) -> int | None:
+    """Return the column without a name that follows the path's curvature best, or None."""
     v, _, y, r = places
-    if v is None or (r is None and y is None) or ("steering", "") not in wanted:
-        return proposed
+    turning = y if r is None else r
+    if v is None or turning is None:
+        return None
     speed = cells[v] * factor[v]
     with np.errstate(invalid="ignore", divide="ignore"):
-        rate = cells[r] * factor[r] if r is not None else cells[y or 0] * factor[y or 0] / speed
+        rate = cells[turning] * factor[turning] / (speed if r is None else 1.0)
         curvature = np.where(speed > 1.0, rate / speed, np.nan)
-    free = [i for i, c in enumerate(columns) if i not in chosen and c.role is None and "steering" in c.units]
-    relations = ((i, fit(cells[i], curvature)) for i in free)
-    surest, steering = max(((abs(f.correlation), i) for i, f in relations if f is not None), default=(0.0, 0))
-    return proposed | ({steering: ("steering", "", "")} if surest > LEAST else {})
+    free = [i for i, c in enumerate(columns) if i not in places and c.role is None and "steering" in c.units]
+    surest, steering = max(((_strength(cells[i], curvature), i) for i in free), default=(0.0, 0))
+    # A roll angle follows the lateral acceleration better than the curvature.
+    return steering if surest > max(LEAST, _strength(cells[steering], rate * speed)) else None
 
 
 def _options(columns: Sequence[Column], role: tuple[str, str], wanted: Sequence[tuple[str, str]]) -> list[int | None]:
-    """Return the columns that may have a role: the named ones, else those without a name if the role is wanted."""
-    named = [i for i, c in enumerate(columns) if c.role == role]
+    """Return the columns that may be a quantity: the named ones, else those without a name if it is wanted."""
+    named: list[int | None] = [i for i, c in enumerate(columns) if c.role == role]
     free = [i for i, c in enumerate(columns) if c.role is None and role[0] in c.units] if role in wanted else []
     return named[:1] or [*free, None]
 
@@ -74,47 +85,48 @@ def _ways(
     pieces: Pieces, columns: Sequence[Column], cells: Sequence[FloatArray], options: Sequence[Sequence[int | None]]
 ) -> Iterator[tuple[float, _Places, tuple[str, ...]]]:
     """Yield evidence, columns and units of the assignments that the drive's motion supports."""
-    of_v, of_x, of_y, of_r = options
+    of_v, *others = options
     for v in (i for i in of_v if i is not None and np.fmin.reduce(cells[i]) > -0.05 * columns[i].seen.largest):
-        change = pieces.rate_of(columns[v].seen.cells)
-        along = {x: _related(cells[x], change) for x in of_x if x is not None}
-        turns = {
-            (y, r): _related(cells[y], cells[r] * cells[v])
-            for y, r in product(of_y, of_r)
-            if y is not None and r is not None and y != r
-        }
-        xs = [x for x in of_x if (f := along.get(x)) is None or f.correlation > 0.0]
-        for x, (y, r) in product(xs, product(of_y, of_r)):
-            ahead, left, places = along.get(x), turns.get((y, r)), (v, x, y, r)
-            free = {p for p in places if p is not None and columns[p].role is None}
-            related = {v, x} if ahead is not None else set()
-            related |= {v, y, r} if left is not None else set()
+        ahead, left = _relations(pieces.rate_of(columns[v].seen.cells), cells, v, others)
+        for x, y, r in product(*others):
+            used = [p for p in (v, x, y, r) if p is not None]
+            free = {p for p in used if columns[p].role is None}
+            related = ({v, x} if x in ahead else set()) | ({v, y, r} if (y, r) in left else set())
             # An acceleration without a lateral one may be the derivative of the speed.
-            if (
-                not free <= related
-                or (x in free and y is None)
-                or len({*places} - {None}) < len(places) - places.count(None)
-            ):
-                continue
-            evidence = sum(math.atanh(min(abs(f.correlation), 0.999)) for f in (ahead, left) if f is not None)
-            every = (
-                columns[p].units[q] if p is not None else (("", 1.0),) for p, (q, _) in zip(places, ROLES, strict=True)
-            )
-            for units in product(*every):
-                s, ax, ay, w = (factor for _, factor in units)
-                gains = [] if ahead is None else [ahead.slope * ax / s]
-                gains += [] if left is None else [abs(left.slope) * ay / (s * w)]
-                sizes = [
-                    (columns[p].seen.largest * u, _LARGEST[q])
-                    for p, (_, u), (q, _) in zip(places, units, ROLES, strict=True)
-                    if p in free and p is not None
-                ]
-                if all(low < size < high for size, (low, high) in sizes):
-                    off = sum((math.log(gain) / SIGMA) ** 2 for gain in gains)
-                    yield evidence - 0.5 * off, places, tuple(name for name, _ in units)
+            if free <= related and len({*used}) == len(used) and not (x in free and y is None):
+                relations = [(f, i) for i, f in enumerate((ahead.get(x), left.get((y, r)))) if f is not None]
+                yield from _with_units(columns, (v, x, y, r), relations)
 
 
-def _related(y: FloatArray, x: FloatArray) -> Fit | None:
-    """Fit a relation; None if it is not clear."""
+def _relations(
+    change: FloatArray, cells: Sequence[FloatArray], v: int, others: Sequence[Sequence[int | None]]
+) -> tuple[dict[int | None, Fit], dict[tuple[int | None, int | None], Fit]]:
+    """Return the fits of a_x ≈ v̇ and of a_y ≈ v r for a speed ``v``, by columns."""
+    of_x, of_y, of_r = ([i for i in its if i is not None] for its in others)
+    ahead = {x: fit(cells[x], change) for x in of_x}
+    left = {(y, r): fit(cells[y], cells[r] * cells[v]) for y, r in product(of_y, of_r) if y != r}
+    return (
+        {x: f for x, f in ahead.items() if f is not None and f.correlation > LEAST},
+        {pair: f for pair, f in left.items() if f is not None and abs(f.correlation) > LEAST},
+    )
+
+
+def _with_units(
+    columns: Sequence[Column], places: _Places, relations: Sequence[tuple[Fit, int]]
+) -> Iterator[tuple[float, _Places, tuple[str, ...]]]:
+    """Yield an assignment with its possible units; relations are a_x ≈ v̇ (0) and a_y ≈ v r (1)."""
+    of_roles = [*zip(places, ROLES, strict=True)]
+    surety = sum(math.atanh(min(abs(f.correlation), 0.999)) for f, _ in relations)
+    for units in product(*(columns[p].units[q] if p is not None else (("", 1.0),) for p, (q, _) in of_roles)):
+        v, x, y, r = (factor for _, factor in units)
+        off = sum((math.log(abs(f.slope) * (x / v, y / (r * v))[i]) / SIGMA) ** 2 for f, i in relations)
+        new = [(columns[p], u, q) for (p, (q, _)), (_, u) in zip(of_roles, units, strict=True) if p is not None]
+        sizes = ((c.seen.largest * u, _LARGEST[q]) for c, u, q in new if c.role is None)
+        if all(low < size < high for size, (low, high) in sizes):
+            yield surety - 0.5 * off, places, tuple(name for name, _ in units)
+
+
+def _strength(y: FloatArray, x: FloatArray) -> float:
+    """Return the magnitude of a correlation; 0 without enough cells."""
     relation = fit(y, x)
-    return relation if relation is not None and abs(relation.correlation) > LEAST else None
+    return 0.0 if relation is None else abs(relation.correlation)

@@ -98,6 +98,28 @@ DIALECTS = {
         _csv(SECONDS, "[Channels]\n0,12,13\ntime,ay,speed\ns,m/s²,km/h\n\n[Data]").encode(),
         RELATIVE_NS,
     ),
+    "labview": (
+        _csv(
+            SECONDS,
+            "LabVIEW Measurement\t\nDate\t2024/05/01\n***End_of_Header***\t\nSamples\t1\t1\t\n"
+            "Y_Unit_Label\tm/s²\tkm/h\t\nDelta_X\t0.01\t0.01\t\n***End_of_Header***\t\t\t\nX_Value\tay\tspeed\tComment",
+            "\t",
+        ).encode(),
+        RELATIVE_NS,
+    ),
+    "labels": (_csv([f",{t}" for t in SECONDS], "unit,s,m/s²,km/h\nname,XAxis,ay,speed").encode(), RELATIVE_NS),
+    "rate-in-head": (_csv([""] * N, "SampleRate,100,100\nVUnit,m/s²,km/h\nTraceName,ay,speed").encode(), RELATIVE_NS),
+    "metadata": (_csv(SECONDS, "time,ay,speed\n,Unit: m/s²,Unit: km/h").encode(), RELATIVE_NS),
+    "aligned": (_csv(SECONDS, "Run 1\nElapsed time (s)   ay (m/s²)   speed (km/h)", "   ").encode(), RELATIVE_NS),
+    "list": (_csv(_iso(), "Channel : ay (m/s²)\nChannel : speed (km/h)\nLog : 1").encode(), NOON_NS),
+    "row-names": (_csv([f"{i},{t}" for i, t in enumerate(SECONDS)], _HEAD).encode(), RELATIVE_NS),
+    "sep": (_csv(SECONDS, f"sep=,\n{_HEAD}").encode(), RELATIVE_NS),
+    "compact": (_csv([t.replace("-", "").replace(":", "") for t in _iso("Z")], _HEAD).encode(), NOON_NS),
+    "named-month": (_csv([f"May 1 2024 {t.partition('T')[2]}" for t in _iso()], _HEAD).encode(), NOON_NS),
+    "colon-milliseconds": (
+        _csv([t.partition("T")[2].replace(".", ":") for t in _iso()], _HEAD).encode(),
+        RELATIVE_NS + 12 * 3600 * 10**9,
+    ),
     "calendar": (
         _csv(
             [f"{100_000_000 * (i % 10)},2024,5,1,12,0,{i // 10}" for i in range(N)],
@@ -117,7 +139,7 @@ DIALECTS = {
 
 
 #: Dialects that need an assumption about their times.
-ASSUMED = {dialect: [("clock", "note")] for dialect in ("milliseconds-by-step", "month-first")}
+ASSUMED = {n: [("clock", "note")] for n in ("milliseconds-by-step", "month-first", "rate-in-head", "labview")}
 
 
 def _log(path: Path, data: bytes) -> DriveLog:
@@ -571,6 +593,24 @@ def test_json_lines_in_long_form_have_a_column_for_each_name(tmp_path: Path) -> 
 def test_a_file_without_objects_in_lines_is_one_line(text: str, tmp_path: Path) -> None:
     with pytest.raises(LogError, match="a JSON object a line"):
         open_log(_write(tmp_path / "a.json", text or "\n"))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.json", json.dumps([{"time": t, "ay": a} for t, a in zip(TIME_S.tolist(), AY.tolist(), strict=True)])),
+        ("a.json", json.dumps({"run": {"time": TIME_S.tolist(), "ay": AY.tolist()}})),
+        ("a.json", json.dumps({"columns": ["time", "ay"], "data": np.stack([TIME_S, AY], 1).tolist()})),
+        ("a.json", json.dumps({"ay": {"unit": "g", "values": np.stack([TIME_S, AY], 1).tolist()}})),
+        ("a.lp", "".join(f"imu,car=7 ay={a} {round(t * 1e9) + NOON_NS}\n" for t, a in zip(TIME_S, AY, strict=True))),
+        ("a.txt", "# Imu,ay,time\n" + "".join(f"Imu,{a},{t}\nGps,1,2,3\n" for t, a in zip(TIME_S, AY, strict=True))),
+    ],
+)
+def test_documents_line_protocol_and_rows_of_several_kinds(name: str, text: str, tmp_path: Path) -> None:
+    with closing(open_log(_write(tmp_path / name, text))) as log:
+        (topic,) = log.topics
+        (field,) = [f.path for f in log.fields(topic.name) if f.path.endswith("ay")]
+        np.testing.assert_allclose(_columns(log, topic.name)[field], AY)
 
 
 def test_limits_of_json_lines(tmp_path: Path) -> None:
