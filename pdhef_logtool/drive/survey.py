@@ -125,7 +125,9 @@ class Survey:
             # Without a known radius, rim speeds in m/s and in rad/s look alike. v_y has the unit of its v_x.
             unit = f"{signal.replace('truth.vy', 'truth.vx')}.unit"
             is_resolved = unit in passed and not signal.startswith("wheel") and "a share" not in check.evidence
-            if f"{signal}.sign" not in passed or (signal in doubted and not is_resolved):
+            # Values that identified a signal do not confirm it.
+            is_proposed = "values alone" in check.evidence
+            if f"{signal}.sign" not in passed or is_proposed or (signal in doubted and not is_resolved):
                 yield check
 
 

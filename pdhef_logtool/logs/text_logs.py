@@ -250,7 +250,7 @@ def _head(
     """Return :func:`_layout` by the rows of texts ``above`` the first row of numbers ``full``; ``last`` has titles."""
     width = len(rows[full])
     is_labelled = not any(row[0].strip() for row in rows[full : full + 3])
-    names = _names_row(rows, last, above if is_labelled else [])
+    names = _names_row(rows, last, above if is_labelled or len(above) > len(last) else [])
     below = (i for i in range(names + 1, full) if i in data)
     first = next((i for i in below if any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i])), full)
     of_units = next((i for i in above if i != names and _share(rows[i], is_unit) >= 0.5), -1)
@@ -259,7 +259,12 @@ def _head(
     titles = _joined(rows[names][:width], rows[names - 1] if has_groups else [], under)
     if len(titles) < width and rows[full][-1].strip():  # names of the rows without a title, as R writes them
         titles = ["row", *titles]
-    return titles, rows[of_units] if of_units >= 0 else [], first
+    units = (
+        []
+        if of_units < 0
+        else ["" if re.search("unit|einheit", c, re.IGNORECASE) and not is_unit(c) else c for c in rows[of_units]]
+    )
+    return titles, units, first
 
 
 def _data_rows(rows: Sequence[Sequence[str]], width: int) -> list[int]:

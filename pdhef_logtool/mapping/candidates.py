@@ -17,6 +17,7 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
@@ -234,6 +235,7 @@ def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], nam
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
     sensors = {t.name: t for t, role in topics if role == "sensor"}
+    sensors = {n: t for n, t in sensors.items() if not holds_frames(n, log.fields(n, quiet=True))}
     columns = _compared(log, [*sensors], named) if wanted else {}
     if all(role is not None for _, role in columns.values()):
         return

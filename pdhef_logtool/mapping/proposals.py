@@ -67,11 +67,11 @@ def _steering(
     speed = cells[v] * factor[v]
     with np.errstate(invalid="ignore", divide="ignore"):
         rate = cells[turning] * factor[turning] / (speed if r is None else 1.0)
-        curvature = np.where(speed > 1.0, rate / speed, np.nan)
+        curvature, lateral = np.where(speed > 1.0, rate / speed, np.nan), rate * speed
     free = [i for i, c in enumerate(columns) if i not in places and c.role is None and "steering" in c.units]
     surest, steering = max(((_strength(cells[i], curvature), i) for i in free), default=(0.0, 0))
     # A roll angle follows the lateral acceleration better than the curvature.
-    return steering if surest > max(LEAST, _strength(cells[steering], rate * speed)) else None
+    return steering if surest > max(LEAST, _strength(cells[steering], lateral)) else None
 
 
 def _options(columns: Sequence[Column], role: tuple[str, str], wanted: Sequence[tuple[str, str]]) -> list[int | None]:

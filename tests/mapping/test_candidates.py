@@ -121,7 +121,8 @@ def test_a_steering_angle_is_told_by_the_paths_curvature(
     steering = {n: v for n, v in taken(auto).items() if n.startswith("steer")}
     assert steering == ({signal: (f"/chassis.{field}", round(scale, 6))} if signal else {})
     # Gravity is upward in the IMU, so that its yaw rate counts to the left, and steering has to.
-    assert unsettled(auto) == set()
+    # A name that gives no steering leaves a doubt.
+    assert unsettled(auto) == ({signal} if field.startswith("front_tire") else set())
 
 
 def test_steering_is_not_turned_after_an_imu_that_may_hang_upside_down() -> None:
