@@ -44,8 +44,7 @@ DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
 RESAMPLES = 2000
 README_ROWS = (
-    "extrapolation", "unseen-manoeuvre", "other-vehicle", "friction-minus-20", "mass-plus-20", "bank-and-grade",
-    INDEPENDENT_ROW, "in-domain", "paper-a", "paper-b",
+    "extrapolation", "other-vehicle", "friction-minus-20", "bank-and-grade", INDEPENDENT_ROW, "paper-a", "paper-b",
 )  # fmt: skip
 KEPT_METRICS = ("rmse", "availability", "coverage95", "lag_s", "nees", "nis", "nis_dof")
 

@@ -57,6 +57,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     physics_parameters,
     planar_ay,
     push,
+    quadratic_ay,
     read_ay,
     settle_forces,
 )
@@ -358,13 +359,18 @@ def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_ha
     """Write the expected readings [3], the lower triangle of their covariance with R, and the cross covariance [3, n].
 
     ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
-    the sigma points of a_y are sufficient.
+    the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
     """
     m = changing(layout)
-    cholesky(P, L)
-    draw(x, L, places, m, points)
-    read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
-    z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
+    s, n = layout.force_scale, x.shape[0]
+    least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
+    if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
+        z_hat[Z_AY], S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz[Z_AY])
+    else:
+        cholesky(P, L)
+        draw(x, L, places, m, points)
+        read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+        z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
         z_hat[i] = x[entry]
         for a in range(x.shape[0]):

@@ -59,5 +59,5 @@ def _yaw_consistency(calibrated: CalibratedSignals, steps: PosteriorSteps) -> fl
     """Return the RMS of the modelled minus the measured yaw rate, rad/s; infinite without any."""
     vy: FloatArray = np.where(steps.valid, steps.x[:, 1], np.nan)
     errors = next(yaw_rate_errors(calibrated, [vy]))
-    known = errors[np.isfinite(errors)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")
+    errors = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(errors**2))) if errors.size else float("inf")

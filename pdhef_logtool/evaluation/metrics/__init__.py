@@ -22,7 +22,7 @@ To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`
     )
 """
 
-from pdhef_logtool.evaluation.metrics.metric import ALL, EvaluatedDrive, MetricRow, evaluate_drive
+from pdhef_logtool.evaluation.metrics.metric import ALL, EvaluatedDrive, MetricRow, evaluate_drive, score_track
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, signal_error
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 
@@ -33,5 +33,6 @@ __all__ = [
     "EvaluatedDrive",
     "MetricRow",
     "evaluate_drive",
+    "score_track",
     "signal_error",
 ]

@@ -246,3 +246,18 @@ def registered() -> Mapping[str, Metric]:
 def evaluate_drive(drive: EvaluatedDrive, names: Collection[str] | None = None) -> list[MetricRow]:
     """Return the values of all metrics, or of the metrics with these names."""
     return figures(drive, [m for m in registered().values() if names is None or m.name in names])
+
+
+def score_track(
+    estimate: StateTrack, truth: StateTrack, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float
+) -> list[MetricRow]:
+    """Return the metrics of one estimate against ground truth at the same stamps [N].
+
+    ``masks``: bool [N] by segment; ``all`` is added when it is absent. ``low_speed_m_s``: sideslip is scored above
+    this ground-truth speed.
+
+    Raises
+    ------
+    ValueError : The tracks or masks are not at the same stamps.
+    """
+    return evaluate_drive(EvaluatedDrive(log, {estimate.name: estimate}, truth, None, masks, low_speed_m_s))
