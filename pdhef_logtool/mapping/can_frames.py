@@ -191,10 +191,9 @@ class CanSignalLog(DriveLog):
 
     def as_mapped(self, mapping: SignalMapping) -> SignalMapping:
         """Return a mapping that names fields of views, as one of ``can:`` sources with the DBC files."""
-        sections = (mapping.signals, mapping.truth)
-        signals, truth = ({name: self.as_source(s) for name, s in section.items()} for section in sections)
-        used = any(s.can_signal is not None for s in (*signals.values(), *truth.values()))
-        return replace(mapping, signals=signals, truth=truth, can=self._settings if used else None)
+        mapping = mapping.changed(self.as_source)
+        used = any(s.can_signal is not None for s in (*mapping.signals.values(), *mapping.truth.values()))
+        return replace(mapping, can=self._settings if used else None)
 
     def as_source(self, source: SignalSource) -> SignalSource:
         """Return a source that names a field of a view as a ``can:`` source."""

@@ -238,12 +238,10 @@ def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
         return mapping
     notes = [f"{topic} is read by {best}, not {stamp}: {why}" for (topic, stamp), (best, why) in better.items()]
 
-    def moved(sources: Mapped[str, SignalSource]) -> dict[str, SignalSource]:
-        chosen = {n: better.get((s.topic, s.stamp), (s.stamp, ""))[0] for n, s in sources.items()}
-        return {n: replace(s, stamp=chosen[n]) for n, s in sources.items()}
+    def moved(source: SignalSource) -> SignalSource:
+        return replace(source, stamp=better.get((source.topic, source.stamp), (source.stamp, ""))[0])
 
-    signals, truth = moved(mapping.signals), moved(mapping.truth)
-    return replace(mapping, signals=signals, truth=truth, notes=(*mapping.notes, *notes))
+    return replace(mapping.changed(moved), notes=(*mapping.notes, *notes))
 
 
 def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None:

@@ -214,12 +214,8 @@ def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | N
         use &= where
     if np.count_nonzero(use) < FEWEST_CELLS:
         return None
-    a, b = y[use], x[use]
     # Exclude a few outliers, such as a sensor's "invalid".
-    low, high = np.quantile(a, [0.005, 0.995])
-    a = np.clip(a, low, high)
-    low, high = np.quantile(b, [0.005, 0.995])
-    b = np.clip(b, low, high)
+    a, b = (np.clip(values, *np.quantile(values, [0.005, 0.995])) for values in (y[use], x[use]))
     da, db = a - a.mean(), b - b.mean()
     sa, sb = float(np.sqrt(np.mean(da * da))), float(np.sqrt(np.mean(db * db)))
     if not (sa > 1e-12 and sb > 1e-12):
