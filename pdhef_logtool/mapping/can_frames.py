@@ -55,8 +55,6 @@ STANDARD_ID_BITS = (1 << 11) - 1
 #: Parts of a log in which identifiers are looked for.
 _PARTS, _PART_NS = 4, 5_000_000_000
 
-SHORT_FRAME = "frame that ends before its signal dropped"
-
 
 def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
     """Return a log with a view for each ``can:`` source of the mapping, or ``log`` if the mapping has none of them.
@@ -267,7 +265,8 @@ class CanSignalLog(DriveLog):
         short_ns = frames.log_time_ns[rows[available < needed]]
         if short_ns.size:
             where = f"{view.topic}.{CAN_PREFIX}{view.message.name}"
-            loss = Loss("undecodable", SHORT_FRAME, where, int(short_ns.min()), int(short_ns.max()) + 1, len(short_ns))
+            what, span = "frame that ends before its signal dropped", (int(short_ns.min()), int(short_ns.max()) + 1)
+            loss = Loss("undecodable", what, where, *span, len(short_ns))
             short[where] = max(loss, short.get(where, loss), key=lambda x: x.count or 0)
         use = (available >= needed) & are_sent(data, available, view.selectors)
         rows, data = rows[use], data[use]

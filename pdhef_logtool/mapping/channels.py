@@ -181,13 +181,9 @@ def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
             continue
         starts = [x for x in (old.start_ns, loss.start_ns) if x is not None]
         ends = [x for x in (old.end_ns, loss.end_ns) if x is not None]
-        counted = old.count is not None or loss.count is not None
-        merged[key] = replace(
-            old,
-            start_ns=min(starts) if starts else None,
-            end_ns=max(ends) if ends else None,
-            count=(old.count or 0) + (loss.count or 0) if counted else None,
-        )
+        counts = [x for x in (old.count, loss.count) if x is not None]
+        count = sum(counts) if counts else None
+        merged[key] = replace(old, start_ns=min(starts, default=None), end_ns=max(ends, default=None), count=count)
     return tuple(merged.values())
 
 
