@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.records.errors import MappingFileError
-from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 CAN_TYPE = "can/msg/Frame"
 _MAX_DBC_BYTES = 32 << 20
 #: Bits of a signal that become a number.
-_MOST_BITS = 64
+MOST_BITS = 64
 _CAN = CONSTANTS["can"]
 ID_BITS = _CAN["id_bits"]
 _BYTE = 0xFF
@@ -150,9 +150,7 @@ class Decoder:
             senders.setdefault(id(message), {}).setdefault(sender, []).append(its)
         for number, message in ((n, m) for n, (_, database) in enumerate(self.databases) for m in database.messages):
             parts = {sender: np.sort(np.concatenate(its)) for sender, its in senders.get(id(message), {}).items()}
-            ranked = sorted(
-                parts, key=lambda sender: (-fits[number, sender[0]], sender[0], -len(parts[sender]), sender)
-            )
+            ranked = sorted(parts, key=lambda its: (-fits[number, its[0]], its[0], -len(parts[its]), its))
             for bus, address in ranked:
                 ending = f"bus{bus}" * (bus != ranked[0][0]) + f"sa{address:02X}" * (address != ranked[0][1])
                 ending = f"#{ending}" * bool(ending)
@@ -170,10 +168,7 @@ class Decoder:
         data = self.frames.data
         lengths = np.minimum(self.frames.parts["length"], data.shape[1])
         for condition, signals, selectors in signal_groups(message):
-            its = rows
-            for selector, values in selectors:
-                its = its[lengths[its] >= bytes_of(selector)]
-                its = its[np.isin(raw_bits(data[its], selector), np.asarray(values, np.uint64))]
+            its = rows[are_sent(data[rows], lengths[rows], selectors)]
             if not its.size:
                 continue
             name = f"{message.name}{condition}{ending}"
@@ -284,6 +279,16 @@ def raw_bits(data: NDArray[np.uint8], signal: Signal) -> NDArray[np.uint64]:
     return value & np.uint64((1 << signal.length) - 1)
 
 
+def are_sent(data: NDArray[np.uint8], lengths: IntArray, selectors: Selectors) -> BoolArray:
+    """Return which frames, uint8 [N, k] with their lengths [N], have a listed value in each multiplexer."""
+    sent = np.ones(len(data), np.bool_)
+    for selector, values in selectors:
+        sent &= lengths >= bytes_of(selector)
+        if sent.any():
+            sent[sent] = np.isin(raw_bits(data[sent], selector), np.asarray(values, np.uint64))
+    return sent
+
+
 def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = False) -> FloatArray:
     """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N].
 
@@ -331,14 +336,12 @@ def fit_of(database: Database, sent: frozenset[int]) -> float:
 def signal_groups(message: Message) -> Iterator[tuple[str, list[Signal], Selectors]]:
     """Yield the signals of a message that are sent together: an ending of their name, they, and their multiplexers."""
     by_name = {s.name: s for s in message.signals}
-    groups: dict[tuple[tuple[str, tuple[int, ...]], ...], list[Signal]] = {}
+    groups: dict[Selectors, list[Signal]] = {}
     for signal in message.signals:
-        if signal.length <= _MOST_BITS:
-            conditions = tuple((s.name, values) for s, values in selectors_of(signal, by_name))
-            groups.setdefault(conditions, []).append(signal)
-    for conditions, signals in groups.items():
-        ending = "".join(f"_{name}_{values[0]}" for name, values in conditions)
-        yield ending, signals, tuple((by_name[name], values) for name, values in conditions)
+        if signal.length <= MOST_BITS:
+            groups.setdefault(tuple(selectors_of(signal, by_name)), []).append(signal)
+    for selectors, signals in groups.items():
+        yield "".join(f"_{selector.name}_{values[0]}" for selector, values in selectors), signals, selectors
 
 
 def selectors_of(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tuple[Signal, tuple[int, ...]]]:

@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.can_decoding import (
     CAN_TYPE,
     ID_BITS,
+    MOST_BITS,
     Selectors,
+    are_sent,
     bytes_of,
     fit_of,
     has_j1939_identifier,
     load_dbc,
-    raw_bits,
     selectors_of,
     signal_groups,
     signal_values,
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 #: Names of the fields of a frame, best first, by part; names are compared in lower case without underscores.
 NAMES = {part: tuple(names.split()) for part, names in VOCABULARY["can_fields"].items()}
+#: Kinds of fields that contain a part; all others are flags.
+_KINDS = {"id": ("number",), "data": ("array", "string"), "length": ("number",)}
 
 #: Flags that SocketCAN and DBC files keep above the 29 bits of an identifier.
 EXTENDED_FLAG = 1 << 31
@@ -51,8 +54,6 @@ STANDARD_ID_BITS = (1 << 11) - 1
 
 #: Parts of a log in which identifiers are looked for.
 _PARTS, _PART_NS = 4, 5_000_000_000
-
-SHORT_FRAME = "frame that ends before its signal dropped"
 
 
 def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
@@ -75,14 +76,12 @@ def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
         )
     views: dict[str, _CanView] = {}
     databases = [(path, load_dbc(log.definition(path))) for path in mapping.can.dbc]
-    valid_ids = {t.name for t in log.topics}
-    paths: dict[str, _FramePaths | str] = {}
+    recorded = {t.name for t in log.topics}
+    # check_mapping names the other topics, with the nearest one.
+    topics = [topic for topic in dict.fromkeys(s.topic for s in sources) if topic in recorded]
+    paths = {topic: _frame_paths(topic, log.fields(topic), mapping.can) for topic in topics}
     problems: list[str] = []
-    for source in sources:
-        if source.topic not in valid_ids:
-            continue  # check_mapping names it, with the nearest topic.
-        if source.topic not in paths:
-            paths[source.topic] = _frame_paths(source.topic, log.fields(source.topic), mapping.can)
+    for source in (s for s in sources if s.topic in paths):
         view = _make_view(source, paths[source.topic], databases)
         buses = _buses(log, view) if isinstance(view, _CanView) and mapping.can.bus is None else []
         if isinstance(view, str):
@@ -131,8 +130,8 @@ def _identifiers(log: DriveLog, topic: str, paths: _FramePaths) -> frozenset[int
     """Return the identifiers of a topic's frames in parts of the log."""
     sent: set[int] = set()
     for start in np.linspace(log.start_ns, max(log.start_ns, log.end_ns - _PART_NS), _PARTS).astype(np.int64).tolist():
-        columns = log.read({topic: [paths.identifier]}, start, start + _PART_NS, quiet=True)[topic]
-        numbers = np.asarray(columns.fields[paths.identifier], np.float64)
+        columns = log.read({topic: [paths.parts["id"]]}, start, start + _PART_NS, quiet=True)[topic]
+        numbers = np.asarray(columns.fields[paths.parts["id"]], np.float64)
         sent |= {int(i) & ID_BITS for i in np.unique(numbers[np.isfinite(numbers)])}
     return frozenset(sent)
 
@@ -142,8 +141,8 @@ def _buses(log: DriveLog, view: _CanView) -> list[int]:
     is_frames = any(t.name == view.topic and t.type_name == CAN_TYPE for t in log.topics)
     if not is_frames or "bus" not in {f.path for f in log.fields(view.topic)}:
         return []
-    frames = log.read({view.topic: [view.paths.identifier, "bus"]}, quiet=True)[view.topic].fields
-    return [int(bus) for bus in np.unique(frames["bus"][frames[view.paths.identifier] == view.message.frame_id])]
+    frames = log.read({view.topic: [view.paths.parts["id"], "bus"]}, quiet=True)[view.topic].fields
+    return [int(bus) for bus in np.unique(frames["bus"][frames[view.paths.parts["id"]] == view.message.frame_id])]
 
 
 def _is_named_like(path: Path, topic: str) -> bool:
@@ -152,19 +151,14 @@ def _is_named_like(path: Path, topic: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _FramePaths:
-    """Field paths of the parts of a frame in a topic; None for parts that the topic does not contain."""
+    """Field paths in a topic: by the part of a frame, and of the flags of frames without data."""
 
-    identifier: str
-    data: str
-    length: str | None
-    extended: str | None
+    parts: Mapping[str, str]
     no_data: tuple[str, ...]
-    bus: str | None
 
     @property
     def all(self) -> tuple[str, ...]:
-        optional = (self.length, self.extended, *self.no_data, self.bus)
-        return (self.identifier, self.data, *(p for p in optional if p is not None))
+        return (*self.parts.values(), *self.no_data)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,10 +189,9 @@ class CanSignalLog(DriveLog):
 
     def as_mapped(self, mapping: SignalMapping) -> SignalMapping:
         """Return a mapping that names fields of views, as one of ``can:`` sources with the DBC files."""
-        signals = {name: self.as_source(source) for name, source in mapping.signals.items()}
-        truth = {name: self.as_source(source) for name, source in mapping.truth.items()}
-        used = any(s.can_signal is not None for s in (*signals.values(), *truth.values()))
-        return replace(mapping, signals=signals, truth=truth, can=self._settings if used else None)
+        mapping = mapping.changed(self.as_source)
+        used = any(s.can_signal is not None for s in (*mapping.signals.values(), *mapping.truth.values()))
+        return replace(mapping, can=self._settings if used else None)
 
     def as_source(self, source: SignalSource) -> SignalSource:
         """Return a source that names a field of a view as a ``can:`` source."""
@@ -269,60 +262,54 @@ class CanSignalLog(DriveLog):
         data, available = _payload(frames, view.paths, rows)
         signals = {p: view.signals[p] for p in paths if p in view.signals}
         needed = max(map(bytes_of, (*signals.values(), *(s for s, _ in view.selectors))), default=0)
-        long_enough = available >= needed
-        if not long_enough.all():
-            times = frames.log_time_ns[rows[~long_enough]]
+        short_ns = frames.log_time_ns[rows[available < needed]]
+        if short_ns.size:
             where = f"{view.topic}.{CAN_PREFIX}{view.message.name}"
-            loss = Loss("undecodable", SHORT_FRAME, where, int(times.min()), int(times.max()) + 1, times.shape[0])
+            what, span = "frame that ends before its signal dropped", (int(short_ns.min()), int(short_ns.max()) + 1)
+            loss = Loss("undecodable", what, where, *span, len(short_ns))
             short[where] = max(loss, short.get(where, loss), key=lambda x: x.count or 0)
-        use = long_enough
-        if data.shape[1] >= needed:  # otherwise no frame is long enough
-            for selector, sent_under in view.selectors:
-                raw = raw_bits(data, selector)
-                use = use & np.isin(raw, np.asarray(sent_under, np.uint64))
+        use = (available >= needed) & are_sent(data, available, view.selectors)
         rows, data = rows[use], data[use]
-        given = {p: frames.fields[p][rows] for p in paths if p not in view.signals}
+        fields = {p: frames.fields[p][rows] for p in paths if p not in signals}
         is_j1939 = has_j1939_identifier(view.message)
-        values = {
-            p: signal_values(data, s, is_j1939=is_j1939) if rows.shape[0] else np.empty(0) for p, s in signals.items()
-        }
-        fields = {**given, **values}
+        for path, signal in signals.items():
+            fields[path] = signal_values(data, signal, is_j1939=is_j1939) if rows.size else np.empty(0)
         return Columns(topic, frames.log_time_ns[rows], frames.publish_time_ns[rows], fields)
 
 
 def _is_message(frames: Columns, view: _CanView, settings: CanSettings) -> BoolArray:
     """Return which frames [N] carry data of the view's message."""
-    number = np.asarray(frames.fields[view.paths.identifier], dtype=np.float64)
-    valid_ids = np.isfinite(number) & (number >= 0.0) & (number < 2.0**32)
+    paths, fields = view.paths.parts, frames.fields
+    number = np.asarray(fields[paths["id"]], dtype=np.float64)
+    is_valid = (number >= -(2.0**31)) & (number < 2.0**32)
     # Signed 32-bit fields contain an identifier with the extended flag as a negative number.
-    negative = np.isfinite(number) & (number < 0.0) & (number >= -(2.0**31))
-    ids: IntArray = np.where(valid_ids, number, np.where(negative, number + 2.0**32, 0.0)).astype(np.int64)
-    fits = (valid_ids | negative) & ((ids & NO_DATA_FLAGS) == 0)
+    ids = np.floor(np.where(is_valid, number, 0.0)).astype(np.int64) & (2**32 - 1)
+    fits = is_valid & ((ids & NO_DATA_FLAGS) == 0)
     bare = ids & ID_BITS
     fits &= (bare & settings.id_mask) == (view.message.frame_id & settings.id_mask)
     flagged = (ids & EXTENDED_FLAG) != 0
-    if view.paths.extended is not None:
-        flagged |= frames.fields[view.paths.extended] > 0.0
+    if "extended" in paths:
+        flagged |= fields[paths["extended"]] > 0.0
     elif view.unflagged_may_be_extended and view.message.is_extended_frame:
         flagged[:] = True
     flagged |= bare > STANDARD_ID_BITS
     fits &= flagged == view.message.is_extended_frame
     for path in view.paths.no_data:
-        fits &= ~(frames.fields[path] > 0.0)
-    if view.paths.bus is not None and settings.bus is not None:
-        fits &= frames.fields[view.paths.bus] == settings.bus
+        fits &= ~(fields[path] > 0.0)
+    if "bus" in paths and settings.bus is not None:
+        fits &= fields[paths["bus"]] == settings.bus
     return np.asarray(fits, dtype=np.bool_)
 
 
 def _payload(frames: Columns, paths: _FramePaths, rows: IntArray) -> tuple[NDArray[np.uint8], IntArray]:
     """Return the bytes [N, k] of frames and how many of them each frame has [N]."""
-    number = np.asarray(frames.fields[paths.data], dtype=np.float64)[rows]
+    number = np.asarray(frames.fields[paths.parts["data"]], dtype=np.float64)[rows]
     if number.ndim == 1:
         number = number[:, np.newaxis]
     valid = np.isfinite(number) & (number >= 0.0) & (number <= 255.0)
     available = np.cumprod(valid, axis=1, dtype=np.int64).sum(axis=1)
-    if paths.length is not None:
-        stated_length = np.asarray(frames.fields[paths.length], dtype=np.float64)[rows]
+    if "length" in paths.parts:
+        stated_length = np.asarray(frames.fields[paths.parts["length"]], dtype=np.float64)[rows]
         # Above 8 a length code of CAN FD is no number of bytes, and the array itself has the right length.
         shorter = (stated_length >= 0.0) & (stated_length <= 8.0) & (stated_length < available)
         available = np.where(shorter, stated_length, available).astype(np.int64)
@@ -351,13 +338,11 @@ def _make_view(
     if signal_name not in by_name:
         return f"message {message_name} has no signal {signal_name}{_near(signal_name, list(by_name))}"
     signal = by_name[signal_name]
-    if signal.length > 64:
-        return f"{message_name}.{signal_name} has {signal.length} bits, at most 64 make a number"
-    same_id = [
-        m for _, d in databases for m in d.messages if m.frame_id == message.frame_id and not m.is_extended_frame
-    ]
-    selectors = tuple(selectors_of(signal, by_name))
-    return _CanView(source.topic, paths, message, dict.fromkeys(source.paths, signal), selectors, not same_id)
+    if signal.length > MOST_BITS:
+        return f"{message_name}.{signal_name} has {signal.length} bits, at most {MOST_BITS} make a number"
+    standard_ids = {m.frame_id for _, d in databases for m in d.messages if not m.is_extended_frame}
+    signals, selectors = dict.fromkeys(source.paths, signal), tuple(selectors_of(signal, by_name))
+    return _CanView(source.topic, paths, message, signals, selectors, message.frame_id not in standard_ids)
 
 
 def holds_frames(topic: str, fields: tuple[FieldInfo, ...]) -> bool:
@@ -368,33 +353,22 @@ def holds_frames(topic: str, fields: tuple[FieldInfo, ...]) -> bool:
 def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSettings) -> _FramePaths | str:
     """Return the field paths of the parts of frames in a topic, or a text that lists the missing parts."""
     kinds = _plain_kinds(fields)
-    problems: list[str] = []
-
-    def find(names: Sequence[str], given: str, entry: str, allowed: tuple[str, ...]) -> str | None:
-        if given:
-            return given
-        matches = _best([p for p, kind in kinds.items() if kind in allowed], names)
-        if len(matches) > 1:
-            problems.append(f"{topic} has {' and '.join(matches)}: name the field in [can] {entry}")
-        return matches[0] if matches else None
-
-    numbers = ("number", "bool")
-    identifier = find(NAMES["id"], settings.id_field, "id_field", ("number",))
-    data = find(NAMES["data"], settings.data_field, "data_field", ("array", "string"))
-    for path, what, entry in ((identifier, "identifier", "id_field"), (data, "data", "data_field")):
-        if path is None:
-            problems.append(f"{topic} has no field that is known as a frame's {what}: name it in [can] {entry}")
-    if data is not None and settings.data_encoding != "bytes":
-        data += f"|{settings.data_encoding}"
-    elif data is not None and kinds.get(data) == "string":
-        problems.append(f'{topic}.{data} is a text: set [can] data_encoding = "hex" or "base64"')
-    length = find(NAMES["length"], settings.length_field, "length_field", ("number",))
-    extended = find(NAMES["extended"], settings.extended_field, "extended_field", numbers)
-    flags = [_best([p for p, k in kinds.items() if k in numbers], n) for n in (NAMES["error"], NAMES["remote"])]
-    if problems or identifier is None or data is None:
-        return "; ".join(problems)
-    no_data = tuple(p for matches in flags for p in matches)
-    return _FramePaths(identifier, data, length, extended, no_data, settings.bus_field or None)
+    given = {part: getattr(settings, f"{part}_field") for part in ("id", "data", "length", "extended")}
+    matches = {part: [path] if path else _best(kinds, part) for part, path in given.items()}
+    several = ((part, its) for part, its in matches.items() if len(its) > 1)
+    problems = [f"{topic} has {' and '.join(its)}: name the field in [can] {part}_field" for part, its in several]
+    for part, what in (("id", "identifier"), ("data", "data")):
+        if not matches[part]:
+            problems.append(f"{topic} has no field that is known as a frame's {what}: name it in [can] {part}_field")
+    parts = {part: its[0] for part, its in matches.items() if its}
+    if settings.bus_field:
+        parts["bus"] = settings.bus_field
+    if "data" in parts and settings.data_encoding != "bytes":
+        parts["data"] += f"|{settings.data_encoding}"
+    elif "data" in parts and kinds.get(parts["data"]) == "string":
+        problems.append(f'{topic}.{parts["data"]} is a text: set [can] data_encoding = "hex" or "base64"')
+    no_data = (*_best(kinds, "error"), *_best(kinds, "remote"))
+    return "; ".join(problems) if problems else _FramePaths(parts, no_data)
 
 
 def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
@@ -409,9 +383,10 @@ def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
     return kinds
 
 
-def _best(paths: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the least nested paths that end in the first name with any match."""
-    for name in names:
+def _best(kinds: Mapping[str, str], part: str) -> list[str]:
+    """Return the least nested paths that end in the first name of a part of a frame with any match."""
+    paths = [path for path, kind in kinds.items() if kind in _KINDS.get(part, ("number", "bool"))]
+    for name in NAMES[part]:
         matches = [p for p in paths if p.rsplit(".", 1)[-1].replace("_", "").lower() == name]
         if matches:
             depth = min(p.count(".") for p in matches)

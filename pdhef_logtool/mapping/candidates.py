@@ -239,11 +239,8 @@ def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], nam
     columns = _compared(log, [*sensors], named) if wanted else {}
     if all(role is not None for _, role in columns.values()):
         return
-    requests: dict[str, list[str]] = {}
-    for topic_name, path in columns:
-        requests.setdefault(topic_name, []).append(path)
     pieces = Pieces(log)
-    read = {key: seen for key, seen in pieces.read(requests).items() if seen.changes}
+    read = {key: seen for key, seen in pieces.read(columns).items() if seen.changes}
     given = [columns.get(key) or columns[key[0], key[1].partition("[")[0]] for key in read]
     compared = [Column(seen, *its) for seen, its in zip(read.values(), given, strict=True)]
     why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
@@ -322,18 +319,13 @@ def look(
     Fields without a number are excluded, as are fields that exceed a car's range in every unit.
     """
     named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[:MOST_READ]
-    requests: dict[str, list[str]] = {}
-    for topic, _, info, _, _ in named:
-        requests.setdefault(topic.name, []).append(info.path.removesuffix("[]"))
-    of_topics = {t: _signs_of({f.path for f in log.fields(t, quiet=True)}) for t in requests}
-    signs = {(t, p): of_topics[t][p] for t, paths in requests.items() for p in paths if p in of_topics[t]}
-    for (of_topic, _), sign in signs.items():
-        requests[of_topic].append(sign)
-    for source in sources:
-        if source.can_signal is None:
-            requests.setdefault(source.topic, []).extend(source.paths)
+    fields = [(topic.name, info.path.removesuffix("[]")) for topic, _, info, _, _ in named]
+    of_topics = {t: _signs_of({f.path for f in log.fields(t, quiet=True)}) for t in dict.fromkeys(t for t, _ in fields)}
+    signs = {(t, p): of_topics[t][p] for t, p in fields if p in of_topics[t]}
+    fields += [(topic, sign) for (topic, _), sign in signs.items()]
+    fields += [(s.topic, path) for s in sources if s.can_signal is None for path in s.paths]
     pieces = Pieces(log)
-    samples = pieces.read(requests)
+    samples = pieces.read(fields)
     for key, sign in signs.items():
         if key in samples:
             size, its = samples[key], samples[key[0], sign]

@@ -13,7 +13,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping.can_frames import CanSignalLog, with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping
-from pdhef_logtool.mapping.clocks import ClockModel, clock_key, request_source, stamps_on_log_clock
+from pdhef_logtool.mapping.clocks import ClockModel, clock_key, requests_of, stamps_on_log_clock
 from pdhef_logtool.mapping.evidence import LARGEST
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.ledger import Role
@@ -154,12 +154,11 @@ def read_signals(
     resolved = resolve_mapping(log, mapping)
     log = with_can_signals(log, resolved)
     gate = resolved.quality
-    requests: dict[str, list[str]] = {}
-    for source in (*resolved.signals.values(), *resolved.truth.values()):
-        request_source(log, source, requests)
+    sources = (*resolved.signals.values(), *resolved.truth.values())
+    requests = requests_of(log, sources)
     columns = log.read(requests, start_ns, end_ns, stamps=stamps) if requests or stamps else {}
     reading = _Reading(log, clocks, columns)
-    for source in (*resolved.signals.values(), *resolved.truth.values()):
+    for source in sources:
         reading.times(source)
     if isinstance(log, CanSignalLog):
         reading.losses += log.short_frames
@@ -182,13 +181,9 @@ def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
             continue
         starts = [x for x in (old.start_ns, loss.start_ns) if x is not None]
         ends = [x for x in (old.end_ns, loss.end_ns) if x is not None]
-        counted = old.count is not None or loss.count is not None
-        merged[key] = replace(
-            old,
-            start_ns=min(starts) if starts else None,
-            end_ns=max(ends) if ends else None,
-            count=(old.count or 0) + (loss.count or 0) if counted else None,
-        )
+        counts = [x for x in (old.count, loss.count) if x is not None]
+        count = sum(counts) if counts else None
+        merged[key] = replace(old, start_ns=min(starts, default=None), end_ns=max(ends, default=None), count=count)
     return tuple(merged.values())
 
 
@@ -277,15 +272,11 @@ class _Reading:
         # A gate that was sent once applies to the whole log.
         whole_ns = max(0, self.log.end_ns - self.log.start_ns)
         hold_ns = int(GATE_HOLD_PERIODS * period_ns) if np.isfinite(period_ns) else whole_ns
-        requests: dict[str, list[str]] = {}
-        request_source(self.log, source, requests)
+        requests = requests_of(self.log, [source])
         # Ground truth in this window may depend on a gate message that was recorded before the window, or after it.
         columns = self.log.read(requests, start_ns - hold_ns - GATE_MARGIN_NS, end_ns + GATE_MARGIN_NS)
-        stamps, values, times = (
-            np.empty(0, np.int64),
-            np.empty(0),
-            _Reading(self.log, self.clocks, columns).times(source),
-        )
+        times = _Reading(self.log, self.clocks, columns).times(source)
+        stamps, values = np.empty(0, np.int64), np.empty(0)
         if times is not None and times.usable.size:
             stamps = times.stamps_ns - np.int64(round(source.latency_s * 1e9))
             values = si_values(columns[source.read_topic], source)[times.usable]

@@ -67,12 +67,8 @@ def resolve_mapping(log: DriveLog, mapping: Mapping) -> Mapping:
         is_auto = source.stamp == AUTO_STAMP and source.topic in names
         return replace(source, stamp=stamp_path_of(log.fields(source.topic))) if is_auto else source
 
-    return replace(
-        mapping,
-        signals={n: resolved(s) for n, s in mapping.signals.items()},
-        truth={n: resolved(s) for n, s in mapping.truth.items()},
-        quality=None if mapping.quality is None else resolved(mapping.quality),
-    )
+    quality = None if mapping.quality is None else resolved(mapping.quality)
+    return replace(mapping.changed(resolved), quality=quality)
 
 
 def check_mapping(mapping: Mapping, log: DriveLog) -> None:

@@ -156,18 +156,12 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     resolved = resolve_mapping(log, mapping)
     log = with_can_signals(log, resolved)
     wanted = sources_by_clock(resolved)
-    requests: dict[str, list[str]] = {}
-    for source in wanted.values():
-        paths = requests.setdefault(source.read_topic, [])
-        paths += [p for p in stamp_request(log, source) if p not in paths]
-    parts, recorded = _survey(log, wanted, requests, survey_windows(start_ns, end_ns))
+    parts, recorded = _survey(log, wanted, survey_windows(start_ns, end_ns))
     # A clock may have stepped between the parts of a survey: read all of its stamps.
     doubtful = {key: source for key, source in wanted.items() if _offset_changes(parts[key])}
     whole: dict[str, list[_Stamps]] = {}
     if doubtful and end_ns - start_ns > SURVEY_WHOLE_NS:
-        topics = {source.read_topic for source in doubtful.values()}
-        some = {topic: paths for topic, paths in requests.items() if topic in topics}
-        whole, _ = _survey(log, doubtful, some, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.recording_span))
+        whole, _ = _survey(log, doubtful, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.recording_span))
     clocks = {}
     for key, source in wanted.items():
         raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
@@ -201,13 +195,11 @@ def _of_other_clocks(clocks: Mapped[str, ClockModel]) -> dict[str, str]:
 
 
 def _survey(
-    log: DriveLog,
-    wanted: Mapped[str, SignalSource],
-    requests: Mapped[str, Sequence[str]],
-    spans: Iterable[tuple[int, int]],
+    log: DriveLog, wanted: Mapped[str, SignalSource], spans: Iterable[tuple[int, int]]
 ) -> tuple[dict[str, list[_Stamps]], dict[str, list[IntArray]]]:
     """Read the usable stamps of each clock and the log times of all messages, window by window."""
     none = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
+    requests = requests_of(log, wanted.values(), values=False)
     parts: dict[str, list[_Stamps]] = {key: [none] for key in wanted}
     recorded: dict[str, list[IntArray]] = {key: [none[0]] for key in wanted}
     for start_ns, end_ns in spans:
@@ -246,12 +238,10 @@ def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
         return mapping
     notes = [f"{topic} is read by {best}, not {stamp}: {why}" for (topic, stamp), (best, why) in better.items()]
 
-    def moved(sources: Mapped[str, SignalSource]) -> dict[str, SignalSource]:
-        chosen = {n: better.get((s.topic, s.stamp), (s.stamp, ""))[0] for n, s in sources.items()}
-        return {n: replace(s, stamp=chosen[n]) for n, s in sources.items()}
+    def moved(source: SignalSource) -> SignalSource:
+        return replace(source, stamp=better.get((source.topic, source.stamp), (source.stamp, ""))[0])
 
-    signals, truth = moved(mapping.signals), moved(mapping.truth)
-    return replace(mapping, signals=signals, truth=truth, notes=(*mapping.notes, *notes))
+    return replace(mapping.changed(moved), notes=(*mapping.notes, *notes))
 
 
 def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None:
@@ -260,8 +250,8 @@ def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None
         return None
     headers = [p for p in stamp_paths(log.fields(source.topic)) if source.stamp not in (p, "log_time")]
     sources = {p: replace(source, stamp=p) for p in (source.stamp, *headers, *RECORDER_STAMPS)}
-    request = {source.read_topic: [*dict.fromkeys(path for s in sources.values() for path in stamp_request(log, s))]}
-    columns = log.read(request, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
+    requests = requests_of(log, sources.values(), values=False)
+    columns = log.read(requests, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
     if columns is None or not len(columns):
         return None
     judged = {p: _judged_stamps(log, columns, s) for p, s in sources.items()}
@@ -363,10 +353,14 @@ def stamp_request(log: DriveLog, source: SignalSource) -> tuple[str, ...]:
     return (source.stamp,)
 
 
-def request_source(log: DriveLog, source: SignalSource, requests: dict[str, list[str]]) -> None:
-    """Add the paths of a source and of its stamp to the read requests, by topic."""
-    paths = requests.setdefault(source.read_topic, [])
-    paths += [p for p in (*stamp_request(log, source), *source.paths) if p not in paths]
+def requests_of(log: DriveLog, sources: Iterable[SignalSource], *, values: bool = True) -> dict[str, list[str]]:
+    """Return the paths of the stamps of sources by topic, with ``values`` also those of their values."""
+    requests: dict[str, list[str]] = {}
+    for source in sources:
+        paths = requests.setdefault(source.read_topic, [])
+        wanted = (*stamp_request(log, source), *(source.paths if values else ()))
+        paths += [p for p in wanted if p not in paths]
+    return requests
 
 
 def raw_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[IntArray, NDArray[np.bool_]]:

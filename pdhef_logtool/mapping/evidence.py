@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -92,14 +92,16 @@ class Pieces:
         self.starts = [log.start_ns + i * step for i in range(count)]
         self.cells_a_piece = PIECE_NS // CELL_NS
 
-    def read(self, requests: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], Seen]:
-        """Read fields by topic; an array becomes one entry per column, ``name[i]``, at most ``MOST_COLUMNS``.
+    def read(self, fields: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Seen]:
+        """Read fields, given by topic and path; an array becomes one entry per column, ``name[i]``.
 
-        Unreadable fields are omitted.
+        At most ``MOST_COLUMNS`` columns of an array are read. Unreadable fields are omitted.
         """
+        requests: dict[str, list[str]] = {}
+        for topic, path in dict.fromkeys(fields):
+            requests.setdefault(topic, []).append(path)
         parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
-        requests = {topic: [*dict.fromkeys(paths)] for topic, paths in requests.items()}
-        for number, start in enumerate(self.starts):
+        for number, start in enumerate(self.starts if requests else ()):
             for topic, columns in self._columns(requests, start).items():
                 cell = (columns.log_time_ns - start) // CELL_NS
                 for path in requests[topic]:
@@ -212,12 +214,8 @@ def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | N
         use &= where
     if np.count_nonzero(use) < FEWEST_CELLS:
         return None
-    a, b = y[use], x[use]
     # Exclude a few outliers, such as a sensor's "invalid".
-    low, high = np.quantile(a, [0.005, 0.995])
-    a = np.clip(a, low, high)
-    low, high = np.quantile(b, [0.005, 0.995])
-    b = np.clip(b, low, high)
+    a, b = (np.clip(values, *np.quantile(values, [0.005, 0.995])) for values in (y[use], x[use]))
     da, db = a - a.mean(), b - b.mean()
     sa, sb = float(np.sqrt(np.mean(da * da))), float(np.sqrt(np.mean(db * db)))
     if not (sa > 1e-12 and sb > 1e-12):

@@ -139,10 +139,8 @@ def twist_axes(log: DriveLog, velocity: SignalSource, references: Sequence[Signa
 
 def _read(log: DriveLog, sources: Sequence[SignalSource]) -> tuple[Pieces, dict[tuple[str, str], Seen], list[Field]]:
     """Read sources in a few pieces of a log; return them also as fields."""
-    pieces, requests = Pieces(log), dict[str, list[str]]()
-    for source in sources:
-        requests.setdefault(source.topic, []).extend(source.paths)
-    read = pieces.read(requests)
+    pieces = Pieces(log)
+    read = pieces.read((source.topic, path) for source in sources for path in source.paths)
     return pieces, read, anchors_of(log, sources, read)
 
 
@@ -240,8 +238,8 @@ class _Instrument:
         """Values of velocities, angles and positions in a few pieces of the log, by path."""
         paths = [*(p for v in self.velocities for p in v.values()), *self.angles]
         paths += [p for p, m in self.meanings.items() if m.quantity == "speed"]
-        wanted = [*dict.fromkeys([*paths, *(s.paths[0] for s in self.places.values())])]
-        return {path: seen for (_, path), seen in self.pieces.read({self.topic: wanted} if wanted else {}).items()}
+        paths += [s.paths[0] for s in self.places.values()]
+        return {path: seen for (_, path), seen in self.pieces.read((self.topic, p) for p in paths).items()}
 
     @cached_property
     def pieces(self) -> Pieces:

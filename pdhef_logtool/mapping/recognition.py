@@ -542,10 +542,7 @@ def _pose(topic: TopicInfo, part: str) -> str:
 def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen]:
     """Read pieces of the fields that may contain constant fillers."""
     fields = {t.name: log.fields(t.name) for t in topics if _probed_paths(t)}
-    requests = {
-        t.name: [p for p in _probed_paths(t) if has_path(fields[t.name], p)] for t in topics if t.name in fields
-    }
-    return Pieces(log).read(requests) if any(requests.values()) else {}
+    return Pieces(log).read((t.name, p) for t in topics for p in _probed_paths(t) if has_path(fields[t.name], p))
 
 
 def _probed_paths(topic: TopicInfo) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -200,6 +200,12 @@ class Mapping:
         """Hash of all sources with their scales, stamps, latencies and limits, and of the ground-truth gate."""
         tables = {name: value for name in ("rate_hz", "group") if (value := getattr(self, name))}
         return digest(jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality, **tables}))
+
+    def changed(self, change: Callable[[SignalSource], SignalSource]) -> Mapping:
+        """Return the mapping with the result of ``change`` for each source of a signal or of ground truth."""
+        sections = (self.signals, self.truth)
+        signals, truth = ({name: change(source) for name, source in section.items()} for section in sections)
+        return replace(self, signals=signals, truth=truth)
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, ground truth, the gate."""

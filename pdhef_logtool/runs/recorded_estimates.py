@@ -40,7 +40,7 @@ from pdhef_logtool.mapping import (
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, si_values
 from pdhef_logtool.mapping.choosing import mapping_for_recorder
-from pdhef_logtool.mapping.clocks import request_source, stamps_on_log_clock
+from pdhef_logtool.mapping.clocks import requests_of, stamps_on_log_clock
 from pdhef_logtool.mapping.estimates import (
     BASE_ORDER,
     STDS,
@@ -362,9 +362,7 @@ def read_estimate(
     log = with_can_signals(log, source.as_mapping())
     mapping = resolve_mapping(log, source.as_mapping())
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
-    requests: dict[str, list[str]] = {}
-    for s in mapping.signals.values():
-        request_source(log, s, requests)
+    requests = requests_of(log, mapping.signals.values())
     if source.covariance is not None:
         requests[source.covariance.topic].append(source.covariance.field)
     losses: list[Loss] = []

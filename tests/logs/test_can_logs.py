@@ -555,6 +555,13 @@ def test_short_frames_give_the_signals_that_they_contain() -> None:
     assert columns == {("Motion", "Speed"): []}
 
 
+def test_frames_that_all_end_before_their_multiplexer_are_a_loss() -> None:
+    dbc = 'BO_ 291 Pages: 4 A\n SG_ Page M : 24|8@1+ (1,0) [0|0] "" A\n SG_ X m0 : 0|8@1+ (1,0) [0|0] "" A\n'
+    tables, lost, _ = decoded([(291, bytes(2))], dbc)
+    assert tables == {}
+    assert [(loss.kind, loss.count) for loss in lost] == [("undecodable", 1)]
+
+
 def test_frames_of_no_database_are_named() -> None:
     frames = [(291, bytes(8)), *((0x300 + i, bytes(8)) for i in range(7))]
     tables, lost, _ = decoded(frames, MOTION)

@@ -76,7 +76,7 @@ def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> dict[str, 
     lines = [line for line in collapsed(log.fields(topic.name)) if not any(map(INNER_ARRAY.search, line[2]))]
     lines = lines[:MOST_FIELDS]
     paths = {p.removesuffix("[]") for _, _, every in lines for p in every}
-    samples = pieces.read({topic.name: [*paths]}) if paths and topic.messages else {}
+    samples = pieces.read((topic.name, path) for path in paths) if topic.messages else {}
     values = _values_by_path(samples, paths)
     reports = []
     for line, kind, every in lines:

@@ -34,10 +34,8 @@ _Card: TypeAlias = dict[str, Any]
 
 def inspection_page(inspection: Inspection, log: DriveLog) -> bytes:
     """Return the HTML page of an inspection of the open ``log``. The figures show short sections of the log."""
-    requests: dict[str, list[str]] = {}
-    for source in (*inspection.mapping.sources(), *(c.source for c in inspection.candidates if not c.taken)):
-        requests.setdefault(source.topic, []).extend(source.paths)
-    samples = Pieces(log).read(requests)
+    sources = (*inspection.mapping.sources(), *(c.source for c in inspection.candidates if not c.taken))
+    samples = Pieces(log).read((source.topic, path) for source in sources for path in source.paths)
     return render(
         "inspection.html",
         inspection=inspection,
