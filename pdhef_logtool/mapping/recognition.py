@@ -179,7 +179,8 @@ def auto_map(
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
     draft = _Draft(log=log, samples=_probe(log, topics))
-    draft.notes += [_why_unused(log, t) for t in unlike]
+    why = {t.name: log.unreadable(t.name) or f"its fields differ from {t.type_name}" for t in unlike}
+    draft.notes += [f"{name} is not used: {reason}" for name, reason in why.items()]
     draft.notes += _what_cannot_be_read(log, [t for t in topics if not _type(t).startswith(NO_SENSORS)])
     draft.notes += [
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
@@ -262,12 +263,6 @@ def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], Ca
         remedy = f"{names} contains none of their identifiers" if names else remedy
         draft.notes += [f"{t.name} contains raw CAN frames: {remedy}" for t in frames]
     return topics, decoded
-
-
-def _why_unused(log: DriveLog, topic: TopicInfo) -> str:
-    """Return why a topic of a well-known type is not used: no definition, or fields of another type."""
-    reason = log.unreadable(topic.name)
-    return f"{topic.name} is not used: {reason or f'its fields differ from {topic.type_name}'}"
 
 
 def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:

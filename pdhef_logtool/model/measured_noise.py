@@ -8,6 +8,7 @@ the model is wrong, more noise makes the estimate follow it. See docs/method.md#
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: Median of χ² with 3 degrees of freedom over 3; beyond this multiple of it the innovations are inconsistent.
 MEDIAN_NIS, INCONSISTENT = 0.789, 1.3
-#: A step more noise may raise the yaw consistency up to this factor of that with the assumed noise.
+#: More noise may raise the yaw consistency up to this factor of the lowest one.
 EXPLAINED = 1.05
 #: Noise as a share of the innovations, whose spread includes that of the prediction; largest number of steps.
 SHARE, STEPS = 0.9, 3
@@ -34,25 +35,21 @@ def measured_noise(calibrated: CalibratedSignals, physics: VehicleUkf) -> dict[s
     """Return raised 1-sigmas by measurement (``r_std``); empty if the innovations are consistent."""
     first = max(0, (len(calibrated.signals) - MOST_STAMPS) // 2)
     calibrated = calibrated._replace(signals=calibrated.signals.rows(first, first + MOST_STAMPS))
-    assumed = r_std = physics.measurement_std
-    steps, _ = physics.run(calibrated.signals, None)
-    allowed = EXPLAINED * _yaw_consistency(calibrated, steps) if _is_inconsistent(steps) else 0.0
-    for _ in range(STEPS):
-        if not _is_inconsistent(steps):
+    assumed = r_std = raised = physics.measurement_std
+    allowed = math.inf
+    for _ in range(STEPS + 1):
+        steps, _ = replace(physics, r_std=tuple(raised.tolist())).run(calibrated.signals, None)
+        consistency = _yaw_consistency(calibrated, steps)
+        if consistency > allowed:
+            break
+        r_std, allowed = raised, min(allowed, EXPLAINED * consistency)
+        used = steps.nis_dof > 0.0
+        if not used.any() or np.median(steps.nis[used] / steps.nis_dof[used]) <= INCONSISTENT * MEDIAN_NIS:
             break
         seen = np.abs(steps.innovation)
-        spread = [_OF_MEDIAN * float(np.median(s)) if (s := c[np.isfinite(c)]).size else 0.0 for c in seen.T]
+        spread = [_OF_MEDIAN * np.median(s) if (s := c[np.isfinite(c)]).size else 0.0 for c in seen.T]
         raised = np.maximum(r_std, SHARE * np.array(spread))
-        steps, _ = replace(physics, r_std=tuple(raised.tolist())).run(calibrated.signals, None)
-        if not _yaw_consistency(calibrated, steps) <= allowed:
-            break
-        r_std = raised
     return {m: float(new) for m, new, old in zip(MEASUREMENTS, r_std, assumed, strict=True) if new > old}
-
-
-def _is_inconsistent(steps: PosteriorSteps) -> bool:
-    used = steps.nis_dof > 0.0
-    return bool(used.any()) and float(np.median(steps.nis[used] / steps.nis_dof[used])) > INCONSISTENT * MEDIAN_NIS
 
 
 def _yaw_consistency(calibrated: CalibratedSignals, steps: PosteriorSteps) -> float:
@@ -60,4 +57,4 @@ def _yaw_consistency(calibrated: CalibratedSignals, steps: PosteriorSteps) -> fl
     vy: FloatArray = np.where(steps.valid, steps.x[:, 1], np.nan)
     errors = next(yaw_rate_errors(calibrated, [vy]))
     errors = errors[np.isfinite(errors)]
-    return float(np.sqrt(np.mean(errors**2))) if errors.size else float("inf")
+    return float(np.sqrt(np.mean(errors**2))) if errors.size else math.inf

@@ -114,10 +114,6 @@ def dead_reckon(
     -------
     x_m, y_m, yaw_rad : [N]; yaw is not wrapped.
     """
-    n = int(stamps_ns.shape[0])
-    if n == 0:
-        empty = np.empty(0)
-        return empty, empty.copy(), empty.copy()
     dt = np.diff(stamps_ns) * 1e-9
     ok = np.isfinite(vx_m_s + vy_m_s + yaw_rate_rad_s)
     dt = np.where(ok[1:] & ok[:-1], dt, 0.0)
@@ -127,8 +123,7 @@ def dead_reckon(
         return 0.5 * (a[1:] + a[:-1])
 
     def accumulate(first: float, steps: FloatArray) -> FloatArray:
-        # One running sum that begins with the start value, so that joined windows are equal bit for bit.
-        return np.cumsum(np.concatenate([[first], steps]))
+        return np.cumsum(np.concatenate([[first], steps]))[: len(stamps_ns)]
 
     yaw = accumulate(start[2], mid(yaw_rate_rad_s) * dt)
     heading = 0.5 * (yaw[1:] + yaw[:-1])

@@ -6,11 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 
-def _ignore_line(_text: str) -> None:
-    pass
-
-
-def _ignore_progress(_text: str, _share: float) -> None:
+def _ignore(*_: object) -> None:
     pass
 
 
@@ -24,9 +20,9 @@ class Reporter:
     warn : called with a warning. note : called with a line of information.
     """
 
-    progress: Callable[[str, float], None] = _ignore_progress
-    warn: Callable[[str], None] = _ignore_line
-    note: Callable[[str], None] = _ignore_line
+    progress: Callable[[str, float], None] = _ignore
+    warn: Callable[[str], None] = _ignore
+    note: Callable[[str], None] = _ignore
 
 
 #: Ignores all lines.

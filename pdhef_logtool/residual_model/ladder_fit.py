@@ -148,14 +148,10 @@ class _Problem:
         return float(left @ self.blocks[block] @ left)
 
 
-def _centred(sums: FloatArray) -> FloatArray:
-    """Return the products of features and error after subtraction of their means."""
-    return np.asarray((sums - np.outer(sums[0], sums[0]) / sums[0, 0])[1:, 1:])
-
-
 def _solve(drives: Sequence[FloatArray], ridge: float) -> FloatArray:
     """Return the weights of a ridge regression with a free constant for each drive."""
-    normal = np.sum([_centred(d) for d in drives], axis=0)
+    # Products of features and error after subtraction of their means.
+    normal = np.sum([(d - np.outer(d[0], d[0]) / d[0, 0])[1:, 1:] for d in drives], axis=0)
     return np.asarray(np.linalg.solve(normal[:-1, :-1] + ridge * np.eye(len(normal) - 1), normal[:-1, -1]))
 
 

@@ -396,15 +396,11 @@ def grouped(failures: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
     """Return reasons with their logs, the most frequent first; numbers and places do not distinguish reasons."""
     members: dict[str, tuple[str, dict[str, None]]] = {}
     for label, reason in failures:
-        text = _without_place(reason)
+        _, expected, rest = reason.partition(": expected ")
+        text = f"expected {rest}" if expected else _PLACE.sub("", reason)
         members.setdefault(_NUMBER.sub("", text), (text, {}))[1][label] = None
     groups = [Failures(text, len(labels), tuple(labels)[:NAMED]) for text, labels in members.values()]
     return tuple(sorted(groups, key=lambda g: (-g.count, g.reason))[:_MOST_GROUPS])
-
-
-def _without_place(reason: str) -> str:
-    _, expected, rest = reason.partition(": expected ")
-    return f"expected {rest}" if expected else _PLACE.sub("", reason)
 
 
 #: Values of drives [N], None where unknown.
