@@ -341,9 +341,10 @@ def _clock_of(struct_: str, length: int, clocks: Mapping[tuple[str, int], Clock]
 
 
 def _has_times(array: NDArray[Any]) -> bool:
-    """Return whether an array is a matrix of times and values."""
-    is_pair = array.ndim == 2 and array.shape[1] == 2 < array.shape[0] and array.dtype.kind in "iuf"
-    return is_pair and bool((np.diff(array[:, 0]) > 0.0).all()) and not bool((np.diff(array[:, 1]) > 0.0).all())
+    """Return whether an array is a matrix of rising times and of values."""
+    is_pair = array.ndim == 2 and array.shape[1] == 2 and len(array) >= _MAT["fewest"] and array.dtype.kind in "iuf"
+    # As floats, because differences of unsigned numbers wrap.
+    return is_pair and (np.diff(array.astype(np.float64), axis=0) > 0.0).all(axis=0).tolist() == [True, False]
 
 
 def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:

@@ -145,6 +145,14 @@ def test_arrays_of_each_class_come_back(kind: str, rows: int, width: int, compre
     assert [t.name for t in tables.tables] == ["d", "d_deep"]
 
 
+@pytest.mark.parametrize("rows", [9, 200])
+def test_a_matrix_of_unsigned_numbers_that_fall_has_no_times(rows: int) -> None:
+    values = np.column_stack([np.arange(rows)[::-1] % 250, np.arange(rows) % 7]).astype("u1")
+    tables = open_mat(_file(_mat({"d": {"time": np.arange(rows) * 0.02, "x": values}})))
+    assert tables.losses == []
+    np.testing.assert_array_equal(_column(tables, "x_0"), values[:, 0])
+
+
 def test_what_is_no_array_of_numbers_is_named() -> None:
     deep: dict[str, Any] = {"x": AY}
     for _ in range(12):
