@@ -222,3 +222,9 @@ def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | N
         return None
     both = float(np.mean(da * db))
     return Fit(both / (sb * sb), both / (sa * sb))
+
+
+def correlation(y: FloatArray, x: FloatArray) -> float:
+    """Return the correlation of the finite cells [M]; 0 where :func:`fit` has no line."""
+    relation = fit(y, x)
+    return 0.0 if relation is None else relation.correlation

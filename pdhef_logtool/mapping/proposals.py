@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.mapping.evidence import Fit, Pieces, Seen, fit
+from pdhef_logtool.mapping.evidence import Fit, Pieces, Seen, correlation, fit
 from pdhef_logtool.records.signals import FloatArray
 
 #: Quantities and parts that a proposal consists of, and the range of the largest value of each in a drive, SI.
@@ -69,9 +69,9 @@ def _steering(
         rate = cells[turning] * factor[turning] / (speed if r is None else 1.0)
         curvature, lateral = np.where(speed > 1.0, rate / speed, np.nan), rate * speed
     free = [i for i, c in enumerate(columns) if i not in places and c.role is None and "steering" in c.units]
-    surest, steering = max(((_strength(cells[i], curvature), i) for i in free), default=(0.0, 0))
+    surest, steering = max(((abs(correlation(cells[i], curvature)), i) for i in free), default=(0.0, 0))
     # A roll angle follows the lateral acceleration better than the curvature.
-    return steering if surest > max(LEAST, _strength(cells[steering], lateral)) else None
+    return steering if surest > max(LEAST, abs(correlation(cells[steering], lateral))) else None
 
 
 def _options(columns: Sequence[Column], role: tuple[str, str], wanted: Sequence[tuple[str, str]]) -> list[int | None]:
@@ -124,9 +124,3 @@ def _with_units(
         sizes = ((c.seen.largest * u, _LARGEST[q]) for c, u, q in new if c.role is None)
         if all(low < size < high for size, (low, high) in sizes):
             yield surety - 0.5 * off, places, tuple(name for name, _ in units)
-
-
-def _strength(y: FloatArray, x: FloatArray) -> float:
-    """Return the magnitude of a correlation; 0 without enough cells."""
-    relation = fit(y, x)
-    return 0.0 if relation is None else abs(relation.correlation)

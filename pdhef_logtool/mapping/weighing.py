@@ -25,7 +25,7 @@ from pdhef_logtool.mapping.candidates import (
     proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, ratio
+from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
@@ -237,9 +237,9 @@ class Weighing:
             return
         ay, pieces, path = across[0], self.fields.pieces, path_velocity(self.fields)
         change = pieces.rate_of(speed.si)
-        ahead = [_correlation(pieces.smooth(f.si), change) for f in (ax, ay)]
+        ahead = [correlation(pieces.smooth(f.si), change) for f in (ax, ay)]
         turning = np.full_like(change, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
-        left = [_correlation(pieces.smooth(f.si), pieces.smooth(turning * speed.si)) for f in (ax, ay)]
+        left = [correlation(pieces.smooth(f.si), pieces.smooth(turning * speed.si)) for f in (ax, ay)]
         if abs(ahead[1]) > CLEAR and abs(ahead[0]) < FOLLOWS:
             ahead_sign = math.copysign(1.0, ahead[1])
         elif abs(left[0]) > CLEAR and abs(left[1]) < FOLLOWS:
@@ -452,12 +452,6 @@ class Weighing:
             if name and item.role in ("truth", "navigation") and not self.true:
                 candidates.append(item.candidate(name, "truth", taken=False))
         return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
-
-
-def _correlation(y: FloatArray, x: FloatArray) -> float:
-    """Return the correlation of two fields on the grid [M]; 0 without enough cells."""
-    relation = fit(y, x)
-    return 0.0 if relation is None else relation.correlation
 
 
 def _has_open_sign(item: Field) -> bool:
