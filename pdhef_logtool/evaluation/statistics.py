@@ -29,6 +29,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.student import student_quantile
 
@@ -207,12 +208,12 @@ def _freedom(part: IntArray, means: int) -> float:
     return max(float(np.sum(counts**2) ** 2 / np.sum(counts**4)) - means, 1.0)
 
 
-def day_and_route(start_ns: int | None, metadata: Mapping[str, Any]) -> tuple[str | None, str | None]:
-    """Return the day (UTC) on which a log starts, and the route from its metadata."""
+def day_and_route(start_ns: int, metadata: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    """Return the day (UTC) on which a log with a date starts, and the route from its metadata."""
     from datetime import UTC, datetime
 
     texts = {str(k).rpartition(".")[2].lower(): str(v) for k, v in metadata.items()}
-    day = None if start_ns is None else datetime.fromtimestamp(start_ns * 1e-9, UTC).date().isoformat()
+    day = datetime.fromtimestamp(start_ns * 1e-9, UTC).date().isoformat() if is_dated(start_ns) else None
     return day, next((texts[key] for key in ROUTE_KEYS if key in texts), None)
 
 

@@ -17,6 +17,7 @@ from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.table_columns import field_name, unique
 from pdhef_logtool.logs.table_file import LogFile, Tables, TableSettings
 from pdhef_logtool.logs.table_log import Table, TableLog
+from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
@@ -96,7 +97,7 @@ def _overlap(logs: Sequence[TableLog]) -> bool:
     """Return whether most of the times of logs are common to all; logs of a few rows do not count."""
     long = [log for log in logs if max(len(table.stamps_ns) for table in log.tables) >= _FOLDER["few_rows"]]
     starts, ends = [log.start_ns for log in long], [log.end_ns for log in long]
-    dated = {start >= CONSTANTS["clocks"]["first_date_ns"] for start in starts}
+    dated = {is_dated(start) for start in starts}
     if len(long) < 2 or len(dated) > 1:
         return len(long) < 2
     return bool(min(ends) - max(starts) >= _FOLDER["common"][all(dated)] * (max(ends) - min(starts)))

@@ -26,6 +26,7 @@ from pdhef_logtool.logs.recording_span import (
     find_epochs,
     steps_back,
 )
+from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
@@ -235,7 +236,7 @@ def _is_within(value: float, limits: Sequence[float]) -> bool:
 
 def _is_dated(stamps: IntArray) -> bool:
     has = stamps != NO_TIME
-    return bool(has.any()) and float(np.median(stamps[has])) >= _CLOCKS["first_date_ns"]
+    return bool(has.any()) and is_dated(float(np.median(stamps[has])))
 
 
 def _outside(value: float, usual: Sequence[float]) -> float:

@@ -24,6 +24,7 @@ from markupsafe import Markup
 from pdhef_logtool.evaluation.requirement_verdicts import joint_notes
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
+from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.version import __version__
@@ -196,11 +197,6 @@ def duration(seconds: float) -> str:
         return f"{seconds:.1f} s"
     hours = seconds / 3600.0
     return f"{seconds / 60.0:.1f} min" if hours < 2.0 else f"{hours:.1f} h" if hours < 100.0 else f"{hours:.0f} h"
-
-
-def is_dated(stamp_ns: int) -> bool:
-    """Return whether a stamp is a date: times that count from the start of a log are of the first days of 1970."""
-    return int(stamp_ns) >= 365 * 86_400 * 10**9
 
 
 def stamp(stamp_ns: int) -> str:

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
+from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
 from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport, number_text
 
@@ -26,11 +27,12 @@ OTHER_CLOCK_S, SIMULATION_CLOCK_S = 60.0, 1e8
 
 def render_inspection(inspection: Inspection, console: Console) -> None:
     """Print an inspection: topics, signals and ground truth, missing signals, and findings."""
-    messages = sum(t.messages for t in inspection.topics)
+    messages, topics = sum(t.messages for t in inspection.topics), len(inspection.topics)
+    start = f"from {shown_time(inspection.start_ns)}" if is_dated(inspection.start_ns) else "without a date"
     console.print(Text(inspection.path, "bold"), soft_wrap=True)
     console.print(
-        f"{inspection.kind}, {inspection.duration_s:.1f} s from {shown_time(inspection.start_ns)}, {messages} messages "
-        f"on {len(inspection.topics)} topics"
+        f"{inspection.kind}, {inspection.duration_s:.1f} s {start}, {messages} messages on {topics} "
+        f"topic{'' if topics == 1 else 's'}"
     )
     if inspection.sample is not None:
         console.print(Text(str(inspection.sample), "cyan"))
