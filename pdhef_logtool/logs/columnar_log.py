@@ -16,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 from mcap.records import Attachment, Metadata
 
-from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
 from pdhef_logtool.logs.decoding import (
@@ -114,19 +113,7 @@ class ColumnarLog(DriveLog):
     @cached_property
     def recording_span(self) -> RecordingSpan:  # type: ignore[override]
         """When the log was recorded; determined at the first access."""
-        return survey(self.containers, self._times, str(self.path))
-
-    def _times(self, c: int, span: Span) -> Mapping[int, IntArray] | None:
-        """Return the log times [N] of a span's messages by known channel; None if they cannot be read."""
-        container = self.containers[c]
-        try:
-            container.meter.check()
-            with container.meter.running():
-                return {id_: times for id_, times in container.times(span).items() if id_ in container.channels}
-        except SourceError:
-            raise
-        except Exception:  # noqa: BLE001 (a read of the span reports the damage)
-            return None
+        return survey(self.containers, str(self.path))
 
     @property
     def lost(self) -> tuple[Loss, ...]:
@@ -208,11 +195,11 @@ class ColumnarLog(DriveLog):
     def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
         """Return each topic's log times in [start, end), ascending, as the indexes have them."""
         parts: dict[str, list[IntArray]] = {topic: [] for topic in self._by_topic}
-        for c, container in enumerate(self.containers):
+        for container in self.containers:
             for span in container.spans:
-                stamps = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
-                for id_, times in (stamps or {}).items():
-                    parts[container.channels[id_].topic].append(times)
+                its = (span.times or {}) if span.overlaps(start_ns, end_ns) else {}
+                for id_ in span.counts.keys() & its.keys():
+                    parts[container.channels[id_].topic].append(its[id_])
         ordered = {topic: np.sort(np.concatenate(part), kind="stable") for topic, part in parts.items() if part}
         return {topic: times[slice(*np.searchsorted(times, (start_ns, end_ns)))] for topic, times in ordered.items()}
 
@@ -363,7 +350,8 @@ class ColumnarLog(DriveLog):
         if declared == claimed and not outside and undeclared <= 0:
             return
         others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
-        container.spans[span.index] = replace(span, counts=others | declared)
+        found = {id_: times[block.rows[id_]] for id_ in declared}
+        container.spans[span.index] = replace(span, counts=others | declared, times={**(span.times or {}), **found})
         missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
         start, _ = container.extent(span)
         for kind, count, text in (
@@ -456,8 +444,7 @@ class ColumnarLog(DriveLog):
             if topic not in plans:
                 continue
             if self.recording_span.left_out:
-                unused = self.recording_span.unused(topic, c, span, block.log_time_ns[rows])
-                rows = rows if unused is None else rows[~unused]
+                rows = rows[self.recording_span.used((c, span.index, id_), block.log_time_ns[rows])]
             rows = rows if keep is None else rows[keep[rows]]
             columns = self._decode(plans[topic], self._channels[c, id_], span, block, rows) if rows.size else None
             if columns is not None:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from mcap.records import Attachment, Metadata
-from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -61,19 +60,30 @@ class ChannelRecord:
         return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 and all(parts) else "/".join(parts)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Span:
     """A run of messages that is read as a whole: an MCAP or bag chunk, a run of unchunked records, a page of rows.
 
     ``start_ns`` and ``end_ns`` bound the log times as [start, end). ``counts`` gives messages by channel id.
-    ``ordered``: the log times of each channel are known not to step back in file order; False: unknown.
+    ``times``: log times [N] by channel id in file order; None in a sound remote file, of which only bounds were read.
     """
 
     index: int
     start_ns: int
     end_ns: int
     counts: Mapping[int, int]
-    ordered: bool = False
+    times: Mapping[int, IntArray] | None = None
+
+    @classmethod
+    def of(cls, channels: Iterable[tuple[int, IntArray]]) -> Span:
+        """Return the span of messages with these channels and log times [N] in file order; a channel may repeat."""
+        parts: dict[int, list[IntArray]] = {}
+        for id_, its in channels:
+            parts.setdefault(id_, []).extend([its] if len(its) else [])
+        times = {id_: its[0] if len(its) == 1 else np.concatenate(its) for id_, its in parts.items() if its}
+        first = min((int(its.min()) for its in times.values()), default=0)
+        last = max((int(its.max()) for its in times.values()), default=-1)
+        return cls(0, first, last + 1, {id_: len(its) for id_, its in times.items()}, times)
 
     def overlaps(self, start_ns: int | None, end_ns: int | None) -> bool:
         """Return whether some of its time is in [start, end); None: without limit."""
@@ -129,15 +139,7 @@ class Block:
     @cached_property
     def rows(self) -> dict[int, IntArray]:
         """Rows by channel, ascending."""
-        if not len(self):
-            return {}
-        # 16 bits, if enough, sort much faster.
-        fit = self.channel.view(np.uint64).max() < 1 << 16  # an id below 0 is a huge one
-        order = np.argsort(self.channel.astype(np.uint16) if fit else self.channel, kind="stable")
-        ordered = self.channel[order]
-        firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
-        ends = [*firsts[1:], len(self)]
-        return {int(ordered[first]): order[first:end] for first, end in zip(firsts, ends, strict=True)}
+        return rows_by_channel(self.channel)
 
     @property
     def counts(self) -> dict[int, int]:
@@ -145,10 +147,9 @@ class Block:
         return {channel: len(rows) for channel, rows in self.rows.items()}
 
     @property
-    def ordered(self) -> bool:
-        """Whether the log times of no channel step back."""
-        by_channel = (self.log_time_ns[rows] for rows in self.rows.values())
-        return all(bool((times[1:] >= times[:-1]).all()) for times in by_channel)
+    def span(self) -> Span:
+        """The span of these messages."""
+        return Span.of((id_, self.log_time_ns[rows]) for id_, rows in self.rows.items())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,16 +277,6 @@ class Container(ABC):
     @abstractmethod
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes [start, end) of a span."""
-
-    def times(self, span: Span) -> dict[int, IntArray]:
-        """Return the log times [N] of a span's messages by channel, in file order.
-
-        Raises
-        ------
-        SpanDamageError : they cannot be read.
-        """
-        block = self.load(span)
-        return {id_: block.log_time_ns[rows] for id_, rows in block.rows.items()}
 
     def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
         """Return the chunk that a block was read from, to be written to another file as it is.
@@ -435,8 +426,7 @@ class FileContainer(Container):
             self.lose(kind, what, start_ns, end_ns, count)
             return None
         if len(block):
-            first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-            self.add_span(chunk, Span(0, first, last + 1, block.counts, block.ordered))
+            self.add_span(chunk, block.span)
         return block
 
     def lose_end(self, offset: int) -> None:
@@ -469,19 +459,17 @@ class FileContainer(Container):
         """Finish open records and check the file as a whole."""
 
 
-def span_of_indexes(indexes: Sequence[tuple[int, NDArray[Any]]]) -> Span:
-    """Return the span that message indexes describe: channel and log times [N] of each, in file order."""
-    indexes = [(id_, times) for id_, times in indexes if len(times)]
-    counts: Counter[int] = Counter()
-    for id_, its in indexes:
-        counts[id_] += len(its)
-    if not counts:
-        return Span(0, 0, 0, counts)
-    times = np.concatenate([its for _, its in indexes])
-    falls = times[1:] < times[:-1]
-    falls[np.cumsum([len(its) for _, its in indexes])[:-1] - 1] = False  # from an index to the next one
-    first, last = (min(int(ns), MAX_TIME_NS) for ns in (times.min(), times.max()))
-    return Span(0, first, last + 1, counts, ordered=not falls.any())
+def rows_by_channel(channel: IntArray) -> dict[int, IntArray]:
+    """Return the rows of each channel, ascending, from the channels [N] of messages."""
+    if not len(channel):
+        return {}
+    # 16 bits, if enough, sort much faster.
+    fit = channel.view(np.uint64).max() < 1 << 16  # an id below 0 is a huge one
+    order = np.argsort(channel.astype(np.uint16) if fit else channel, kind="stable")
+    ordered = channel[order]
+    firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
+    ends = [*firsts[1:], len(channel)]
+    return {int(ordered[first]): order[first:end] for first, end in zip(firsts, ends, strict=True)}
 
 
 def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import struct
 from array import array
 from bisect import bisect_right
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from io import BytesIO
@@ -42,7 +41,7 @@ from pdhef_logtool.logs.container import (
     Wanted,
     block_from_lists,
     describe_damage,
-    span_of_indexes,
+    rows_by_channel,
 )
 from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -179,23 +178,24 @@ class McapContainer(FileContainer):
         if span is None:
             self._records_at[Attachment].append((extent.start, extent.end))
             return extent.end
-        ordered = self.source.is_remote
-        if not ordered:
-            named = self._span_by_indexes(extent)
-            ordered = named is not None and named.ordered
-            if named is None or named.counts != span.counts:
-                self._lose_indexes(extent)
-        self.add_span(extent, replace(span, ordered=ordered))
+        named = span if self.source.is_remote else self._span_by_indexes(extent)
+        if named is None or named.counts != span.counts:
+            self._lose_indexes(extent)
+        if named is not None and _agree(named, span):
+            self.add_span(extent, named)
+        else:
+            self._opened_chunks += 1
+            self.add_content(extent, span)
         return extent.index_end
-
-    def _indexes(self, extent: Extent) -> list[tuple[int, UintArray, UintArray]] | None:
-        """Return channel, log times [N] and offsets [N] of each message index of a chunk; None if one is malformed."""
-        return _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
 
     def _span_by_indexes(self, extent: Extent) -> Span | None:
         """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
-        indexes = self._indexes(extent)
-        return None if indexes is None else span_of_indexes([(id_, times) for id_, times, _ in indexes])
+        indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
+        if indexes is None:
+            return None
+        # A writer may sort an index by time.
+        in_order = ((id_, times[np.argsort(offsets, kind="stable")]) for id_, times, offsets in indexes)
+        return Span.of((id_, _held_times(times)) for id_, times in in_order)
 
     def _lose_indexes(self, extent: Extent) -> None:
         what = (
@@ -294,9 +294,8 @@ class McapContainer(FileContainer):
             self.lose_record(offset, SpanDamageError("a message record is too short"))
             return self._record_head(offset)[1]
         heads = _heads(block, np.array(places, dtype=np.int64))
-        times, counts = _held_times(heads["log"]), Counter(heads["channel"].tolist())
-        ordered = bool((times[1:] >= times[:-1]).all())
-        span = Span(0, int(times.min()), int(times.max()) + 1, counts, ordered)
+        times, rows = _held_times(heads["log"]), rows_by_channel(heads["channel"].astype(np.int64))
+        span = Span.of((id_, times[its]) for id_, its in rows.items())
         self.add_span(Extent(offset, base + place, base + place, is_chunk=False), span)
         return base + place
 
@@ -318,10 +317,11 @@ class McapContainer(FileContainer):
         if named is None:
             self._lose_indexes(extent)
         elif sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked:
-            claimed = replace(claimed, counts=named.counts, ordered=named.ordered)
+            claimed = replace(claimed, counts=named.counts)
             is_known = bool(named.counts) and named.counts.keys() <= self._raw_channels.keys()
-            if not self._has_end and is_known and named == claimed and unpacked <= self.meter.limits.chunk_bytes:
-                self.add_span(extent, claimed)
+            fits = _agree(named, claimed) and unpacked <= self.meter.limits.chunk_bytes
+            if not self._has_end and is_known and fits:
+                self.add_span(extent, named)
                 return index_end
         self._opened_chunks += 1
         block = self.add_content(extent, claimed)
@@ -511,15 +511,6 @@ class McapContainer(FileContainer):
             return False
         return True
 
-    def times(self, span: Span) -> dict[int, IntArray]:
-        """Return a span's log times by channel; of a chunk, by its message indexes if they agree with the span."""
-        indexes = [(id_, times) for id_, times, _ in self._indexes(self.chunks[span.index]) or () if len(times)]
-        named = span_of_indexes(indexes)
-        is_complete = len(indexes) == len(span.counts) and named.counts == span.counts
-        if is_complete and (named.start_ns, named.end_ns) == (span.start_ns, span.end_ns):
-            return {id_: _held_times(times) for id_, times in indexes}
-        return super().times(span)
-
     def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
         for start, end in self._records_at[kind]:
@@ -626,6 +617,11 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
         if others is None or any(opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS for opcode, _, _ in others):
             return None
     return block
+
+
+def _agree(span: Span, other: Span) -> bool:
+    """Return whether two spans have the same bounds and counts."""
+    return (span.start_ns, span.end_ns, span.counts) == (other.start_ns, other.end_ns, other.counts)
 
 
 def _held_times(times: UintArray) -> IntArray:

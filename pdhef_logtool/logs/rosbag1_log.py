@@ -21,9 +21,9 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     FileContainer,
+    Span,
     SpanDamageError,
     block_from_lists,
-    span_of_indexes,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
@@ -182,7 +182,7 @@ class Rosbag1Container(FileContainer):
         if chunk is None:
             return
         self._found += 1
-        span = span_of_indexes(chunk.indexes)
+        span = Span.of(chunk.indexes)
         is_known = bool(span.counts) and span.counts.keys() <= self.channels.keys()
         if complete and is_known and sum(span.counts.values()) * _LEAST_MESSAGE_BYTES <= chunk.size:
             self.add_span(chunk, span)

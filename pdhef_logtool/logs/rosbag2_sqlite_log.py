@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from array import array
-from collections import Counter
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from urllib.parse import quote
@@ -22,10 +22,10 @@ from pdhef_logtool.logs.container import (
     SpanDamageError,
     block_from_lists,
     describe_damage,
+    rows_by_channel,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
-from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.storage.files import scratch_folder
 
 _PAGE_ROWS = 8192
@@ -52,7 +52,6 @@ class SqliteContainer(Container):
         super().__init__(shown_path or path, path.stat().st_size, meter)
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._ends: list[int] = []  # bytes of the rows up to the end of each page
-        self._times: list[tuple[IntArray, IntArray]] = []  # channels and times of each page
         self._late: LimitError | None = None
         self._db = self._connect(path)
         self.on_close(self._db.close)
@@ -143,12 +142,10 @@ class SqliteContainer(Container):
         ends = np.cumsum(lengths)
         page = ends // _PAGE_BYTES + np.arange(len(ids)) // _PAGE_ROWS
         for part in np.split(np.arange(len(ids)), np.flatnonzero(np.diff(page)) + 1) if len(ids) else ():
-            stamps, counts = times[part], Counter(topics[part].tolist())
-            ordered = bool((np.diff(stamps) >= 0).all())
-            self.spans.append(Span(len(self.spans), int(stamps.min()), int(stamps.max()) + 1, counts, ordered))
+            stamps = ((id_, times[part][its]) for id_, its in rows_by_channel(topics[part]).items())
+            self.spans.append(replace(Span.of(stamps), index=len(self.spans)))
             self._pages.append((int(ids[part[0]]), int(ids[part[-1]])))
             self._ends.append(int(ends[part[-1]]))
-            self._times.append((topics[part].copy(), stamps))
         if unknown := row_count - len(ids):
             what = f"{unknown} messages of topics that the database does not name, or without a time or data"
             self.lose("unknown-channel", what, count=unknown)
@@ -201,11 +198,6 @@ class SqliteContainer(Container):
         lengths = [len(p) for p in payloads]
         offsets = [0, *accumulate(lengths)][:-1]
         return block_from_lists(b"".join(payloads), channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
-
-    def times(self, span: Span) -> dict[int, IntArray]:
-        """Return the log times of one page by channel."""
-        topics, times = self._times[span.index]
-        return {int(topic): times[topics == topic] for topic in np.unique(topics)}
 
 
 def _text(stored: bytes) -> str:
