@@ -8,25 +8,25 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from mcap.records import Attachment, Metadata
+from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.errors import LogError, PdhefError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.table_file import LogFile
 
-# First bytes of the files of each format.
+#: First and last bytes of an MCAP.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
-SQLITE_MAGIC = b"SQLite format 3\0"
 #: Log times above this (unsigned in the file) do not fit int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 #: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
@@ -115,6 +115,34 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
+    def take(self, rows: slice | IntArray | BoolArray) -> Block:
+        """Return some of the messages."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+
+    def split(self, before_ns: float) -> tuple[Block | None, Block | None]:
+        """Return the messages before a time and the others, None without any; they ascend in log time."""
+        n = int(np.searchsorted(self.log_time_ns, before_ns))
+        return self.take(slice(n)) if n else None, self.take(slice(n, None)) if n < len(self) else None
+
+    @staticmethod
+    def merged(parts: Sequence[Block], head: int = 0) -> Block:
+        """Return messages in order of log time, of equal times in the given order, one behind the other in memory.
+
+        ``head``: bytes that are left free before each message.
+        """
+        columns = [np.concatenate([_NONE, *(getattr(part, name) for part in parts)]) for name in _COLUMNS]
+        order = np.argsort(columns[_COLUMNS.index("log_time_ns")], kind="stable")
+        channel, log_time, publish_time, sequence, _, length = (column[order] for column in columns)
+        offset = np.cumsum(length + head) - length
+        place = np.empty(len(order), np.int64)
+        place[order] = offset
+        buffer = np.empty(int((length + head).sum()), np.uint8)
+        first = 0
+        for part in parts:
+            _copy(part, buffer, place[first : first + len(part)])
+            first += len(part)
+        return Block(buffer.data, channel, log_time, publish_time, sequence, offset, length)
+
     def without_large(self, most: int) -> Block:
         """Return the block without payloads above ``most`` bytes."""
         large = self.length > most
@@ -133,8 +161,7 @@ class Block:
     @property
     def nbytes(self) -> int:
         """Memory of the block in bytes."""
-        columns = self.channel, self.log_time_ns, self.publish_time_ns, self.sequence, self.offset, self.length
-        return memoryview(self.buffer).nbytes + sum(c.nbytes for c in columns)
+        return memoryview(self.buffer).nbytes + sum(int(getattr(self, name).nbytes) for name in _COLUMNS)
 
     @cached_property
     def rows(self) -> dict[int, IntArray]:
@@ -150,6 +177,47 @@ class Block:
     def span(self) -> Span:
         """The span of these messages."""
         return Span.of((id_, self.log_time_ns[rows]) for id_, rows in self.rows.items())
+
+
+_COLUMNS = ("channel", "log_time_ns", "publish_time_ns", "sequence", "offset", "length")
+_NONE = np.empty(0, np.int64)
+
+
+class RawMessage(NamedTuple):
+    """A message as ready bytes."""
+
+    channel: int
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+def block_of(messages: Iterable[RawMessage]) -> Block:
+    """Return the block of single messages."""
+    messages = list(messages)
+    length = [len(message.data) for message in messages]
+    columns = zip(*(message[:-1] for message in messages), strict=True) if messages else ((),) * 4
+    return block_from_lists(b"".join(m.data for m in messages), *columns, [0, *accumulate(length)][:-1], length)
+
+
+def items_at_bytes(buffer: bytes | memoryview, size: int, start: int = 0) -> NDArray[np.void]:
+    """Return the ``size`` bytes at each byte from ``start`` on, as overlapping items: indexing copies them as a whole.
+
+    Plain bytes need no alignment, and NumPy copies structured items member by member.
+    """
+    plain = np.dtype((np.void, size))
+    places = memoryview(buffer).nbytes - start - size + 1
+    return np.ndarray((places,), dtype=plain, buffer=buffer, offset=start, strides=(1,))
+
+
+def _copy(block: Block, buffer: NDArray[np.uint8], place: IntArray) -> None:
+    """Copy the payloads of a block to places [N] in a buffer, those of one length at once."""
+    order = np.argsort(block.length, kind="stable")
+    borders = np.flatnonzero(np.diff(block.length[order])) + 1
+    for rows in np.split(order, borders) if len(order) else ():
+        if size := int(block.length[rows[0]]):
+            items_at_bytes(buffer.data, size)[place[rows]] = items_at_bytes(block.buffer, size)[block.offset[rows]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,6 +246,10 @@ class RawChunk:
     def start_ns(self) -> int:
         """First log time."""
         return int(self.log_time_ns.min())
+
+    def split(self, before_ns: float) -> tuple[RawChunk | None, RawChunk | None]:
+        """Return the chunk as the first item if it begins before a time, as the second otherwise."""
+        return (self, None) if self.start_ns < before_ns else (None, self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,15 +59,14 @@ class CdrEncoder:
         self._layouts: dict[tuple[tuple[Steps, int], ...], tuple[WireLayout, bytes]] = {}
         self.encode(1, {})  # the constants must fit the definition
 
-    def encode(self, n: int, fields: Mapping[str, NDArray[Any]], head: int = 0) -> NDArray[np.uint8]:
-        """Return N messages as uint8 [N, head + size].
+    def encode(self, n: int, fields: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+        """Return N messages as uint8 [N, size].
 
         Parameters
         ----------
         n : number of messages.
         fields : columns by path: [N] for a number, a bool or a time (int64 nanoseconds); [N, k] for an array or a
             vector struct (x, y, z; for a quaternion w, x, y, z).
-        head : bytes that are left free before each message.
 
         Raises
         ------
@@ -79,8 +78,7 @@ class CdrEncoder:
             if values.shape[:1] != (n,) or values.ndim > 2:
                 raise self._misfit(path, f"{n} rows", f"shape {values.shape}")
         layout, template = self._layout({path: v.shape[1] for path, v in columns.items() if v.ndim == 2})
-        rows = np.empty((n, head + layout.size), dtype=np.uint8)
-        rows[:, head:] = np.frombuffer(template, dtype=np.uint8)
+        rows = np.tile(np.frombuffer(template, dtype=np.uint8), (n, 1))
         for path, values in columns.items():
             self._put(layout, rows, path, values)
         return rows
@@ -163,7 +161,6 @@ class CdrEncoder:
             if not np.all(np.isfinite(values)):
                 raise self._misfit(path, "finite values for an integer field", "NaN or infinity")
             values = np.rint(values)
-        size, kind = rows.shape[1], np.dtype((leaf.dtype, inner))
-        offset = size - layout.size + leaf.offset
-        place = np.dtype({"names": ["leaf"], "formats": [kind], "offsets": [offset], "itemsize": size})
+        kind = np.dtype((leaf.dtype, inner))
+        place = np.dtype({"names": ["leaf"], "formats": [kind], "offsets": [leaf.offset], "itemsize": layout.size})
         rows.view(place)["leaf"][:, 0] = values  # many times faster than byte by byte

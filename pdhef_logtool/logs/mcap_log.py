@@ -11,6 +11,7 @@ import struct
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -41,6 +42,7 @@ from pdhef_logtool.logs.container import (
     Wanted,
     block_from_lists,
     describe_damage,
+    items_at_bytes,
     rows_by_channel,
 )
 from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
@@ -435,7 +437,7 @@ class McapContainer(FileContainer):
         block = _indexed_messages(content, record, size)
         block = self._scan(content) if block is None else block
         self.meter.limits.check_messages(len(block), size)
-        for opcode, start, end in (_other_records(block) or ()) if declare else ():
+        for opcode, start, end in _other_records(block) if declare else ():
             if opcode in _DECLARATIONS:
                 try:
                     self._declare(opcode, content[start:end])
@@ -454,19 +456,14 @@ class McapContainer(FileContainer):
     def _scan(self, content: bytes) -> Block:
         """Return the messages among the records of a content; SpanDamageError if it contains anything else."""
         offsets = array("q")
-        offset, size = 0, len(content)
-        while offset + RECORD.size <= size:
-            opcode, length = RECORD.unpack_from(content, offset)
+        for opcode, start, _ in _records(content, 0, len(content)):
             if opcode == _OP_MESSAGE:
                 if len(offsets) % _MESSAGES_A_CHECK == 0:
                     self.meter.limits.check("chunk_messages", len(offsets), "a chunk")
                     self.meter.check()
-                offsets.append(offset)
+                offsets.append(start - RECORD.size)
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
                 raise SpanDamageError(f"it contains a record of kind {opcode}, which no chunk may")
-            offset += RECORD.size + length
-        if offset != size:
-            raise SpanDamageError("its last record is cut")
         if not offsets:
             return block_from_lists(content, *[()] * 6)
         block = _gather_messages(content, np.array(offsets, dtype=np.int64))
@@ -482,8 +479,7 @@ class McapContainer(FileContainer):
         if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
             return None  # the time does not fit the index
         content = bytes(block.buffer)
-        others = _other_records(block)
-        if others is None or not all(self._is_known(op, content[start:end], kept) for op, start, end in others):
+        if not all(self._is_known(op, content[start:end], kept) for op, start, end in _other_records(block)):
             return None
         record = self.source.read(extent.start, extent.end - extent.start)
         size, crc, compression, start, length = _chunk_head(record, len(record))
@@ -585,10 +581,7 @@ def _indexed_messages(content: bytes, record: bytes, index_start: int) -> Block 
 
 def _heads(content: bytes, offset: IntArray) -> NDArray[np.void]:
     """Return the heads of messages at offsets [N]."""
-    # Gathered as plain bytes: NumPy copies structured items member by member.
-    plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
-    places = np.ndarray((len(content) - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))
-    return places[offset].view(MESSAGE_HEAD)
+    return items_at_bytes(content, MESSAGE_HEAD.itemsize)[offset].view(MESSAGE_HEAD)
 
 
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
@@ -612,11 +605,12 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
         offset=offset + MESSAGE_HEAD.itemsize,
         length=size - _MESSAGE_BYTES,
     )
-    if offset[0] != 0 or ends[-1] != n or (offset[1:] != ends[:-1]).any():
-        others = _other_records(block)
-        if others is None or any(opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS for opcode, _, _ in others):
-            return None
-    return block
+    if offset[0] == 0 and ends[-1] == n and (offset[1:] == ends[:-1]).all():
+        return block
+    with suppress(SpanDamageError):
+        if all(opcode >= _FIRST_PRIVATE or opcode in _DECLARATIONS for opcode, *_ in _other_records(block)):
+            return block
+    return None
 
 
 def _agree(span: Span, other: Span) -> bool:
@@ -629,19 +623,20 @@ def _held_times(times: UintArray) -> IntArray:
     return np.minimum(times, np.uint64(MAX_TIME_NS)).astype(np.int64)
 
 
-def _other_records(block: Block) -> list[tuple[int, int, int]] | None:
-    """Return opcode and extent of the records between the messages of a chunk; None if they do not fill a gap."""
-    records: list[tuple[int, int, int]] = []
+def _other_records(block: Block) -> list[tuple[int, int, int]]:
+    """Return opcode and extent of the records between the messages of a chunk; SpanDamageError if they fill no gap."""
     starts = np.append(0, block.offset + block.length)
     ends = np.append(block.offset - MESSAGE_HEAD.itemsize, len(block.buffer))
     gaps = np.flatnonzero(starts != ends)
-    for offset, end in zip(starts[gaps].tolist(), ends[gaps].tolist(), strict=True):
-        while offset < end:
-            if offset + RECORD.size > end:
-                return None
-            opcode, length = RECORD.unpack_from(block.buffer, offset)
-            records.append((opcode, offset + RECORD.size, offset + RECORD.size + length))
-            offset += RECORD.size + length
-        if offset != end:
-            return None
-    return records
+    extents = zip(starts[gaps].tolist(), ends[gaps].tolist(), strict=True)
+    return [record for offset, end in extents for record in _records(block.buffer, offset, end)]
+
+
+def _records(content: bytes | memoryview, offset: int, end: int) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode and extent of the content of the records in a part; SpanDamageError if they do not end with it."""
+    while offset + RECORD.size <= end:
+        opcode, length = RECORD.unpack_from(content, offset)
+        offset += RECORD.size + length
+        yield opcode, offset - length, offset
+    if offset != end:
+        raise SpanDamageError("its last record is cut")

@@ -6,7 +6,6 @@ import shutil
 import sqlite3
 from array import array
 from dataclasses import replace
-from itertools import accumulate
 from pathlib import Path
 from urllib.parse import quote
 
@@ -18,9 +17,10 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     Container,
+    RawMessage,
     Span,
     SpanDamageError,
-    block_from_lists,
+    block_of,
     describe_damage,
     rows_by_channel,
 )
@@ -183,21 +183,13 @@ class SqliteContainer(Container):
             "SELECT topic_id, timestamp, data FROM messages "  # noqa: S608
             f"WHERE id BETWEEN ? AND ? AND topic_id IN ({marks}) ORDER BY id"
         )
-        channels: list[int] = []
-        stamps: list[int] = []
-        payloads: list[bytes] = []
         try:
-            for topic, timestamp, data in self._db.execute(query, (first, last, *sorted(wanted))):
-                if not isinstance(timestamp, int) or not isinstance(data, bytes):
-                    continue
-                channels.append(topic)
-                stamps.append(min(timestamp, MAX_TIME_NS))
-                payloads.append(data)
+            rows = self._db.execute(query, (first, last, *sorted(wanted))).fetchall()
         except sqlite3.Error as error:
             raise self._late or SpanDamageError(str(error)) from error
-        lengths = [len(p) for p in payloads]
-        offsets = [0, *accumulate(lengths)][:-1]
-        return block_from_lists(b"".join(payloads), channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
+        sound = (row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes))
+        timed = ((topic, min(timestamp, MAX_TIME_NS), data) for topic, timestamp, data in sound)
+        return block_of(RawMessage(topic, time_ns, time_ns, 0, data) for topic, time_ns, data in timed)
 
 
 def _text(stored: bytes) -> str:

@@ -8,22 +8,19 @@ metadata records are copied too. Bags and rosbag2 databases keep their bytes and
 
 from __future__ import annotations
 
-from bisect import bisect_left
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
 from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk, Span
 from pdhef_logtool.logs.definitions import message_definition
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
-
-#: Times of MCAP are unsigned; times in this package are signed.
-_UNSIGNED = (1 << 64) - 1
+from pdhef_logtool.logs.writer import McapLogWriter
 
 #: Number of a channel in the log: file of the log, and channel id in that file.
 _Key = tuple[int, int]
-#: A message behind log time, file, span and row.
-_Sortable = tuple[int, int, int, int, RawMessage]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +90,7 @@ def iterate_copy(
     channels: SourceChannels,
     start_ns: int | None = None,
     end_ns: int | None = None,
-) -> Iterator[RawMessage | RawChunk]:
+) -> Iterator[Block | RawChunk]:
     """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
 
     Messages of equal log time are in file order. Spans that overlap in time are merged; only these are in memory.
@@ -107,41 +104,44 @@ def iterate_copy(
     spans = _in_file_order_where_overlapping(_spans_to_copy(log, channels, start_ns, end_ns), unchanged)
     for c, container in enumerate(log.containers):
         container.prefetch(span for of, span in spans if of == c)
-    pending: list[_Sortable] = []
+    pending: dict[tuple[int, int], Block] = {}
     for c, span in spans:
-        ready = bisect_left(pending, (span.start_ns,))
-        yield from (message for *_, message in pending[:ready])
-        del pending[:ready]
+        yield from _taken(pending, span.start_ns)
         block = log.load(c, span)
         if block is None:
             continue
         inside = in_window(block.log_time_ns, start_ns, end_ns) is None
         chunk = log.containers[c].raw_chunk(span, block, unchanged[c]) if inside else None
         if chunk is None:
-            pending += _messages(block, (c, span.index), channels, start_ns, end_ns)
-            pending.sort()
+            pending[c, span.index] = _copied(block, c, channels, start_ns, end_ns)
         else:
             yield chunk
-    yield from (message for *_, message in pending)
+    yield from _taken(pending, math.inf)
 
 
-def _messages(
-    block: Block, place: tuple[int, int], channels: SourceChannels, start_ns: int | None, end_ns: int | None
-) -> Iterator[_Sortable]:
-    """Yield the messages of a span; ``place``: its file and number.
+def _copied(block: Block, c: int, channels: SourceChannels, start_ns: int | None, end_ns: int | None) -> Block:
+    """Return the messages to be copied of a span of file ``c``, in order of log time, with the copy's channel ids.
 
-    Messages of other channels are left out, and messages before 1970: an MCAP file cannot contain their times.
+    Messages before 1970 are left out: an MCAP file cannot contain their times.
     """
-    c = place[0]
-    keep = in_window(block.log_time_ns, start_ns, end_ns)
-    columns = [getattr(block, f.name) for f in fields(block) if f.name not in ("buffer", "dropped")]
-    rows = zip(*((column if keep is None else column[keep]).tolist() for column in columns), strict=True)
-    for row, (channel, log_time, publish_time, sequence, offset, length) in enumerate(rows):
-        id_ = channels.ids.get((c, channel)) if log_time >= 0 else None
-        if id_ is None:
-            continue
-        data = bytes(block.buffer[offset : offset + length])
-        yield log_time, *place, row, RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
+    ids = {id_: channels.ids.get((c, id_), -1) for id_ in block.rows}
+    known, number = np.unique(block.channel, return_inverse=True)
+    channel = np.array([ids[id_] for id_ in known.tolist()], np.int64)[number]
+    window = in_window(block.log_time_ns, max(start_ns or 0, 0), end_ns)
+    keep = np.flatnonzero((channel >= 0) & (True if window is None else window))
+    return replace(block, channel=channel).take(keep[np.argsort(block.log_time_ns[keep], kind="stable")])
+
+
+def _taken(pending: dict[tuple[int, int], Block], before_ns: float) -> Iterator[Block]:
+    """Yield the messages before a time as a block; the others stay."""
+    taken: list[Block] = []
+    for place in sorted(pending):
+        ready, rest = pending.pop(place).split(before_ns)
+        taken += [ready] if ready is not None else []
+        if rest is not None:
+            pending[place] = rest
+    if taken:
+        yield Block.merged(taken)
 
 
 def _spans_to_copy(

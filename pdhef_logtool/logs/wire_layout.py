@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.container import items_at_bytes
 from pdhef_logtool.logs.message_schema import Array, Node, Scalar, Step, Struct, Unknown
 
 #: Arrays of structs (or of texts) are unrolled up to this many elements.
@@ -199,12 +200,7 @@ class LayoutReader:
         """
         if not self._record.itemsize:
             return None, np.empty(len(offset), self._record)
-        # An overlapping item at every byte: indexing then copies items. As plain bytes, which need no alignment
-        # and are copied as a whole.
-        plain = np.dtype((np.void, self._record.itemsize))
-        places = len(buffer) - self._start - plain.itemsize + 1
-        view = np.ndarray((places,), dtype=plain, buffer=buffer, offset=self._start, strides=(1,))
-        records = view[offset].view(self._record)
+        records = items_at_bytes(buffer, self._record.itemsize, self._start)[offset].view(self._record)
         fits = np.ones(len(offset), np.bool_)
         for name, expected in self._expected.items():
             fits &= records[name] == expected
