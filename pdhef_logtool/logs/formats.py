@@ -83,11 +83,9 @@ class LogFormat:
 
 def _shipped(opener: str, magic: Sequence[str] = (), **entries: Any) -> LogFormat:
     """Return a format of this package from its entries in ``formats.toml``."""
-    parts: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in entries.items()
-    }
+    entries |= {name: tuple(value) for name, value in entries.items() if isinstance(value, list)}
     starts = tuple(start.encode("latin-1") for start in magic) or b""
-    return LogFormat(opener=f"{__package__}.{opener}", magic=starts, **parts)
+    return LogFormat(opener=f"{__package__}.{opener}", magic=starts, **entries)
 
 
 _FILE = Path(__file__).with_suffix(".toml")
