@@ -36,6 +36,7 @@ _LOSSES_OF_A_KIND = 20  # of one file; further ones become one loss
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
 _RECORDS_A_CHECK = 256  # of the time that a walk takes
+_NONE = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +78,12 @@ class Span:
     @classmethod
     def of(cls, channels: Iterable[tuple[int, IntArray]]) -> Span:
         """Return the span of messages with these channels and log times [N] in file order; a channel may repeat."""
-        parts: dict[int, list[IntArray]] = {}
+        times: dict[int, IntArray] = {}
         for id_, its in channels:
-            parts.setdefault(id_, []).extend([its] if len(its) else [])
-        times = {id_: its[0] if len(its) == 1 else np.concatenate(its) for id_, its in parts.items() if its}
-        first = min((int(its.min()) for its in times.values()), default=0)
-        last = max((int(its.max()) for its in times.values()), default=-1)
+            if len(its):
+                times[id_] = np.concatenate((times[id_], its)) if id_ in times else its
+        every = np.concatenate([_NONE, *times.values()])
+        first, last = (int(every.min()), int(every.max())) if len(every) else (0, -1)
         return cls(0, first, last + 1, {id_: len(its) for id_, its in times.items()}, times)
 
     def overlaps(self, start_ns: int | None, end_ns: int | None) -> bool:
@@ -180,7 +181,6 @@ class Block:
 
 
 _COLUMNS = ("channel", "log_time_ns", "publish_time_ns", "sequence", "offset", "length")
-_NONE = np.empty(0, np.int64)
 
 
 class RawMessage(NamedTuple):

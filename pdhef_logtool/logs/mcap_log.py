@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -71,7 +72,7 @@ MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 _MESSAGE_BYTES = MESSAGE_HEAD.itemsize - RECORD.size
-_INDEX_PAIR = np.dtype([("log", "<u8"), ("offset", "<u8")])
+_PAIR_BYTES = 2 * _U64.size
 
 
 class McapContainer(FileContainer):
@@ -195,9 +196,13 @@ class McapContainer(FileContainer):
         indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
         if indexes is None:
             return None
-        # A writer may sort an index by time.
-        in_order = ((id_, times[np.argsort(offsets, kind="stable")]) for id_, times, offsets in indexes)
-        return Span.of((id_, _held_times(times)) for id_, times in in_order)
+        parts, pairs = indexes
+        times, offsets, ends = _held_times(pairs[:, 0]), pairs[:, 1], list(accumulate(n for _, n in parts))
+        falls = offsets[1:] < offsets[:-1]
+        falls[[end - 1 for end in ends[:-1]]] = False  # from an index to the next one
+        if falls.any():  # some writers sort an index by time
+            times = times[np.lexsort((offsets, np.repeat(np.arange(len(parts)), [n for _, n in parts])))]
+        return Span.of((id_, times[end - n : end]) for (id_, n), end in zip(parts, ends, strict=True))
 
     def _lose_indexes(self, extent: Extent) -> None:
         what = (
@@ -553,30 +558,34 @@ def _chunk_head(record: bytes, end: int) -> tuple[int, int, str, int, int]:
     return size, crc, compression, _CHUNK_HEAD_BYTES + n, stored
 
 
-def _message_indexes(record: bytes, offset: int) -> list[tuple[int, UintArray, UintArray]] | None:
-    """Return channel, log times [N] and offsets [N] of each message index from a byte on; None if one is malformed."""
-    indexes: list[tuple[int, UintArray, UintArray]] = []
+def _message_indexes(record: bytes, offset: int) -> tuple[list[tuple[int, int]], UintArray] | None:
+    """Return the message indexes from a byte on, None if one is malformed.
+
+    Channel and count of each that is not empty, and the pairs [N, 2] of all: log time and offset in the chunk.
+    """
+    parts: list[tuple[int, int]] = []
+    pairs: list[UintArray] = [np.empty(0, np.uint64)]
     while offset < len(record):
         if offset + INDEX_RECORD.size > len(record):
             return None
-        opcode, length, channel, n = INDEX_RECORD.unpack_from(record, offset)
-        end = offset + RECORD.size + length
-        if opcode != _OP_MESSAGE_INDEX or n % _INDEX_PAIR.itemsize or offset + INDEX_RECORD.size + n > end:
+        opcode, length, channel, size = INDEX_RECORD.unpack_from(record, offset)
+        start, end = offset + INDEX_RECORD.size, offset + RECORD.size + length
+        if opcode != _OP_MESSAGE_INDEX or size % _PAIR_BYTES or start + size > end:
             return None
-        pairs = np.frombuffer(record, _INDEX_PAIR, n // _INDEX_PAIR.itemsize, offset + INDEX_RECORD.size)
-        indexes.append((channel, pairs["log"], pairs["offset"]))
+        if size:
+            pairs.append(np.frombuffer(record, "<u8", 2 * size // _PAIR_BYTES, start))
+            parts.append((channel, size // _PAIR_BYTES))
         offset = end
-    return indexes
+    return parts, np.concatenate(pairs).reshape(-1, 2)
 
 
 def _indexed_messages(content: bytes, record: bytes, index_start: int) -> Block | None:
     """Return a chunk's messages through its message indexes; None if these do not name all of them."""
     indexes = _message_indexes(record, index_start)
-    if not indexes:
+    if indexes is None:
         return None
     # Each channel's offsets ascend already, which the stable sort makes use of.
-    offset = np.sort(np.concatenate([offsets for _, _, offsets in indexes]).view(np.int64), kind="stable")
-    return _gather_messages(content, offset)
+    return _gather_messages(content, np.sort(indexes[1][:, 1].astype(np.int64), kind="stable"))
 
 
 def _heads(content: bytes, offset: IntArray) -> NDArray[np.void]:

@@ -188,7 +188,7 @@ def _survey(
     topics = sorted({topic for topic, _ in times_ns} | {topic for topic, *_ in whole})
     number = {topic: i for i, topic in enumerate(topics)}
     pieces = [np.array([(start, end, n, number[topic]) for topic, start, end, n in whole], _PIECE)]
-    pieces += [_stretches(np.sort(its), number[topic]) for (topic, _), its in times_ns.items() if len(its)]
+    pieces += [_stretches(its, number[topic]) for (topic, _), its in times_ns.items() if len(its)]
     every = np.concatenate(pieces)
     intervals, left_out, losses = _kept_epoch(every, topics, where)
     repeated = _repeated(times_ns, intervals)
@@ -222,7 +222,9 @@ _PIECE = np.dtype([(name, np.int64) for name in ("start", "end", "count", "topic
 
 
 def _stretches(times_ns: IntArray, topic: int) -> NDArray[np.void]:
-    """Return the pieces of ascending times that a silence keeps apart."""
+    """Return the pieces of times that a silence keeps apart."""
+    if (times_ns[1:] < times_ns[:-1]).any():
+        times_ns = np.sort(times_ns)
     first = np.flatnonzero(np.append(True, np.diff(times_ns.astype(np.float64)) > SILENCE_NS))
     pieces = np.empty(len(first), _PIECE)
     pieces["start"], pieces["end"] = times_ns[first], times_ns[np.append(first[1:], 0) - 1] + 1
@@ -232,6 +234,8 @@ def _stretches(times_ns: IntArray, topic: int) -> NDArray[np.void]:
 
 def _repeated(times_ns: Mapping[_Lane, IntArray], intervals: Sequence[tuple[int, int]]) -> dict[_Lane, BoolArray]:
     """Return which messages [N] were recorded before, of all lanes, if the time of one of them clearly stepped back."""
+    if not any((np.diff(times) < -STEP_BACK_NS).any() for times in times_ns.values()):
+        return {}
     inside = {lane: _inside(times, intervals) for lane, times in times_ns.items()}
     if not any(steps_back(times[inside[lane]]).size for lane, times in times_ns.items()):
         return {}
