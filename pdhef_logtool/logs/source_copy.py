@@ -9,13 +9,13 @@ metadata records are copied too. Bags and rosbag2 databases keep their bytes and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
-from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk, Span
+from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk
 from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter
 
@@ -97,11 +97,18 @@ def iterate_copy(
     Damaged spans are left out and reported by ``log.lost``.
 
     Chunks that can be copied as they are, are yielded whole: sound chunks of MCAP files that are inside the window and
-    contain and declare only channels with unchanged ids. They are in order of their first log times, and in file order
-    where they overlap.
+    contain and declare only channels with unchanged ids. If all chunks are such, they are in the order of the files, so
+    that readers return messages of equal log times in the same order as from the source.
     """
     unchanged = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(log.containers))]
-    spans = _in_file_order_where_overlapping(_spans_to_copy(log, channels, start_ns, end_ns), unchanged)
+    spans = [
+        (c, span)
+        for c, container in enumerate(log.containers)
+        for span in container.spans
+        if span.overlaps(start_ns, end_ns) and (not span.counts or any((c, id_) in channels.ids for id_ in span.counts))
+    ]
+    if not all(unchanged[c].issuperset(span.counts) for c, span in spans):
+        spans.sort(key=lambda item: item[1].start_ns)
     for c, container in enumerate(log.containers):
         container.prefetch(span for of, span in spans if of == c)
     pending: dict[tuple[int, int], Block] = {}
@@ -142,40 +149,6 @@ def _taken(pending: dict[tuple[int, int], Block], before_ns: float) -> Iterator[
             pending[place] = rest
     if taken:
         yield Block.merged(taken)
-
-
-def _spans_to_copy(
-    log: ColumnarLog, channels: SourceChannels, start_ns: int | None, end_ns: int | None
-) -> list[tuple[int, Span]]:
-    """Return file and span of the spans that contain messages to be copied, by start, file and place."""
-    spans = [
-        (c, span)
-        for c, container in enumerate(log.containers)
-        for span in container.spans
-        if span.overlaps(start_ns, end_ns) and (not span.counts or any((c, id_) in channels.ids for id_ in span.counts))
-    ]
-    return sorted(spans, key=lambda item: (item[1].start_ns, item[0], item[1].index))
-
-
-def _in_file_order_where_overlapping(
-    spans: Sequence[tuple[int, Span]], unchanged: Sequence[frozenset[int]]
-) -> list[tuple[int, Span]]:
-    """Sort groups of overlapping spans that will all be copied as they are back to the order of the file.
-
-    Readers return messages of equal log times in file order, which then equals the order in the source.
-    """
-    groups: list[list[tuple[int, Span]]] = []
-    end_ns = 0
-    for c, span in spans:
-        if not groups or span.start_ns >= end_ns:
-            groups.append([])
-            end_ns = span.end_ns
-        end_ns = max(end_ns, span.end_ns)
-        groups[-1].append((c, span))
-    for group in groups:
-        if all(unchanged[c].issuperset(span.counts) for c, span in group):
-            group.sort(key=lambda item: (item[0], item[1].index))
-    return [item for group in groups for item in group]
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:

@@ -38,9 +38,9 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, Block, ChannelRecord, RawChunk, items_at_bytes, rows_by_channel
 from pdhef_logtool.logs.definitions import message_definition
-from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.mcap_index import INDEX_RECORD, RECORD
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
+from pdhef_logtool.logs.wire_layout import CdrEncoder
 from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import LIBRARY
