@@ -117,7 +117,8 @@ class WireLayout:
         elif node.code and node.kind == "string":
             raise NoLayoutError("wide strings have no layout here")
         elif node.kind == "string":
-            self.size += self._length_word()
+            length = self._length_word()
+            self.size += length
         else:
             self._place_numbers(node, steps, None)
 
