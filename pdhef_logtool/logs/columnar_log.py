@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -95,7 +95,7 @@ class ColumnarLog(DriveLog):
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
         self._kept_bytes = 0
-        self._extracted: tempfile.TemporaryDirectory[str] | None = None
+        self._closing = ExitStack()
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -151,20 +151,16 @@ class ColumnarLog(DriveLog):
         for name, key, text in entries:
             if _DBC.search(text):
                 stored.append((key if key.endswith(".dbc") else f"{name}.{key}.dbc", text.encode()))
-        return tuple(self._extract(name, data) for name, data in stored)
+        folder = Path(self._closing.enter_context(scratch_folder())) if stored else Path()
+        paths = [folder / Path(name).name for name, _ in stored]
+        for path, (_, data) in zip(paths, stored, strict=True):
+            write_bytes(path, data)
+        return tuple(paths)
 
     def definition(self, path: Path) -> Path:
         """Return the file of a definition in the log; a name without a folder is an attached file."""
         attached = {} if path.exists() and len(path.parts) > 1 else {p.name: p for p in self.databases}
         return attached.get(path.name, path)
-
-    def _extract(self, name: str, data: bytes) -> Path:
-        """Write a file that the log contains, to be read until the log is closed."""
-        if self._extracted is None:
-            self._extracted = scratch_folder()
-        path = Path(self._extracted.name) / Path(name).name
-        write_bytes(path, data)
-        return path
 
     def metadata(self) -> dict[str, str]:
         """Return the entries of metadata records by ``key`` and ``record.key``, and rosbag2's ``custom_data``."""
@@ -288,8 +284,7 @@ class ColumnarLog(DriveLog):
         self._kept.clear()
         for container in self.containers:
             container.close()
-        if self._extracted is not None:
-            self._extracted.cleanup()
+        self._closing.close()
 
     def load(
         self, c: int, span: Span, want: frozenset[int] | None = None, payloads: frozenset[int] | None = None

@@ -97,9 +97,7 @@ class McapContainer(FileContainer):
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
         self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
-        self._unread: dict[
-            int, int
-        ] = {}  # chunks and attachments of a remote file that are not wanted, from start to end
+        self._unread: dict[int, int] = {}  # start and end of the parts of a remote file that are not wanted
         self._indexed: list[int] | None = None  # places of the chunks that a damaged summary names
         self._closed = False
         self._data_end: tuple[int, int] | None = None  # extent of the record

@@ -97,12 +97,12 @@ class SqliteContainer(Container):
 
     def _read_topics(self) -> None:
         tables = {str(row[0]) for row in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not {"topics", "messages"} <= tables:  # a view can be a program that never ends
+        needed = {"topics": {"id", "name", "type", "serialization_format"}}
+        needed["messages"] = {"id", "topic_id", "timestamp", "data"}
+        # Only tables, because a view can be a program that never ends.
+        if not needed.keys() <= tables or any(not names <= self._columns_of(table) for table, names in needed.items()):
             raise self.no_log("rosbag2's tables 'topics' and 'messages'", "a database without them")
         topic_columns = self._columns_of("topics")
-        needed = {"id", "name", "type", "serialization_format"}
-        if not needed <= topic_columns or not {"id", "topic_id", "timestamp", "data"} <= self._columns_of("messages"):
-            raise self.no_log("rosbag2's tables 'topics' and 'messages'", "a database without them")
         if "ros_distro" in self._columns_of("schema"):
             row = self._db.execute("SELECT ros_distro FROM schema").fetchone()
             self.distro = str(row[0]) if row and row[0] else ""
