@@ -18,12 +18,7 @@ from mcap.records import Attachment, Metadata
 
 from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
-from pdhef_logtool.logs.decoding import (
-    ChannelDecoder,
-    channel_schema,
-    concatenate_columns,
-    missing_column,
-)
+from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema, concatenate_columns, missing_column
 from pdhef_logtool.logs.definitions import SHIPPED
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import (

@@ -16,14 +16,7 @@ import numpy as np
 
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
-from pdhef_logtool.logs.container import (
-    Block,
-    ChannelRecord,
-    FileContainer,
-    Span,
-    SpanDamageError,
-    block_from_lists,
-)
+from pdhef_logtool.logs.container import Block, ChannelRecord, FileContainer, Span, SpanDamageError, block_from_lists
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.records.signals import IntArray

@@ -86,10 +86,7 @@ def register_channels(
 
 
 def iterate_copy(
-    log: ColumnarLog,
-    channels: SourceChannels,
-    start_ns: int | None = None,
-    end_ns: int | None = None,
+    log: ColumnarLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Block | RawChunk]:
     """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
 

@@ -364,15 +364,11 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             (Opcode.METADATA_INDEX, self._metadata_indexes),
         ]
         for opcode, records in groups:
-            group_start = builder.count
+            first = builder.count
             for record in records:
                 record.write(builder)
-            if records:
-                offsets.append(
-                    SummaryOffset(
-                        group_opcode=opcode, group_start=start + group_start, group_length=builder.count - group_start
-                    )
-                )
+            if length := builder.count - first:
+                offsets.append(SummaryOffset(group_opcode=opcode, group_start=start + first, group_length=length))
         offset_start = start + builder.count
         for offset in offsets:
             offset.write(builder)
@@ -380,11 +376,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
         self._emit(summary)
         self._emit_record(
-            Footer(
-                summary_start=start,
-                summary_offset_start=offset_start,
-                summary_crc=crc32(head, crc32(summary)),
-            )
+            Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc32(head, crc32(summary)))
         )
         self._emit(MCAP_MAGIC)
 
