@@ -97,8 +97,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._chunk_indexes: list[ChunkIndex] = []
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
-        self._first_ns: int | None = None
-        self._last_ns = 0
         self._crc = 0
         self._at = 0
         self._compressor: ZstdCompressor | None = None
@@ -305,8 +303,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
                 **about,
             )
         )
-        self._first_ns = start_ns if self._first_ns is None else min(self._first_ns, start_ns)
-        self._last_ns = max(self._last_ns, end_ns)
 
     def attachment(self, record: Attachment) -> None:
         """Add a file."""
@@ -350,8 +346,8 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             channel_message_counts=dict(sorted(self._counts.items())),
             chunk_count=len(self._chunk_indexes),
             message_count=self._counts.total(),
-            message_end_time=self._last_ns,
-            message_start_time=self._first_ns or 0,
+            message_end_time=max((chunk.message_end_time for chunk in self._chunk_indexes), default=0),
+            message_start_time=min((chunk.message_start_time for chunk in self._chunk_indexes), default=0),
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self._schemas),
         )
