@@ -340,8 +340,8 @@ class ColumnarLog(DriveLog):
         if declared == claimed and not outside and undeclared <= 0:
             return
         others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
-        found = {id_: times[block.rows[id_]] for id_ in declared}
-        container.spans[span.index] = replace(span, counts=others | declared, times={**(span.times or {}), **found})
+        actual = {id_: times[block.rows[id_]] for id_ in declared}
+        container.spans[span.index] = replace(span, counts=others | declared, times={**(span.times or {}), **actual})
         missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
         start, _ = container.extent(span)
         for kind, count, text in (

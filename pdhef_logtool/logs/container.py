@@ -66,7 +66,7 @@ class Span:
     """A run of messages that is read as a whole: an MCAP or bag chunk, a run of unchunked records, a page of rows.
 
     ``start_ns`` and ``end_ns`` bound the log times as [start, end). ``counts`` gives messages by channel id.
-    ``times``: log times [N] by channel id in file order; None in a sound remote file, of which only bounds were read.
+    ``times``: log times [N] by channel id in file order; None if only the bounds were read, as in a sound remote file.
     """
 
     index: int

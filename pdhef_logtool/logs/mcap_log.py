@@ -46,7 +46,7 @@ from pdhef_logtool.logs.container import (
     items_at_bytes,
     rows_by_channel,
 )
-from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_PAIR, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -72,7 +72,6 @@ MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 _MESSAGE_BYTES = MESSAGE_HEAD.itemsize - RECORD.size
-_PAIR_BYTES = 2 * _U64.size
 
 
 class McapContainer(FileContainer):
@@ -568,11 +567,11 @@ def _message_indexes(record: bytes, offset: int) -> tuple[list[tuple[int, int]],
             return None
         opcode, length, channel, size = INDEX_RECORD.unpack_from(record, offset)
         start, end = offset + INDEX_RECORD.size, offset + RECORD.size + length
-        if opcode != _OP_MESSAGE_INDEX or size % _PAIR_BYTES or start + size > end:
+        if opcode != _OP_MESSAGE_INDEX or size % INDEX_PAIR.size or start + size > end:
             return None
         if size:
-            pairs.append(np.frombuffer(record, "<u8", 2 * size // _PAIR_BYTES, start))
-            parts.append((channel, size // _PAIR_BYTES))
+            pairs.append(np.frombuffer(record, "<u8", 2 * size // INDEX_PAIR.size, start))
+            parts.append((channel, size // INDEX_PAIR.size))
         offset = end
     return parts, np.concatenate(pairs).reshape(-1, 2)
 

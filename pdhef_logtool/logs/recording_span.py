@@ -162,13 +162,13 @@ def survey(containers: Sequence[Container], where: str) -> RecordingSpan:
                     parts.append(((c, span.index, id_), span.times[id_]))
                     numbers[topic] += 1
     times = {lane: np.concatenate([its for _, its in parts]) for lane, parts in lanes.items()}
-    found, repeated = _survey(times, where, whole)
+    recording_span, repeated = _survey(times, where, whole)
     by_place: dict[Place, BoolArray] = {}
     for lane, mask in repeated.items():
         ends = np.cumsum([len(its) for _, its in lanes[lane]])
         masks = zip((place for place, _ in lanes[lane]), np.split(mask, ends[:-1]), strict=True)
         by_place |= {place: its for place, its in masks if its.any()}
-    return replace(found, repeated=by_place)
+    return replace(recording_span, repeated=by_place)
 
 
 def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> RecordingSpan:

@@ -128,9 +128,9 @@ def _copied(block: Block, c: int, channels: SourceChannels, start_ns: int | None
 
     Messages before 1970 are left out: an MCAP file cannot contain their times.
     """
-    ids = {id_: channels.ids.get((c, id_), -1) for id_ in block.rows}
-    known, number = np.unique(block.channel, return_inverse=True)
-    channel = np.array([ids[id_] for id_ in known.tolist()], np.int64)[number]
+    channel = np.full(len(block), -1)
+    for id_, rows in block.rows.items():
+        channel[rows] = channels.ids.get((c, id_), -1)
     window = in_window(block.log_time_ns, max(start_ns or 0, 0), end_ns)
     keep = np.flatnonzero((channel >= 0) & (True if window is None else window))
     return replace(block, channel=channel).take(keep[np.argsort(block.log_time_ns[keep], kind="stable")])
