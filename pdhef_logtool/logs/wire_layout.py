@@ -269,7 +269,8 @@ class CdrEncoder:
             if values.shape[:1] != (n,) or values.ndim > 2:
                 raise self._misfit(path, f"{n} rows", f"shape {values.shape}")
         layout, template = self._layout({path: v.shape[1] for path, v in columns.items() if v.ndim == 2})
-        rows = np.tile(np.frombuffer(template, dtype=np.uint8), (n, 1))
+        rows = np.empty((n, layout.size), dtype=np.uint8)
+        rows[:] = np.frombuffer(template, dtype=np.uint8)
         for path, values in columns.items():
             self._put(layout, rows, path, values)
         return rows

@@ -237,8 +237,10 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
 
     def _emit_messages(self, block: Block, before_ns: int | None = None) -> Block:
         """Write :meth:`_records` in chunks, as long as these begin before a time; return the others."""
-        start, end = block.offset - MESSAGE_HEAD.itemsize, block.offset + block.length
         first = 0
+        if not len(block) or (before_ns is not None and block.log_time_ns[0] >= before_ns):
+            return block
+        start, end = block.offset - MESSAGE_HEAD.itemsize, block.offset + block.length
         while first < len(block) and (before_ns is None or block.log_time_ns[first] < before_ns):
             last = max(int(np.searchsorted(end, start[first] + CHUNK_BYTES, side="right")), first + 1)
             content, rows = block.buffer[start[first] : end[last - 1]], slice(first, last)
