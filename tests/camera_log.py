@@ -8,8 +8,8 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from pdhef_logtool.logs.container import ChannelRecord
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
+from pdhef_logtool.logs.writer import McapLogWriter
 
 _SLICE_NS = 20_000_000_000
 _IMAGE_BYTES, _IMAGE_NS = 20_000, 200_000_000
@@ -29,7 +29,7 @@ def write_apart(path: Path, chunks: Iterable[list[Message]]) -> None:
             for topic, (name, encoding, text), *_ in chunk:
                 if topic not in ids:
                     ids[topic] = writer.add_channel(ChannelRecord(-1, topic, "cdr", name, encoding, text))
-            writer.write([], [RawMessage(ids[topic], at, at, 0, data) for topic, _, at, data in chunk])
+            writer.write([], [block_of(RawMessage(ids[topic], at, at, 0, data) for topic, _, at, data in chunk)])
 
 
 def with_camera(source: Path, slice_ns: int = _SLICE_NS) -> Iterator[list[Message]]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -16,15 +16,9 @@ from types import MappingProxyType
 import numpy as np
 from mcap.records import Attachment, Metadata
 
-from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
-from pdhef_logtool.logs.decoding import (
-    ChannelDecoder,
-    channel_schema,
-    concatenate_columns,
-    missing_column,
-)
+from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema, concatenate_columns, missing_column
 from pdhef_logtool.logs.definitions import SHIPPED
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import (
@@ -96,7 +90,7 @@ class ColumnarLog(DriveLog):
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
         self._kept_bytes = 0
-        self._extracted: tempfile.TemporaryDirectory[str] | None = None
+        self._closing = ExitStack()
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -114,19 +108,7 @@ class ColumnarLog(DriveLog):
     @cached_property
     def recording_span(self) -> RecordingSpan:  # type: ignore[override]
         """When the log was recorded; determined at the first access."""
-        return survey(self.containers, self._times, str(self.path))
-
-    def _times(self, c: int, span: Span) -> Mapping[int, IntArray] | None:
-        """Return the log times [N] of a span's messages by known channel; None if they cannot be read."""
-        container = self.containers[c]
-        try:
-            container.meter.check()
-            with container.meter.running():
-                return {id_: times for id_, times in container.times(span).items() if id_ in container.channels}
-        except SourceError:
-            raise
-        except Exception:  # noqa: BLE001 (a read of the span reports the damage)
-            return None
+        return survey(self.containers, str(self.path))
 
     @property
     def lost(self) -> tuple[Loss, ...]:
@@ -164,20 +146,16 @@ class ColumnarLog(DriveLog):
         for name, key, text in entries:
             if _DBC.search(text):
                 stored.append((key if key.endswith(".dbc") else f"{name}.{key}.dbc", text.encode()))
-        return tuple(self._extract(name, data) for name, data in stored)
+        folder = Path(self._closing.enter_context(scratch_folder())) if stored else Path()
+        paths = [folder / Path(name).name for name, _ in stored]
+        for path, (_, data) in zip(paths, stored, strict=True):
+            write_bytes(path, data)
+        return tuple(paths)
 
     def definition(self, path: Path) -> Path:
         """Return the file of a definition in the log; a name without a folder is an attached file."""
         attached = {} if path.exists() and len(path.parts) > 1 else {p.name: p for p in self.databases}
         return attached.get(path.name, path)
-
-    def _extract(self, name: str, data: bytes) -> Path:
-        """Write a file that the log contains, to be read until the log is closed."""
-        if self._extracted is None:
-            self._extracted = scratch_folder()
-        path = Path(self._extracted.name) / Path(name).name
-        write_bytes(path, data)
-        return path
 
     def metadata(self) -> dict[str, str]:
         """Return the entries of metadata records by ``key`` and ``record.key``, and rosbag2's ``custom_data``."""
@@ -208,11 +186,11 @@ class ColumnarLog(DriveLog):
     def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
         """Return each topic's log times in [start, end), ascending, as the indexes have them."""
         parts: dict[str, list[IntArray]] = {topic: [] for topic in self._by_topic}
-        for c, container in enumerate(self.containers):
+        for container in self.containers:
             for span in container.spans:
-                stamps = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
-                for id_, times in (stamps or {}).items():
-                    parts[container.channels[id_].topic].append(times)
+                its = (span.times or {}) if span.overlaps(start_ns, end_ns) else {}
+                for id_ in span.counts.keys() & its.keys():
+                    parts[container.channels[id_].topic].append(its[id_])
         ordered = {topic: np.sort(np.concatenate(part), kind="stable") for topic, part in parts.items() if part}
         return {topic: times[slice(*np.searchsorted(times, (start_ns, end_ns)))] for topic, times in ordered.items()}
 
@@ -301,8 +279,7 @@ class ColumnarLog(DriveLog):
         self._kept.clear()
         for container in self.containers:
             container.close()
-        if self._extracted is not None:
-            self._extracted.cleanup()
+        self._closing.close()
 
     def load(
         self, c: int, span: Span, want: frozenset[int] | None = None, payloads: frozenset[int] | None = None
@@ -363,7 +340,8 @@ class ColumnarLog(DriveLog):
         if declared == claimed and not outside and undeclared <= 0:
             return
         others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
-        container.spans[span.index] = replace(span, counts=others | declared)
+        actual = {id_: times[block.rows[id_]] for id_ in declared}
+        container.spans[span.index] = replace(span, counts=others | declared, times={**(span.times or {}), **actual})
         missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
         start, _ = container.extent(span)
         for kind, count, text in (
@@ -456,8 +434,7 @@ class ColumnarLog(DriveLog):
             if topic not in plans:
                 continue
             if self.recording_span.left_out:
-                unused = self.recording_span.unused(topic, c, span, block.log_time_ns[rows])
-                rows = rows if unused is None else rows[~unused]
+                rows = rows[self.recording_span.used((c, span.index, id_), block.log_time_ns[rows])]
             rows = rows if keep is None else rows[keep[rows]]
             columns = self._decode(plans[topic], self._channels[c, id_], span, block, rows) if rows.size else None
             if columns is not None:

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from mcap.records import Attachment, Metadata
@@ -19,15 +20,13 @@ from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, rais
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.errors import LogError, PdhefError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.table_file import LogFile
 
-# First bytes of the files of each format.
+#: First and last bytes of an MCAP.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
-SQLITE_MAGIC = b"SQLite format 3\0"
 #: Log times above this (unsigned in the file) do not fit int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 #: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
@@ -37,6 +36,7 @@ _LOSSES_OF_A_KIND = 20  # of one file; further ones become one loss
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
 _RECORDS_A_CHECK = 256  # of the time that a walk takes
+_NONE = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,19 +61,30 @@ class ChannelRecord:
         return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 and all(parts) else "/".join(parts)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Span:
     """A run of messages that is read as a whole: an MCAP or bag chunk, a run of unchunked records, a page of rows.
 
     ``start_ns`` and ``end_ns`` bound the log times as [start, end). ``counts`` gives messages by channel id.
-    ``ordered``: the log times of each channel are known not to step back in file order; False: unknown.
+    ``times``: log times [N] by channel id in file order; None if only the bounds were read, as in a sound remote file.
     """
 
     index: int
     start_ns: int
     end_ns: int
     counts: Mapping[int, int]
-    ordered: bool = False
+    times: Mapping[int, IntArray] | None = None
+
+    @classmethod
+    def of(cls, channels: Iterable[tuple[int, IntArray]]) -> Span:
+        """Return the span of messages with these channels and log times [N] in file order; a channel may repeat."""
+        times: dict[int, IntArray] = {}
+        for id_, its in channels:
+            if len(its):
+                times[id_] = np.concatenate((times[id_], its)) if id_ in times else its
+        every = np.concatenate([_NONE, *times.values()])
+        first, last = (int(every.min()), int(every.max())) if len(every) else (0, -1)
+        return cls(0, first, last + 1, {id_: len(its) for id_, its in times.items()}, times)
 
     def overlaps(self, start_ns: int | None, end_ns: int | None) -> bool:
         """Return whether some of its time is in [start, end); None: without limit."""
@@ -105,6 +116,34 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
+    def take(self, rows: slice | IntArray | BoolArray) -> Block:
+        """Return some of the messages."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+
+    def split(self, before_ns: float) -> tuple[Block | None, Block | None]:
+        """Return the messages before a time and the others, None without any; they ascend in log time."""
+        n = int(np.searchsorted(self.log_time_ns, before_ns))
+        return self.take(slice(n)) if n else None, self.take(slice(n, None)) if n < len(self) else None
+
+    @staticmethod
+    def merged(parts: Sequence[Block], head: int = 0) -> Block:
+        """Return messages in order of log time, of equal times in the given order, one behind the other in memory.
+
+        ``head``: bytes that are left free before each message.
+        """
+        columns = [np.concatenate([_NONE, *(getattr(part, name) for part in parts)]) for name in _COLUMNS]
+        order = np.argsort(columns[_COLUMNS.index("log_time_ns")], kind="stable")
+        channel, log_time, publish_time, sequence, _, length = (column[order] for column in columns)
+        offset = np.cumsum(length + head) - length
+        place = np.empty(len(order), np.int64)
+        place[order] = offset
+        buffer = np.empty(int((length + head).sum()), np.uint8)
+        first = 0
+        for part in parts:
+            _copy(part, buffer, place[first : first + len(part)])
+            first += len(part)
+        return Block(buffer.data, channel, log_time, publish_time, sequence, offset, length)
+
     def without_large(self, most: int) -> Block:
         """Return the block without payloads above ``most`` bytes."""
         large = self.length > most
@@ -123,21 +162,12 @@ class Block:
     @property
     def nbytes(self) -> int:
         """Memory of the block in bytes."""
-        columns = self.channel, self.log_time_ns, self.publish_time_ns, self.sequence, self.offset, self.length
-        return memoryview(self.buffer).nbytes + sum(c.nbytes for c in columns)
+        return memoryview(self.buffer).nbytes + sum(int(getattr(self, name).nbytes) for name in _COLUMNS)
 
     @cached_property
     def rows(self) -> dict[int, IntArray]:
         """Rows by channel, ascending."""
-        if not len(self):
-            return {}
-        # 16 bits, if enough, sort much faster.
-        fit = self.channel.view(np.uint64).max() < 1 << 16  # an id below 0 is a huge one
-        order = np.argsort(self.channel.astype(np.uint16) if fit else self.channel, kind="stable")
-        ordered = self.channel[order]
-        firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
-        ends = [*firsts[1:], len(self)]
-        return {int(ordered[first]): order[first:end] for first, end in zip(firsts, ends, strict=True)}
+        return rows_by_channel(self.channel)
 
     @property
     def counts(self) -> dict[int, int]:
@@ -145,10 +175,49 @@ class Block:
         return {channel: len(rows) for channel, rows in self.rows.items()}
 
     @property
-    def ordered(self) -> bool:
-        """Whether the log times of no channel step back."""
-        by_channel = (self.log_time_ns[rows] for rows in self.rows.values())
-        return all(bool((times[1:] >= times[:-1]).all()) for times in by_channel)
+    def span(self) -> Span:
+        """The span of these messages."""
+        return Span.of((id_, self.log_time_ns[rows]) for id_, rows in self.rows.items())
+
+
+_COLUMNS = ("channel", "log_time_ns", "publish_time_ns", "sequence", "offset", "length")
+
+
+class RawMessage(NamedTuple):
+    """A message as ready bytes."""
+
+    channel: int
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+def block_of(messages: Iterable[RawMessage]) -> Block:
+    """Return the block of single messages."""
+    messages = list(messages)
+    length = [len(message.data) for message in messages]
+    columns = zip(*(message[:-1] for message in messages), strict=True) if messages else ((),) * 4
+    return block_from_lists(b"".join(m.data for m in messages), *columns, [0, *accumulate(length)][:-1], length)
+
+
+def items_at_bytes(buffer: bytes | memoryview, size: int, start: int = 0) -> NDArray[np.void]:
+    """Return the ``size`` bytes at each byte from ``start`` on, as overlapping items: indexing copies them as a whole.
+
+    Plain bytes need no alignment, and NumPy copies structured items member by member.
+    """
+    plain = np.dtype((np.void, size))
+    places = memoryview(buffer).nbytes - start - size + 1
+    return np.ndarray((places,), dtype=plain, buffer=buffer, offset=start, strides=(1,))
+
+
+def _copy(block: Block, buffer: NDArray[np.uint8], place: IntArray) -> None:
+    """Copy the payloads of a block to places [N] in a buffer, those of one length at once."""
+    order = np.argsort(block.length, kind="stable")
+    borders = np.flatnonzero(np.diff(block.length[order])) + 1
+    for rows in np.split(order, borders) if len(order) else ():
+        if size := int(block.length[rows[0]]):
+            items_at_bytes(buffer.data, size)[place[rows]] = items_at_bytes(block.buffer, size)[block.offset[rows]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,6 +246,10 @@ class RawChunk:
     def start_ns(self) -> int:
         """First log time."""
         return int(self.log_time_ns.min())
+
+    def split(self, before_ns: float) -> tuple[RawChunk | None, RawChunk | None]:
+        """Return the chunk as the first item if it begins before a time, as the second otherwise."""
+        return (self, None) if self.start_ns < before_ns else (None, self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,16 +349,6 @@ class Container(ABC):
     @abstractmethod
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes [start, end) of a span."""
-
-    def times(self, span: Span) -> dict[int, IntArray]:
-        """Return the log times [N] of a span's messages by channel, in file order.
-
-        Raises
-        ------
-        SpanDamageError : they cannot be read.
-        """
-        block = self.load(span)
-        return {id_: block.log_time_ns[rows] for id_, rows in block.rows.items()}
 
     def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
         """Return the chunk that a block was read from, to be written to another file as it is.
@@ -435,8 +498,7 @@ class FileContainer(Container):
             self.lose(kind, what, start_ns, end_ns, count)
             return None
         if len(block):
-            first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-            self.add_span(chunk, Span(0, first, last + 1, block.counts, block.ordered))
+            self.add_span(chunk, block.span)
         return block
 
     def lose_end(self, offset: int) -> None:
@@ -469,19 +531,17 @@ class FileContainer(Container):
         """Finish open records and check the file as a whole."""
 
 
-def span_of_indexes(indexes: Sequence[tuple[int, NDArray[Any]]]) -> Span:
-    """Return the span that message indexes describe: channel and log times [N] of each, in file order."""
-    indexes = [(id_, times) for id_, times in indexes if len(times)]
-    counts: Counter[int] = Counter()
-    for id_, its in indexes:
-        counts[id_] += len(its)
-    if not counts:
-        return Span(0, 0, 0, counts)
-    times = np.concatenate([its for _, its in indexes])
-    falls = times[1:] < times[:-1]
-    falls[np.cumsum([len(its) for _, its in indexes])[:-1] - 1] = False  # from an index to the next one
-    first, last = (min(int(ns), MAX_TIME_NS) for ns in (times.min(), times.max()))
-    return Span(0, first, last + 1, counts, ordered=not falls.any())
+def rows_by_channel(channel: IntArray) -> dict[int, IntArray]:
+    """Return the rows of each channel, ascending, from the channels [N] of messages."""
+    if not len(channel):
+        return {}
+    # 16 bits, if enough, sort much faster.
+    fit = channel.view(np.uint64).max() < 1 << 16  # an id below 0 is a huge one
+    order = np.argsort(channel.astype(np.uint16) if fit else channel, kind="stable")
+    ordered = channel[order]
+    firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
+    ends = [*firsts[1:], len(channel)]
+    return {int(ordered[first]): order[first:end] for first, end in zip(firsts, ends, strict=True)}
 
 
 def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:

@@ -38,7 +38,7 @@ from pdhef_logtool.logs.message_schema import (
     values_at,
 )
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
-from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout, layout_of_message
+from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray
 
@@ -137,7 +137,7 @@ class ChannelDecoder:
             if number == len(self._layouts):
                 message = block.message(rows[left[0]])
                 try:
-                    layout = layout_of_message(self.schema.root, self.schema.wire, message)
+                    layout = WireLayout(self.schema.root, self.schema.wire, message)
                     self._check_widths(layout, len(rows))
                 except NoLayoutError:
                     break

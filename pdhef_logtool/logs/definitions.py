@@ -179,9 +179,7 @@ def message_definition(type_name: str) -> str:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)
-    shipped = schema_file(f"{type_name}.msg")
-    if shipped.is_file():
-        text = shipped.read_text(encoding="utf-8")
+    if text := shipped_definition(type_name):
         types = get_types_from_msg(text, type_name)
         store.register(with_contained_types(types, store.fielddefs, shipped_definition))
         generated = store.generate_msgdef(type_name, ros_version=2)[0]

@@ -1,4 +1,4 @@
-"""The formats of logs: an entry defines how files of a format are recognised and opened.
+"""The formats of logs (``formats.toml``): an entry defines how files of a format are recognised and opened.
 
 A package adds formats by entry points of the group ``pdhef.log_formats``; each is a :class:`LogFormat`. Example, with
 ``Table`` (a topic with its own times) and ``TableLog`` of :mod:`~.table_log`::
@@ -15,12 +15,14 @@ A package adds formats by entry points of the group ``pdhef.log_formats``; each 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Iterable, Iterator
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.logs.container import MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC, Container
+from pdhef_logtool.logs.container import Container
 from pdhef_logtool.logs.table_file import LogFile
 
 if TYPE_CHECKING:
@@ -79,46 +81,15 @@ class LogFormat:
         return opener(file)  # type: ignore[no-any-return]
 
 
-FORMATS = (
-    LogFormat("an MCAP file", f"{__package__}.mcap_log:McapContainer.open", (".mcap",), MCAP_MAGIC),
-    LogFormat("a ROS 1 bag", f"{__package__}.rosbag1_log:Rosbag1Container.open", (".bag",), ROSBAG1_MAGIC),
-    LogFormat("a rosbag2 database", f"{__package__}.rosbag2_sqlite_log:SqliteContainer.open", (".db3",), SQLITE_MAGIC),
-    LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), libraries=("polars",)),
-    LogFormat(
-        "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
-        is_general=True, named=(".txt", ".dat", ".tab", ".prn", ".ascii", ".lvm", ".msl"), libraries=("polars",),
-    ),
-    LogFormat(
-        "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",
-        is_general=True, libraries=("polars", "pyarrow.parquet"),
-    ),
-    LogFormat(
-        "a MAT file", f"{__package__}.mat_log:open_mat", (".mat",), b"MATLAB ",
-        is_general=True, libraries=("h5py",),
-    ),
-    LogFormat(
-        "an HDF5 file", f"{__package__}.mat_log:open_mat", (".h5", ".hdf5"), b"\x89HDF",
-        is_general=True, libraries=("h5py",),
-    ),
-    LogFormat(
-        "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "),
-        libraries=("asammdf",),
-    ),
-    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=()),
-    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=()),
-    LogFormat(
-        "a candump log", f"{__package__}.can_logs:open_candump", (".log",),
-        is_general=True, is_text=True, libraries=(),
-    ),
-    LogFormat(
-        "a file of line protocol", f"{__package__}.text_logs:open_line_protocol", (".lp", ".line", ".influx"),
-        is_general=True, is_text=True, libraries=("polars",),
-    ),
-    LogFormat(
-        "a file of JSON lines", f"{__package__}.text_logs:open_json_lines", (".jsonl", ".ndjson"),
-        is_general=True, is_text=True, named=(".json",), libraries=("polars",),
-    ),
-)  # fmt: skip
+def _shipped(opener: str, magic: Sequence[str] = (), **entries: Any) -> LogFormat:
+    """Return a format of this package from its entries in ``formats.toml``."""
+    entries |= {name: tuple(value) for name, value in entries.items() if isinstance(value, list)}
+    starts = tuple(start.encode("latin-1") for start in magic) or b""
+    return LogFormat(opener=f"{__package__}.{opener}", magic=starts, **entries)
+
+
+_FILE = Path(__file__).with_suffix(".toml")
+FORMATS = tuple(_shipped(**entries) for entries in tomllib.loads(_FILE.read_text(encoding="utf-8"))["formats"])
 
 
 @cache

@@ -30,7 +30,7 @@ _MOST_SUMMARY_BYTES = 64 << 20
 RECORD = struct.Struct("<BQ")  # opcode, size of the content
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
 INDEX_RECORD = struct.Struct("<BQHI")  # opcode, size, channel, size of its pairs
-_PAIR = struct.Struct("<QQ")  # log time and offset of a message
+INDEX_PAIR = struct.Struct("<QQ")  # log time and offset of a message
 _UNREADABLE = (McapError, struct.error, ValueError, CutError)
 
 
@@ -138,7 +138,7 @@ def _chunk(record: ChunkIndex) -> IndexedChunk:
     places = [*(place for _, place in offsets), index_end]
     counts: dict[int, int] = {}
     for (id_, place), following in zip(offsets, places[1:], strict=True):
-        n, rest = divmod(following - place - INDEX_RECORD.size, _PAIR.size)
+        n, rest = divmod(following - place - INDEX_RECORD.size, INDEX_PAIR.size)
         if n < 0 or rest:
             raise ValueError("message indexes that do not follow each other")
         if n:

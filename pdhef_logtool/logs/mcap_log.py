@@ -10,10 +10,11 @@ from __future__ import annotations
 import struct
 from array import array
 from bisect import bisect_right
-from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -42,9 +43,10 @@ from pdhef_logtool.logs.container import (
     Wanted,
     block_from_lists,
     describe_damage,
-    span_of_indexes,
+    items_at_bytes,
+    rows_by_channel,
 )
-from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_PAIR, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -70,7 +72,6 @@ MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 _MESSAGE_BYTES = MESSAGE_HEAD.itemsize - RECORD.size
-_INDEX_PAIR = np.dtype([("log", "<u8"), ("offset", "<u8")])
 
 
 class McapContainer(FileContainer):
@@ -95,9 +96,7 @@ class McapContainer(FileContainer):
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
         self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
-        self._unread: dict[
-            int, int
-        ] = {}  # chunks and attachments of a remote file that are not wanted, from start to end
+        self._unread: dict[int, int] = {}  # start and end of the parts of a remote file that are not wanted
         self._indexed: list[int] | None = None  # places of the chunks that a damaged summary names
         self._closed = False
         self._data_end: tuple[int, int] | None = None  # extent of the record
@@ -179,23 +178,28 @@ class McapContainer(FileContainer):
         if span is None:
             self._records_at[Attachment].append((extent.start, extent.end))
             return extent.end
-        ordered = self.source.is_remote
-        if not ordered:
-            named = self._span_by_indexes(extent)
-            ordered = named is not None and named.ordered
-            if named is None or named.counts != span.counts:
-                self._lose_indexes(extent)
-        self.add_span(extent, replace(span, ordered=ordered))
+        named = span if self.source.is_remote else self._span_by_indexes(extent)
+        if named is None or named.counts != span.counts:
+            self._lose_indexes(extent)
+        if named is not None and _agree(named, span):
+            self.add_span(extent, named)
+        else:
+            self._opened_chunks += 1
+            self.add_content(extent, span)
         return extent.index_end
-
-    def _indexes(self, extent: Extent) -> list[tuple[int, UintArray, UintArray]] | None:
-        """Return channel, log times [N] and offsets [N] of each message index of a chunk; None if one is malformed."""
-        return _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
 
     def _span_by_indexes(self, extent: Extent) -> Span | None:
         """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
-        indexes = self._indexes(extent)
-        return None if indexes is None else span_of_indexes([(id_, times) for id_, times, _ in indexes])
+        indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
+        if indexes is None:
+            return None
+        parts, pairs = indexes
+        times, offsets, ends = _held_times(pairs[:, 0]), pairs[:, 1], list(accumulate(n for _, n in parts))
+        falls = offsets[1:] < offsets[:-1]
+        falls[[end - 1 for end in ends[:-1]]] = False  # from an index to the next one
+        if falls.any():  # some writers sort an index by time
+            times = times[np.lexsort((offsets, np.repeat(np.arange(len(parts)), [n for _, n in parts])))]
+        return Span.of((id_, times[end - n : end]) for (id_, n), end in zip(parts, ends, strict=True))
 
     def _lose_indexes(self, extent: Extent) -> None:
         what = (
@@ -294,9 +298,8 @@ class McapContainer(FileContainer):
             self.lose_record(offset, SpanDamageError("a message record is too short"))
             return self._record_head(offset)[1]
         heads = _heads(block, np.array(places, dtype=np.int64))
-        times, counts = _held_times(heads["log"]), Counter(heads["channel"].tolist())
-        ordered = bool((times[1:] >= times[:-1]).all())
-        span = Span(0, int(times.min()), int(times.max()) + 1, counts, ordered)
+        times, rows = _held_times(heads["log"]), rows_by_channel(heads["channel"].astype(np.int64))
+        span = Span.of((id_, times[its]) for id_, its in rows.items())
         self.add_span(Extent(offset, base + place, base + place, is_chunk=False), span)
         return base + place
 
@@ -318,10 +321,11 @@ class McapContainer(FileContainer):
         if named is None:
             self._lose_indexes(extent)
         elif sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked:
-            claimed = replace(claimed, counts=named.counts, ordered=named.ordered)
+            claimed = replace(claimed, counts=named.counts)
             is_known = bool(named.counts) and named.counts.keys() <= self._raw_channels.keys()
-            if not self._has_end and is_known and named == claimed and unpacked <= self.meter.limits.chunk_bytes:
-                self.add_span(extent, claimed)
+            fits = _agree(named, claimed) and unpacked <= self.meter.limits.chunk_bytes
+            if not self._has_end and is_known and fits:
+                self.add_span(extent, named)
                 return index_end
         self._opened_chunks += 1
         block = self.add_content(extent, claimed)
@@ -435,7 +439,7 @@ class McapContainer(FileContainer):
         block = _indexed_messages(content, record, size)
         block = self._scan(content) if block is None else block
         self.meter.limits.check_messages(len(block), size)
-        for opcode, start, end in (_other_records(block) or ()) if declare else ():
+        for opcode, start, end in _other_records(block) if declare else ():
             if opcode in _DECLARATIONS:
                 try:
                     self._declare(opcode, content[start:end])
@@ -454,19 +458,14 @@ class McapContainer(FileContainer):
     def _scan(self, content: bytes) -> Block:
         """Return the messages among the records of a content; SpanDamageError if it contains anything else."""
         offsets = array("q")
-        offset, size = 0, len(content)
-        while offset + RECORD.size <= size:
-            opcode, length = RECORD.unpack_from(content, offset)
+        for opcode, start, _ in _records(content, 0, len(content)):
             if opcode == _OP_MESSAGE:
                 if len(offsets) % _MESSAGES_A_CHECK == 0:
                     self.meter.limits.check("chunk_messages", len(offsets), "a chunk")
                     self.meter.check()
-                offsets.append(offset)
+                offsets.append(start - RECORD.size)
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
                 raise SpanDamageError(f"it contains a record of kind {opcode}, which no chunk may")
-            offset += RECORD.size + length
-        if offset != size:
-            raise SpanDamageError("its last record is cut")
         if not offsets:
             return block_from_lists(content, *[()] * 6)
         block = _gather_messages(content, np.array(offsets, dtype=np.int64))
@@ -482,8 +481,7 @@ class McapContainer(FileContainer):
         if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
             return None  # the time does not fit the index
         content = bytes(block.buffer)
-        others = _other_records(block)
-        if others is None or not all(self._is_known(op, content[start:end], kept) for op, start, end in others):
+        if not all(self._is_known(op, content[start:end], kept) for op, start, end in _other_records(block)):
             return None
         record = self.source.read(extent.start, extent.end - extent.start)
         size, crc, compression, start, length = _chunk_head(record, len(record))
@@ -510,15 +508,6 @@ class McapContainer(FileContainer):
         except (struct.error, UnicodeDecodeError, ValueError, McapError):
             return False
         return True
-
-    def times(self, span: Span) -> dict[int, IntArray]:
-        """Return a span's log times by channel; of a chunk, by its message indexes if they agree with the span."""
-        indexes = [(id_, times) for id_, times, _ in self._indexes(self.chunks[span.index]) or () if len(times)]
-        named = span_of_indexes(indexes)
-        is_complete = len(indexes) == len(span.counts) and named.counts == span.counts
-        if is_complete and (named.start_ns, named.end_ns) == (span.start_ns, span.end_ns):
-            return {id_: _held_times(times) for id_, times in indexes}
-        return super().times(span)
 
     def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
@@ -566,38 +555,39 @@ def _chunk_head(record: bytes, end: int) -> tuple[int, int, str, int, int]:
     return size, crc, compression, _CHUNK_HEAD_BYTES + n, stored
 
 
-def _message_indexes(record: bytes, offset: int) -> list[tuple[int, UintArray, UintArray]] | None:
-    """Return channel, log times [N] and offsets [N] of each message index from a byte on; None if one is malformed."""
-    indexes: list[tuple[int, UintArray, UintArray]] = []
+def _message_indexes(record: bytes, offset: int) -> tuple[list[tuple[int, int]], UintArray] | None:
+    """Return the message indexes from a byte on, None if one is malformed.
+
+    Channel and count of each that is not empty, and the pairs [N, 2] of all: log time and offset in the chunk.
+    """
+    parts: list[tuple[int, int]] = []
+    pairs: list[UintArray] = [np.empty(0, np.uint64)]
     while offset < len(record):
         if offset + INDEX_RECORD.size > len(record):
             return None
-        opcode, length, channel, n = INDEX_RECORD.unpack_from(record, offset)
-        end = offset + RECORD.size + length
-        if opcode != _OP_MESSAGE_INDEX or n % _INDEX_PAIR.itemsize or offset + INDEX_RECORD.size + n > end:
+        opcode, length, channel, size = INDEX_RECORD.unpack_from(record, offset)
+        start, end = offset + INDEX_RECORD.size, offset + RECORD.size + length
+        if opcode != _OP_MESSAGE_INDEX or size % INDEX_PAIR.size or start + size > end:
             return None
-        pairs = np.frombuffer(record, _INDEX_PAIR, n // _INDEX_PAIR.itemsize, offset + INDEX_RECORD.size)
-        indexes.append((channel, pairs["log"], pairs["offset"]))
+        if size:
+            pairs.append(np.frombuffer(record, "<u8", 2 * size // INDEX_PAIR.size, start))
+            parts.append((channel, size // INDEX_PAIR.size))
         offset = end
-    return indexes
+    return parts, np.concatenate(pairs).reshape(-1, 2)
 
 
 def _indexed_messages(content: bytes, record: bytes, index_start: int) -> Block | None:
     """Return a chunk's messages through its message indexes; None if these do not name all of them."""
     indexes = _message_indexes(record, index_start)
-    if not indexes:
+    if indexes is None:
         return None
     # Each channel's offsets ascend already, which the stable sort makes use of.
-    offset = np.sort(np.concatenate([offsets for _, _, offsets in indexes]).view(np.int64), kind="stable")
-    return _gather_messages(content, offset)
+    return _gather_messages(content, np.sort(indexes[1][:, 1].astype(np.int64), kind="stable"))
 
 
 def _heads(content: bytes, offset: IntArray) -> NDArray[np.void]:
     """Return the heads of messages at offsets [N]."""
-    # Gathered as plain bytes: NumPy copies structured items member by member.
-    plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
-    places = np.ndarray((len(content) - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))
-    return places[offset].view(MESSAGE_HEAD)
+    return items_at_bytes(content, MESSAGE_HEAD.itemsize)[offset].view(MESSAGE_HEAD)
 
 
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
@@ -621,11 +611,17 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
         offset=offset + MESSAGE_HEAD.itemsize,
         length=size - _MESSAGE_BYTES,
     )
-    if offset[0] != 0 or ends[-1] != n or (offset[1:] != ends[:-1]).any():
-        others = _other_records(block)
-        if others is None or any(opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS for opcode, _, _ in others):
-            return None
-    return block
+    if offset[0] == 0 and ends[-1] == n and (offset[1:] == ends[:-1]).all():
+        return block
+    with suppress(SpanDamageError):
+        if all(opcode >= _FIRST_PRIVATE or opcode in _DECLARATIONS for opcode, *_ in _other_records(block)):
+            return block
+    return None
+
+
+def _agree(span: Span, other: Span) -> bool:
+    """Return whether two spans have the same bounds and counts."""
+    return (span.start_ns, span.end_ns, span.counts) == (other.start_ns, other.end_ns, other.counts)
 
 
 def _held_times(times: UintArray) -> IntArray:
@@ -633,19 +629,20 @@ def _held_times(times: UintArray) -> IntArray:
     return np.minimum(times, np.uint64(MAX_TIME_NS)).astype(np.int64)
 
 
-def _other_records(block: Block) -> list[tuple[int, int, int]] | None:
-    """Return opcode and extent of the records between the messages of a chunk; None if they do not fill a gap."""
-    records: list[tuple[int, int, int]] = []
+def _other_records(block: Block) -> list[tuple[int, int, int]]:
+    """Return opcode and extent of the records between the messages of a chunk; SpanDamageError if they fill no gap."""
     starts = np.append(0, block.offset + block.length)
     ends = np.append(block.offset - MESSAGE_HEAD.itemsize, len(block.buffer))
     gaps = np.flatnonzero(starts != ends)
-    for offset, end in zip(starts[gaps].tolist(), ends[gaps].tolist(), strict=True):
-        while offset < end:
-            if offset + RECORD.size > end:
-                return None
-            opcode, length = RECORD.unpack_from(block.buffer, offset)
-            records.append((opcode, offset + RECORD.size, offset + RECORD.size + length))
-            offset += RECORD.size + length
-        if offset != end:
-            return None
-    return records
+    extents = zip(starts[gaps].tolist(), ends[gaps].tolist(), strict=True)
+    return [record for offset, end in extents for record in _records(block.buffer, offset, end)]
+
+
+def _records(content: bytes | memoryview, offset: int, end: int) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode and extent of the content of the records in a part; SpanDamageError if they do not end with it."""
+    while offset + RECORD.size <= end:
+        opcode, length = RECORD.unpack_from(content, offset)
+        offset += RECORD.size + length
+        yield opcode, offset - length, offset
+    if offset != end:
+        raise SpanDamageError("its last record is cut")

@@ -142,8 +142,8 @@ class Selection:
 TEXT_ENDINGS = {"|hex": "hex", "|base64": "base64"}
 
 #: Member that message types without members get, and its description by rosbags.
-_FILLER = "structure_needs_at_least_one_member"
-_NO_MEMBERS = ((_FILLER, (1, ("uint8", 0))),)
+NO_MEMBERS = "structure_needs_at_least_one_member"
+_ONLY_FILLER = ((NO_MEMBERS, (1, ("uint8", 0))),)
 
 
 class SchemaError(Exception):
@@ -311,7 +311,7 @@ def _ros_root(defs: Mapping[str, Any], type_name: str, limits: ResourceLimits) -
     if type_name not in defs:
         raise SchemaError(f"no definition of {type_name}")
     members = defs[type_name][1]
-    if not members or [field for field, _ in members] == [_FILLER]:
+    if not members or [field for field, _ in members] == [NO_MEMBERS]:
         return Struct({})
     return _ros_node(defs, type_name, (), 1, Unfolding(limits, f"the definition of {type_name}"))
 
@@ -320,7 +320,7 @@ def _ros_node(defs: Mapping[str, Any], name: str, above: tuple[str, ...], times:
     if name in above:
         raise SchemaError(f"{name} contains itself")
     above = (*above, name)
-    members = defs[name][1] or _NO_MEMBERS
+    members = defs[name][1] or _ONLY_FILLER
     return Struct({field: _field_node(defs, desc, above, times, unfolding) for field, desc in members})
 
 

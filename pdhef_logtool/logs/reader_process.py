@@ -17,7 +17,7 @@ import signal
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from io import BytesIO
 from multiprocessing.connection import Connection
@@ -130,9 +130,8 @@ class _Session:
         timeout_s = _PATIENCE_S + _PATIENCE * self._seconds
         with self._path.open("rb") as stream:
             self._child = _fork(self._reader, self._libraries, stream.fileno(), timeout_s)
-        order = _Order(self._reader, self._file, folder, self._bytes, self._seconds)
         with suppress(OSError):  # the next request notices the end of the reader
-            self._child.connection.send(order)
+            self._child.connection.send((self._reader, self._file, folder, self._bytes, self._seconds))
 
     def _ask(self, *request: Any) -> tuple[dict[str, Any], list[NDArray[Any]]]:
         assert self._child is not None
@@ -152,17 +151,6 @@ class _Session:
         how = "an unknown cause" if code is None else f"exit code {code}" if code >= 0 else signal.Signals(-code).name
         got = f"one that ends its reader ({how})"
         return LogError(expected="a readable file", got=got, where=self._file.name, remedy=_REMEDY)
-
-
-@dataclass(frozen=True, slots=True)
-class _Order:
-    """Settings of a reader process; it has the stream of the file."""
-
-    reader: str
-    file: TableFile
-    folder: str
-    more_bytes: int
-    seconds: float
 
 
 #: Fork servers, which have imported the libraries of a reader, by process and reader; kept until this process ends.
@@ -194,23 +182,23 @@ def _end_servers() -> None:
 
 def serve_tables(connection: Connection, descriptor: int) -> None:
     """Run a reader of an open file: receive the order, then answer requests until the other side closes."""
-    order: _Order = connection.recv()
-    confine(Path(order.folder), order.more_bytes)
+    reader, file, folder, more_bytes, seconds = connection.recv()
+    confine(Path(folder), more_bytes)
     stream = os.fdopen(descriptor, "rb")
     tables = Tables("", [])
     with suppress(EOFError):
         while True:
             name, *arguments = connection.recv()
-            allow_processor_time(order.seconds)
+            allow_processor_time(seconds)
             try:
                 if name == "open":
-                    tables = pkgutil.resolve_name(order.reader)(replace(order.file, stream=stream))
+                    tables = pkgutil.resolve_name(reader)(replace(file, stream=stream))
                     head, arrays = _contents(tables), [t.stamps_ns for t in tables.tables]
                 else:
                     number, path, start, stop = arguments
                     head, arrays = {}, [np.asarray(tables.tables[number].load(path, slice(start, stop)))]
             except MemoryError:
-                head, arrays = _failure(_over("memory", f"{order.more_bytes / 1e6:.0f} MB", order.file.name)), []
+                head, arrays = _failure(_over("memory", f"{more_bytes / 1e6:.0f} MB", file.name)), []
             except Exception as error:  # noqa: BLE001  any error of a library
                 head, arrays = _failure(error), []
             _reply(connection, head, arrays)

@@ -1,4 +1,4 @@
-"""The recording span of a log: determined before windows are read, from spans, and from stamps where spans are wide.
+"""The recording span of a log: determined before windows are read, from the log times of all messages.
 
 Log times depend on the recorder's clock. One message at time 0 makes a log 56 years long; a clock that is set after
 boot splits a recording in two; a clock that is set back records the same times twice. So three cases are removed:
@@ -15,15 +15,15 @@ A sound log keeps all messages, and its first and last log time.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.container import Container, Span
+from pdhef_logtool.logs.container import Container
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 #: A longer silence ends a stretch.
@@ -48,18 +48,10 @@ _WHAT = {
     TIME_JUMP: "messages are left out: the recorder's clock stepped back, and their times were recorded before",
 }
 
-#: Log times [N] of a span's messages by known channel, in file order; None if the span is damaged.
-SpanTimes = Callable[[int, Span], Mapping[int, IntArray] | None]
-
-
-@dataclass(frozen=True, slots=True)
-class Cut:
-    """Messages of a topic to leave out: log times in [low_ns, high_ns], at or after ``place`` (file, span, row)."""
-
-    topic: str
-    place: tuple[int, int, int]
-    low_ns: int
-    high_ns: int
+#: Messages of a channel in a span: number of the file, of the span, and id of the channel.
+Place: TypeAlias = tuple[int, int, int]
+#: A topic, and the number of its channel among those of the same topic in a span: their times need not ascend together.
+_Lane: TypeAlias = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +61,12 @@ class RecordingSpan:
     Attributes
     ----------
     intervals : [start, end) in ns, ascending, apart by more than ``SILENCE_NS``; none for a log without messages.
-    cuts : intervals left out within them. left_out : messages left out, by topic and reason. losses : in words.
+    repeated : which messages [N] within them are left out, as their times were recorded before.
+    left_out : messages left out, by topic and reason. losses : in words.
     """
 
     intervals: tuple[tuple[int, int], ...]
-    cuts: tuple[Cut, ...] = ()
+    repeated: Mapping[Place, BoolArray] = field(default_factory=dict)
     left_out: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     losses: tuple[Loss, ...] = ()
 
@@ -87,14 +80,10 @@ class RecordingSpan:
         """Last log time + 1; 0 without messages."""
         return self.intervals[-1][1] if self.intervals else 0
 
-    def unused(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray | None:
-        """Return which of a topic's messages in a span (all of them, in file order) are left out; None: none of them.
-
-        Only of use if any message is ``left_out``.
-        """
-        of_earlier_passes = _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
-        unused = ~_inside(log_time_ns, self.intervals) | of_earlier_passes
-        return unused if unused.any() else None
+    def used(self, place: Place, log_time_ns: IntArray) -> BoolArray:
+        """Return which messages of a channel in a span (all of them, in file order) are used."""
+        used, repeated = _inside(log_time_ns, self.intervals), self.repeated.get(place)
+        return used & ~repeated if repeated is not None and len(repeated) == len(used) else used
 
 
 def find_epochs(
@@ -157,38 +146,58 @@ def recorded_twice(times_ns: IntArray) -> list[tuple[int, int, int]]:
     return repeated
 
 
-def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> RecordingSpan:
-    """Find the times of a log; only the stamps of spans that are torn or out of order are looked at.
-
-    Parameters
-    ----------
-    times : reads the times of a span. where : name of the log in losses.
-    """
-    pieces, topics = _look(containers, times)
-    intervals, left_out, losses = _kept_epoch(pieces, topics, where)
-    cuts = _cuts(pieces, topics, intervals)
-    twice: list[IntArray] = []
-    for c, span in ((c, span) for c, of in enumerate(containers) for span in of.spans) if cuts else ():
-        place = (c, span.index)
-        if not any(place >= cut.place[:2] and _touches(span, cut) for cut in cuts):
-            continue
-        for id_, channel_times in (times(c, span) or {}).items():
-            topic = containers[c].channels[id_].topic
-            again = channel_times[_inside(channel_times, intervals) & _cut_out(channel_times, topic, place, cuts)]
-            if again.size:
-                left_out.setdefault(topic, Counter())[TIME_JUMP] += again.size
-                twice.append(again)
-    if twice:
-        all_of_it = np.concatenate(twice)
-        losses.append(_loss(TIME_JUMP, where, all_of_it, all_of_it + 1, all_of_it.size, int(pieces["count"].sum())))
-    return RecordingSpan(tuple(intervals), tuple(cuts), left_out, tuple(losses))
+def survey(containers: Sequence[Container], where: str) -> RecordingSpan:
+    """Find the times of a log; ``where`` is its name in losses."""
+    whole: list[tuple[str, int, int, int]] = []
+    lanes: dict[_Lane, list[tuple[Place, IntArray]]] = {}
+    for c, container in enumerate(containers):
+        for span in container.spans:
+            numbers: Counter[str] = Counter()
+            for id_, count in span.counts.items():
+                topic = container.channels[id_].topic
+                if span.times is None:
+                    whole.append((topic, span.start_ns, span.end_ns, count))
+                else:
+                    parts = lanes.setdefault((topic, numbers[topic]), [])
+                    parts.append(((c, span.index, id_), span.times[id_]))
+                    numbers[topic] += 1
+    times = {lane: np.concatenate([its for _, its in parts]) for lane, parts in lanes.items()}
+    recording_span, repeated = _survey(times, where, whole)
+    by_place: dict[Place, BoolArray] = {}
+    for lane, mask in repeated.items():
+        ends = np.cumsum([len(its) for _, its in lanes[lane]])
+        masks = zip((place for place, _ in lanes[lane]), np.split(mask, ends[:-1]), strict=True)
+        by_place |= {place: its for place, its in masks if its.any()}
+    return replace(recording_span, repeated=by_place)
 
 
 def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> RecordingSpan:
-    """Find the times of a log from all log times [N] of each topic; ``where`` as for :func:`survey`."""
-    listed = [_stretches(times, i) for i, times in enumerate(stamps_ns.values()) if len(times)]
-    intervals, left_out, losses = _kept_epoch(np.concatenate([_NO_PIECE, *listed]), [*stamps_ns], where)
-    return RecordingSpan(tuple(intervals), left_out=left_out, losses=tuple(losses))
+    """Find the times of a log from the ascending log times [N] of each topic; ``where`` as for :func:`survey`."""
+    return _survey({(topic, 0): times for topic, times in stamps_ns.items()}, where)[0]
+
+
+def _survey(
+    times_ns: Mapping[_Lane, IntArray], where: str, whole: Sequence[tuple[str, int, int, int]] = ()
+) -> tuple[RecordingSpan, dict[_Lane, BoolArray]]:
+    """Return the times of a log, and which messages [N] of each lane were recorded before.
+
+    Parameters
+    ----------
+    times_ns : log times in file order. whole : topic, start, end and messages of sound pieces without known times.
+    """
+    topics = sorted({topic for topic, _ in times_ns} | {topic for topic, *_ in whole})
+    number = {topic: i for i, topic in enumerate(topics)}
+    pieces = [np.array([(start, end, n, number[topic]) for topic, start, end, n in whole], _PIECE)]
+    pieces += [_stretches(its, number[topic]) for (topic, _), its in times_ns.items() if len(its)]
+    every = np.concatenate(pieces)
+    intervals, left_out, losses = _kept_epoch(every, topics, where)
+    repeated = _repeated(times_ns, intervals)
+    for (topic, _), mask in repeated.items():
+        left_out.setdefault(topic, Counter())[TIME_JUMP] += int(mask.sum())
+    if repeated:
+        again = np.concatenate([times_ns[lane][mask] for lane, mask in repeated.items()])
+        losses.append(_loss(TIME_JUMP, where, again, again + 1, len(again), int(every["count"].sum())))
+    return RecordingSpan(tuple(intervals), left_out=left_out, losses=tuple(losses)), repeated
 
 
 def _kept_epoch(
@@ -208,83 +217,35 @@ def _kept_epoch(
     return intervals, left_out, losses
 
 
-# ---- the look at the spans ----
-
-
-#: A piece of a recording: messages of a channel in a span, [start, end); ``row`` in the span is -1 for all of them.
-_NO_PIECE = np.array([], [(name, np.int64) for name in ("start", "end", "count", "topic", "file", "span", "row")])
-
-
-def _of_messages(times_ns: IntArray, topic: int, file: int, span: int) -> NDArray[np.void]:
-    """Return each message as a piece."""
-    pieces = np.empty(len(times_ns), _NO_PIECE.dtype)
-    pieces["start"], pieces["end"], pieces["count"], pieces["row"] = times_ns, times_ns + 1, 1, np.arange(len(times_ns))
-    pieces["topic"], pieces["file"], pieces["span"] = topic, file, span
-    return pieces
+#: A piece of a recording: messages of a topic in [start, end).
+_PIECE = np.dtype([(name, np.int64) for name in ("start", "end", "count", "topic")])
 
 
 def _stretches(times_ns: IntArray, topic: int) -> NDArray[np.void]:
-    """Return the pieces of ascending times that a silence keeps apart."""
+    """Return the pieces of times that a silence keeps apart."""
+    if (times_ns[1:] < times_ns[:-1]).any():
+        times_ns = np.sort(times_ns)
     first = np.flatnonzero(np.append(True, np.diff(times_ns.astype(np.float64)) > SILENCE_NS))
-    pieces = _of_messages(times_ns[first], topic, 0, 0)
-    pieces["end"], pieces["count"] = times_ns[np.append(first[1:], 0) - 1] + 1, np.diff(first, append=len(times_ns))
+    pieces = np.empty(len(first), _PIECE)
+    pieces["start"], pieces["end"] = times_ns[first], times_ns[np.append(first[1:], 0) - 1] + 1
+    pieces["count"], pieces["topic"] = np.diff(first, append=len(times_ns)), topic
     return pieces
 
 
-def _look(containers: Sequence[Container], times: SpanTimes) -> tuple[NDArray[np.void], list[str]]:
-    """Return pieces in file order, and the topics: each message where the bounds of a span are not enough."""
-    looked: list[NDArray[np.void]] = [_NO_PIECE]
-    names: dict[str, int] = {}
-    newest: dict[int, int] = {}
-    for c, container in enumerate(containers):
-        topics = {id_: names.setdefault(channel.topic, len(names)) for id_, channel in container.channels.items()}
-        for span in container.spans:
-            if not span.counts:
-                continue  # it has no message of a declared channel
-            lasts = span.end_ns - span.start_ns
-            is_torn = lasts <= 0 or lasts > SILENCE_NS
-            is_torn |= any(span.start_ns < newest.get(topics[id_], 0) - STEP_BACK_NS for id_ in span.counts)
-            stamps = times(c, span) if is_torn or (lasts > STEP_BACK_NS and not span.ordered) else {}
-            if stamps is None:
-                continue  # damaged: nothing of it can be read
-            if not is_torn and not any((np.diff(its) < -STEP_BACK_NS).any() for its in stamps.values()):
-                bounds = span.start_ns, span.end_ns
-                whole = [(*bounds, n, topics[id_], c, span.index, -1) for id_, n in span.counts.items()]
-                looked.append(np.array(whole, _NO_PIECE.dtype))
-                last = dict.fromkeys(span.counts, span.end_ns - 1)
-            else:
-                looked += [_of_messages(its, topics[id_], c, span.index) for id_, its in stamps.items()]
-                last = {id_: int(its.max(initial=0)) for id_, its in stamps.items()}
-            for id_, last_ns in last.items():
-                newest[topics[id_]] = max(newest.get(topics[id_], 0), last_ns)
-    return np.concatenate(looked), [*names]
-
-
-def _cuts(pieces: NDArray[np.void], topics: Sequence[str], intervals: Sequence[tuple[int, int]]) -> list[Cut]:
-    """Return the intervals that were recorded twice, of all topics, if the time of one of them clearly stepped back."""
-    is_message = pieces["row"] >= 0
-    sequences: list[tuple[str, IntArray, NDArray[np.void]]] = []
-    for i, topic in enumerate(topics) if is_message.any() else ():
-        its = pieces[pieces["topic"] == i]
-        # First and last time of a span, the only one of a message.
-        ends = np.stack([its["start"], its["end"] - 1], axis=1)
-        used = np.stack([its["row"] >= -1, its["row"] < 0], axis=1)
-        times, places = ends[used], its[np.nonzero(used)[0]]
-        if (inside := _inside(times, intervals)).any():
-            # Left-out messages take the time of a neighbour, so that the others keep their places.
-            last = np.maximum.accumulate(np.where(inside, np.arange(len(times)), -1))
-            sequences.append((topic, times[np.where(last >= 0, last, int(np.argmax(inside)))], places))
-    if not any(steps_back(times).size for _, times, _ in sequences):
-        return []
-    cuts = []
-    for topic, times, places in sequences:
-        for place, low, high in recorded_twice(times):
-            c, index, row = (int(places[name][place]) for name in ("file", "span", "row"))
-            cuts.append(Cut(topic, (c, index, max(row, 0)), low, high))
-    return cuts
-
-
-# ---- small things ----
+def _repeated(times_ns: Mapping[_Lane, IntArray], intervals: Sequence[tuple[int, int]]) -> dict[_Lane, BoolArray]:
+    """Return which messages [N] were recorded before, of all lanes, if the time of one of them clearly stepped back."""
+    if not any((np.diff(times) < -STEP_BACK_NS).any() for times in times_ns.values()):
+        return {}
+    inside = {lane: _inside(times, intervals) for lane, times in times_ns.items()}
+    if not any(steps_back(times[inside[lane]]).size for lane, times in times_ns.items()):
+        return {}
+    repeated = {lane: np.zeros(len(times), np.bool_) for lane, times in times_ns.items()}
+    for lane, times in times_ns.items():
+        rows = np.flatnonzero(inside[lane])
+        for place, low, high in recorded_twice(times[rows]) if rows.size else ():
+            later = rows[place:]
+            repeated[lane][later] |= (times[later] >= low) & (times[later] <= high)
+    return {lane: mask for lane, mask in repeated.items() if mask.any()}
 
 
 def _groups(start_ns: IntArray, end_ns: IntArray, silence_ns: int) -> IntArray:
@@ -302,21 +263,6 @@ def _inside(times_ns: IntArray, intervals: Sequence[tuple[int, int]]) -> BoolArr
     for start, end in intervals:
         inside |= (times_ns >= start) & (times_ns < end)
     return inside
-
-
-def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Iterable[Cut]) -> BoolArray:
-    """Return the mask of a topic's messages in a span, at ``place`` (file, span), that the cuts leave out."""
-    left_out = np.zeros(times_ns.shape[0], np.bool_)
-    for cut in cuts:
-        if cut.topic == topic and place >= cut.place[:2]:
-            first = cut.place[2] if place == cut.place[:2] else 0
-            later = times_ns[first:]
-            left_out[first:] |= (later >= cut.low_ns) & (later <= cut.high_ns)
-    return left_out
-
-
-def _touches(span: Span, cut: Cut) -> bool:
-    return span.end_ns < span.start_ns or (span.start_ns <= cut.high_ns and span.end_ns > cut.low_ns)
 
 
 def _loss(reason: str, where: str, start_ns: IntArray, end_ns: IntArray, count: int, total: int) -> Loss:

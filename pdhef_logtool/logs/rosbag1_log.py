@@ -16,15 +16,7 @@ import numpy as np
 
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
-from pdhef_logtool.logs.container import (
-    ROSBAG1_MAGIC,
-    Block,
-    ChannelRecord,
-    FileContainer,
-    SpanDamageError,
-    block_from_lists,
-    span_of_indexes,
-)
+from pdhef_logtool.logs.container import Block, ChannelRecord, FileContainer, Span, SpanDamageError, block_from_lists
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.records.signals import IntArray
@@ -54,18 +46,16 @@ class Rosbag1Container(FileContainer):
 
     kind = "rosbag1"
     profile = ""  # of ROS 1 messages beside ours of ROS 2
-    magic = ROSBAG1_MAGIC
+    magic = b"#ROSBAG V2.0\n"
     magic_text = "'#ROSBAG V2.0' at its start"
     remedy = "is it a ROS 1 bag?"
     chunks: list[_Chunk]
 
     def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
-        self._found = 0
-        self._pending: _Chunk | None = None  # the chunk of the index records
-        self._header: tuple[int, int] | None = None  # where the index begins, and how many chunks there are
-        self._infos: dict[
-            int, Counter[int]
-        ] = {}  # counts by connection of the chunk at a byte, by the bag's index section
+        self._found: list[_Chunk] = []
+        self._is_truncated = False
+        self._header: tuple[int, int] | None = None  # where the index section begins, and how many chunks there are
+        self._infos: dict[int, Counter[int]] = {}  # counts by connection of the chunk at a byte, by the index section
         super().__init__(path, shown_path, meter)
 
     def _walk(self) -> None:
@@ -80,8 +70,7 @@ class Rosbag1Container(FileContainer):
                     continue
                 if self._header is None:
                     raise self.no_log("a complete bag header record", "a cut or malformed one")
-                self._close_chunk(complete=False)
-                self.lose_end(offset)
+                self._is_truncated = True
                 return
             fields, start, end = record
             try:
@@ -93,67 +82,57 @@ class Rosbag1Container(FileContainer):
     def _take(self, fields: Mapping[str, bytes], offset: int, start: int, end: int) -> None:
         """Handle one complete record."""
         op = _op(fields)
-        limits = self.meter.limits
-        if op == _OP_INDEX and self._pending is not None:
-            limits.check("metadata_bytes", end - start, "an index record")
-            self._index_record(self._pending, fields, self.source.read(start, end - start))
-            return
-        self._close_chunk()
         if op == _OP_CHUNK:
             compression, (size,) = fields["compression"].decode(), _U32.unpack(fields["size"])
-            self._pending = _Chunk(offset, start, end, compression, size)
+            self._found.append(_Chunk(offset, start, end, compression, size))
             return
         if op == _OP_BAG_HEADER:
             self._header = (int.from_bytes(fields["index_pos"], "little"), _U32.unpack(fields["chunk_count"])[0])
-        elif op == _OP_CONNECTION:
-            limits.check("metadata_bytes", end - start, "a connection record")
+            return
+        self.meter.limits.check("metadata_bytes", end - start, f"a record of kind {op}")
+        if op == _OP_CONNECTION:
             self._add_connection(fields, self.source.read(start, end - start))
         elif op == _OP_CHUNK_INFO:
-            limits.check("metadata_bytes", end - start, "a chunk info record")
             pairs = np.frombuffer(self.source.read(start, end - start), dtype="<u4")
             counts = Counter(dict(zip(pairs[::2].tolist(), pairs[1::2].tolist(), strict=True)))
             self._infos[int.from_bytes(fields["chunk_pos"], "little")] = counts
-            return
+        elif op == _OP_INDEX and self._found:
+            self._found[-1].indexes.append(_index(fields, self.source.read(start, end - start)))
         else:
             raise SpanDamageError(f"no record of kind {op} is allowed here")
 
     def _finish(self) -> None:
         if self._header is None:
             raise self.no_log("a bag header record", "none")
-        self._close_chunk(complete=not self.cut)
+        for chunk in self._found:
+            # Some index records of the last chunk may be missing.
+            self._add_chunk(chunk, is_complete=not self._is_truncated or chunk is not self._found[-1])
+        if self._is_truncated:
+            self.lose_end(self.position)
         index_at, chunks = self._header
-        if index_at and not self.lost:
-            self._check_infos(chunks)
         if not index_at and not self.lost:
             what = "the bag has no index (it was not closed); its complete chunks were read by a scan"
             self.lose("unindexed", what, self.last_ns())
+        missing = chunks - len(self._found)
+        if index_at and missing > 0 and not self.lost:
+            self.lose("missing-messages", f"the bag's header names {chunks} chunks, {missing} of them are not there")
         self.drop_undeclared("connections")
 
-    def _check_infos(self, chunks: int) -> None:
-        """Open the chunks with index records that differ from the bag's index section: these could hide messages."""
-        chunks_read, spans = self.chunks, self.spans[:]
-        missing = chunks - self._found
-        self.chunks = []
-        self.spans.clear()
-        for chunk, span in zip(chunks_read, spans, strict=True):
-            if self._infos.get(chunk.start, span.counts) == span.counts:
-                self.add_span(chunk, span)
-            else:
-                self.add_content(chunk)
-        if missing > 0 and not self.lost:
-            self.lose("missing-messages", f"the bag's header names {chunks} chunks, {missing} of them are not there")
+    def _add_chunk(self, chunk: _Chunk, *, is_complete: bool) -> None:
+        """Add a chunk by its index records; by its content, if these are missing or implausible or hide messages."""
+        span = Span.of(chunk.indexes)
+        is_known = bool(span.counts) and span.counts.keys() <= self.channels.keys()
+        agrees = self._infos.get(chunk.start, span.counts) == span.counts
+        if is_complete and is_known and agrees and sum(span.counts.values()) * _LEAST_MESSAGE_BYTES <= chunk.size:
+            self.add_span(chunk, span)
+        else:
+            self.add_content(chunk)
 
     def _is_zero(self, start: int, end: int) -> bool:
         return all(
             not any(self.source.read(offset, min(_ZERO_BLOCK_BYTES, end - offset)))
             for offset in range(start, end, _ZERO_BLOCK_BYTES)
         )
-
-    def _index_record(self, chunk: _Chunk, fields: Mapping[str, bytes], payload: bytes) -> None:
-        """Add the connection and the log times of an index record."""
-        (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
-        words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
-        chunk.indexes.append((connection, words[:, 0] * 1_000_000_000 + words[:, 1]))
 
     def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
         inner = _header_fields(payload)
@@ -175,19 +154,6 @@ class Rosbag1Container(FileContainer):
             schema_data=inner.get("message_definition", b""),
             metadata=metadata,
         )
-
-    def _close_chunk(self, complete: bool = True) -> None:
-        """Add the chunk after its index records; open it if they are missing or implausible, or new connections."""
-        chunk, self._pending = self._pending, None
-        if chunk is None:
-            return
-        self._found += 1
-        span = span_of_indexes(chunk.indexes)
-        is_known = bool(span.counts) and span.counts.keys() <= self.channels.keys()
-        if complete and is_known and sum(span.counts.values()) * _LEAST_MESSAGE_BYTES <= chunk.size:
-            self.add_span(chunk, span)
-        else:
-            self.add_content(chunk)
 
     def _decoded(self, chunk: _Chunk, *, declare: bool) -> Block:
         self.meter.limits.check("chunk_bytes", chunk.end - chunk.stored_start, "a chunk")
@@ -218,6 +184,13 @@ class Rosbag1Container(FileContainer):
                 raise SpanDamageError(f"a record is malformed: {error}") from error
         self.meter.limits.check_messages(len(stamps), len(stored))
         return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
+
+
+def _index(fields: Mapping[str, bytes], payload: bytes) -> tuple[int, IntArray]:
+    """Return the connection and the log times [N] of an index record."""
+    (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
+    words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
+    return connection, words[:, 0] * 1_000_000_000 + words[:, 1]
 
 
 def _op(fields: Mapping[str, bytes]) -> int:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from array import array
-from collections import Counter
-from itertools import accumulate
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote
 
@@ -18,14 +17,15 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     Container,
+    RawMessage,
     Span,
     SpanDamageError,
-    block_from_lists,
+    block_of,
     describe_damage,
+    rows_by_channel,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
-from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.storage.files import scratch_folder
 
 _PAGE_ROWS = 8192
@@ -52,7 +52,6 @@ class SqliteContainer(Container):
         super().__init__(shown_path or path, path.stat().st_size, meter)
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._ends: list[int] = []  # bytes of the rows up to the end of each page
-        self._times: list[tuple[IntArray, IntArray]] = []  # channels and times of each page
         self._late: LimitError | None = None
         self._db = self._connect(path)
         self.on_close(self._db.close)
@@ -98,12 +97,12 @@ class SqliteContainer(Container):
 
     def _read_topics(self) -> None:
         tables = {str(row[0]) for row in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not {"topics", "messages"} <= tables:  # a view can be a program that never ends
+        needed = {"topics": {"id", "name", "type", "serialization_format"}}
+        needed["messages"] = {"id", "topic_id", "timestamp", "data"}
+        # Only tables, because a view can be a program that never ends.
+        if not needed.keys() <= tables or any(not names <= self._columns_of(table) for table, names in needed.items()):
             raise self.no_log("rosbag2's tables 'topics' and 'messages'", "a database without them")
         topic_columns = self._columns_of("topics")
-        needed = {"id", "name", "type", "serialization_format"}
-        if not needed <= topic_columns or not {"id", "topic_id", "timestamp", "data"} <= self._columns_of("messages"):
-            raise self.no_log("rosbag2's tables 'topics' and 'messages'", "a database without them")
         if "ros_distro" in self._columns_of("schema"):
             row = self._db.execute("SELECT ros_distro FROM schema").fetchone()
             self.distro = str(row[0]) if row and row[0] else ""
@@ -143,12 +142,10 @@ class SqliteContainer(Container):
         ends = np.cumsum(lengths)
         page = ends // _PAGE_BYTES + np.arange(len(ids)) // _PAGE_ROWS
         for part in np.split(np.arange(len(ids)), np.flatnonzero(np.diff(page)) + 1) if len(ids) else ():
-            stamps, counts = times[part], Counter(topics[part].tolist())
-            ordered = bool((np.diff(stamps) >= 0).all())
-            self.spans.append(Span(len(self.spans), int(stamps.min()), int(stamps.max()) + 1, counts, ordered))
+            stamps = ((id_, times[part][its]) for id_, its in rows_by_channel(topics[part]).items())
+            self.spans.append(replace(Span.of(stamps), index=len(self.spans)))
             self._pages.append((int(ids[part[0]]), int(ids[part[-1]])))
             self._ends.append(int(ends[part[-1]]))
-            self._times.append((topics[part].copy(), stamps))
         if unknown := row_count - len(ids):
             what = f"{unknown} messages of topics that the database does not name, or without a time or data"
             self.lose("unknown-channel", what, count=unknown)
@@ -186,26 +183,13 @@ class SqliteContainer(Container):
             "SELECT topic_id, timestamp, data FROM messages "  # noqa: S608
             f"WHERE id BETWEEN ? AND ? AND topic_id IN ({marks}) ORDER BY id"
         )
-        channels: list[int] = []
-        stamps: list[int] = []
-        payloads: list[bytes] = []
         try:
-            for topic, timestamp, data in self._db.execute(query, (first, last, *sorted(wanted))):
-                if not isinstance(timestamp, int) or not isinstance(data, bytes):
-                    continue
-                channels.append(topic)
-                stamps.append(min(timestamp, MAX_TIME_NS))
-                payloads.append(data)
+            rows = self._db.execute(query, (first, last, *sorted(wanted))).fetchall()
         except sqlite3.Error as error:
             raise self._late or SpanDamageError(str(error)) from error
-        lengths = [len(p) for p in payloads]
-        offsets = [0, *accumulate(lengths)][:-1]
-        return block_from_lists(b"".join(payloads), channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
-
-    def times(self, span: Span) -> dict[int, IntArray]:
-        """Return the log times of one page by channel."""
-        topics, times = self._times[span.index]
-        return {int(topic): times[topics == topic] for topic in np.unique(topics)}
+        sound = (row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes))
+        timed = ((topic, min(timestamp, MAX_TIME_NS), data) for topic, timestamp, data in sound)
+        return block_of(RawMessage(topic, time_ns, time_ns, 0, data) for topic, time_ns, data in timed)
 
 
 def _text(stored: bytes) -> str:

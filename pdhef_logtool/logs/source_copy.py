@@ -8,22 +8,19 @@ metadata records are copied too. Bags and rosbag2 databases keep their bytes and
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
-from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk, Span
+from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk
 from pdhef_logtool.logs.definitions import message_definition
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
-
-#: Times of MCAP are unsigned; times in this package are signed.
-_UNSIGNED = (1 << 64) - 1
+from pdhef_logtool.logs.writer import McapLogWriter
 
 #: Number of a channel in the log: file of the log, and channel id in that file.
 _Key = tuple[int, int]
-#: A message behind log time, file, span and row.
-_Sortable = tuple[int, int, int, int, RawMessage]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,93 +86,66 @@ def register_channels(
 
 
 def iterate_copy(
-    log: ColumnarLog,
-    channels: SourceChannels,
-    start_ns: int | None = None,
-    end_ns: int | None = None,
-) -> Iterator[RawMessage | RawChunk]:
+    log: ColumnarLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[Block | RawChunk]:
     """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
 
     Messages of equal log time are in file order. Spans that overlap in time are merged; only these are in memory.
     Damaged spans are left out and reported by ``log.lost``.
 
     Chunks that can be copied as they are, are yielded whole: sound chunks of MCAP files that are inside the window and
-    contain and declare only channels with unchanged ids. They are in order of their first log times, and in file order
-    where they overlap.
+    contain and declare only channels with unchanged ids. If all chunks are such, they are in the order of the files, so
+    that readers return messages of equal log times in the same order as from the source.
     """
     unchanged = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(log.containers))]
-    spans = _in_file_order_where_overlapping(_spans_to_copy(log, channels, start_ns, end_ns), unchanged)
-    for c, container in enumerate(log.containers):
-        container.prefetch(span for of, span in spans if of == c)
-    pending: list[_Sortable] = []
-    for c, span in spans:
-        ready = bisect_left(pending, (span.start_ns,))
-        yield from (message for *_, message in pending[:ready])
-        del pending[:ready]
-        block = log.load(c, span)
-        if block is None:
-            continue
-        inside = in_window(block.log_time_ns, start_ns, end_ns) is None
-        chunk = log.containers[c].raw_chunk(span, block, unchanged[c]) if inside else None
-        if chunk is None:
-            pending += _messages(block, (c, span.index), channels, start_ns, end_ns)
-            pending.sort()
-        else:
-            yield chunk
-    yield from (message for *_, message in pending)
-
-
-def _messages(
-    block: Block, place: tuple[int, int], channels: SourceChannels, start_ns: int | None, end_ns: int | None
-) -> Iterator[_Sortable]:
-    """Yield the messages of a span; ``place``: its file and number.
-
-    Messages of other channels are left out, and messages before 1970: an MCAP file cannot contain their times.
-    """
-    c = place[0]
-    keep = in_window(block.log_time_ns, start_ns, end_ns)
-    columns = [getattr(block, f.name) for f in fields(block) if f.name not in ("buffer", "dropped")]
-    rows = zip(*((column if keep is None else column[keep]).tolist() for column in columns), strict=True)
-    for row, (channel, log_time, publish_time, sequence, offset, length) in enumerate(rows):
-        id_ = channels.ids.get((c, channel)) if log_time >= 0 else None
-        if id_ is None:
-            continue
-        data = bytes(block.buffer[offset : offset + length])
-        yield log_time, *place, row, RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
-
-
-def _spans_to_copy(
-    log: ColumnarLog, channels: SourceChannels, start_ns: int | None, end_ns: int | None
-) -> list[tuple[int, Span]]:
-    """Return file and span of the spans that contain messages to be copied, by start, file and place."""
     spans = [
         (c, span)
         for c, container in enumerate(log.containers)
         for span in container.spans
         if span.overlaps(start_ns, end_ns) and (not span.counts or any((c, id_) in channels.ids for id_ in span.counts))
     ]
-    return sorted(spans, key=lambda item: (item[1].start_ns, item[0], item[1].index))
-
-
-def _in_file_order_where_overlapping(
-    spans: Sequence[tuple[int, Span]], unchanged: Sequence[frozenset[int]]
-) -> list[tuple[int, Span]]:
-    """Sort groups of overlapping spans that will all be copied as they are back to the order of the file.
-
-    Readers return messages of equal log times in file order, which then equals the order in the source.
-    """
-    groups: list[list[tuple[int, Span]]] = []
-    end_ns = 0
+    if not all(unchanged[c].issuperset(span.counts) for c, span in spans):
+        spans.sort(key=lambda item: item[1].start_ns)
+    for c, container in enumerate(log.containers):
+        container.prefetch(span for of, span in spans if of == c)
+    pending: dict[tuple[int, int], Block] = {}
     for c, span in spans:
-        if not groups or span.start_ns >= end_ns:
-            groups.append([])
-            end_ns = span.end_ns
-        end_ns = max(end_ns, span.end_ns)
-        groups[-1].append((c, span))
-    for group in groups:
-        if all(unchanged[c].issuperset(span.counts) for c, span in group):
-            group.sort(key=lambda item: (item[0], item[1].index))
-    return [item for group in groups for item in group]
+        yield from _taken(pending, span.start_ns)
+        block = log.load(c, span)
+        if block is None:
+            continue
+        inside = in_window(block.log_time_ns, start_ns, end_ns) is None
+        chunk = log.containers[c].raw_chunk(span, block, unchanged[c]) if inside else None
+        if chunk is None:
+            pending[c, span.index] = _copied(block, c, channels, start_ns, end_ns)
+        else:
+            yield chunk
+    yield from _taken(pending, math.inf)
+
+
+def _copied(block: Block, c: int, channels: SourceChannels, start_ns: int | None, end_ns: int | None) -> Block:
+    """Return the messages to be copied of a span of file ``c``, in order of log time, with the copy's channel ids.
+
+    Messages before 1970 are left out: an MCAP file cannot contain their times.
+    """
+    channel = np.full(len(block), -1)
+    for id_, rows in block.rows.items():
+        channel[rows] = channels.ids.get((c, id_), -1)
+    window = in_window(block.log_time_ns, max(start_ns or 0, 0), end_ns)
+    keep = np.flatnonzero((channel >= 0) & (True if window is None else window))
+    return replace(block, channel=channel).take(keep[np.argsort(block.log_time_ns[keep], kind="stable")])
+
+
+def _taken(pending: dict[tuple[int, int], Block], before_ns: float) -> Iterator[Block]:
+    """Yield the messages before a time as a block; the others stay."""
+    taken: list[Block] = []
+    for place in sorted(pending):
+        ready, rest = pending.pop(place).split(before_ns)
+        taken += [ready] if ready is not None else []
+        if rest is not None:
+            pending[place] = rest
+    if taken:
+        yield Block.merged(taken)
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:

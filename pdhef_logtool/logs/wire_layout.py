@@ -1,4 +1,4 @@
-"""Byte layouts of CDR and ROS 1 messages with strings and sequences of known lengths.
+"""Byte layouts of CDR and ROS 1 messages with strings and sequences of known lengths; columns to CDR messages.
 
 Such a message is one record of fixed size, so that N of them are one structured NumPy array: read and written
 column by column instead of message by message. Alignment follows CDR version 1: every primitive is aligned to its
@@ -8,15 +8,31 @@ size counted from after the 4-byte encapsulation header. ROS 1 packs without ali
 from __future__ import annotations
 
 import struct
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.message_schema import Array, Node, Scalar, Step, Struct, Unknown
+from pdhef_logtool.logs.container import items_at_bytes
+from pdhef_logtool.logs.message_schema import (
+    NO_MEMBERS,
+    Array,
+    MessageSchema,
+    Node,
+    Scalar,
+    SchemaError,
+    Selection,
+    Step,
+    Struct,
+    Unknown,
+    parse_path,
+    resolve,
+    ros_schema,
+)
+from pdhef_logtool.records.errors import MappingError
 
 #: Arrays of structs (or of texts) are unrolled up to this many elements.
 UNROLLED_ELEMENTS = 64
@@ -43,92 +59,68 @@ class Leaf:
     count: int | None
 
 
-#: Returns the length of the string or sequence at these steps, with its length word at this offset.
-LengthOf: TypeAlias = Callable[[Steps, int, bool], int]
-
-
-def layout_of_message(root: Node, wire: str, message: bytes) -> WireLayout:
-    """Build the layout that one received message has; raises :class:`NoLayoutError`."""
-    if wire == "cdr" and message[:2] != b"\x00\x01":
-        raise NoLayoutError("only little-endian CDR version 1 has a layout here")
-
-    def length_of(steps: Steps, offset: int, is_text: bool) -> int:
-        del steps, is_text
-        try:
-            (length,) = struct.unpack_from("<I", message, offset)
-        except struct.error as error:
-            raise NoLayoutError("the message ends early") from error
-        if length > len(message):
-            raise NoLayoutError("a length exceeds the message")
-        return int(length)
-
-    return WireLayout(root, wire, length_of, len(message))
-
-
 class WireLayout:
-    """Offsets of all leaves of a message type with the variable lengths of ``length_of``.
+    """Offsets of all leaves of a message type in messages with the variable lengths of one message.
 
     Attributes
     ----------
     size : bytes of one message, encapsulation header included.
     leaves : by their steps; arrays of primitives as one leaf.
     lengths : (offset, uint32) in wire order: lengths of strings and sequences, which identify this layout.
-    texts : (offset, length without terminator) of every string, by its steps.
 
     Raises
     ------
-    NoLayoutError : it has none, or is longer than ``end`` bytes.
+    NoLayoutError : the message has none, or ends early.
     """
 
-    def __init__(self, root: Node, wire: str, length_of: LengthOf, end: int = sys.maxsize) -> None:
-        self._aligned = wire == "cdr"
+    def __init__(self, root: Node, wire: str, message: bytes) -> None:
+        self._aligned, self._message = wire == "cdr", message
+        if self._aligned and message[:2] != b"\x00\x01":
+            raise NoLayoutError("only little-endian CDR version 1 has a layout here")
         self._origin = 4 if self._aligned else 0
         self.size = self._origin
-        self._length_of = length_of
-        self._end = end
         self._places = 0
         self.leaves: dict[Steps, Leaf] = {}
         self.lengths: list[tuple[int, int]] = []
-        self.texts: dict[Steps, tuple[int, int]] = {}
         self._place(root, ())
-        if self.size > self._end:
+        if self.size > len(message):
             raise NoLayoutError("the message ends early")
 
     def _align(self, size: int) -> None:
         if self._aligned:
             self.size += -(self.size - self._origin) % size
 
-    def _length_word(self, steps: Steps, is_text: bool) -> int:
-        self._align(4)
-        length = self._length_of(steps, self.size, is_text)
+    def _length_word(self) -> int:
+        self._align(_WORD.itemsize)
+        try:
+            (length,) = struct.unpack_from("<I", self._message, self.size)
+        except struct.error as error:
+            raise NoLayoutError("the message ends early") from error
+        if length > len(self._message):
+            raise NoLayoutError("a length exceeds the message")
         self.lengths.append((self.size, length))
-        self.size += 4
-        return length
+        self.size += _WORD.itemsize
+        return int(length)
 
     def _place(self, node: Node, steps: Steps) -> None:
         # Arrays in arrays multiply.
         self._places += 1
-        if self.size > self._end or self._places > _MOST_PLACES:
-            raise NoLayoutError("the message ends early" if self.size > self._end else "too many places")
+        if self.size > len(self._message) or self._places > _MOST_PLACES:
+            raise NoLayoutError("the message ends early, or it has too many places")
         if isinstance(node, Struct):
             for name, member in node.members.items():
                 self._place(member, (*steps, name))
         elif isinstance(node, Array):
-            count = node.length if node.length is not None else self._length_word(steps, False)
-            self._place_items(node.item, steps, count)
+            self._place_items(node.item, steps, self._length_word() if node.length is None else node.length)
         elif isinstance(node, Unknown):
             raise NoLayoutError("the type is not known in full")
+        elif node.code and node.kind == "string":
+            raise NoLayoutError("wide strings have no layout here")
         elif node.kind == "string":
-            self._place_text(node, steps)
+            length = self._length_word()
+            self.size += length
         else:
             self._place_numbers(node, steps, None)
-
-    def _place_text(self, node: Scalar, steps: Steps) -> None:
-        if node.code:
-            raise NoLayoutError("wide strings have no layout here")
-        length = self._length_word(steps, True)
-        self.texts[steps] = (self.size, max(length - 1, 0) if self._aligned else length)
-        self.size += length
 
     def _place_items(self, item: Node, steps: Steps, count: int) -> None:
         if isinstance(item, Scalar) and item.kind != "string":
@@ -199,12 +191,7 @@ class LayoutReader:
         """
         if not self._record.itemsize:
             return None, np.empty(len(offset), self._record)
-        # An overlapping item at every byte: indexing then copies items. As plain bytes, which need no alignment
-        # and are copied as a whole.
-        plain = np.dtype((np.void, self._record.itemsize))
-        places = len(buffer) - self._start - plain.itemsize + 1
-        view = np.ndarray((places,), dtype=plain, buffer=buffer, offset=self._start, strides=(1,))
-        records = view[offset].view(self._record)
+        records = items_at_bytes(buffer, self._record.itemsize, self._start)[offset].view(self._record)
         fits = np.ones(len(offset), np.bool_)
         for name, expected in self._expected.items():
             fits &= records[name] == expected
@@ -227,3 +214,144 @@ def leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:
     if whole is None or whole.count is None or steps[-1] >= whole.count:
         return None
     return Leaf(whole.offset + steps[-1] * whole.dtype.itemsize, whole.dtype, None)
+
+
+class CdrEncoder:
+    """Encodes the messages of one topic.
+
+    Parameters
+    ----------
+    topic, type_name : topic and ROS 2 type.
+    definition : ros2msg text with all contained types.
+    constants : constant fields of every message, by path: a text, a number, or an array. Unset texts and sequences
+        are empty, unset numbers are zero.
+
+    Raises
+    ------
+    MappingError : the definition does not parse, or a constant's path or value does not fit it.
+    """
+
+    def __init__(
+        self, topic: str, type_name: str, definition: str, constants: Mapping[str, str | float | Sequence[float]]
+    ) -> None:
+        self.topic = topic
+        try:
+            self.schema: MessageSchema = ros_schema(type_name, "ros2msg", definition, "cdr")
+        except SchemaError as error:
+            raise MappingError(expected=f"a definition of {type_name}", got=str(error), where=topic) from error
+        self._texts: dict[Steps, str] = {}
+        self._numbers: dict[str, NDArray[np.float64]] = {}
+        self._selections: dict[str, Selection] = {}
+        for path, value in constants.items():
+            if isinstance(value, str):
+                self._texts[self._text_steps(path)] = value
+            else:
+                self._numbers[path] = np.asarray(value, dtype=np.float64)
+        self._layouts: dict[tuple[tuple[Steps, int], ...], tuple[WireLayout, bytes]] = {}
+        self.encode(1, {})  # the constants must fit the definition
+
+    def encode(self, n: int, fields: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+        """Return N messages as uint8 [N, size].
+
+        Parameters
+        ----------
+        n : number of messages.
+        fields : columns by path: [N] for a number, a bool or a time (int64 nanoseconds); [N, k] for an array or a
+            vector struct (x, y, z; for a quaternion w, x, y, z).
+
+        Raises
+        ------
+        MappingError : a path is not in the type, or a column does not fit it.
+        """
+        columns = {path: np.broadcast_to(value, (n, *value.shape)) for path, value in self._numbers.items()}
+        columns |= {path: np.asarray(values) for path, values in fields.items()}
+        for path, values in columns.items():
+            if values.shape[:1] != (n,) or values.ndim > 2:
+                raise self._misfit(path, f"{n} rows", f"shape {values.shape}")
+        layout, template = self._layout({path: v.shape[1] for path, v in columns.items() if v.ndim == 2})
+        rows = np.empty((n, layout.size), dtype=np.uint8)
+        rows[:] = np.frombuffer(template, dtype=np.uint8)
+        for path, values in columns.items():
+            self._put(layout, rows, path, values)
+        return rows
+
+    def _select(self, path: str) -> Selection:
+        if path not in self._selections:
+            self._selections[path] = resolve(self.schema, self.topic, path)
+        return self._selections[path]
+
+    def _text_steps(self, path: str) -> Steps:
+        steps = parse_path(path)
+        node: Node | object = self.schema.root
+        for step in steps:
+            node = node.members.get(str(step)) if isinstance(node, Struct) else None
+        if not (isinstance(node, Scalar) and node.kind == "string"):
+            raise self._misfit(path, "a text field", "another or no field")
+        return steps
+
+    def _misfit(self, path: str, expected: str, got: str) -> MappingError:
+        return MappingError(expected=expected, got=got, where=f"{self.topic}.{path}")
+
+    def _layout(self, widths: Mapping[str, int]) -> tuple[WireLayout, bytes]:
+        """Return the layout for these array widths and a message with only the constants."""
+        lengths: dict[Steps, int] = {}
+        for path, width in widths.items():
+            selection = self._select(path)
+            if selection.shape == "array" and selection.length is None:
+                lengths[selection.components[0]] = width
+        key = tuple(sorted(lengths.items(), key=repr))
+        if key not in self._layouts:
+            assert self.schema.store is not None
+            constant = self._constant(self.schema.root, (), lengths)
+            message = bytes(self.schema.store.serialize_cdr(constant, self.schema.type_name))
+            try:
+                layout = WireLayout(self.schema.root, "cdr", message)
+            except NoLayoutError as error:
+                raise MappingError(expected="a type with a fixed layout", got=str(error), where=self.topic) from error
+            self._layouts[key] = layout, message[: layout.size]
+        return self._layouts[key]
+
+    def _constant(self, node: Node, steps: Steps, lengths: Mapping[Steps, int]) -> Any:
+        """Return a message, or a part of it, with constant texts, arrays of the given lengths, and zeros."""
+        if isinstance(node, Struct):
+            members = {name: self._constant(member, (*steps, name), lengths) for name, member in node.members.items()}
+            return SimpleNamespace(**({NO_MEMBERS: 0} | members))
+        if isinstance(node, Array):
+            count = lengths.get(steps, 0) if node.length is None else node.length
+            if isinstance(node.item, Scalar) and node.item.kind != "string":
+                return np.zeros(count, node.item.code)
+            return [self._constant(node.item, (*steps, i), lengths) for i in range(count)]
+        return self._texts.get(steps, "") if isinstance(node, Scalar) and node.kind == "string" else 0
+
+    def _put(self, layout: WireLayout, rows: NDArray[np.uint8], path: str, values: NDArray[Any]) -> None:
+        selection = self._select(path)
+        if selection.shape == "time":
+            if values.dtype.kind not in "iu" or values.ndim != 1:
+                raise self._misfit(path, "int64 nanoseconds [N]", f"{values.dtype} {values.shape}")
+            parts: Sequence[NDArray[Any]] = np.divmod(values.astype(np.int64), 1_000_000_000)
+        elif selection.shape == "vector":
+            if values.ndim != 2 or values.shape[1] != len(selection.components):
+                raise self._misfit(path, f"[N, {len(selection.components)}]", f"shape {values.shape}")
+            parts = tuple(values.T)
+        else:
+            parts = (values,)
+        for steps, part in zip(selection.components, parts, strict=False):
+            self._put_leaf(layout, rows, steps, part, path)
+
+    def _put_leaf(
+        self, layout: WireLayout, rows: NDArray[np.uint8], steps: Steps, values: NDArray[Any], path: str
+    ) -> None:
+        leaf = leaf_at(layout, steps)
+        if leaf is None:
+            raise self._misfit(path, "an element of the message", "an index outside its sequence")
+        inner = () if leaf.count is None else (leaf.count,)
+        if values.shape[1:] != inner:
+            expected = "[N]" if leaf.count is None else f"[N, {leaf.count}]"
+            raise self._misfit(path, expected, f"shape {values.shape}")
+        if leaf.dtype.kind in "iu" and values.dtype.kind == "f":
+            if not np.all(np.isfinite(values)):
+                raise self._misfit(path, "finite values for an integer field", "NaN or infinity")
+            values = np.rint(values)
+        kind = np.dtype((leaf.dtype, inner))
+        place = np.dtype({"names": ["leaf"], "formats": [kind], "offsets": [leaf.offset], "itemsize": layout.size})
+        rows.view(place)["leaf"][:, 0] = values  # many times faster than byte by byte

@@ -7,10 +7,9 @@ schemas are written before the first chunk that uses them and again in the summa
 from __future__ import annotations
 
 import contextlib
-import heapq
 import struct
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -37,11 +36,11 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.container import MCAP_MAGIC, ChannelRecord, RawChunk
+from pdhef_logtool.logs.container import MCAP_MAGIC, Block, ChannelRecord, RawChunk, items_at_bytes, rows_by_channel
 from pdhef_logtool.logs.definitions import message_definition
-from pdhef_logtool.logs.encoding import CdrEncoder
-from pdhef_logtool.logs.mcap_index import RECORD
+from pdhef_logtool.logs.mcap_index import INDEX_RECORD, RECORD
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
+from pdhef_logtool.logs.wire_layout import CdrEncoder
 from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import LIBRARY
@@ -55,7 +54,6 @@ CHUNK_BYTES = 1 << 20
 #: Of zstd.
 _LEVEL = 6
 _LARGEST_ID = 0xFFFF
-_PACKED_HEAD = struct.Struct("<BQHIQQ")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,17 +71,6 @@ class TopicBatch:
     log_time_ns: IntArray
     publish_time_ns: IntArray
     fields: Mapping[str, NDArray[Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class RawMessage:
-    """A message as ready bytes on a channel of :meth:`McapLogWriter.add_channel`."""
-
-    channel: int
-    log_time_ns: int
-    publish_time_ns: int
-    sequence: int
-    data: bytes
 
 
 class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
@@ -110,8 +97,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._chunk_indexes: list[ChunkIndex] = []
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
-        self._first_ns: int | None = None
-        self._last_ns = 0
         self._crc = 0
         self._at = 0
         self._compressor: ZstdCompressor | None = None
@@ -217,86 +202,67 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             raise OutputError(expected="at most 65535 channels", got="more", where=str(self._path))
         return free
 
-    def write(self, batches: Sequence[TopicBatch], raws: Iterable[RawMessage | RawChunk] = ()) -> None:
-        """Write messages: batches merged by log time, and raw messages, which are consumed as they come and not held.
+    def write(self, batches: Sequence[TopicBatch], raws: Iterable[Block | RawChunk] = ()) -> None:
+        """Write batches and raw messages on channels of :meth:`add_channel`, which ascend in log time.
 
-        Raw chunks are written as they are. Raw messages and batches are in separate chunks, which are sorted by their
-        first log times; of equal times raw messages come first.
+        Both are merged by log time, of equal times raw messages first. Raw messages are consumed as they come. Raw
+        chunks are written as they are, between chunks of the other messages by their first log times.
         """
-        of_batches = self._chunks_of_batches([self._encode(batch) for batch in batches if len(batch.log_time_ns)])
-        for chunk in heapq.merge(self._chunks_of_raws(raws), of_batches, key=lambda chunk: chunk.start_ns):
-            self._emit_chunk(chunk)
-
-    def _chunks_of_raws(self, raws: Iterable[RawMessage | RawChunk]) -> Iterator[RawChunk]:
-        group: list[RawMessage] = []
-        size = 0
+        ours = self._records([self._encode(batch) for batch in batches if len(batch.log_time_ns)])
+        group: list[Block] = []
         for raw in raws:
-            if isinstance(raw, RawMessage):
-                group.append(raw)
-                size += MESSAGE_HEAD.itemsize + len(raw.data)
-            if group and (isinstance(raw, RawChunk) or size >= CHUNK_BYTES):
-                yield self._chunk_of(group)
-                group, size = [], 0
+            if isinstance(raw, Block):
+                group += [raw] if len(raw) else []
+            if group and (isinstance(raw, RawChunk) or sum(map(_record_bytes, group)) >= CHUNK_BYTES):
+                before = int(np.searchsorted(ours.log_time_ns, group[-1].log_time_ns[-1]))
+                self._emit_messages(self._records([*group, ours.take(slice(before))]))
+                group, ours = [], ours.take(slice(before, None))
             if isinstance(raw, RawChunk):
-                yield raw
-        if group:
-            yield self._chunk_of(group)
+                ours = self._emit_messages(ours, before_ns=raw.start_ns)
+                self._emit_chunk(raw)
+        self._emit_messages(self._records([*group, ours]) if group else ours)
 
-    def _chunk_of(self, raws: Sequence[RawMessage]) -> RawChunk:
-        length = np.array([len(raw.data) for raw in raws]) + MESSAGE_HEAD.itemsize
-        about = zip(length - RECORD.size, raws, strict=True)
-        records = (
-            _PACKED_HEAD.pack(Opcode.MESSAGE, n, r.channel, r.sequence, r.log_time_ns, r.publish_time_ns) + r.data
-            for n, r in about
-        )
-        channel, log_time = np.array([r.channel for r in raws]), np.array([r.log_time_ns for r in raws])
-        return self._compressed(b"".join(records), channel, log_time, np.cumsum(length) - length)
+    @staticmethod
+    def _records(parts: Sequence[Block]) -> Block:
+        """Return messages in order of log time, one behind the other, each behind the head of its record."""
+        block = Block.merged(parts, MESSAGE_HEAD.itemsize)
+        head = np.empty(len(block), dtype=MESSAGE_HEAD)
+        head["op"], head["size"] = Opcode.MESSAGE, block.length + MESSAGE_HEAD.itemsize - RECORD.size
+        head["channel"], head["sequence"] = block.channel, block.sequence
+        head["log"], head["publish"] = block.log_time_ns, block.publish_time_ns
+        if len(block):
+            items = items_at_bytes(block.buffer, MESSAGE_HEAD.itemsize)
+            items[block.offset - MESSAGE_HEAD.itemsize] = head.view(items.dtype)
+        return block
 
-    def _chunks_of_batches(self, topics: Sequence[tuple[int, IntArray, NDArray[np.uint8]]]) -> Iterator[RawChunk]:
-        """Yield the chunks of topics with channel, log times [N] and records uint8 [N, size] each.
-
-        Of equal times the earlier topic comes first.
-        """
-        none = np.empty(0, np.int64)
-        log_time = np.concatenate([none, *(log for _, log, _ in topics)])
-        order = np.argsort(log_time, kind="stable")
-        counts = [len(log) for _, log, _ in topics]
-        log_time, source = log_time[order], np.repeat(np.arange(len(topics)), counts)[order]
-        row = np.concatenate([none, *map(np.arange, counts)])[order]
-        channel = np.array([channel for channel, _, _ in topics], np.int64)[source]
-        length = np.array([records.shape[1] for _, _, records in topics], np.int64)[source]
-        ends = np.cumsum(length)
+    def _emit_messages(self, block: Block, before_ns: int | None = None) -> Block:
+        """Write :meth:`_records` in chunks, as long as these begin before a time; return the others."""
         first = 0
-        while first < len(ends):
-            begin = ends[first] - length[first]
-            last = max(int(np.searchsorted(ends, begin + CHUNK_BYTES, side="right")), first + 1)
-            content = np.empty(ends[last - 1] - begin, np.uint8)
-            start = ends[first:last] - length[first:last] - begin
-            for i in np.unique(source[first:last]).tolist():
-                its = source[first:last] == i
-                _scatter(content, start[its], topics[i][2][row[first:last][its]])
-            yield self._compressed(content.data, channel[first:last], log_time[first:last], start)
+        if not len(block) or (before_ns is not None and block.log_time_ns[0] >= before_ns):
+            return block
+        start, end = block.offset - MESSAGE_HEAD.itemsize, block.offset + block.length
+        while first < len(block) and (before_ns is None or block.log_time_ns[first] < before_ns):
+            last = max(int(np.searchsorted(end, start[first] + CHUNK_BYTES, side="right")), first + 1)
+            content, rows = block.buffer[start[first] : end[last - 1]], slice(first, last)
+            channel, log_time = block.channel[rows], block.log_time_ns[rows]
+            self._emit_chunk(self._compressed(content, channel, log_time, start[rows] - start[first]))
             first = last
+        return block.take(slice(first, None))
 
-    def _encode(self, batch: TopicBatch) -> tuple[int, IntArray, NDArray[np.uint8]]:
-        """Return channel, log times and message records of a batch."""
+    def _encode(self, batch: TopicBatch) -> Block:
+        """Return the messages of a batch."""
         if batch.topic not in self._encoders:
             raise MappingError(expected="a topic of this file", got="an unknown one", where=batch.topic)
         if np.any(np.diff(batch.log_time_ns) < 0):
             raise MappingError(expected="ascending log times", got="a step back", where=batch.topic)
         channel, encoder = self._encoders[batch.topic]
         n = len(batch.log_time_ns)
-        rows = encoder.encode(n, batch.fields, head=MESSAGE_HEAD.itemsize)
-        head = np.zeros(n, dtype=MESSAGE_HEAD)
-        head["op"] = Opcode.MESSAGE
-        head["size"] = 22 + rows.shape[1] - MESSAGE_HEAD.itemsize
-        head["channel"] = channel
-        head["sequence"] = self._sequences[channel] + np.arange(n)
-        head["log"] = batch.log_time_ns
-        head["publish"] = batch.publish_time_ns
+        rows = encoder.encode(n, batch.fields)
+        number, size = np.arange(n), rows.shape[1]
+        sequence = self._sequences[channel] + number
         self._sequences[channel] += n
-        rows[:, : MESSAGE_HEAD.itemsize] = head.view(np.uint8).reshape(n, MESSAGE_HEAD.itemsize)
-        return channel, batch.log_time_ns.astype(np.int64), rows
+        times = batch.log_time_ns.astype(np.int64), batch.publish_time_ns.astype(np.int64)
+        return Block(rows.data.cast("B"), np.full(n, channel), *times, sequence, number * size, np.full(n, size))
 
     def _compressed(
         self, records: bytes | memoryview, channel: IntArray, log_time_ns: IntArray, offset: IntArray
@@ -322,15 +288,12 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         index_at = self._at
         offsets: dict[int, int] = {}
         index = bytearray()
-        order = np.argsort(channel, kind="stable")
-        pairs = np.empty((len(order), 2), dtype="<u8")
-        pairs[:, 0], pairs[:, 1] = log_time[order], offset[order]
-        ids, firsts = np.unique(channel[order], return_index=True)
-        for id_, mine in zip(ids.tolist(), np.split(pairs, firsts[1:]), strict=True):
+        pairs = np.stack((log_time, offset), axis=1).astype("<u8")
+        for id_, rows in rows_by_channel(channel).items():
             offsets[id_] = index_at + len(index)
-            data = mine.tobytes()
-            index += struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(data), id_, len(data)) + data
-            self._counts[id_] += len(mine)
+            data = pairs[rows].tobytes()
+            index += INDEX_RECORD.pack(Opcode.MESSAGE_INDEX, 6 + len(data), id_, len(data)) + data
+            self._counts[id_] += len(rows)
         self._emit(bytes(index))
         self._chunk_indexes.append(
             ChunkIndex(
@@ -342,8 +305,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
                 **about,
             )
         )
-        self._first_ns = start_ns if self._first_ns is None else min(self._first_ns, start_ns)
-        self._last_ns = max(self._last_ns, end_ns)
 
     def attachment(self, record: Attachment) -> None:
         """Add a file."""
@@ -387,8 +348,8 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             channel_message_counts=dict(sorted(self._counts.items())),
             chunk_count=len(self._chunk_indexes),
             message_count=self._counts.total(),
-            message_end_time=self._last_ns,
-            message_start_time=self._first_ns or 0,
+            message_end_time=max((chunk.message_end_time for chunk in self._chunk_indexes), default=0),
+            message_start_time=min((chunk.message_start_time for chunk in self._chunk_indexes), default=0),
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self._schemas),
         )
@@ -401,15 +362,11 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             (Opcode.METADATA_INDEX, self._metadata_indexes),
         ]
         for opcode, records in groups:
-            group_start = builder.count
+            first = builder.count
             for record in records:
                 record.write(builder)
-            if records:
-                offsets.append(
-                    SummaryOffset(
-                        group_opcode=opcode, group_start=start + group_start, group_length=builder.count - group_start
-                    )
-                )
+            if length := builder.count - first:
+                offsets.append(SummaryOffset(group_opcode=opcode, group_start=start + first, group_length=length))
         offset_start = start + builder.count
         for offset in offsets:
             offset.write(builder)
@@ -417,11 +374,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
         self._emit(summary)
         self._emit_record(
-            Footer(
-                summary_start=start,
-                summary_offset_start=offset_start,
-                summary_crc=crc32(head, crc32(summary)),
-            )
+            Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc32(head, crc32(summary)))
         )
         self._emit(MCAP_MAGIC)
 
@@ -444,9 +397,5 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         return start, len(data)
 
 
-def _scatter(content: NDArray[np.uint8], start: IntArray, records: NDArray[np.uint8]) -> None:
-    """Copy records [N, size] to their places [N] in a chunk."""
-    record = np.dtype((np.void, records.shape[1]))
-    # A view of a record at every byte: one indexed assignment copies them all.
-    places = np.ndarray((len(content) - record.itemsize + 1,), dtype=record, buffer=content.data, strides=(1,))
-    places[start] = records.view(record)[:, 0]
+def _record_bytes(block: Block) -> int:
+    return int((block.length + MESSAGE_HEAD.itemsize).sum())

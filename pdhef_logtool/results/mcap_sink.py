@@ -15,11 +15,11 @@ from mcap.records import Attachment
 from numpy.typing import NDArray
 
 from pdhef_logtool.evaluation.dead_reckoned import pose_known
-from pdhef_logtool.logs.container import ChannelRecord, RawChunk
+from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk, RawMessage, block_of
 from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -28,7 +28,7 @@ from pdhef_logtool.results.plotted import LogLine, log_lines, log_message, plott
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots, rounded
 from pdhef_logtool.storage.documents import jsonable
 
-_Raw: TypeAlias = RawMessage | RawChunk
+_Raw: TypeAlias = Block | RawChunk
 
 #: Everything below this name in a source log is ours and is replaced.
 NAMESPACE = "/pdhef/"
@@ -229,14 +229,14 @@ class AnnotatedMcap:
                 channel = self._raw_channel(topic_of(track.name, "path"), PATH_TYPE)
                 data = _path_message(start_ns, poses[:: 1 + len(poses) // _MOST_POSES])
                 raws.append(RawMessage(channel, start_ns, start_ns, 0, data))
-        self._writer.write([], raws=raws)
+        self._writer.write([], [block_of(raws)] if raws else [])
 
     def _write_log(self, lines: Sequence[LogLine]) -> None:
         """Write the lines of the log."""
         if lines:
             channel = self._raw_channel(LOG_TOPIC, LOG_TYPE)
             raws = [RawMessage(channel, x.stamp_ns, x.stamp_ns, i, log_message(x)) for i, x in enumerate(lines)]
-            self._writer.write([], raws=raws)
+            self._writer.write([], [block_of(raws)])
 
     def _raw_channel(self, topic: str, type_name: str) -> int:
         definition = message_definition(type_name).encode()
@@ -254,10 +254,12 @@ def _pieces(tracks: Sequence[StateTrack]) -> Iterator[tuple[int, int]]:
 def _until(raws: Iterator[_Raw], waiting: list[_Raw], end_ns: float) -> Iterator[_Raw]:
     """Yield the messages up to the first one at or after a time, which waits for the next call."""
     while (raw := waiting.pop() if waiting else next(raws, None)) is not None:
-        if (raw.start_ns if isinstance(raw, RawChunk) else raw.log_time_ns) >= end_ns:
-            waiting.append(raw)
+        ready, rest = raw.split(end_ns)
+        if ready is not None:
+            yield ready
+        if rest is not None:
+            waiting.append(rest)
             return
-        yield raw
 
 
 def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:

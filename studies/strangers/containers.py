@@ -14,8 +14,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.container import ChannelRecord
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
+from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
+from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.signals import IntArray
 from studies.strangers import buses, tables
 
@@ -82,7 +82,8 @@ def _mcap(topics: Sequence[Topic], path: Path) -> Path:
                 text = definition(topic.type_name)
                 writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
         raws = [message for topic in joints for message in _joints(writer, topic)]
-        writer.write([TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints], raws)
+        batches = [TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints]
+        writer.write(batches, [block_of(raws)])
     return path
 
 
@@ -153,7 +154,7 @@ def _mcap_ros1(topics: Sequence[Topic], path: Path) -> Path:
             RawMessage(ids[t.name], arrival, stamp, i, data)
             for i, (t, arrival, stamp, data) in enumerate(_messages(topics, path, ros1=True))
         ]
-        writer.write([], raws)
+        writer.write([], [block_of(raws)])
     return path
 
 
@@ -235,7 +236,7 @@ def _json(topics: Sequence[Topic], path: Path, *, bare: bool = False) -> Path:
             for t in topics
             for i, (arrival, stamp, row) in enumerate(_rows(t))
         ]
-        writer.write([], sorted(raws, key=lambda r: r.log_time_ns))
+        writer.write([], [block_of(sorted(raws, key=lambda r: r.log_time_ns))])
     return path
 
 
@@ -263,7 +264,7 @@ def _protobuf(topics: Sequence[Topic], path: Path) -> Path:
             for t in topics
             for i, (arrival, stamp, row) in enumerate(_rows(t))
         ]
-        writer.write([], sorted(raws, key=lambda r: r.log_time_ns))
+        writer.write([], [block_of(sorted(raws, key=lambda r: r.log_time_ns))])
     return path
 
 

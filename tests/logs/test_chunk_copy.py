@@ -14,11 +14,11 @@ from mcap.writer import CompressionType
 from recorded import messages_of, raw_channel, summary_of
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.container import RawChunk
+from pdhef_logtool.logs.container import Block, RawChunk, RawMessage, block_of
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from tests.mcap_files import mcap_writer
 
 pytestmark = pytest.mark.slow
@@ -111,7 +111,7 @@ def test_chunks_that_hold_what_is_left_out_are_taken_apart(tmp_path: Path) -> No
     _write(source, extra=("/old",))
     items, lost = _annotate(source, target, leave_out=lambda topic: topic == "/old")
     assert lost == ()
-    assert all(isinstance(item, RawMessage) for item in items)
+    assert all(isinstance(item, Block) for item in items)
     assert _messages(target) == [m for m in _messages(source) if m[1] != "/old"]
 
 
@@ -135,9 +135,8 @@ def _split(tmp_path: Path, swap: bool) -> ColumnarLog:
             names = ["/b", "/a"] if swap and k else ["/a", "/b"]
             ids = {name: raw_channel(writer, name, f"own/msg/{name[1].upper()}", TEXT) for name in names}
             times = T0 + 10**9 * k + np.arange(100)
-            writer.write(
-                [], [RawMessage(ids["/b" if i % 2 else "/a"], int(t), 0, i, b"x") for i, t in enumerate(times)]
-            )
+            messages = (RawMessage(ids["/b" if i % 2 else "/a"], int(t), 0, i, b"x") for i, t in enumerate(times))
+            writer.write([], [block_of(messages)])
         containers.append(McapContainer(path))
     return ColumnarLog(tmp_path, "rosbag2-mcap", containers)
 
@@ -147,7 +146,7 @@ def test_split_files_keep_their_chunks_while_their_ids_agree(tmp_path: Path, swa
     target = tmp_path / "copy.mcap"
     items, _ = _annotate(_split(tmp_path, swap), target)
     assert isinstance(items[0], RawChunk)
-    assert [type(item) for item in items[1:]] == ([RawMessage] * 100 if swap else [RawChunk])
+    assert [type(item) for item in items[1:]] == [Block if swap else RawChunk]
     expected = _messages(tmp_path / "0.mcap") + _messages(tmp_path / "1.mcap")
     assert _messages(target) == expected
     assert len(summary_of(target).channels) == 3

@@ -14,8 +14,9 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from recorded import raw_channel
 
+from pdhef_logtool.logs.container import RawMessage, block_of
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+from pdhef_logtool.logs.writer import McapLogWriter
 
 pytestmark = pytest.mark.slow
 
@@ -145,7 +146,7 @@ def test_columns_equal_the_independent_deserialiser(
         for first in range(0, n, 8):  # a chunk each; the layout changes in the middle of one
             part = enumerate(payloads[first : first + 8], first)
             raws = [(RawMessage(channel, T0 + i, T0, i, p), RawMessage(other, T0 + i, T0, i, p[:i])) for i, p in part]
-            writer.write([], [message for pair in raws for message in pair])
+            writer.write([], [block_of(message for pair in raws for message in pair)])
     messages = [store.deserialize_cdr(p, "own/msg/T0") for p in payloads]
     with closing(open_log(path)) as log:
         assert len(log.containers[0].spans) == 5  # type: ignore[attr-defined]
@@ -175,7 +176,7 @@ def _with_payloads(path: Path, payload_bytes: int) -> None:
         image = raw_channel(writer, "/image", message="octets")
         numbers = [RawMessage(channel, T0 + i, T0, i, b"\0\1\0\0" + np.float64(i).tobytes()) for i in range(200)]
         images = [RawMessage(image, T0 + i, T0, i, noise) for i in range(200)] if payload_bytes else []
-        writer.write([], sorted([*numbers, *images], key=lambda m: m.log_time_ns))
+        writer.write([], [block_of(sorted([*numbers, *images], key=lambda m: m.log_time_ns))])
 
 
 def _peak_bytes(path: Path) -> int:

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from recorded import fields_of
 
-from pdhef_logtool.logs.container import ChannelRecord
+from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.decoding import NO_TIME_NS
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import MappingError
 
 T0 = 1_700_000_000_000_000_000
@@ -24,7 +24,7 @@ T0 = 1_700_000_000_000_000_000
 def _write_raw(path: Path, payloads: Sequence[bytes], encoding: str, name: str, schema: str, text: str) -> None:
     with McapLogWriter(path, profile="") as writer:
         channel = writer.add_channel(ChannelRecord(-1, "/t", encoding, name, schema, text.encode()))
-        writer.write([], [RawMessage(channel, T0 + i, T0 + i, i, p) for i, p in enumerate(payloads)])
+        writer.write([], [block_of(RawMessage(channel, T0 + i, T0 + i, i, p) for i, p in enumerate(payloads))])
 
 
 def _read_json(path: Path, messages: Sequence[object], schema: object, fields: Sequence[str]) -> dict[str, Any]:

@@ -14,8 +14,8 @@ from hypothesis.extra import numpy as hnp
 from recorded import attribute, decoded_by_rosbags
 
 from pdhef_logtool.logs.definitions import message_definition
-from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.wire_layout import CdrEncoder
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import MappingError, OutputError
 
