@@ -67,28 +67,14 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
 
     With ``roll_correction``, the measured a_y is (1 + g·K_φ) times the planar a_y (docs/method.md#model).
     """
-    bf, cf, df, ef = vehicle.magic_formula(True, 1.0)
-    br, cr, dr, er = vehicle.magic_formula(False, 1.0)
+    blend_m_s, gradient = vehicle.low_speed_blend_m_s, vehicle.roll_gradient_rad_per_m_s2
+    body = vehicle.mass_kg, vehicle.yaw_inertia_kg_m2, vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
+    front = *vehicle.magic_formula(True, 1.0), vehicle.tyres.front.keeps_stiffness
+    rear = *vehicle.magic_formula(False, 1.0), vehicle.tyres.rear.keeps_stiffness
+    imu_x_m, imu_y_m, _ = vehicle.imu_position_m
+    ay_roll_gain = GRAVITY_M_S2 * gradient if roll_correction else 0.0
     return ModelParameters(
-        mass_kg=vehicle.mass_kg,
-        yaw_inertia_kg_m2=vehicle.yaw_inertia_kg_m2,
-        front_m=vehicle.cg_to_front_axle_m,
-        rear_m=vehicle.cg_to_rear_axle_m,
-        front_B=bf,
-        front_C=cf,
-        front_D_n=df,
-        front_E=ef,
-        front_fixed_stiffness=vehicle.tyres.front.keeps_stiffness,
-        rear_B=br,
-        rear_C=cr,
-        rear_D_n=dr,
-        rear_E=er,
-        rear_fixed_stiffness=vehicle.tyres.rear.keeps_stiffness,
-        blend_low_m_s=BLEND_START_SHARE * vehicle.low_speed_blend_m_s,
-        blend_high_m_s=vehicle.low_speed_blend_m_s,
-        imu_x_m=vehicle.imu_position_m[0],
-        imu_y_m=vehicle.imu_position_m[1],
-        ay_roll_gain=GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2 if roll_correction else 0.0,
+        *body, *front, *rear, BLEND_START_SHARE * blend_m_s, blend_m_s, imu_x_m, imu_y_m, ay_roll_gain
     )
 
 

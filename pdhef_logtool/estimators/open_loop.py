@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.nominal_model import (
     model_parameters,
     planar_lateral_acceleration,
@@ -16,13 +16,10 @@ from pdhef_logtool.car.nominal_model import (
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
+from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.stepwise import StepState, advance_speed, prepared_steps
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 #: Time step of the derivative of a_y along the motion.
 AY_RATE_STEP_S = 0.001

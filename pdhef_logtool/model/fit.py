@@ -28,7 +28,7 @@ from copy import copy
 
 import numpy as np
 
-from pdhef_logtool.car.descent import descend
+from pdhef_logtool.car.descent import descend, linearised
 from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.posterior import FittedParameter, Posterior
 from pdhef_logtool.car.vehicle import STIFFNESS_TYRE_SHAPE, VehicleParameters
@@ -249,12 +249,7 @@ class CarFit:
     def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the inverse curvature of the cost [n, n], and its gradient by block [blocks, n]."""
         centre = self.errors_of(theta)
-        residuals = self._residuals(centre, centre)
-        jacobian = np.empty((residuals.size, theta.size))
-        for i in range(theta.size):
-            moved = theta.copy()
-            moved[i] += DERIVATIVE_STEP
-            jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
+        residuals, jacobian = linearised(self.errors_of, self._residuals, theta, centre, DERIVATIVE_STEP)
         inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
         gradients = np.zeros((int(self._block.max()) + 1, theta.size))
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -34,7 +34,6 @@ from pdhef_logtool.residual_model.bundle import (
 )
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import ResidualNetwork, State
-from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
 
@@ -42,7 +41,9 @@ from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_pa
 # After the network, which checks that PyTorch is installed.
 import torch
 
-CHECKPOINT = "checkpoint.safetensors"
+CHECKPOINT = "checkpoint.pt"
+#: Length of the checksum at the start of a checkpoint.
+DIGEST_BYTES = 32
 
 
 #: Maximum number of validation steps at once, with the state carried on; an hour at once would need a gigabyte.
@@ -129,34 +130,21 @@ Progress = Callable[[Epoch, int], None]
 def normalisation_of(
     sequences: Iterable[FeatureSequence], names: tuple[str, ...], *, odd: bool = False
 ) -> Normalisation:
-    """Return weighted mean and standard deviation of features and targets over the training sequences.
+    """Return mean and standard deviation of features and targets over the used samples of training sequences.
 
-    ``sequences`` is iterated twice. With ``odd``, features that change sign under mirroring have a mean of 0.
+    With ``odd``, features that change sign under mirroring have a mean of 0.
     """
     columns = [FEATURES.index(n) for n in names]
-    count, total, squares = 0, np.zeros(len(columns)), np.zeros(0)
-    for s in sequences:
-        use = s.weight > 0
-        total = _summed(total, s.features[use][:, columns])
-        squares = _summed(squares if squares.size else np.zeros(s.target.shape[1]), s.target[use] ** 2)
-        count += int(np.count_nonzero(use))
-    if count == 0:
+    parts = [(s.features[s.weight > 0][:, columns], s.target[s.weight > 0]) for s in sequences]
+    # Contiguous rows are summed one by one, so that rounding does not depend on the split into sequences.
+    features, target = (np.ascontiguousarray(np.concatenate(c)) for c in zip(*parts, strict=True))
+    if not len(features):
         raise ModelError(expected="training sequences with usable samples", got="none", where="train")
-    mean = total / count
+    mean = features.mean(axis=0)
     if odd:
         mean[[n in ODD_FEATURES for n in names]] = 0.0
-    deviations = np.zeros(len(columns))
-    for s in sequences:
-        deviations = _summed(deviations, (s.features[s.weight > 0][:, columns] - mean) ** 2)
-    std = np.maximum(np.sqrt(deviations / count), 1e-6)
-    spread = np.maximum(np.sqrt(squares / count), 1e-6)
-    return Normalisation(*(tuple(map(float, column)) for column in (mean, std, spread)))
-
-
-def _summed(before: FloatArray, rows: FloatArray) -> FloatArray:
-    """Add rows [N, k] one by one to a sum [k], so that rounding does not depend on the split into sequences."""
-    total: FloatArray = np.add.reduce(np.ascontiguousarray(np.concatenate([before[None], rows])), axis=0)
-    return total
+    std, spread = (np.maximum(np.sqrt(np.mean(v**2, axis=0)), 1e-6) for v in (features - mean, target))
+    return Normalisation(*(tuple(column.tolist()) for column in (mean, std, spread)))
 
 
 def train(
@@ -205,7 +193,12 @@ def train(
     document = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
     document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
     identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
-    history, best, best_loss = _resume(work, identity, network, optimiser, device)
+    history, best = list[Epoch](), _weights(network)
+    if (work / CHECKPOINT).is_file():
+        stored = _read_checkpoint(work / CHECKPOINT, identity)
+        network.load_state_dict(stored["network"])
+        optimiser.load_state_dict(stored["optimiser"])
+        history, best = [Epoch(**e) for e in stored["history"]], stored["best"]
     for epoch in range(len(history), recipe.epochs):
         if len(history) - 1 - _best_epoch(history) >= recipe.patience:
             break
@@ -213,20 +206,21 @@ def train(
         train_loss, rate = _train_epoch(network, optimiser, train_pieces, recipe, epoch, signs, device)
         loss = _validate(network, validation_pieces, device, signs)
         history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
-        if loss < best_loss:
-            best, best_loss = _weights(network), loss
-        _write_checkpoint(work, identity, history, network, optimiser, best)
+        if _best_epoch(history) == epoch:
+            best = _weights(network)
+        state = {"network": network.state_dict(), "optimiser": optimiser.state_dict(), "best": best}
+        _write_checkpoint(work / CHECKPOINT, {"identity": identity, "history": list(map(asdict, history)), **state})
         progress(history[-1], recipe.epochs)
     provenance = {
         "recipe": asdict(recipe),
         "epochs": len(history),
         "best_epoch": _best_epoch(history) + 1,
-        "validation_loss": best_loss,
+        "validation_loss": history[_best_epoch(history)].validation_loss,
         "training_sequences": train_pieces.sequences,
         "validation_sequences": validation_pieces.sequences,
         "training_hours": round(train_pieces.steps * recipe.period_s / 3600.0, 3),
     }
-    return replace(empty, weights=best, provenance=provenance), history
+    return replace(empty, weights={k: v.numpy() for k, v in best.items()}, provenance=provenance), history
 
 
 # ---- data ----
@@ -385,81 +379,42 @@ def _new_network(recipe: Recipe, init: ModelBundle | None) -> ResidualNetwork:
     return network
 
 
-def _weights(network: ResidualNetwork) -> dict[str, Any]:
-    return {k: v.detach().cpu().numpy().copy() for k, v in network.state_dict().items()}
+def _weights(network: ResidualNetwork) -> dict[str, torch.Tensor]:
+    return {k: v.detach().cpu().clone() for k, v in network.state_dict().items()}
 
 
 def _best_epoch(history: Sequence[Epoch]) -> int:
-    return int(np.argmin([e.validation_loss for e in history])) if history else -1
+    return min(range(len(history)), key=lambda i: history[i].validation_loss, default=-1)
 
 
-def _write_checkpoint(
-    work: Path,
-    identity: dict[str, Any],
-    history: Sequence[Epoch],
-    network: ResidualNetwork,
-    optimiser: torch.optim.Optimizer,
-    best: dict[str, Any],
-) -> None:
-    from safetensors.numpy import save
-
-    states = optimiser.state_dict()["state"]
-    groups = {
-        "network": _weights(network),
-        "best": best,
-        "optimiser": {f"{i}.{key}": value.cpu().numpy() for i, of in states.items() for key, value in of.items()},
-    }
-    tensors = {f"{group}.{name}": np.array(value) for group, of in groups.items() for name, value in of.items()}
-    document = seal({"identity": identity, "history": [asdict(e) for e in history], "sha256": _sha256(tensors)})
-    # Tensors and document are in one file, so that an interrupted write cannot leave an inconsistent pair.
-    data = save(tensors, metadata={"document": json.dumps(document)})
-    write_bytes(work / CHECKPOINT, data)
+def _write_checkpoint(path: Path, content: dict[str, Any]) -> None:
+    """Write the state of a training after an epoch, with its checksum."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    data = buffer.getvalue()
+    write_bytes(path, hashlib.sha256(data).digest() + data)
 
 
-def _sha256(tensors: Mapping[str, Any]) -> str:
-    total = hashlib.sha256()
-    for name in sorted(tensors):
-        total.update(name.encode() + np.ascontiguousarray(tensors[name]).tobytes())
-    return total.hexdigest()
-
-
-def _resume(
-    work: Path, identity: dict[str, Any], network: ResidualNetwork, optimiser: torch.optim.Optimizer, device: str
-) -> tuple[list[Epoch], dict[str, Any], float]:
-    from safetensors import SafetensorError, safe_open
-
-    file = work / CHECKPOINT
-    if not file.is_file():
-        return [], _weights(network), math.inf
-    try:
-        with safe_open(file, framework="numpy") as stored:
-            document = json.loads(stored.metadata()["document"])
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
-        if not is_sealed(document) or document["sha256"] != _sha256(tensors):
-            raise ValueError("content that is not as it was written")
-    except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
+def _read_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
+    """Return the state of an interrupted training; raises ModelError if it is damaged, or of another recipe or data."""
+    data = path.read_bytes()
+    digest, data = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
+    if hashlib.sha256(data).digest() != digest:
         raise ModelError(
-            expected="a checkpoint of a training", got=str(error), where=str(file), remedy="remove it to train again"
-        ) from None
-    if document["identity"] != identity:
+            expected="a checkpoint of a training",
+            got="content that is not as it was written",
+            where=str(path),
+            remedy="remove it to train again",
+        )
+    content: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    if content["identity"] != identity:
         raise ModelError(
             expected="a checkpoint of this recipe and data",
             got="one of another",
-            where=str(file),
+            where=str(path),
             remedy="train into another folder, or remove the checkpoint",
         )
-    groups: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
-    for name, value in tensors.items():
-        group, _, key = name.partition(".")
-        groups[group][key] = value
-    network.load_state_dict({key: torch.from_numpy(value) for key, value in groups["network"].items()})
-    states: dict[int, dict[str, torch.Tensor]] = {}
-    for name, value in groups["optimiser"].items():
-        index, _, key = name.partition(".")
-        states.setdefault(int(index), {})[key] = torch.from_numpy(value).to("cpu" if key == "step" else device)
-    optimiser.load_state_dict({"state": states, "param_groups": optimiser.state_dict()["param_groups"]})
-    history = [Epoch(**e) for e in document["history"]]
-    return history, groups["best"], min(e.validation_loss for e in history)
+    return content
 
 
 HISTORY_FILE = "history.parquet"
