@@ -8,7 +8,7 @@ approach r = v_x tan δ / L and v_y = l_r r with a short time constant.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pdhef_logtool.car.elementary_functions import arctangent, sine
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
@@ -69,8 +69,8 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
     """
     blend_m_s, gradient = vehicle.low_speed_blend_m_s, vehicle.roll_gradient_rad_per_m_s2
     body = vehicle.mass_kg, vehicle.yaw_inertia_kg_m2, vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
-    front = *vehicle.magic_formula(True, 1.0), vehicle.tyres.front.keeps_stiffness
-    rear = *vehicle.magic_formula(False, 1.0), vehicle.tyres.rear.keeps_stiffness
+    front: tuple[Any, ...] = *vehicle.magic_formula(True, 1.0), vehicle.tyres.front.keeps_stiffness
+    rear: tuple[Any, ...] = *vehicle.magic_formula(False, 1.0), vehicle.tyres.rear.keeps_stiffness
     imu_x_m, imu_y_m, _ = vehicle.imu_position_m
     ay_roll_gain = GRAVITY_M_S2 * gradient if roll_correction else 0.0
     return ModelParameters(

@@ -173,7 +173,7 @@ OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
 }
 #: Estimators of this package, in the order of the tables.
 SPECS: tuple[Spec, ...] = tuple(
-    Spec(name, **{k: frozenset(v) if isinstance(v, list) else v for k, v in entries.items()})
+    Spec(name, **(entries | {key: frozenset(entries.get(key, ())) for key in ("needs", "one_of")}))
     for name, entries in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items()
 )
 

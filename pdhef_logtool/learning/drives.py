@@ -156,15 +156,12 @@ class DriveRecord:
         return document | ({"reason": reason} if reason else {})
 
 
-def record_of(
-    drive: Drive, *, split: str | None = None, whole: WholeDrive | None = None, left_out: str = ""
-) -> DriveRecord:
+def record_of(drive: Drive, *, whole: WholeDrive | None = None, left_out: str = "") -> DriveRecord:
     """Return the record of a drive that was read."""
     return DriveRecord(
         name=drive.name,
         file=drive.file,
         sha256=drive.sha256,
-        split=split,
         seconds=0.0 if whole is None else whole.seconds,
         span_s=None if whole is None else whole.span_s,
         truth=tuple(sorted({source.label for source in drive.mapping.truth.values()})),

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import pydantic
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
@@ -51,11 +52,11 @@ OUTPUT_COUNT = {RESIDUAL: 2, LATERAL_VELOCITY: 1}
 _LIMITS_OF = {RESIDUAL: LIMITS, LATERAL_VELOCITY: (30.0,)}
 
 
-#: Entries of model.json, which are checked.
-_checked = pydantic.dataclasses.dataclass(config=pydantic.ConfigDict(extra="forbid", allow_inf_nan=False), frozen=True)
+#: Of the entries of model.json, which are checked.
+_CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-@_checked
+@checked_dataclass(frozen=True, config=_CHECKED)
 class Normalisation:
     """x_normalised = (x − mean) / std per feature; target = output · target_std."""
 
@@ -64,7 +65,7 @@ class Normalisation:
     target_std: tuple[float, ...]
 
 
-@_checked
+@checked_dataclass(frozen=True, config=_CHECKED)
 class NetworkDesign:
     """What decides the outputs of a network, beside its weights.
 
@@ -236,9 +237,9 @@ class ModelBundle(NetworkDesign):
                     file.write(data)
 
 
-def network_folder(network: Path) -> Path | None:
+def network_folder(network: Path | str) -> Path | None:
     """Return the folder of a network: of a shipped one by name, or the folder itself; None for ``none``."""
-    return None if str(network) == NO_MODEL else SHIPPED_FOLDERS.get(str(network), network)
+    return None if str(network) == NO_MODEL else SHIPPED_FOLDERS.get(str(network), Path(network))
 
 
 def load_bundle(folder: Path) -> ModelBundle:

@@ -270,24 +270,14 @@ def read_dataset(folder: Path) -> Dataset:
         The folder contains no dataset, or one of another format or with other features.
     """
     path = folder / MANIFEST
-    try:
-        document = read_sealed(path, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
-        kind = (document["format"], document["version"])
-        if kind[0] != FORMAT or kind[1] != FORMAT_VERSION or document["features"] != list(FEATURES):
-            raise OutputError(
-                expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
-                got=f"{kind[0]} {kind[1]} with {', '.join(document['features'])}",
-                where=str(path),
-                remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
-            )
-        return Dataset(
-            folder=folder,
-            model=str(document["model"]),
-            sha256=str(document["sha256"]),
-            drives=tuple(DatasetDrive(folder / d["file"], d) for d in document["drives"]),
-            manifest=document,
-        )
-    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:  # format without a digest
+    document = read_sealed(path, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
+    kind, version, names = (document.get(key) for key in ("format", "version", "features"))
+    if (kind, version, names) != (FORMAT, FORMAT_VERSION, list(FEATURES)):
         raise OutputError(
-            expected=_EXPECTED, got=str(error) or type(error).__name__, where=str(folder), remedy=_REMEDY
-        ) from None
+            expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
+            got=f"{kind} {version} with {', '.join(names or ['none'])}",
+            where=str(path),
+            remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
+        )
+    drives = tuple(DatasetDrive(folder / d["file"], d) for d in document["drives"])
+    return Dataset(folder, document["model"], document["sha256"], drives, document)

@@ -393,8 +393,8 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
         dataset.write_drive(target, rows, entry, truth_source=truth["kind"])
         if not entry["usable_rows"]:
             drive.tell("not one usable target: no ground truth above the low-speed limit")
-        record = record_of(drive, split=split)
-    return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
+        record = replace(record_of(drive), split=split, seconds=entry["duration_s"])
+    return DriveResult(record, entry)
 
 
 def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -22,6 +21,7 @@ from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
+    NO_MODEL,
     NOMINAL_MODEL,
     OUTPUT_COUNT,
     PHYSICS_MODEL,
@@ -124,7 +124,7 @@ class Epoch:
     seconds: float
 
 
-Progress = Callable[[Epoch, int], None]
+Progress = Callable[[str, float], None]
 
 
 def normalisation_of(
@@ -155,7 +155,7 @@ def train(
     *,
     init: ModelBundle | None = None,
     device: str = "cpu",
-    progress: Progress = lambda _epoch, _of: None,
+    progress: Progress = lambda _text, _share: None,
 ) -> tuple[ModelBundle, list[Epoch]]:
     """Train a network and return the bundle of the best validation epoch with the loss history.
 
@@ -188,12 +188,12 @@ def train(
     network = _new_network(recipe, init).to(device)
     optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
     signs = torch.tensor(empty.signs, dtype=torch.float32) if recipe.odd else None
+    run = _Training(network, optimiser, recipe, signs, device)
     train_pieces = Pieces(training, lambda s: _pieces(s, recipe.piece_steps, empty))
     validation_pieces = Pieces(validation, lambda s: [_balanced(_scaled(s, empty))])
-    document = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
-    document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
-    identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
-    history, best = list[Epoch](), _weights(network)
+    identity = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
+    identity |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
+    history, best = list[Epoch](), run.weights
     if (work / CHECKPOINT).is_file():
         stored = _read_checkpoint(work / CHECKPOINT, identity)
         network.load_state_dict(stored["network"])
@@ -203,14 +203,14 @@ def train(
         if len(history) - 1 - _best_epoch(history) >= recipe.patience:
             break
         began = time.perf_counter()
-        train_loss, rate = _train_epoch(network, optimiser, train_pieces, recipe, epoch, signs, device)
-        loss = _validate(network, validation_pieces, device, signs)
+        train_loss, rate = run.epoch(train_pieces, epoch)
+        loss = run.validate(validation_pieces)
         history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
         if _best_epoch(history) == epoch:
-            best = _weights(network)
+            best = run.weights
         state = {"network": network.state_dict(), "optimiser": optimiser.state_dict(), "best": best}
         _write_checkpoint(work / CHECKPOINT, {"identity": identity, "history": list(map(asdict, history)), **state})
-        progress(history[-1], recipe.epochs)
+        progress(f"epoch {epoch + 1}: train {train_loss:.4f}, validation {loss:.4f}", (epoch + 1) / recipe.epochs)
     provenance = {
         "recipe": asdict(recipe),
         "epochs": len(history),
@@ -285,77 +285,77 @@ def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
 # ---- one epoch ----
 
 
-def _train_epoch(
-    network: ResidualNetwork,
-    optimiser: torch.optim.Optimizer,
-    pieces: Sequence[_Piece],
-    recipe: Recipe,
-    epoch: int,
-    signs: torch.Tensor | None,
-    device: str,
-) -> tuple[float, float]:
-    """Train once on the pieces of an epoch in a seeded random order; return mean loss and last learning rate.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Training:
+    """A network in training. ``signs``: of its features when left and right are exchanged; None does not mirror."""
 
-    ``signs``: of the features when left and right are exchanged, for pieces that are as often mirrored as not.
-    """
-    # All randomness of an epoch depends on seed and epoch number only, so that a resumed training is identical.
-    torch.manual_seed(recipe.seed * 1_000_003 + epoch)
-    order = torch.randperm(len(pieces)).tolist()[: recipe.pieces_per_epoch]
-    batches = max(1, math.ceil(len(order) / recipe.batch))
-    network.train()
-    losses = []
-    for b in range(batches):
-        rate = _learning_rate(recipe, (epoch + b / batches) / recipe.epochs)
-        for group in optimiser.param_groups:
-            group["lr"] = rate
-        chosen = [pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
-        if signs is not None:
-            mirrored = [p._replace(features=p.features * signs, target=-p.target) for p in chosen]
-            chosen = [m if torch.rand(()) < 0.5 else p for m, p in zip(mirrored, chosen, strict=True)]
-        losses.append(_train_batch(network, optimiser, chosen, recipe.chunk_steps, device))
-    return float(np.mean(losses)), rate
+    network: ResidualNetwork
+    optimiser: torch.optim.Optimizer
+    recipe: Recipe
+    signs: torch.Tensor | None
+    device: str
 
+    def epoch(self, pieces: Sequence[_Piece], number: int) -> tuple[float, float]:
+        """Train once on pieces in a seeded random order; return mean loss and last learning rate."""
+        recipe = self.recipe
+        # All randomness of an epoch depends on seed and epoch number only, so that a resumed training is identical.
+        torch.manual_seed(recipe.seed * 1_000_003 + number)
+        order = torch.randperm(len(pieces)).tolist()[: recipe.pieces_per_epoch]
+        batches = max(1, math.ceil(len(order) / recipe.batch))
+        self.network.train()
+        losses = []
+        for b in range(batches):
+            rate = _learning_rate(recipe, (number + b / batches) / recipe.epochs)
+            for group in self.optimiser.param_groups:
+                group["lr"] = rate
+            chosen = [pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
+            if self.signs is not None:  # pieces are as often mirrored as not
+                mirrored = [p._replace(features=p.features * self.signs, target=-p.target) for p in chosen]
+                chosen = [m if torch.rand(()) < 0.5 else p for m, p in zip(mirrored, chosen, strict=True)]
+            losses.append(self._batch(_padded(chosen, self.device)))
+        return float(np.mean(losses)), rate
 
-def _train_batch(
-    network: ResidualNetwork, optimiser: torch.optim.Optimizer, pieces: Sequence[_Piece], chunk_steps: int, device: str
-) -> float:
-    batch = _padded(pieces, device)
-    state: State | None = None
-    losses = []
-    for first in range(0, batch.features.shape[1], chunk_steps):
-        part = slice(first, first + chunk_steps)
-        output, after = network(batch.features[:, part], state)
-        state = (after[0].detach(), after[1].detach())
-        weight = batch.weight[:, part]
-        total = weight.sum()
-        if float(total) == 0.0:
-            continue
-        loss = ((output - batch.target[:, part]) ** 2).mean(dim=2).mul(weight).sum() / total
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_CLIP)
-        optimiser.step()
-        losses.append(float(loss.detach()))
-    return float(np.mean(losses)) if losses else 0.0
+    def _batch(self, batch: _Piece) -> float:
+        """Train on a batch chunk by chunk, with the recurrent state carried on; return the mean loss."""
+        state: State | None = None
+        losses = []
+        for features, target, weight in zip(
+            *(torch.split(c, self.recipe.chunk_steps, dim=1) for c in batch), strict=True
+        ):
+            output, after = self.network(features, state)
+            state = (after[0].detach(), after[1].detach())
+            total = weight.sum()
+            if float(total) == 0.0:
+                continue
+            loss = ((output - target) ** 2).mean(dim=2).mul(weight).sum() / total
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_CLIP)
+            self.optimiser.step()
+            losses.append(float(loss.detach()))
+        return float(np.mean(losses)) if losses else 0.0
 
+    def validate(self, pieces: Iterable[_Piece]) -> float:
+        """Return the loss as in operation, over whole sequences; a network that is mirrored is made odd."""
+        self.network.eval()
+        total, weight = 0.0, 0.0
+        with torch.inference_mode():
+            for p in pieces:
+                state: State | None = None
+                parts = []
+                for features in torch.split(p.features, VALIDATION_STEPS):
+                    sides = features[None] if self.signs is None else torch.stack([features, features * self.signs])
+                    output, state = self.network(sides.to(self.device), state)
+                    parts.append((output[0] if self.signs is None else 0.5 * (output[0] - output[1])).cpu())
+                square = ((torch.cat(parts) - p.target) ** 2).mean(dim=1)
+                total += float((square * p.weight).sum())
+                weight += float(p.weight.sum())
+        return total / weight if weight else math.inf
 
-def _validate(network: ResidualNetwork, pieces: Iterable[_Piece], device: str, signs: torch.Tensor | None) -> float:
-    """Return the loss as in operation, over whole sequences; with ``signs`` the network is made odd."""
-    network.eval()
-    total, weight = 0.0, 0.0
-    with torch.inference_mode():
-        for p in pieces:
-            state: State | None = None
-            parts = []
-            for first in range(0, len(p.weight), VALIDATION_STEPS):
-                features = p.features[first : first + VALIDATION_STEPS]
-                sides = features[None] if signs is None else torch.stack([features, features * signs])
-                output, state = network(sides.to(device), state)
-                parts.append((output[0] if signs is None else 0.5 * (output[0] - output[1])).cpu())
-            square = ((torch.cat(parts) - p.target) ** 2).mean(dim=1)
-            total += float((square * p.weight).sum())
-            weight += float(p.weight.sum())
-    return total / weight if weight else math.inf
+    @property
+    def weights(self) -> dict[str, torch.Tensor]:
+        """A copy of the network's weights."""
+        return {k: v.detach().cpu().clone() for k, v in self.network.state_dict().items()}
 
 
 def _learning_rate(recipe: Recipe, share: float) -> float:
@@ -377,10 +377,6 @@ def _new_network(recipe: Recipe, init: ModelBundle | None) -> ResidualNetwork:
     if init is not None:
         network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})
     return network
-
-
-def _weights(network: ResidualNetwork) -> dict[str, torch.Tensor]:
-    return {k: v.detach().cpu().clone() for k, v in network.state_dict().items()}
 
 
 def _best_epoch(history: Sequence[Epoch]) -> int:
@@ -455,7 +451,7 @@ def run_training(
     seed: int = 0,
     epochs: int | None = None,
     device: str = "cpu",
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
+    progress: Progress = lambda _text, _share: None,
 ) -> TrainResult:
     """Train on a residual dataset and write the bundle, ``history.parquet`` to ``output``.
 
@@ -476,10 +472,9 @@ def run_training(
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
     dataset, output = Path(dataset), local_path(output)
-    init = None if init is None else Path(init)
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
     data = dataset_for(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
-    start = None if init is None else network_folder(init)
+    start = network_folder(NO_MODEL if init is None else init)
     bundle = None if start is None else load_bundle(start)
     if bundle is not None and bundle.model != data.model:
         raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=str(init))
@@ -524,20 +519,15 @@ def train_on(
     *,
     init: ModelBundle | None = None,
     device: str = "cpu",
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
+    progress: Progress = lambda _text, _share: None,
 ) -> TrainResult:
     """Train one network by a recipe, which contains the target; otherwise as :func:`run_training`."""
     import polars as pl
 
     splits = {name: SplitSequences(data, name, recipe.target, recipe.odd) for name in SPLITS}
 
-    def tell(epoch: Epoch, of: int) -> None:
-        losses = f"train {epoch.train_loss:.4f}, validation {epoch.validation_loss:.4f}"
-        progress(f"epoch {epoch.epoch}: {losses}", epoch.epoch / of)
-
-    bundle, history = train(
-        splits["train"], splits["validation"], recipe, output, init=init, device=device, progress=tell
-    )
+    settings: dict[str, Any] = {"init": init, "device": device, "progress": progress}
+    bundle, history = train(splits["train"], splits["validation"], recipe, output, **settings)
     test_loss = None if next(iter(splits["test"]), None) is None else mean_square(bundle, splits["test"])
     provenance = {
         **bundle.provenance,
