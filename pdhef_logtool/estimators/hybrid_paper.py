@@ -208,9 +208,7 @@ class PaperHybridUkf:
     @property
     def measurement_variance(self) -> FloatArray:
         """R_0 of [a_y, r, v_x], [3]: the sensors' variance, for a_y at least ``constants.ay_variance``."""
-        s = self.vehicle.sensors
-        std = np.array([s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s])
-        variance: FloatArray = std**2
+        variance: FloatArray = np.square(self.vehicle.sensors.measurement_std)
         variance[Z_AY] = max(variance[Z_AY], self.constants.ay_variance)
         return variance
 

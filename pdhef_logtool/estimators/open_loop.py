@@ -34,13 +34,7 @@ def _open_loop(inputs, hold_s, default_friction, p, state, values, rates, valid)
         advance_speed(state, dt[k], ax[k], speed[k], hold_s)
         mu = friction[k] if math.isfinite(friction[k]) else default_friction
         ok = math.isfinite(state[0]) and math.isfinite(steer[k])
-        if (
-            ok
-            and dt[k] <= RESTART_GAP_S
-            and math.isfinite(before)
-            and math.isfinite(state[2])
-            and math.isfinite(state[4])
-        ):
+        if ok and dt[k] <= RESTART_GAP_S and math.isfinite(before + state[2] + state[4]):
             n = substeps(before, dt[k], state[5], p)
             _, state[2], state[3] = rk4_step(before, state[2], state[3], state[4], 0.0, state[5], dt[k], n, p)
         elif ok:

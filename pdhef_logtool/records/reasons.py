@@ -24,10 +24,16 @@ class Reason:
     text: str
 
 
-_KINDS = (("burst", "noise burst"), ("spike", "spike"), ("stuck", "stuck"), ("dead", "dead"), ("missing", "missing"))
 #: All reasons in order of their bits.
-REASONS = tuple(
-    Reason(BURST_AY << (2 * number + of_gyro), f"{kind}_{channel}", f"{sensor} {text}")
-    for number, (kind, text) in enumerate(_KINDS)
-    for of_gyro, (channel, sensor) in enumerate((("ay", "a_y"), ("yaw_rate", "gyro")))
+REASONS = (
+    Reason(BURST_AY, "burst_ay", "a_y noise burst"),
+    Reason(BURST_YAW_RATE, "burst_yaw_rate", "gyro noise burst"),
+    Reason(SPIKE_AY, "spike_ay", "a_y spike"),
+    Reason(SPIKE_YAW_RATE, "spike_yaw_rate", "gyro spike"),
+    Reason(STUCK_AY, "stuck_ay", "a_y stuck"),
+    Reason(STUCK_YAW_RATE, "stuck_yaw_rate", "gyro stuck"),
+    Reason(DEAD_AY, "dead_ay", "a_y dead"),
+    Reason(DEAD_YAW_RATE, "dead_yaw_rate", "gyro dead"),
+    Reason(MISSING_AY, "missing_ay", "a_y missing"),
+    Reason(MISSING_YAW_RATE, "missing_yaw_rate", "gyro missing"),
 )

@@ -170,8 +170,7 @@ def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
     if not np.isfinite(std).any():
         return np.empty((0, 3, 3))
     covariance = np.full((std.shape[0], 3, 3), np.nan)
-    for i in range(3):
-        covariance[:, i, i] = std[:, i] ** 2
+    covariance[:, range(3), range(3)] = std**2
     return covariance
 
 

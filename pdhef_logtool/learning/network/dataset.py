@@ -64,12 +64,11 @@ def write_drive(path: Path, rows: ResidualRows, entry: Mapping[str, Any], *, tru
     """
     chosen = np.ones(len(rows), dtype=np.bool_) if rows.chosen is None else rows.chosen
     schema = arrow_schema(_SCHEMA)
-    columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
-    columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
-    columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
+    names = (*FEATURES, *(name for name, _ in TARGETS), *TRUTH)
+    numbers = np.hstack([rows.features, rows.targets, rows.truth_velocity])
+    columns: dict[str, Any] = dict(zip(names, numbers.T, strict=True))
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
-    columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": chosen}
-    columns |= {"truth_source": np.full(len(rows), truth_source)}
+    columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": chosen, "truth_source": np.full(len(rows), truth_source)}
     table = pa.Table.from_arrays([arrow_array(columns[f.name], f.type) for f in schema], schema=schema)
     with parquet_writer(path, schema, ["segment"]) as writer:
         writer.write_table(table, row_group_size=ROWS_A_GROUP)

@@ -467,23 +467,17 @@ def _strict_truth(plan: DrivePlan) -> DrivePlan:
 
 
 def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool = False) -> None:
-    where = str(job.log_input.path)
     needed = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
     if not estimated and (plan.truth is None or not needed <= plan.derivation.keys()):
-        raise EstimatorError(
-            expected="ground truth from which v_x, v_y and yaw rate follow",
-            got=", ".join(sorted(needed & plan.derivation.keys())) or "none",
-            where=where,
-            remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-        )
-    missing = sorted(FEATURES - plan.alignment.available)
-    if missing:
-        raise EstimatorError(
-            expected="the signals of the physics filter",
-            got=f"no {', '.join(missing)}",
-            where=where,
-            remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
-        )
+        expected = "ground truth from which v_x, v_y and yaw rate follow"
+        got = ", ".join(sorted(needed & plan.derivation.keys())) or "none"
+        remedy = "map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference"
+    elif missing := sorted(FEATURES - plan.alignment.available):
+        expected, got = "the signals of the physics filter", f"no {', '.join(missing)}"
+        remedy = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
+    else:
+        return
+    raise EstimatorError(expected=expected, got=got, where=str(job.log_input.path), remedy=remedy)
 
 
 def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import io
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,8 +42,6 @@ from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_pa
 import torch
 
 CHECKPOINT = "checkpoint.pt"
-#: Length of the checksum at the start of a checkpoint.
-DIGEST_BYTES = 32
 
 
 #: Maximum number of validation steps at once, with the state carried on; an hour at once would need a gigabyte.
@@ -185,42 +183,32 @@ def train(
         normalisation=init.normalisation if init else normalisation_of(training, recipe.feature_names, odd=recipe.odd),
         weights={},
     )
-    network = _new_network(recipe, init).to(device)
-    optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
-    signs = torch.tensor(empty.signs, dtype=torch.float32) if recipe.odd else None
-    run = _Training(network, optimiser, recipe, signs, device)
+    run = _Training.start(recipe, init, empty.signs, device)
     train_pieces = Pieces(training, lambda s: _pieces(s, recipe.piece_steps, empty))
     validation_pieces = Pieces(validation, lambda s: [_balanced(_scaled(s, empty))])
     identity = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
     identity |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
-    history, best = list[Epoch](), run.weights
     if (work / CHECKPOINT).is_file():
-        stored = _read_checkpoint(work / CHECKPOINT, identity)
-        network.load_state_dict(stored["network"])
-        optimiser.load_state_dict(stored["optimiser"])
-        history, best = [Epoch(**e) for e in stored["history"]], stored["best"]
-    for epoch in range(len(history), recipe.epochs):
-        if len(history) - 1 - _best_epoch(history) >= recipe.patience:
+        run.resume(work / CHECKPOINT, identity)
+    for epoch in range(len(run.history), recipe.epochs):
+        if len(run.history) - 1 - run.best_epoch >= recipe.patience:
             break
         began = time.perf_counter()
         train_loss, rate = run.epoch(train_pieces, epoch)
         loss = run.validate(validation_pieces)
-        history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
-        if _best_epoch(history) == epoch:
-            best = run.weights
-        state = {"network": network.state_dict(), "optimiser": optimiser.state_dict(), "best": best}
-        _write_checkpoint(work / CHECKPOINT, {"identity": identity, "history": list(map(asdict, history)), **state})
+        run.end_epoch(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
+        run.save(work / CHECKPOINT, identity)
         progress(f"epoch {epoch + 1}: train {train_loss:.4f}, validation {loss:.4f}", (epoch + 1) / recipe.epochs)
     provenance = {
         "recipe": asdict(recipe),
-        "epochs": len(history),
-        "best_epoch": _best_epoch(history) + 1,
-        "validation_loss": history[_best_epoch(history)].validation_loss,
+        "epochs": len(run.history),
+        "best_epoch": run.best_epoch + 1,
+        "validation_loss": run.history[run.best_epoch].validation_loss,
         "training_sequences": train_pieces.sequences,
         "validation_sequences": validation_pieces.sequences,
         "training_hours": round(train_pieces.steps * recipe.period_s / 3600.0, 3),
     }
-    return replace(empty, weights={k: v.numpy() for k, v in best.items()}, provenance=provenance), history
+    return replace(empty, weights={k: v.numpy() for k, v in run.best.items()}, provenance=provenance), run.history
 
 
 # ---- data ----
@@ -285,15 +273,38 @@ def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
 # ---- one epoch ----
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Training:
-    """A network in training. ``signs``: of its features when left and right are exchanged; None does not mirror."""
+    """A network in training. ``signs``: of its features when left and right are exchanged; None does not mirror.
+
+    ``best`` : weights of the best epoch in ``history``.
+    """
 
     network: ResidualNetwork
     optimiser: torch.optim.Optimizer
     recipe: Recipe
     signs: torch.Tensor | None
     device: str
+    best: dict[str, torch.Tensor]
+    history: list[Epoch] = field(default_factory=list)
+
+    @classmethod
+    def start(cls, recipe: Recipe, init: ModelBundle | None, signs: FloatArray, device: str) -> _Training:
+        """Return a network with random weights by the seed of a recipe, or with the weights of a bundle."""
+        torch.manual_seed(recipe.seed)
+        sizes, outputs = (len(recipe.feature_names), recipe.hidden, recipe.layers), OUTPUT_COUNT[recipe.target]
+        network = ResidualNetwork(*sizes, recipe.head, recipe.dropout, outputs=outputs)
+        if init is not None:
+            network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})
+        network = network.to(device)
+        optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
+        mirror = torch.tensor(signs, dtype=torch.float32) if recipe.odd else None
+        return cls(network, optimiser, recipe, mirror, device, _weights(network))
+
+    @property
+    def best_epoch(self) -> int:
+        """Index of the epoch with the lowest validation loss; -1 before the first."""
+        return min(range(len(self.history)), key=lambda i: self.history[i].validation_loss, default=-1)
 
     def epoch(self, pieces: Sequence[_Piece], number: int) -> tuple[float, float]:
         """Train once on pieces in a seeded random order; return mean loss and last learning rate."""
@@ -319,9 +330,8 @@ class _Training:
         """Train on a batch chunk by chunk, with the recurrent state carried on; return the mean loss."""
         state: State | None = None
         losses = []
-        for features, target, weight in zip(
-            *(torch.split(c, self.recipe.chunk_steps, dim=1) for c in batch), strict=True
-        ):
+        chunks = (torch.split(column, self.recipe.chunk_steps, dim=1) for column in batch)
+        for features, target, weight in zip(*chunks, strict=True):
             output, after = self.network(features, state)
             state = (after[0].detach(), after[1].detach())
             total = weight.sum()
@@ -352,10 +362,41 @@ class _Training:
                 weight += float(p.weight.sum())
         return total / weight if weight else math.inf
 
-    @property
-    def weights(self) -> dict[str, torch.Tensor]:
-        """A copy of the network's weights."""
-        return {k: v.detach().cpu().clone() for k, v in self.network.state_dict().items()}
+    def end_epoch(self, epoch: Epoch) -> None:
+        """Add an epoch to the history, and keep its weights if it is the best one."""
+        self.history.append(epoch)
+        if self.best_epoch == len(self.history) - 1:
+            self.best = _weights(self.network)
+
+    def save(self, path: Path, identity: dict[str, Any]) -> None:
+        """Write a checkpoint with its checksum; ``identity`` of the training: its recipe and data."""
+        buffer = io.BytesIO()
+        states = {"network": self.network.state_dict(), "optimiser": self.optimiser.state_dict(), "best": self.best}
+        torch.save({"identity": identity, "history": [asdict(e) for e in self.history], **states}, buffer)
+        data = buffer.getvalue()
+        write_bytes(path, hashlib.sha256(data).digest() + data)
+
+    def resume(self, path: Path, identity: dict[str, Any]) -> None:
+        """Continue after a checkpoint; raises ModelError if it is damaged, or of another recipe or other data."""
+        checksum = hashlib.sha256()
+        data = path.read_bytes()
+        stated, data = data[: checksum.digest_size], data[checksum.digest_size :]
+        checksum.update(data)
+        if checksum.digest() != stated:
+            expected, got = "a checkpoint of a training", "content that is not as it was written"
+            raise ModelError(expected=expected, got=got, where=str(path), remedy="remove it to train again")
+        stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        if stored["identity"] != identity:
+            expected, got = "a checkpoint of this recipe and data", "one of another"
+            remedy = "train into another folder, or remove the checkpoint"
+            raise ModelError(expected=expected, got=got, where=str(path), remedy=remedy)
+        self.network.load_state_dict(stored["network"])
+        self.optimiser.load_state_dict(stored["optimiser"])
+        self.history, self.best = [Epoch(**e) for e in stored["history"]], stored["best"]
+
+
+def _weights(network: ResidualNetwork) -> dict[str, torch.Tensor]:
+    return {k: v.detach().cpu().clone() for k, v in network.state_dict().items()}
 
 
 def _learning_rate(recipe: Recipe, share: float) -> float:
@@ -365,52 +406,6 @@ def _learning_rate(recipe: Recipe, share: float) -> float:
     if share < 0.3:
         return recipe.learning_rate * (0.04 + 0.96 * (0.5 - 0.5 * math.cos(math.pi * share / 0.3)))
     return recipe.learning_rate * (1e-4 + (1.0 - 1e-4) * (0.5 + 0.5 * math.cos(math.pi * (share - 0.3) / 0.7)))
-
-
-# ---- state ----
-
-
-def _new_network(recipe: Recipe, init: ModelBundle | None) -> ResidualNetwork:
-    torch.manual_seed(recipe.seed)
-    sizes, outputs = (len(recipe.feature_names), recipe.hidden, recipe.layers), OUTPUT_COUNT[recipe.target]
-    network = ResidualNetwork(*sizes, recipe.head, recipe.dropout, outputs=outputs)
-    if init is not None:
-        network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})
-    return network
-
-
-def _best_epoch(history: Sequence[Epoch]) -> int:
-    return min(range(len(history)), key=lambda i: history[i].validation_loss, default=-1)
-
-
-def _write_checkpoint(path: Path, content: dict[str, Any]) -> None:
-    """Write the state of a training after an epoch, with its checksum."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    data = buffer.getvalue()
-    write_bytes(path, hashlib.sha256(data).digest() + data)
-
-
-def _read_checkpoint(path: Path, identity: dict[str, Any]) -> dict[str, Any]:
-    """Return the state of an interrupted training; raises ModelError if it is damaged, or of another recipe or data."""
-    data = path.read_bytes()
-    digest, data = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
-    if hashlib.sha256(data).digest() != digest:
-        raise ModelError(
-            expected="a checkpoint of a training",
-            got="content that is not as it was written",
-            where=str(path),
-            remedy="remove it to train again",
-        )
-    content: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    if content["identity"] != identity:
-        raise ModelError(
-            expected="a checkpoint of this recipe and data",
-            got="one of another",
-            where=str(path),
-            remedy="train into another folder, or remove the checkpoint",
-        )
-    return content
 
 
 HISTORY_FILE = "history.parquet"
