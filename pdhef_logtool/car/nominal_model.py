@@ -67,15 +67,14 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
 
     With ``roll_correction``, the measured a_y is (1 + g·K_φ) times the planar a_y (docs/method.md#model).
     """
-    blend_m_s, gradient = vehicle.low_speed_blend_m_s, vehicle.roll_gradient_rad_per_m_s2
-    body = vehicle.mass_kg, vehicle.yaw_inertia_kg_m2, vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
-    front: tuple[Any, ...] = *vehicle.magic_formula(True, 1.0), vehicle.tyres.front.keeps_stiffness
-    rear: tuple[Any, ...] = *vehicle.magic_formula(False, 1.0), vehicle.tyres.rear.keeps_stiffness
-    imu_x_m, imu_y_m, _ = vehicle.imu_position_m
-    ay_roll_gain = GRAVITY_M_S2 * gradient if roll_correction else 0.0
-    return ModelParameters(
-        *body, *front, *rear, BLEND_START_SHARE * blend_m_s, blend_m_s, imu_x_m, imu_y_m, ay_roll_gain
-    )
+    blend_m_s, imu_m, tyres = vehicle.low_speed_blend_m_s, vehicle.imu_position_m, vehicle.tyres
+    ay_roll_gain = GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2 if roll_correction else 0.0
+    values: list[Any] = [vehicle.mass_kg, vehicle.yaw_inertia_kg_m2]
+    values += [vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m]
+    for is_front, tyre in ((True, tyres.front), (False, tyres.rear)):
+        values += [*vehicle.magic_formula(is_front, 1.0), tyre.keeps_stiffness]
+    values += [BLEND_START_SHARE * blend_m_s, blend_m_s, *imu_m[:2], ay_roll_gain]
+    return ModelParameters(*values)
 
 
 @njit(cache=True)
