@@ -80,12 +80,9 @@ class DriveSet:
                 raise UsageError(expected=f"drives of split {wanted}", got=got, where="--split")
         refused = [f"{i.stem} ({splits[i.stem]})" for i in logs if splits[i.stem] in HELD_OUT]
         if refused and wanted != ANY_SPLIT:
-            raise UsageError(
-                expected="drives that no result is reported on",
-                got=listed(refused, _NAMED),
-                where="learn",
-                remedy="a car must not learn from test drives: use --split validation, or --split any",
-            )
+            expected = "drives that no result is reported on"
+            remedy = "drives that a car learns from are no longer test drives: use --split validation, or --split any"
+            raise UsageError(expected=expected, got=listed(refused, _NAMED), where="learn", remedy=remedy)
         return cls(car, settings, tuple(logs), mapping_of(config.mapping), splits, reporter)
 
     def read(
