@@ -1,4 +1,4 @@
-"""Registry of estimators: an entry of ``table.toml`` and a file with the builder of each.
+"""Registry of estimators: a line of :data:`SPECS` and a file with the builder of each.
 
 A name is a preset: ``build`` returns the algorithm for a car and options (:mod:`~.algorithm`).
 
@@ -43,14 +43,12 @@ receives read-only signals, and its errors are contained (:mod:`~.plug_ins`). Ex
 from __future__ import annotations
 
 import sys
-import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
 from itertools import chain
 from operator import attrgetter
-from pathlib import Path
 from typing import Any, Final, Literal, cast
 
 from pdhef_logtool.car.car import Car
@@ -70,8 +68,14 @@ from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import has_gnss
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
-#: Signals for the features of a network. A filter uses a_y and yaw rate if the log has them, ``physics`` steering too.
-FEATURES: frozenset[str] = frozenset({"speed_m_s", "steer_rad", "yaw_rate_rad_s", "ay_m_s2"})
+#: Inputs of the vehicle model; a filter uses a_y and yaw rate if the log has them, ``physics`` steering too.
+_SPEED = frozenset({"speed_m_s"})
+_INPUTS = _SPEED | {"steer_rad"}
+_PLANAR = _SPEED | {"yaw_rate_rad_s"}
+_PLANAR_IMU = frozenset({"yaw_rate_rad_s", "ay_m_s2"})
+_LATERAL = _PLANAR_IMU | {"steer_rad"}
+#: Signals for the features of a network.
+FEATURES: frozenset[str] = _INPUTS | _PLANAR_IMU
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,11 +175,48 @@ OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
     "pd-hef": {"gain": (0.0, 1.0), "fixed-r": None},
     "linear-kf": {"open-loop": None},
 }
-#: Estimators of this package, in the order of the tables.
-SPECS: tuple[Spec, ...] = tuple(
-    Spec(name, **(entries | {key: frozenset(entries.get(key, ())) for key in ("needs", "one_of")}))
-    for name, entries in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items()
-)
+#: Estimators of this package, in the order of the tables. A preset with an option has an entry if it differs.
+SPECS: tuple[Spec, ...] = (
+    Spec("zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors",
+         "pass_through:build", _PLANAR, 0xF0E442),
+    Spec("zero:no-lateral", "the sensors passed through; claims no lateral velocity",
+         "pass_through:build", _PLANAR, 0xCC79A7),
+    Spec("kinematic", "leaky integral of a_y - v_x r", "kinematic:build", _PLANAR | {"ay_m_s2"}, 0x009E73),
+    Spec("open-loop", "nominal single-track model from steering and speed alone",
+         "open_loop:build", _INPUTS, 0xE69F00),
+    Spec(OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",
+         "open_loop:build", _INPUTS, 0x661100, causal=False),
+    Spec("linear-regression", "sideslip linear in the network's features, low-passed at 2 Hz (needs such a model)",
+         "direct_network:build", FEATURES, 0xDDCC77, network="linear_regression"),
+    Spec("phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
+         "vehicle_ukf:build_nominal", _INPUTS, 0x0072B2),
+    Spec("physics", "best filter with physics only, with the model parts supported by driving data",
+         "adaptive_physics:build", _SPEED, 0x44AA99, one_of=_LATERAL),
+    Spec("phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
+         "vehicle_ukf:build_nominal", _INPUTS, 0x56B4E9, needs_noise=True),
+    Spec("pure-lstm", "a network that outputs v_y, without a filter (needs such a model)",
+         "direct_network:build", FEATURES, 0xAA4499, network="pure_lstm"),
+    Spec("pd-hef", "physics plus the residual of the car's network, within its region of validity",
+         "pd_hef:build", _SPEED, 0xD55E00, network="optional", one_of=_LATERAL),
+    Spec("pd-hef:fixed-r", "pd-hef at gain 1 without the adaptive mechanism (needs a network)",
+         "pd_hef:build", _INPUTS, 0x117733, network="residual"),
+    Spec("pd-hef-smoothed", "pd-hef smoothed with later samples: not causal, ranked apart",
+         "pd_hef:build_smoothed", _SPEED, 0x332288, causal=False, network="optional", one_of=_LATERAL),
+    Spec("pd-hef:gain=1", "pd-hef at a residual gain from 0 to 1 on any car (needs a network)",
+         "pd_hef:build", _INPUTS, 0x882255, group="", network="residual"),
+    Spec("pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, unchanged (needs its network)",
+         "hybrid_paper:build", FEATURES, 0xCC6677, network="paper"),
+    Spec("linear-kf", "peer: Kalman filter on the linear single track (Leanza et al. 2021)",
+         "peers.linear_kf:LinearKalman.build", _INPUTS, 0x7F7F7F, group=PEERS, one_of=_PLANAR_IMU),
+    Spec("linear-kf:open-loop", "peer: linear single track from steering and speed alone (Riekert and Schunck 1940)",
+         "peers.linear_kf:LinearKalman.build", _INPUTS, 0xBBBBBB, group=PEERS),
+    Spec("learned-single-track", "peer: single track with parameters learned from the yaw rate (openpilot's paramsd)",
+         "peers.learned_single_track:LearnedSingleTrack.build", _INPUTS | _PLANAR, 0x999933, group=PEERS),
+    Spec("slip-ukf", "peer: unscented Kalman filter over speed and sideslip with axle forces (Goblirsch et al. 2024)",
+         "peers.slip_ukf:SlipUkf.build", FEATURES, 0x6699CC, group=PEERS),
+    Spec("washout", "peer: kinematic with a leak to the stationary single track (Piyabongkarn et al. 2009)",
+         "peers.washout:Washout.build", FEATURES, 0x88CCEE, group=PEERS),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

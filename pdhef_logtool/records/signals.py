@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -16,10 +14,69 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
 WHEELS = ("fl", "fr", "rl", "rr")
-#: Units of all signals, truth channels and recorded estimates by name, in their order.
-SIGNAL_UNITS, TRUTH_UNITS, ESTIMATE_UNITS = tomllib.loads(
-    Path(__file__).with_name("units.toml").read_text(encoding="utf-8")
-).values()
+
+#: All signals of mappings, with their SI units (ISO 8855: x forward, y left, z up, positive left).
+SIGNAL_UNITS: dict[str, str] = {
+    "steer_rad": "rad",  # mean road-wheel angle
+    "steering_wheel_rad": "rad",
+    "ax_m_s2": "m/s^2",
+    "ay_m_s2": "m/s^2",
+    "yaw_rate_rad_s": "rad/s",
+    "roll_rate_rad_s": "rad/s",
+    "pitch_rate_rad_s": "rad/s",
+    "speed_m_s": "m/s",
+    **{f"wheel_speed_{w}_m_s": "m/s" for w in WHEELS},
+    **{f"wheel_speed_{w}_rad_s": "rad/s" for w in WHEELS},
+    "gnss_velocity_east_m_s": "m/s",  # of the antenna, Doppler
+    "gnss_velocity_north_m_s": "m/s",
+    "gnss_speed_m_s": "m/s",
+    "gnss_course_rad": "rad",  # ENU: counter-clockwise from east
+    "gnss_velocity_accuracy_m_s": "m/s",  # from the receiver, 1-sigma
+    "gnss_fix_type": "1",  # below 1: no position
+    "gnss_latitude_deg": "deg",  # of the antenna
+    "gnss_longitude_deg": "deg",
+    "gnss_position_accuracy_m": "m",  # horizontal, from the receiver, 1-sigma
+    "gnss_heading_rad": "rad",  # of two antennas, ENU: only if mapped by hand
+    "friction": "1",
+}
+
+#: All truth channels of mappings, with their units. ``*_ecef*``, ``enu_*`` have 3 columns, ``quat_wxyz`` 4.
+TRUTH_UNITS: dict[str, str] = {
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "sideslip_rad": "rad",
+    "yaw_rate_rad_s": "rad/s",
+    "ax_m_s2": "m/s^2",
+    "ay_m_s2": "m/s^2",
+    "x_m": "m",
+    "y_m": "m",
+    "lat_deg": "deg",
+    "lon_deg": "deg",
+    "alt_m": "m",
+    "ecef_position_m": "m",
+    "ecef_velocity_m_s": "m/s",
+    "enu_velocity_m_s": "m/s",
+    "quat_wxyz": "1",
+    "course_rad": "rad",  # ENU: counter-clockwise from east
+    "yaw_rad": "rad",  # ENU: counter-clockwise from east
+    "position_std_m": "m",
+    "friction": "1",
+}
+
+#: All quantities of recorded estimates, with their units. ``valid`` is 0 where the estimate must not be used.
+ESTIMATE_UNITS: dict[str, str] = {
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "yaw_rate_rad_s": "rad/s",
+    "sideslip_rad": "rad",
+    "ay_m_s2": "m/s^2",
+    "vx_std_m_s": "m/s",
+    "vy_std_m_s": "m/s",
+    "yaw_rate_std_rad_s": "rad/s",
+    "sideslip_std_rad": "rad",
+    "valid": "1",
+    "diverged": "1",
+}
 
 #: Prefix of the names of all GNSS signals.
 GNSS = "gnss_"

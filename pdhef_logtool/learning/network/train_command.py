@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -34,6 +35,7 @@ from pdhef_logtool.residual_model.bundle import (
 )
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import ResidualNetwork, State
+from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
 
@@ -41,7 +43,7 @@ from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_pa
 # After the network, which checks that PyTorch is installed.
 import torch
 
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT = "checkpoint.safetensors"
 
 
 #: Maximum number of validation steps at once, with the state carried on; an hour at once would need a gigabyte.
@@ -369,30 +371,58 @@ class _Training:
             self.best = _weights(self.network)
 
     def save(self, path: Path, identity: dict[str, Any]) -> None:
-        """Write a checkpoint with its checksum; ``identity`` of the training: its recipe and data."""
-        buffer = io.BytesIO()
-        states = {"network": self.network.state_dict(), "optimiser": self.optimiser.state_dict(), "best": self.best}
-        torch.save({"identity": identity, "history": [asdict(e) for e in self.history], **states}, buffer)
-        data = buffer.getvalue()
-        write_bytes(path, hashlib.sha256(data).digest() + data)
+        """Write a checkpoint: tensors and document in one file, so that no write can leave an inconsistent pair.
+
+        ``identity`` of the training: its recipe and data.
+        """
+        from safetensors.torch import save
+
+        states = self.optimiser.state_dict()["state"]
+        optimiser = {f"{i}.{key}": value for i, of in states.items() for key, value in of.items()}
+        groups = {"network": self.network.state_dict(), "best": self.best, "optimiser": optimiser}
+        tensors = {f"{g}.{name}": value.cpu().contiguous() for g, of in groups.items() for name, value in of.items()}
+        document = seal(
+            {"identity": identity, "history": [asdict(e) for e in self.history], "sha256": _sha256(tensors)}
+        )
+        write_bytes(path, save(tensors, metadata={"document": json.dumps(document)}))
 
     def resume(self, path: Path, identity: dict[str, Any]) -> None:
         """Continue after a checkpoint; raises ModelError if it is damaged, or of another recipe or other data."""
-        checksum = hashlib.sha256()
-        data = path.read_bytes()
-        stated, data = data[: checksum.digest_size], data[checksum.digest_size :]
-        checksum.update(data)
-        if checksum.digest() != stated:
-            expected, got = "a checkpoint of a training", "content that is not as it was written"
-            raise ModelError(expected=expected, got=got, where=str(path), remedy="remove it to train again")
-        stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-        if stored["identity"] != identity:
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, framework="pt") as stored:
+                document = json.loads(stored.metadata()["document"])
+                tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
+            if not is_sealed(document) or document["sha256"] != _sha256(tensors):
+                raise ValueError("content that is not as it was written")
+        except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
+            expected = "a checkpoint of a training"
+            raise ModelError(
+                expected=expected, got=str(error), where=str(path), remedy="remove it to train again"
+            ) from None
+        if document["identity"] != json.loads(json.dumps(identity)):
             expected, got = "a checkpoint of this recipe and data", "one of another"
             remedy = "train into another folder, or remove the checkpoint"
             raise ModelError(expected=expected, got=got, where=str(path), remedy=remedy)
-        self.network.load_state_dict(stored["network"])
-        self.optimiser.load_state_dict(stored["optimiser"])
-        self.history, self.best = [Epoch(**e) for e in stored["history"]], stored["best"]
+        groups: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
+        for name, value in tensors.items():
+            group, _, key = name.partition(".")
+            groups[group][key] = value
+        states: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in groups["optimiser"].items():
+            index, _, key = name.partition(".")
+            states.setdefault(int(index), {})[key] = value
+        self.network.load_state_dict(groups["network"])
+        self.optimiser.load_state_dict({"state": states, "param_groups": self.optimiser.state_dict()["param_groups"]})
+        self.history, self.best = [Epoch(**e) for e in document["history"]], groups["best"]
+
+
+def _sha256(tensors: Mapping[str, torch.Tensor]) -> str:
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        total.update(name.encode() + tensors[name].numpy().tobytes())
+    return total.hexdigest()
 
 
 def _weights(network: ResidualNetwork) -> dict[str, torch.Tensor]:
