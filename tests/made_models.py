@@ -43,7 +43,7 @@ def random_network(
         weights[last.replace("bias", "weight")][:] = 0.0
         weights[last][:] = constant
     normalisation = Normalisation((0.0,) * size, (scales[0],) * size, (scales[1],) * outputs)
-    return ModelBundle(names, hidden, layers, head, 0.01, normalisation, weights, **settings)
+    return ModelBundle(names, hidden, layers, head, 0.01, normalisation, weights=weights, **settings)
 
 
 def full_network(seed: int = 1) -> ModelBundle:

@@ -109,15 +109,12 @@ def _axle_distances(entries: dict[str, Any], assumed: list[AssumedValue]) -> Non
     """Replace wheelbase and weight share by the axle distances, in place; complete the third of the three."""
     wheelbase, share = entries.get("wheelbase_m"), entries.get("front_weight_share")
     front, rear = entries.get("cg_to_front_axle_m"), entries.get("cg_to_rear_axle_m")
-    if front is not None and rear is not None:
+    if (front is not None and rear is not None) or not _is_positive(wheelbase):
         return  # an additional wheelbase is rejected as an unknown entry
-    if not _is_positive(wheelbase):
-        return
     if front is not None or rear is not None:
         name, other = ("cg_to_rear_axle_m", front) if rear is None else ("cg_to_front_axle_m", rear)
         if _is_positive(other) and float(other) < float(wheelbase):
-            entries[name] = float(wheelbase) - float(other)
-            del entries["wheelbase_m"]
+            entries[name] = float(entries.pop("wheelbase_m")) - float(other)
         return
     if share is None:
         share = FRONT_WEIGHT_SHARE
@@ -125,8 +122,8 @@ def _axle_distances(entries: dict[str, Any], assumed: list[AssumedValue]) -> Non
         assumed.append(AssumedValue("front_weight_share", share, FRONT_WEIGHT_SHARE_SPREAD, text))
     if not (_is_positive(share) and float(share) < 1.0):
         return
-    entries.pop("front_weight_share", None)
-    del entries["wheelbase_m"]
+    for name in ("front_weight_share", "wheelbase_m"):
+        entries.pop(name, None)
     entries["cg_to_front_axle_m"] = float(wheelbase) * (1.0 - float(share))
     entries["cg_to_rear_axle_m"] = float(wheelbase) * float(share)
 

@@ -165,9 +165,16 @@ class Car:
         calibrated = self.self_calibrated
         if calibrated is None:
             return self
-        physics = FittedPhysics(values=FittedValues.of(calibrated.vehicle), noise=calibrated.noise)
-        car = replace(self.with_vehicle(calibrated.vehicle), fitted_physics=physics, self_calibrated=None)
-        return car.with_noise(PHYSICS, calibrated.noise)
+        vehicle, noise = calibrated.vehicle, calibrated.noise
+        changed = {name: value for name, value in vehicle if value != getattr(self.vehicle, name)}
+        return replace(
+            self.with_noise(PHYSICS, noise),
+            vehicle=vehicle,
+            datasheet=self.datasheet.model_copy(update=changed),
+            network_gain=self.residual_gain,
+            fitted_physics=FittedPhysics(values=FittedValues.of(vehicle), noise=noise),
+            self_calibrated=None,
+        )
 
     def with_fit(self, fit: Fit) -> Car:
         """Return the car with identified parameters; a residual gain of other parameters is dropped."""
@@ -183,19 +190,6 @@ class Car:
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
         """Return the car with different noise of one filter."""
         return replace(self, noise={**self.noise, name: noise})
-
-    def with_vehicle(self, vehicle: VehicleParameters) -> Car:
-        """Return the car with deliberately wrong physics; all else, including the residual gain, is unchanged.
-
-        Values that were identified with ``physics`` are kept, except the changed entries, which they would overwrite.
-        """
-        physics = self.fitted_physics
-        other = {k: v for k, v in vehicle if v != getattr(self.vehicle, k)}
-        if physics is not None:
-            overridden = {k: None for k in FittedValues.model_fields if k in other}
-            physics = physics.model_copy(update={"values": physics.values.model_copy(update=overridden)})
-        datasheet, gain = self.datasheet.model_copy(update=other), self.residual_gain
-        return replace(self, vehicle=vehicle, datasheet=datasheet, network_gain=gain, fitted_physics=physics)
 
 
 def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:

@@ -23,6 +23,21 @@ class Descent(NamedTuple):
     cost: float
 
 
+def linearised(
+    errors: Callable[[FloatArray], _Errors],
+    scaled: Callable[[_Errors, _Errors], FloatArray],
+    theta: FloatArray,
+    here: _Errors,
+    step: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the residuals [R] at θ [K], with the errors ``here``, and their derivatives [R, K] by differences."""
+    residuals = scaled(here, here)
+    jacobian = np.empty((residuals.size, theta.size))
+    for i, moved in enumerate(theta + step * np.eye(theta.size)):
+        jacobian[:, i] = (scaled(errors(moved), here) - residuals) / step
+    return residuals, jacobian
+
+
 def descend(
     errors: Callable[[FloatArray], _Errors],
     cost: Callable[[_Errors, FloatArray], float],
@@ -50,12 +65,7 @@ def descend(
     damping = 1e-2
     normal = np.eye(theta.size)
     for _ in range(iterations):
-        residuals = scaled(values_here, values_here)
-        jac = np.empty((residuals.size, theta.size))
-        for i in range(theta.size):
-            moved = theta.copy()
-            moved[i] += derivative_step
-            jac[:, i] = (scaled(errors(moved), values_here) - residuals) / derivative_step
+        residuals, jac = linearised(errors, scaled, theta, values_here, derivative_step)
         normal = jac.T @ jac + np.eye(theta.size)
         gradient = jac.T @ residuals + theta
         gain = 0.0

@@ -8,7 +8,7 @@ approach r = v_x tan δ / L and v_y = l_r r with a short time constant.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pdhef_logtool.car.elementary_functions import arctangent, sine
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
@@ -67,29 +67,14 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
 
     With ``roll_correction``, the measured a_y is (1 + g·K_φ) times the planar a_y (docs/method.md#model).
     """
-    bf, cf, df, ef = vehicle.magic_formula(True, 1.0)
-    br, cr, dr, er = vehicle.magic_formula(False, 1.0)
-    return ModelParameters(
-        mass_kg=vehicle.mass_kg,
-        yaw_inertia_kg_m2=vehicle.yaw_inertia_kg_m2,
-        front_m=vehicle.cg_to_front_axle_m,
-        rear_m=vehicle.cg_to_rear_axle_m,
-        front_B=bf,
-        front_C=cf,
-        front_D_n=df,
-        front_E=ef,
-        front_fixed_stiffness=vehicle.tyres.front.keeps_stiffness,
-        rear_B=br,
-        rear_C=cr,
-        rear_D_n=dr,
-        rear_E=er,
-        rear_fixed_stiffness=vehicle.tyres.rear.keeps_stiffness,
-        blend_low_m_s=BLEND_START_SHARE * vehicle.low_speed_blend_m_s,
-        blend_high_m_s=vehicle.low_speed_blend_m_s,
-        imu_x_m=vehicle.imu_position_m[0],
-        imu_y_m=vehicle.imu_position_m[1],
-        ay_roll_gain=GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2 if roll_correction else 0.0,
-    )
+    blend_m_s, imu_m, tyres = vehicle.low_speed_blend_m_s, vehicle.imu_position_m, vehicle.tyres
+    ay_roll_gain = GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2 if roll_correction else 0.0
+    values: list[Any] = [vehicle.mass_kg, vehicle.yaw_inertia_kg_m2]
+    values += [vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m]
+    for is_front, tyre in ((True, tyres.front), (False, tyres.rear)):
+        values += [*vehicle.magic_formula(is_front, 1.0), tyre.keeps_stiffness]
+    values += [BLEND_START_SHARE * blend_m_s, blend_m_s, *imu_m[:2], ay_roll_gain]
+    return ModelParameters(*values)
 
 
 @njit(cache=True)

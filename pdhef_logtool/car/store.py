@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pdhef_logtool.car.car import VEHICLE_FILE, Car
-from pdhef_logtool.car.toml_files import vehicle_toml
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.storage.files import write_bytes, writing
 from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction
@@ -45,7 +45,7 @@ def check_output(source: Car, output: Path) -> None:
 def vehicle_file(car: Car) -> bytes:
     """Return the bytes of a car's vehicle.toml, generated for the default car."""
     if car.source is None:
-        return vehicle_toml(car.datasheet, "The default car of pdhef.").encode()
+        return part_toml(car.datasheet, "The default car of pdhef.").encode()
     return (car.source / VEHICLE_FILE if car.source.is_dir() else car.source).read_bytes()
 
 

@@ -99,12 +99,7 @@ def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
     return VehicleFile(vehicle, None if file.network is None else file.network.gain, assumed)
 
 
-def part_toml(part: Record, head: str) -> str:
-    """Return a part of a car's folder as TOML with ``head`` above it."""
+def part_toml(part: Record, head: str = "") -> str:
+    """Return a part of a car's folder, for example its vehicle file, as TOML with ``head`` above it, without loss."""
     plain: dict[str, Any] = part.model_dump(mode="json", exclude_none=True)
     return toml_text({k: v for k, v in plain.items() if v not in ([], {})}, head)
-
-
-def vehicle_toml(vehicle: VehicleParameters, head: str = "") -> str:
-    """Return physics and sensors as vehicle.toml, without loss."""
-    return part_toml(vehicle, head)

@@ -18,6 +18,7 @@ from pdhef_logtool.records.tracks import StateTrack, make_track
 
 # Entries of a step's values and of their time derivatives.
 VX, VY, YAW_RATE, AY = 0, 1, 2, 3
+QUANTITIES = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,15 +115,7 @@ def linear_track(name: str, steps: Steps, ahead: Extrapolation, stamps_ns: IntAr
     """Extrapolate steps to first order with constant rates."""
     out = steps.values[ahead.step] + steps.rates[ahead.step] * ahead.horizon_s[:, None]
     out[~ahead.usable] = np.nan
-    return make_track(
-        name,
-        stamps_ns,
-        vx_m_s=out[:, VX].copy(),
-        vy_m_s=out[:, VY].copy(),
-        yaw_rate_rad_s=out[:, YAW_RATE].copy(),
-        ay_m_s2=out[:, AY].copy(),
-        valid=ahead.usable,
-    )
+    return make_track(name, stamps_ns, **dict(zip(QUANTITIES, out.T.copy(), strict=True)), valid=ahead.usable)
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:

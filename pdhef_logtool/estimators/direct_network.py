@@ -70,13 +70,6 @@ class LinearRegression(DirectNetwork):
 
 
 def build(name: str, car: Car, options: Options) -> DirectNetwork:
-    """Return ``pure-lstm`` for a car with such a network."""
-    del name
-    assert car.network is not None and car.network.pure_lstm is not None
-    return DirectNetwork(car.vehicle, car.network.pure_lstm, use_speed=options.use_speed)
-
-
-def build_regression(name: str, car: Car, options: Options) -> LinearRegression:
-    """Return ``linear-regression`` for a car with such a model."""
-    assert car.network is not None and car.network.linear_regression is not None
-    return LinearRegression(car.vehicle, car.network.linear_regression, use_speed=options.use_speed, name=name)
+    """Return ``pure-lstm`` or ``linear-regression`` for a car with such a model."""
+    kind = {"pure-lstm": DirectNetwork, "linear-regression": LinearRegression}[name]
+    return kind(car.vehicle, getattr(car.network, name.replace("-", "_")), use_speed=options.use_speed, name=name)

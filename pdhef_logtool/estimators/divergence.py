@@ -10,7 +10,8 @@ D, the leaky sum of the changes of v̂_y,i beyond that, is the error that the es
 fast (``LINEAR_S``) in the linear range of the tyres, where only one solution exists and D would accumulate bank, bias
 and noise. It is slow (``LIMIT_S``) near the limit of grip, and while the flag is set, so that a return to the right
 solution clears the flag. The flag is set while abs D exceeds v̂_x times ``ON_RAD``, and cleared below v̂_x times
-``OFF_RAD``. Both limits are increased by ``NOISE_SIGMAS`` of the sensors' white noise (vehicle file) in D.
+``OFF_RAD``. Both limits are increased by ``NOISE_SIGMAS`` of the white noise of the sensors in D, as the vehicle file
+states it, or larger as the drive shows it.
 
 Not detected: an estimate that is wrong from its start, or drifts more slowly than the leak forgets. Errors of
 accelerometer or gyro are attributed to the estimate, except for missing and stuck samples, which are not judged.
@@ -23,6 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.readings import without_impossible
@@ -45,17 +47,26 @@ D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW
 MEMORY_SIZE = 15
 
 
-def watched_track(track: StateTrack, signals: Signals, vehicle: VehicleParameters) -> StateTrack:
+#: The noise of the sensors is that of the vehicle file.
+AS_STATED = FilterNoise()
+
+
+def watched_track(
+    track: StateTrack, signals: Signals, vehicle: VehicleParameters, noise: FilterNoise = AS_STATED
+) -> StateTrack:
     """Return a track [N] with ``diverged`` set also where the sensors contradict it.
 
-    Estimates without a covariance are not monitored: they make no claim about their accuracy.
+    Estimates without a covariance are not monitored: they make no claim about their accuracy. ``noise`` : of the
+    measurements as the drive shows it, if it is larger than in the vehicle file.
     """
     if track.covariance.shape[0] == 0:
         return track
-    return replace(track, diverged=track.diverged | (wrong_branch(track, signals, vehicle) & track.valid))
+    return replace(track, diverged=track.diverged | (wrong_branch(track, signals, vehicle, noise) & track.valid))
 
 
-def wrong_branch(track: StateTrack, signals: Signals, vehicle: VehicleParameters) -> BoolArray:
+def wrong_branch(
+    track: StateTrack, signals: Signals, vehicle: VehicleParameters, noise: FilterNoise = AS_STATED
+) -> BoolArray:
     """Return where a track departs from the sensors' motion, [N].
 
     Computed on measurement time; a scored stamp has the flag of the newest step that had arrived.
@@ -71,11 +82,10 @@ def wrong_branch(track: StateTrack, signals: Signals, vehicle: VehicleParameters
         signals.steps_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s,
         track.yaw_rate_rad_s, track.valid,
     )  # fmt: skip
-    sensors = vehicle.sensors
+    sensors, tilt = vehicle.sensors, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
     car = (
-        vehicle.assumed_friction, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2, sensors.ay_std_m_s2,
-        sensors.yaw_rate_std_rad_s, *vehicle.imu_position_m[:2], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
-        sensors.imu_hold_s, float(sensors.stuck_samples),
+        vehicle.assumed_friction, tilt, *noise.measurement_std(sensors)[:2], *vehicle.imu_position_m[:2],
+        LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s, sensors.imu_hold_s, float(sensors.stuck_samples),
     )  # fmt: skip
     _watch(motion, car, np.zeros(MEMORY_SIZE), flags)
     released = release(signals.ready_ns, signals.stamps_ns)

@@ -301,8 +301,7 @@ class GnssAided:
         else:
             aiding = deepcopy(state.aiding)
         start, start_std = np.zeros(n), np.zeros(n)
-        for entry, value in START_STD.items():
-            start_std[entry] = value
+        start_std[list(START_STD)] = list(START_STD.values())
         start[[f.IMU_X, f.ANTENNA_HEIGHT]] = vehicle.imu_position_m[0], ANTENNA_HEIGHT_M
         if (antenna := vehicle.gnss_antenna_position_m) is not None:
             start[f.ANTENNA_X], start_std[f.ANTENNA_X] = antenna[0], KNOWN_ANTENNA_STD_M

@@ -19,15 +19,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import vehicle_ukf as ukf
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.unscented import update
 from pdhef_logtool.estimators.vehicle_model import NOMINAL, PLACES, READINGS, VX, WIDTH, Z_AY
@@ -36,10 +38,6 @@ from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 #: Memory of the mechanism: β, and C of Eq 22 for each measurement.
 ADAPTED = np.dtype([("trust", np.float64), ("c", np.float64, (READINGS,))])
@@ -210,9 +208,7 @@ class PaperHybridUkf:
     @property
     def measurement_variance(self) -> FloatArray:
         """R_0 of [a_y, r, v_x], [3]: the sensors' variance, for a_y at least ``constants.ay_variance``."""
-        s = self.vehicle.sensors
-        std = np.array([s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s])
-        variance: FloatArray = std**2
+        variance: FloatArray = np.square(self.vehicle.sensors.measurement_std)
         variance[Z_AY] = max(variance[Z_AY], self.constants.ay_variance)
         return variance
 

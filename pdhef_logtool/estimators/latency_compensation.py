@@ -9,7 +9,6 @@ A smoother (:class:`~.base.Smoother`) reads later samples: it has each estimate 
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from typing import Any, cast
 
 import numpy as np
@@ -20,7 +19,7 @@ from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import StepColumns, extrapolation, release
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 #: Steps that an estimator makes at a time; an hour of steps with covariances would take 350 MB per filter.
 PIECE_STEPS = 8192
@@ -41,7 +40,7 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     if isinstance(estimator, Smoother):
         return _smoothed(estimator, signals)
     arrivals = release(signals.ready_ns, signals.stamps_ns)
-    columns: dict[str, Any] = {}
+    tracks: list[StateTrack] = []
     state = None
     for first in range(0, max(len(signals), 1), PIECE_STEPS):
         # Numba compiles a kernel again for read-only arrays: the estimator gets a copy.
@@ -53,15 +52,8 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
                 continue
             stamps_ns = signals.stamps_ns[due].copy()
             ahead = extrapolation(piece.stamps_ns, arrivals.rows(due, first), steps.valid, stamps_ns)
-            track = predict_track(estimator, steps, ahead, stamps_ns)
-        if len(track) == len(signals):
-            return track
-        for name in (f.name for f in fields(track) if f.name != "name"):
-            part = getattr(track, name)
-            if name not in columns:
-                columns[name] = np.empty((len(signals) if len(part) else 0, *part.shape[1:]), part.dtype)
-            columns[name][due] = part
-    return replace(track, **columns)
+            tracks.append(predict_track(estimator, steps, ahead, stamps_ns))
+    return concatenate(tracks) if len(tracks) > 1 else tracks[0]
 
 
 def _run_piece(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.nominal_model import (
     model_parameters,
     planar_lateral_acceleration,
@@ -16,13 +16,10 @@ from pdhef_logtool.car.nominal_model import (
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
+from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.stepwise import StepState, advance_speed, prepared_steps
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.presets import Options
 
 #: Time step of the derivative of a_y along the motion.
 AY_RATE_STEP_S = 0.001
@@ -37,13 +34,7 @@ def _open_loop(inputs, hold_s, default_friction, p, state, values, rates, valid)
         advance_speed(state, dt[k], ax[k], speed[k], hold_s)
         mu = friction[k] if math.isfinite(friction[k]) else default_friction
         ok = math.isfinite(state[0]) and math.isfinite(steer[k])
-        if (
-            ok
-            and dt[k] <= RESTART_GAP_S
-            and math.isfinite(before)
-            and math.isfinite(state[2])
-            and math.isfinite(state[4])
-        ):
+        if ok and dt[k] <= RESTART_GAP_S and math.isfinite(before + state[2] + state[4]):
             n = substeps(before, dt[k], state[5], p)
             _, state[2], state[3] = rk4_step(before, state[2], state[3], state[4], 0.0, state[5], dt[k], n, p)
         elif ok:

@@ -187,7 +187,7 @@ SPECS: tuple[Spec, ...] = (
     Spec(OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",
          "open_loop:build", _INPUTS, 0x661100, causal=False),
     Spec("linear-regression", "sideslip linear in the network's features, low-passed at 2 Hz (needs such a model)",
-         "direct_network:build_regression", FEATURES, 0xDDCC77, network="linear_regression"),
+         "direct_network:build", FEATURES, 0xDDCC77, network="linear_regression"),
     Spec("phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
          "vehicle_ukf:build_nominal", _INPUTS, 0x0072B2),
     Spec("physics", "best filter with physics only, with the model parts supported by driving data",

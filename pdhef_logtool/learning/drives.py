@@ -19,6 +19,7 @@ from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, UsageError
+from pdhef_logtool.records.printable import listed
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
@@ -48,38 +49,6 @@ class LearnSettings:
     split: str | None = None
 
 
-def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInput], dict[str, str]]:
-    """Return the logs to use, and by name the split that a set's manifest assigns to a log.
-
-    Raises
-    ------
-    UsageError
-        A drive belongs to a rejected split, or no drive is left.
-    """
-    inputs = logs_of(arguments, settings.config.read_options)
-    manifests = cache(set_manifest)
-    splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in inputs}
-    if settings.split not in (None, ANY_SPLIT):
-        inputs = [i for i in inputs if splits[i.stem] == settings.split]
-        if not inputs:
-            there = ", ".join(sorted({s for s in splits.values() if s}))
-            raise UsageError(
-                expected=f"drives of split {settings.split}",
-                got=f"drives of {there}" if there else "drives without a set's manifest beside them",
-                where="--split",
-            )
-    refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in HELD_OUT]
-    if refused and settings.split != ANY_SPLIT:
-        more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
-        raise UsageError(
-            expected="drives that no result is reported on",
-            got=", ".join(refused[:_NAMED]) + more,
-            where="learn",
-            remedy="drives that a car learns from are no longer test drives: use --split validation, or --split any",
-        )
-    return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveSet:
     """Drives of one car, as a command names them.
@@ -87,7 +56,7 @@ class DriveSet:
     Attributes
     ----------
     car : car to read them with. logs : of the drives.
-    splits : split of each log in its simulated set, by log name.
+    splits : split of each log in its simulated set, by log name; empty without one.
     """
 
     car: Car
@@ -99,9 +68,22 @@ class DriveSet:
 
     @classmethod
     def of(cls, arguments: Logs, car: Car, settings: LearnSettings, reporter: Reporter) -> DriveSet:
-        """Return the drives of arguments; raises UsageError as :func:`choose_drives`."""
-        logs, splits = choose_drives(arguments, settings)
-        return cls(car, settings, tuple(logs), mapping_of(settings.config.mapping), splits, reporter)
+        """Return the drives of arguments; raises UsageError without a drive, or for drives that results need."""
+        config, wanted, manifests = settings.config, settings.split, cache(set_manifest)
+        logs = logs_of(arguments, config.read_options)
+        splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in logs}
+        if wanted not in (None, ANY_SPLIT):
+            logs = [i for i in logs if splits[i.stem] == wanted]
+            if not logs:
+                there = ", ".join(sorted({s for s in splits.values() if s}))
+                got = f"drives of {there}" if there else "drives without a set's manifest beside them"
+                raise UsageError(expected=f"drives of split {wanted}", got=got, where="--split")
+        refused = [f"{i.stem} ({splits[i.stem]})" for i in logs if splits[i.stem] in HELD_OUT]
+        if refused and wanted != ANY_SPLIT:
+            expected = "drives that no result is reported on"
+            remedy = "drives that a car learns from are no longer test drives: use --split validation, or --split any"
+            raise UsageError(expected=expected, got=listed(refused, _NAMED), where="learn", remedy=remedy)
+        return cls(car, settings, tuple(logs), mapping_of(config.mapping), splits, reporter)
 
     def read(
         self, read: Callable[[LogInput], tuple[DriveRecord, _Read | None]], share: float = 1.0
@@ -114,7 +96,7 @@ class DriveSet:
         for number, log in enumerate(self.logs):
             self.reporter.progress(f"reading {log.stem}", share * number / len(self.logs))
             record, drive = read(log)
-            records.append(replace(record, split=self.splits.get(log.stem)))
+            records.append(replace(record, split=self.splits[log.stem] or None))
             if drive is not None:
                 drives.append(drive)
         return tuple(records), drives
@@ -122,18 +104,12 @@ class DriveSet:
 
 def set_manifest(folder: Path | None) -> Mapping[str, Mapping[str, Any]]:
     """Return the entries of a set's manifest.json (``drives``) or manifest.toml (``log``) by file name."""
-    if folder is None:
-        return {}
-    documents: list[Any] = []
-    for name, parse in (("manifest.json", json.loads), ("manifest.toml", tomllib.loads)):
-        with suppress(OSError, ValueError, RecursionError):  # no manifest, or a file of another program
-            documents.append(parse((folder / name).read_text(encoding="utf-8")))
-    entries = [e for d in documents if isinstance(d, dict) for key in ("drives", "log") for e in _entries(d.get(key))]
-    return {e["file"]: e for e in entries if isinstance(e.get("file"), str)}
-
-
-def _entries(value: Any) -> list[dict[str, Any]]:
-    return [e for e in value if isinstance(e, dict)] if isinstance(value, list) else []
+    entries: list[Any] = []
+    for name, parse, key in (("manifest.json", json.loads, "drives"), ("manifest.toml", tomllib.loads, "log")):
+        # No folder or manifest, or a file of another program.
+        with suppress(OSError, ValueError, RecursionError, TypeError, LookupError):
+            entries += parse((folder / name).read_text(encoding="utf-8"))[key]  # type: ignore[operator]
+    return {e["file"]: e for e in entries if isinstance(e, dict) and isinstance(e.get("file"), str)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,25 +147,18 @@ class DriveRecord:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the record as JSON-able values."""
-        document = asdict(self)
-        if reason := document.pop("left_out"):
-            document["reason"] = reason
-        return {
-            **document,
-            "seconds": round(self.seconds, 3),
-            "span_s": None if self.span_s is None else [round(s, 3) for s in self.span_s],
-        }
+        span_s = None if self.span_s is None else [round(s, 3) for s in self.span_s]
+        document = {**asdict(self), "seconds": round(self.seconds, 3), "span_s": span_s}
+        reason = document.pop("left_out")
+        return document | ({"reason": reason} if reason else {})
 
 
-def record_of(
-    drive: Drive, *, split: str | None = None, whole: WholeDrive | None = None, left_out: str = ""
-) -> DriveRecord:
+def record_of(drive: Drive, *, whole: WholeDrive | None = None, left_out: str = "") -> DriveRecord:
     """Return the record of a drive that was read."""
     return DriveRecord(
         name=drive.name,
         file=drive.file,
         sha256=drive.sha256,
-        split=split,
         seconds=0.0 if whole is None else whole.seconds,
         span_s=None if whole is None else whole.span_s,
         truth=tuple(sorted({source.label for source in drive.mapping.truth.values()})),

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -46,11 +46,10 @@ from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.model.priors import TYRES
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import release
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.residual_model.features import SlowFeatures, slow_features
+from pdhef_logtool.residual_model.features import slow_features
 from pdhef_logtool.residual_model.ladder import NONE
 from pdhef_logtool.residual_model.ladder_fit import LadderFit, TaughtDrive, fit_ladder
 from pdhef_logtool.runs.config import RunConfig
@@ -122,46 +121,34 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
     return LearnResult(output, records, model.evidence, figures)
 
 
-#: Driving and sensors of a drive, and its content for teaching, None without ground truth.
-_Read: TypeAlias = "tuple[Driving | None, Sensors, OpenedDrive | None]"
-
-
 def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
     """Return the records of drives, their model, and figures."""
     config, car, progress = drives.settings.config, drives.car, drives.reporter.progress
 
-    def read(log: LogInput) -> tuple[DriveRecord, _Read]:
+    def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive]:
         with read_drive(log, car, drives.mapping, config.read_options) as drive:
-            record, opened = open_drive(drive, config)
-            if opened is not None:
-                return record, (opened.driving, drive.plan.sensors, opened)
-            start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
-            driving = None if lacking(drive) else read_driving(drive)
-            record = replace(record, seconds=end_s - start_s, span_s=(start_s, end_s))
-            return record, (driving, drive.plan.sensors, None)
+            return open_drive(drive, config)
 
-    records, content = drives.read(read, 0.3)
-    teachers = [opened for *_, opened in content if opened is not None]
+    records, opened = drives.read(read, 0.3)
+    teachers = [d for d in opened if d.whole is not None]
     if not teachers and config.reference != "on":
-        return _without_truth(records, content, car)
+        return _without_truth(records, opened, car)
     _check("" if teachers else "none", "at least one drive with a true sideslip and the signals of a calibration")
     seconds, slow = math.fsum(d.seconds for d in teachers), car.vehicle.low_speed_blend_m_s
     few = "" if seconds >= LEAST_S else f"{seconds:.1f} s"
     _check(few, f"at least {LEAST_S:g} s of driving with ground truth above {slow:g} m/s")
     taught = learn_from(teachers, progress)
-    sensors = teachers[0].drive.plan.sensors
-    stated = {name: getattr(taught, name) for name in ("parameters", "calibrated", "truth", "evidence")}
-    return records, model_of(car, sensors, residual=taught.ladder.model, **stated), figures_of(taught)
+    return records, taught.model(car, teachers[0].drive.plan.sensors), taught.figures
 
 
 def _without_truth(
-    records: Sequence[DriveRecord], content: Sequence[_Read], car: Car
+    records: Sequence[DriveRecord], drives: Sequence[OpenedDrive], car: Car
 ) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
     """Return the records of drives without ground truth, their model, and figures."""
-    fits = [None if driving is None else fit_car(driving, car.vehicle) for driving, *_ in content]
+    fits = [None if d.driving is None else fit_car(d.driving, car.vehicle) for d in drives]
     left_out = [r.left_out if fit is None else fit.refused for r, fit in zip(records, fits, strict=True)]
     records = tuple(replace(r, left_out=reason) for r, reason in zip(records, left_out, strict=True))
-    used = [(fit, of[1]) for fit, of in zip(fits, content, strict=True) if fit is not None and not fit.refused]
+    used = [(fit, d.drive.plan.sensors) for fit, d in zip(fits, drives, strict=True) if fit and not fit.refused]
     _check(
         "" if used else next(iter(left_out), "no drive"),
         "driving that calibrates the car, such as lane changes and bends",
@@ -188,22 +175,25 @@ SETTLE_NS = 3_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenedDrive:
-    """A drive in memory: its reader, its signals with the true sideslip, and the driving for the calibration."""
+    """A drive: its reader, the driving for the calibration, and its signals in memory if it has the true sideslip.
+
+    ``driving`` is None if a signal of the calibration is missing.
+    """
 
     drive: Drive
-    whole: WholeDrive
-    driving: Driving
+    driving: Driving | None
+    whole: WholeDrive | None = None
 
     @property
     def truth(self) -> StateTrack:
         """The true sideslip."""
-        assert self.whole.truth is not None
+        assert self.whole is not None and self.whole.truth is not None
         return self.whole.truth
 
     @property
     def seconds(self) -> float:
-        """Duration of usable driving."""
-        assert self.driving.slopes is not None
+        """Duration of driving with a true sideslip."""
+        assert self.driving is not None and self.driving.slopes is not None
         return float(np.count_nonzero(np.isfinite(self.driving.slopes))) * STEP_S
 
 
@@ -226,36 +216,61 @@ class Teaching:
             f" (RMSE without constants: {tried or 'not tried'})"
         )
 
+    @property
+    def figures(self) -> dict[str, Any]:
+        """The figures as JSON-able values."""
+        return {
+            "evidence": self.evidence,
+            "rung": self.ladder.rung,
+            "seconds": round(self.ladder.seconds, 1),
+            "blocks": self.ladder.blocks,
+            "rungs": [asdict(t) for t in self.ladder.trials],
+            "calibrated": self.calibrated,
+            "truth": self.truth,
+        }
 
-def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive | None]:
-    """Return the record of an open drive and its content for teaching, or None with the reason in the record."""
-    missing = sorted({*lacking(drive), *(FEATURES - drive.available)})
-    truth_at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
-    if lacks:
-        return record_of(drive, left_out=lacks), None
-    whole = drive.whole()
-    if truth_at is not None:
-        whole = replace(whole, truth=truth_at(whole.signals.stamps_ns))
-    assert whole.truth is not None
-    driving = with_truth(read_driving(drive), whole.truth)
-    if not np.isfinite(driving.slopes).any():  # type: ignore[arg-type]
-        return record_of(drive, left_out="no driving with a true sideslip above the low-speed limit"), None
-    record = record_of(drive, whole=whole)
-    return record if truth_at is None else replace(record, truth=(ESTIMATED,)), OpenedDrive(drive, whole, driving)
+    def model(self, car: Car, sensors: Sensors) -> CarModel:
+        """Return the model of the car with the sensors of one of its drives."""
+        stated = {name: getattr(self, name) for name in ("parameters", "calibrated", "truth", "evidence")}
+        return model_of(car, sensors, residual=self.ladder.model, **stated)
+
+
+def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive]:
+    """Return the record of an open drive and its content; the record has the reason if it does not teach."""
+    if missing := sorted({*lacking(drive), *(FEATURES - drive.available)}):
+        truth_at, lacks = None, f"the log has no {', '.join(missing)}"
+    else:
+        truth_at, lacks = teaching_reference(drive, config)
+    driving = None if lacking(drive) else read_driving(drive)
+    if driving is not None and not lacks:
+        whole = drive.whole()
+        if truth_at is not None:
+            whole = replace(whole, truth=truth_at(whole.signals.stamps_ns))
+        assert whole.truth is not None
+        taught = with_truth(driving, whole.truth)
+        if np.isfinite(taught.slopes).any():  # type: ignore[arg-type]
+            record = record_of(drive, whole=whole)
+            record = record if truth_at is None else replace(record, truth=(ESTIMATED,))
+            return record, OpenedDrive(drive, taught, whole)
+        lacks = "no driving with a true sideslip above the low-speed limit"
+    start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
+    record = replace(record_of(drive, left_out=lacks), seconds=end_s - start_s, span_s=(start_s, end_s))
+    return record, OpenedDrive(drive, driving)
 
 
 def learn_from(drives: Sequence[OpenedDrive], progress: Any = lambda _text, _share: None) -> Teaching:
     """Return prior and residual from drives of one car, read with its vehicle file."""
     progress("fitting the prior", 0.3)
     vehicle = drives[0].drive.car.vehicle
-    fits = (fit_car(d.driving, vehicle) for d in drives)
+    driven = [d.driving for d in drives if d.driving is not None]
+    fits = (fit_car(driving, vehicle) for driving in driven)
     parameters = tuple(p for fit in fits if not fit.refused for p in for_later_drives(fit, TYRES))
-    calibrations = [fit_car(replace(d.driving, slopes=None), vehicle, parameters) for d in drives]
+    calibrations = [fit_car(replace(driving, slopes=None), vehicle, parameters) for driving in driven]
     progress("fitting the residual", 0.8)
     lacks = [lacking_of(d, c) for d, c in zip(drives, calibrations, strict=True)]
     seconds = {False: 0.0, True: 0.0}
-    for drive, calibration in zip(drives, calibrations, strict=True):
-        seconds[not calibration.refused] += drive.driving.seconds
+    for driving, calibration in zip(driven, calibrations, strict=True):
+        seconds[not calibration.refused] += driving.seconds
     calibrated = seconds[True] >= seconds[False]  # calibrated and uncalibrated physics differ
     fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
     ladder = fit_ladder(fitted)
@@ -267,35 +282,17 @@ def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:
     """Return features, sideslip error of ``physics`` on the calibrated car, and response of a drive."""
     model = DriveModel.of(drive.drive, calibration)
     car = model.car
-    physics, signals = make_estimator(PHYSICS, car), model.apply(drive.whole.signals).calibrated
-    assert isinstance(physics, AdaptivePhysics)
+    physics, whole = make_estimator(PHYSICS, car), drive.whole
+    assert isinstance(physics, AdaptivePhysics) and whole is not None
+    signals = model.apply(whole.signals).calibrated
     arrived = release(signals.ready_ns, signals.stamps_ns)
     track = run_estimator(physics, signals)
-    features = features_of(physics, signals)
+    extra_r = np.nan_to_num(signals.extra_variance)
+    table, dt_s, *_ = run_features(physics.physics, signals, None, seen=without_bursts(signals), extra_r=extra_r)
+    features, _ = slow_features(table, dt_s, None)
     error = signal_error(track, drive.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
     settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS
     error = np.where(arrived.arrived & settled, error, np.nan)
     response = residual_response(physics, signals, arrived.step)
     weight = weight_of(np.nan_to_num(drive.truth.sideslip_std_rad))
     return TaughtDrive(drive.drive.name, signals.stamps_ns, features, -error, response, weight)
-
-
-def features_of(physics: AdaptivePhysics, signals: Signals) -> SlowFeatures:
-    """Return the features of a drive's steps, as the filter in service computes them."""
-    extra_r = np.nan_to_num(signals.extra_variance)
-    table, dt_s, *_ = run_features(physics.physics, signals, None, seen=without_bursts(signals), extra_r=extra_r)
-    return slow_features(table, dt_s, None)[0]
-
-
-def figures_of(taught: Teaching) -> dict[str, Any]:
-    """Return the figures as JSON-able values."""
-    ladder = taught.ladder
-    return {
-        "evidence": taught.evidence,
-        "rung": ladder.rung,
-        "seconds": round(ladder.seconds, 1),
-        "blocks": ladder.blocks,
-        "rungs": [asdict(t) for t in ladder.trials],
-        "calibrated": taught.calibrated,
-        "truth": taught.truth,
-    }

@@ -68,7 +68,7 @@ class Driving:
         inside = np.zeros(ay.size, dtype=np.bool_)
         for piece in sorted(pieces, key=lambda p: -float(np.var(ay[p])))[: round(MOST_S / PIECE_S)]:
             inside[piece] = True
-        return replace(self, stretches=_long(_spans(inside)))
+        return replace(self, stretches=_long_runs(inside))
 
 
 def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
@@ -81,14 +81,9 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
     cell = (signals.stamps_ns - start_ns) // round(STEP_S * 1e9)
     cells, place = np.unique(cell, return_inverse=True)
     means = np.full((_COLUMNS, cells.size), np.nan)
-    sources = {
-        STEER: signals.steer_rad,
-        SPEED: signals.speed_m_s,
-        YAW_RATE: signals.yaw_rate_rad_s,
-        AY: signals.ay_m_s2,
-        FRICTION: signals.friction,
-    }
-    for row, values in sources.items():
+    # In the order of the columns.
+    sources = (signals.steer_rad, signals.speed_m_s, signals.yaw_rate_rad_s, signals.ay_m_s2, signals.friction)
+    for row, values in enumerate(sources):
         count, total = samples_and_sums(values, place, cells.size)
         means[row] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     ends_ns = start_ns + (cells + 1) * round(STEP_S * 1e9)
@@ -104,8 +99,8 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
         columns[row] = _bridged(columns[row], round(bridged_s / STEP_S))
     if not (has_ay := bool(np.isfinite(columns[AY]).any())):
         columns[AY] = columns[SPEED] * columns[YAW_RATE]
-    stretches = _stretches(columns, vehicle.low_speed_blend_m_s)
-    return Driving(columns, stamps_ns, stretches, has_ay)
+    complete = np.isfinite(columns).all(axis=0)
+    return Driving(columns, stamps_ns, _long_runs(complete & (columns[SPEED] > vehicle.low_speed_blend_m_s)), has_ay)
 
 
 def _bridged(values: FloatArray, most: int) -> FloatArray:
@@ -114,18 +109,8 @@ def _bridged(values: FloatArray, most: int) -> FloatArray:
     return Bracket(finite, np.arange(values.size), most).linear(values[finite])
 
 
-def _stretches(columns: FloatArray, least_speed_m_s: float) -> IntArray:
-    """Return [first, last) of each stretch that is complete, fast and long enough."""
-    good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > least_speed_m_s)
-    return _long(_spans(good))
-
-
-def _spans(mask: BoolArray) -> IntArray:
-    """Return [first, last) of each run of true values in a mask [N]."""
+def _long_runs(mask: BoolArray) -> IntArray:
+    """Return [first, last) of each run of true values in a mask [N] that is long enough for a stretch."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return edges.reshape(-1, 2).astype(np.int64)
-
-
-def _long(spans: IntArray) -> IntArray:
-    """Return the spans that are long enough."""
-    return spans[spans[:, 1] - spans[:, 0] >= round(LEAST_STRETCH_S / STEP_S)]
+    runs = edges.reshape(-1, 2).astype(np.int64)
+    return runs[runs[:, 1] - runs[:, 0] >= round(LEAST_STRETCH_S / STEP_S)]

@@ -28,7 +28,7 @@ from copy import copy
 
 import numpy as np
 
-from pdhef_logtool.car.descent import descend
+from pdhef_logtool.car.descent import descend, linearised
 from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.posterior import FittedParameter, Posterior
 from pdhef_logtool.car.vehicle import STIFFNESS_TYRE_SHAPE, VehicleParameters
@@ -94,14 +94,14 @@ def fit_car(driving: Driving, vehicle_file: VehicleParameters, earlier: Sequence
         vehicle = vehicle_file if reached is None else vehicle_file.model_copy(update={"friction": reached})
     root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     varied = () if refused else varied_parameters(theta, root, fit.sideslip, VARIED)
-    rms = fit.rms(fit.values(theta))
+    rms = fit.rms(theta)
     return Posterior(
         vehicle,
         fit.fitted(theta, covariance),
         refused,
         tuple(fit.vehicle(to) for to in varied),
         # A good fit is no proof of a better model.
-        error_scale=max(1.0, float(np.sqrt(np.mean((np.array(rms) / ERROR_STD[:2]) ** 2)))),
+        error_scale=max(1.0, float(np.sqrt(np.mean((rms / ERROR_STD[:2]) ** 2)))),
         reached_friction=reached,
         seconds=driving.seconds,
         level_m_s2=level_of(driving),
@@ -172,18 +172,13 @@ class CarFit:
         )
         return descent.theta
 
-    def errors_of(self, theta: FloatArray) -> FloatArray:
-        """Return errors over their standard deviations: yaw rate, a_y, and sideslip if it is known, [2 or 3, K]."""
-        return self._errors(self.values(theta))
-
-    def rms(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """Return the RMS error of yaw rate and a_y for parameters by name."""
-        rms = self._rms(self._errors(values))
-        return float(rms[equations.OF_RATE]), float(rms[equations.OF_AY])
+    def rms(self, theta: FloatArray) -> FloatArray:
+        """Return the RMS error of yaw rate and a_y, [2]."""
+        return self._rms(self.errors_of(theta))[:2]
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
         """Return the model's v_y / v_x of all used samples [K]."""
-        self._errors(self.values(theta))
+        self.errors_of(theta)
         return np.asarray(self._out[2, self._kept] / self._columns[equations.SPEED, self._kept], dtype=np.float64)
 
     def values(self, theta: FloatArray) -> dict[str, float]:
@@ -204,7 +199,7 @@ class CarFit:
 
     def refusal(self, theta: FloatArray) -> tuple[str, bool]:
         """Return why a fit is rejected, its error is too large or the car slides, and whether it slides."""
-        rms = self.rms(self.values(theta))
+        rms = self.rms(theta)
         for name, column, row in (
             ("yaw rate", equations.YAW_RATE, equations.OF_RATE),
             ("lateral acceleration", equations.AY, equations.OF_AY),
@@ -220,9 +215,10 @@ class CarFit:
             return f"the rear axle slides in {sliding:.0%} of the driving", True
         return "", False
 
-    def _errors(self, values: Mapping[str, float]) -> FloatArray:
+    def errors_of(self, theta: FloatArray) -> FloatArray:
+        """Return errors over their standard deviations: yaw rate, a_y, and sideslip if it is known, [2 or 3, K]."""
         driving, kept = self._driving, self._kept
-        track = _track_of(values, self.vehicle_file)
+        track = _track_of(self.values(theta), self.vehicle_file)
         equations.errors(self._columns, driving.stretches, STEP_S, track, self._filter, self._out, self._differences)
         if not driving.has_ay:
             self._differences[equations.OF_AY] = 0.0
@@ -249,12 +245,7 @@ class CarFit:
     def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the inverse curvature of the cost [n, n], and its gradient by block [blocks, n]."""
         centre = self.errors_of(theta)
-        residuals = self._residuals(centre, centre)
-        jacobian = np.empty((residuals.size, theta.size))
-        for i in range(theta.size):
-            moved = theta.copy()
-            moved[i] += DERIVATIVE_STEP
-            jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
+        residuals, jacobian = linearised(self.errors_of, self._residuals, theta, centre, DERIVATIVE_STEP)
         inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
         gradients = np.zeros((int(self._block.max()) + 1, theta.size))
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])

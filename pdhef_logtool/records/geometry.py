@@ -30,17 +30,12 @@ def rotation_from_quat(quat_wxyz: FloatArray) -> FloatArray:
     """
     q = quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True)
     w, x, y, z = q.T
-    m = np.empty((q.shape[0], 3, 3))
-    m[:, 0, 0] = 1 - 2 * (y * y + z * z)
-    m[:, 0, 1] = 2 * (x * y - w * z)
-    m[:, 0, 2] = 2 * (x * z + w * y)
-    m[:, 1, 0] = 2 * (x * y + w * z)
-    m[:, 1, 1] = 1 - 2 * (x * x + z * z)
-    m[:, 1, 2] = 2 * (y * z - w * x)
-    m[:, 2, 0] = 2 * (x * z - w * y)
-    m[:, 2, 1] = 2 * (y * z + w * x)
-    m[:, 2, 2] = 1 - 2 * (x * x + y * y)
-    return m
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
 
 
 def quat_from_yaw(yaw_rad: FloatArray) -> FloatArray:
@@ -55,14 +50,9 @@ def ecef_from_geodetic(lat_deg: FloatArray, lon_deg: FloatArray, alt_m: FloatArr
     """Convert WGS-84 latitude, longitude (deg) and ellipsoidal height (m), each [N], to ECEF [N, 3] in metres."""
     lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
     n = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
-    return np.stack(
-        [
-            (n + alt_m) * np.cos(lat) * np.cos(lon),
-            (n + alt_m) * np.cos(lat) * np.sin(lon),
-            (n * (1.0 - WGS84_E2) + alt_m) * np.sin(lat),
-        ],
-        axis=1,
-    )
+    to_axis = (n + alt_m) * np.cos(lat)
+    z = (n * (1.0 - WGS84_E2) + alt_m) * np.sin(lat)
+    return np.stack([to_axis * np.cos(lon), to_axis * np.sin(lon), z], axis=1)
 
 
 def geodetic_from_ecef(ecef_m: FloatArray) -> FloatArray:

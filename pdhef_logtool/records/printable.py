@@ -10,12 +10,10 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import PurePath
-from typing import Any, TypeVar
+from typing import Any
 
 #: The middle of longer texts is omitted.
 MOST_SIGNS = 1000
-
-_T = TypeVar("_T")
 
 
 def printable(text: object, most: int = MOST_SIGNS) -> str:
@@ -35,12 +33,8 @@ def listed(names: Sequence[str], most: int = 5, count: int | None = None) -> str
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
-def all_printable(value: _T) -> _T:
+def all_printable(value: Any) -> Any:
     """Return a copy of a record, a document or a list of them with all texts :func:`printable`."""
-    return _all_printable(value)  # type: ignore[no-any-return]
-
-
-def _all_printable(value: Any) -> Any:
     if value is None or type(value) in (float, int, bool):  # in the order of their frequency in a report
         return value
     if type(value) is str:
@@ -48,15 +42,15 @@ def _all_printable(value: Any) -> Any:
     if isinstance(value, PurePath):
         return type(value)(printable(value))
     if isinstance(value, Mapping):
-        return {_all_printable(k): _all_printable(v) for k, v in value.items()}
+        return {all_printable(k): all_printable(v) for k, v in value.items()}
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*map(_all_printable, value))
+        return type(value)(*map(all_printable, value))
     if isinstance(value, list | tuple | set | frozenset):
-        return type(value)(map(_all_printable, value))
+        return type(value)(map(all_printable, value))
     if is_dataclass(value) and not isinstance(value, type):
         record = copy.copy(value)
         for f in fields(value):
-            object.__setattr__(record, f.name, _all_printable(getattr(value, f.name)))
+            object.__setattr__(record, f.name, all_printable(getattr(value, f.name)))
         return record
     return value
 

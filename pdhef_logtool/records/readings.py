@@ -28,18 +28,16 @@ POSSIBLE_FRICTION = (0.01, 5.0)
 
 def impossible_readings(signals: Signals) -> dict[str, BoolArray]:
     """Return the masks [N] of impossible readings by column; columns without any are omitted."""
-    bad = {c: ~(np.abs(getattr(signals, c)) <= limit) for c, limit in POSSIBLE_MAGNITUDE.items()}
+    bad = {c: np.abs(getattr(signals, c)) > limit for c, limit in POSSIBLE_MAGNITUDE.items()}
     low, high = POSSIBLE_FRICTION
-    bad["friction"] = ~((signals.friction >= low) & (signals.friction <= high))
-    read = {c: mask & ~np.isnan(getattr(signals, c)) for c, mask in bad.items()}
-    return {c: mask for c, mask in read.items() if mask.any()}
+    bad["friction"] = (signals.friction < low) | (signals.friction > high)
+    return {c: mask for c, mask in bad.items() if mask.any()}
 
 
 def without_impossible(signals: Signals) -> Signals:
     """Return the signals with impossible readings as missing; the same object without any."""
-    changed: dict[str, Any] = {
-        c: np.where(mask, np.nan, getattr(signals, c)) for c, mask in impossible_readings(signals).items()
-    }
+    bad = impossible_readings(signals)
+    changed: dict[str, Any] = {c: np.where(mask, np.nan, getattr(signals, c)) for c, mask in bad.items()}
     return replace(signals, **changed) if changed else signals
 
 
@@ -47,6 +45,5 @@ def without_impossible_states(track: StateTrack) -> StateTrack:
     """Return the track with impossible states as invalid and diverged; the same object without any."""
     bad = np.zeros(len(track), np.bool_)
     for name, limit in POSSIBLE_STATE.items():
-        column = getattr(track, name)
-        bad |= ~(np.abs(column) <= limit) & ~np.isnan(column)
+        bad |= np.abs(getattr(track, name)) > limit
     return replace(track, valid=track.valid & ~bad, diverged=track.diverged | bad) if bad.any() else track

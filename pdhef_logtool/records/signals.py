@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, TypeAlias
 
@@ -212,20 +212,23 @@ class Signals:
 
     def rows(self, start: int, end: int) -> Signals:
         """Return the stamps [start, end)."""
-        columns: dict[str, Any] = {c: getattr(self, c)[start:end] for c in SIGNAL_COLUMNS}
         before_ns = self.stamps_ns[start - 1 : start] if start else self.before_ns
-        return replace(self, **columns, before_ns=before_ns)
+        return replace(self._with(lambda column: column[start:end]), before_ns=before_ns)
 
     def copy(self) -> Signals:
         """Return the same signals in arrays that may be written."""
-        return replace(self, **{c: getattr(self, c).copy() for c in SIGNAL_COLUMNS})
+        return self._with(np.ndarray.copy)
 
     def read_only(self) -> Signals:
         """Return the same signals in views that cannot be written."""
-        columns: dict[str, Any] = {c: getattr(self, c).view() for c in SIGNAL_COLUMNS}
-        for column in columns.values():
-            column.setflags(write=False)
-        return replace(self, **columns)
+        signals = self._with(np.ndarray.view)
+        for name in SIGNAL_COLUMNS:
+            getattr(signals, name).setflags(write=False)
+        return signals
+
+    def _with(self, function: Callable[[Any], Any]) -> Signals:
+        """Return the signals with a function of each column."""
+        return replace(self, **{name: function(getattr(self, name)) for name in SIGNAL_COLUMNS})
 
 
 SIGNAL_COLUMNS = tuple(f.name for f in fields(Signals) if f.name not in ("available", "before_ns"))

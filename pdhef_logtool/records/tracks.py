@@ -21,27 +21,10 @@ ESTIMATED_COLUMNS = (
 SHARE_COLUMNS = ("share_law", "share_kinematics", "share_gnss", "independent")
 #: Columns of estimates.parquet in order, without ``estimator`` (the name of the track).
 TRACK_COLUMNS = (
-    "stamp_ns",
-    "vx_m_s",
-    "vy_m_s",
-    "yaw_rate_rad_s",
-    "sideslip_rad",
-    "ay_m_s2",
-    "x_m",
-    "y_m",
-    "yaw_rad",
-    "vx_std_m_s",
-    "vy_std_m_s",
-    "yaw_rate_std_rad_s",
-    "sideslip_std_rad",
-    "network_trust",
-    "r_scale",
-    "nis",
-    "friction",
-    "valid",
-    "diverged",
-    "mixture_weight",
-    "reason",
+    *("stamp_ns", "vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"),
+    *("x_m", "y_m", "yaw_rad"),
+    *("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s", "sideslip_std_rad"),
+    *("network_trust", "r_scale", "nis", "friction", "valid", "diverged", "mixture_weight", "reason"),
     *ESTIMATED_COLUMNS,
     *SHARE_COLUMNS,
     "steer_rad",
@@ -187,8 +170,7 @@ def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
     if not np.isfinite(std).any():
         return np.empty((0, 3, 3))
     covariance = np.full((std.shape[0], 3, 3), np.nan)
-    for i in range(3):
-        covariance[:, i, i] = std[:, i] ** 2
+    covariance[:, range(3), range(3)] = std**2
     return covariance
 
 

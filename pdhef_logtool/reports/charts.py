@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from pdhef_logtool.estimators.table import all_specs
-from pdhef_logtool.records.printable import all_printable
+from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.encoding import Grid, encode
 from pdhef_logtool.results.plotted import colour_rgb
@@ -262,7 +262,7 @@ class _Blocks:
 def _label(text: str) -> str:
     half = _LABEL_SIGNS // 2
     cut = text if len(text) <= _LABEL_SIGNS else f"{text[: half - 1]}…{text[-half:]}"
-    return all_printable(cut)
+    return printable(cut)
 
 
 def joined(spans: Sequence[Span]) -> list[Span]:

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES
 from pdhef_logtool.residual_model.interface import LIMITS, Residual, ResidualModel
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
-from pdhef_logtool.storage.documents import read_json
+from pdhef_logtool.storage.documents import one_of, read_json, validated
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 if TYPE_CHECKING:
@@ -50,7 +52,11 @@ OUTPUT_COUNT = {RESIDUAL: 2, LATERAL_VELOCITY: 1}
 _LIMITS_OF = {RESIDUAL: LIMITS, LATERAL_VELOCITY: (30.0,)}
 
 
-@dataclass(frozen=True, slots=True)
+#: Of the entries of model.json, which are checked.
+_CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+@checked_dataclass(frozen=True, config=_CHECKED)
 class Normalisation:
     """x_normalised = (x − mean) / std per feature; target = output · target_std."""
 
@@ -59,35 +65,45 @@ class Normalisation:
     target_std: tuple[float, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class ModelBundle:
-    """A trained network, which predicts step by step.
+@checked_dataclass(frozen=True, config=_CHECKED)
+class NetworkDesign:
+    """What decides the outputs of a network, beside its weights.
 
     Attributes
     ----------
     feature_names : in order; a subset of :data:`~.features.FEATURES`.
     hidden, layers, head : architecture. period_s : step of the training data.
-    weights : by name, float32, as PyTorch names them.
-    provenance : training data hash, seeds, metrics and other entries of the model card; JSON-able.
     target : predicted quantity, one of :data:`OUTPUT_COUNT`.
     model : the filter of its features and its residual, one of :data:`MODELS`.
     physics_sha256 : digest of the physics of the training car or cars.
     odd : half of the difference between outputs for the input and its mirror image is used, which is exactly odd.
-    pure_lstm, linear_regression, paper_network : the baselines beside it, None without.
     """
 
-    feature_names: tuple[str, ...]
+    feature_names: tuple[Annotated[str, one_of(FEATURES)], ...]
     hidden: int
     layers: int
     head: tuple[int, ...]
     period_s: float
     normalisation: Normalisation
-    weights: dict[str, np.ndarray[Any, np.dtype[np.float32]]]
-    provenance: dict[str, Any] = field(default_factory=dict)
     target: str = RESIDUAL
-    model: str = PHYSICS_MODEL
+    model: Annotated[str, one_of(MODELS)] = PHYSICS_MODEL
     physics_sha256: str = ""
     odd: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ModelBundle(NetworkDesign):
+    """A trained network, which predicts step by step.
+
+    Attributes
+    ----------
+    weights : by name, float32, as PyTorch names them.
+    provenance : training data hash, seeds, metrics and other entries of the model card; JSON-able.
+    pure_lstm, linear_regression, paper_network : the baselines beside it, None without.
+    """
+
+    weights: dict[str, np.ndarray[Any, np.dtype[np.float32]]] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
     pure_lstm: ModelBundle | None = None
     linear_regression: LinearModel | None = None
     paper_network: ModelBundle | None = None
@@ -192,18 +208,15 @@ class ModelBundle:
         return 0.5 * (straight - mirrored) if self.odd else straight, after
 
     def _document(self) -> dict[str, Any]:
-        other = {} if self.target == RESIDUAL else {"target": self.target}
         return {
-            **other,
+            **({} if self.target == RESIDUAL else {"target": self.target}),
             "format": FORMAT,
             "version": FORMAT_VERSION,
-            "model": self.model,
-            "physics_sha256": self.physics_sha256,
-            "odd": self.odd,
-            "features": list(self.feature_names),
-            "architecture": {"hidden": self.hidden, "layers": self.layers, "head": list(self.head)},
-            "period_s": float(self.period_s),
-            "normalisation": {k: [float(x) for x in v] for k, v in asdict(self.normalisation).items()},
+            **{name: getattr(self, name) for name in ("model", "physics_sha256", "odd")},
+            "features": self.feature_names,
+            "architecture": {name: getattr(self, name) for name in ("hidden", "layers", "head")},
+            "period_s": self.period_s,
+            "normalisation": asdict(self.normalisation),
         }
 
     def save(self, folder: Path) -> None:
@@ -224,9 +237,9 @@ class ModelBundle:
                     file.write(data)
 
 
-def network_folder(network: Path) -> Path | None:
+def network_folder(network: Path | str) -> Path | None:
     """Return the folder of a network: of a shipped one by name, or the folder itself; None for ``none``."""
-    return None if str(network) == NO_MODEL else SHIPPED_FOLDERS.get(str(network), network)
+    return None if str(network) == NO_MODEL else SHIPPED_FOLDERS.get(str(network), Path(network))
 
 
 def load_bundle(folder: Path) -> ModelBundle:
@@ -278,36 +291,18 @@ def load_network(folder: Path, target: str) -> ModelBundle:
         )
     if (learnt := document.get("target", RESIDUAL)) != target:
         raise ModelError(expected=f"a network for {target}", got=f"one for {learnt}", where=where)
-    try:
-        a, n = document["architecture"], document["normalisation"]
-        bundle = ModelBundle(
-            feature_names=tuple(str(name) for name in document["features"]),
-            hidden=int(a["hidden"]),
-            layers=int(a["layers"]),
-            head=tuple(int(w) for w in a["head"]),
-            period_s=float(document["period_s"]),
-            normalisation=Normalisation(
-                tuple(float(x) for x in n["feature_mean"]),
-                tuple(float(x) for x in n["feature_std"]),
-                tuple(float(n["target_std"][i]) for i in range(OUTPUT_COUNT[target])),
-            ),
-            weights=weights,
-            provenance=document.get("provenance", {}),
-            target=target,
-            model=str(document["model"]),
-            physics_sha256=str(document["physics_sha256"]),
-            odd=bool(document["odd"]),
-        )
-    except (LookupError, TypeError, ValueError, OverflowError) as error:
-        raise ModelError(expected="the entries of model.json", got=f"{error!r}", where=where) from None
+    architecture = document.get("architecture")
+    stated = {**document, **(architecture if isinstance(architecture, dict) else {})}
+    stated = {"feature_names": document.get("features"), **stated}
+    entries = {f.name: stated[f.name] for f in fields(NetworkDesign) if f.name in stated}
+    design = validated(NetworkDesign, entries, where, ModelError, expected="the entries of model.json")
+    bundle = ModelBundle(**vars(design), weights=weights, provenance=document.get("provenance", {}))
     shapes = {name: w.shape for name, w in weights.items()}
     if shapes != bundle.weight_shapes or any(w.dtype != np.float32 for w in weights.values()):
         raise ModelError(expected="float32 weights of the architecture of model.json", got=f"{shapes}", where=where)
-    unknown = [f for f in bundle.feature_names if f not in FEATURES]
-    if unknown:
-        raise ModelError(expected=f"features out of {', '.join(FEATURES)}", got=", ".join(unknown), where=where)
-    if bundle.model not in MODELS:
-        raise ModelError(expected=f"a network for {' or '.join(MODELS)}", got=bundle.model, where=where)
+    sizes, inputs = [len(values) for values in vars(bundle.normalisation).values()], len(bundle.feature_names)
+    if sizes != [inputs, inputs, OUTPUT_COUNT[target]]:
+        raise ModelError(expected="a normalisation of all features and targets", got=f"{sizes} values", where=where)
     if document.get("sha256") != bundle.sha256:
         raise ModelError(expected="weights that belong to model.json", got="another hash", where=where)
     return bundle

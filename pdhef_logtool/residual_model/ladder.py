@@ -90,15 +90,9 @@ class LadderModel(BaseModel):
         from pdhef_logtool.residual_model.ladder_kernels import Basis
 
         random = len(self.phases)
-        basis = Basis(
-            np.array(self.scale),
-            np.array(self.even_mean),
-            np.array(self.even_scale),
-            np.array(self.odd_directions, dtype=np.float64).reshape(random, ODD_COUNT),
-            np.array(self.even_directions, dtype=np.float64).reshape(random, EVEN_COUNT),
-            np.array(self.phases, dtype=np.float64),
-        )
-        return basis, np.array(self.weights), np.array(self.whitening)
+        shapes = {"odd_directions": (random, ODD_COUNT), "even_directions": (random, EVEN_COUNT)}
+        arrays = {n: np.array(getattr(self, n), dtype=np.float64).reshape(shapes.get(n, -1)) for n in Basis._fields}
+        return Basis(**arrays), np.array(self.weights), np.array(self.whitening)
 
     def residual(self, features: FloatArray, dt_s: FloatArray, state: FloatArray | None) -> tuple[Residual, FloatArray]:
         """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""

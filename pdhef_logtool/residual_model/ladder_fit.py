@@ -186,12 +186,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     speed = np.quantile(even[:, SPEED_COLUMN], [1.0 - QUANTILE, QUANTILE])
     model = LadderModel(
         rung=chosen,  # type: ignore[arg-type]
-        scale=plain(scale),
-        even_mean=plain(even_mean),
-        even_scale=plain(even_scale),
-        odd_directions=plain(basis.odd_directions[:random]),
-        even_directions=plain(basis.even_directions[:random]),
-        phases=plain(basis.phases[:random]),
+        **{name: plain(values) for name, values in _part(basis, slice(random))._asdict().items()},
         weights=plain(weights),
         whitening=plain(_whitening(odd / scale)),
         speed_m_s=plain(np.maximum(speed, 0.1)),
@@ -208,11 +203,16 @@ def _features(basis: Basis, features: SlowFeatures, rows: IntArray | slice) -> F
     return out
 
 
+def _part(basis: Basis, part: slice) -> Basis:
+    """Return a basis with a part of its random features."""
+    return basis._replace(**{name: getattr(basis, name)[part] for name in RANDOM_ARRAYS})
+
+
 def _responses(basis: Basis, sample: _Sample) -> FloatArray:
     """Return the changes of the sideslip by each feature as a rate, at the rows of a sample."""
     columns = []
     for first in range(0, max(len(basis.phases), 1), TOGETHER):
-        part = basis._replace(**{n: getattr(basis, n)[first : first + TOGETHER] for n in RANDOM_ARRAYS})
+        part = _part(basis, slice(first, first + TOGETHER))
         phi = _features(part, sample.drive.features, slice(None))
         columns.append(sample.drive.response(phi if first == 0 else phi[:, ODD_COUNT:])[sample.rows])
     return np.concatenate(columns, axis=1)

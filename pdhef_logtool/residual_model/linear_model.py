@@ -7,23 +7,25 @@ uses low-passed features; its coefficients partly compensate the delay of the lo
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
 
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.storage.documents import digest, read_json
+from pdhef_logtool.storage.documents import digest, one_of, read_json, validated
 
 FORMAT = "pdhef.linear-regression"
 FORMAT_VERSION = 1
 TARGET = "sideslip"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
 class LinearModel:
     """Coefficients of the file's equation.
 
@@ -34,7 +36,7 @@ class LinearModel:
     provenance : training data hash, errors and other entries of the model card; JSON-able.
     """
 
-    feature_names: tuple[str, ...]
+    feature_names: tuple[Annotated[str, one_of(FEATURES)], ...]
     coefficients: tuple[float, ...]
     intercept_rad: float
     low_pass_hz: float
@@ -43,7 +45,7 @@ class LinearModel:
     @property
     def sha256(self) -> str:
         """Hash of everything that decides the outputs."""
-        return digest(self._document())
+        return digest({k: v for k, v in self._document().items() if k != "provenance"})
 
     def sideslip_rad(self, features: FloatArray) -> FloatArray:
         """Return the sideslip before the low-pass, [N], of the full feature array."""
@@ -68,20 +70,13 @@ class LinearModel:
         return features[:, 0] * np.tan(np.clip(beta[:, 0], -1.4, 1.4)), memory
 
     def _document(self) -> dict[str, Any]:
-        return {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "target": TARGET,
-            "features": list(self.feature_names),
-            "coefficients": [float(c) for c in self.coefficients],
-            "intercept_rad": float(self.intercept_rad),
-            "low_pass_hz": float(self.low_pass_hz),
-        }
+        entries = asdict(self)
+        kind = {"format": FORMAT, "version": FORMAT_VERSION, "target": TARGET}
+        return {**kind, "features": entries.pop("feature_names"), **entries}
 
     def to_json(self) -> str:
         """Return the file's text."""
-        document = {**self._document(), "sha256": self.sha256, "provenance": self.provenance}
-        return json.dumps(document, indent=2) + "\n"
+        return json.dumps({**self._document(), "sha256": self.sha256}, indent=2) + "\n"
 
 
 def load_linear_model(path: Path) -> LinearModel:
@@ -95,23 +90,13 @@ def load_linear_model(path: Path) -> LinearModel:
     where = str(path)
     remedy = "remove the file, or take a complete network"
     document = read_json(path, "the coefficients of a linear regression", ModelError, remedy)
-    kind = tuple(document.get(key) for key in ("format", "version", "target"))
+    kind = tuple(document.pop(key, None) for key in ("format", "version", "target"))
     if kind != (FORMAT, FORMAT_VERSION, TARGET):
         wanted = f"{FORMAT} {FORMAT_VERSION} of {TARGET}"
         raise ModelError(expected=wanted, got=f"{kind[0]} {kind[1]} of {kind[2]}", where=where, remedy=remedy)
-    try:
-        model = LinearModel(
-            feature_names=tuple(str(name) for name in document["features"]),
-            coefficients=tuple(float(c) for c in document["coefficients"]),
-            intercept_rad=float(document["intercept_rad"]),
-            low_pass_hz=float(document["low_pass_hz"]),
-            provenance=document.get("provenance", {}),
-        )
-    except (LookupError, TypeError, ValueError, OverflowError) as error:
-        raise ModelError(expected="the entries of a linear regression", got=f"{error!r}", where=where) from None
-    unknown = [f for f in model.feature_names if f not in FEATURES]
-    if unknown:
-        raise ModelError(expected=f"features out of {', '.join(FEATURES)}", got=", ".join(unknown), where=where)
-    if len(model.coefficients) != len(model.feature_names) or document.get("sha256") != model.sha256:
+    sha256, names = document.pop("sha256", None), document.pop("features", None)
+    entries, expected = {"feature_names": names, **document}, "the entries of a linear regression"
+    model = validated(LinearModel, entries, where, ModelError, expected=expected)
+    if len(model.coefficients) != len(model.feature_names) or sha256 != model.sha256:
         raise ModelError(expected="coefficients that belong to the file's hash", got="another hash", where=where)
     return model

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from pdhef_logtool.residual_model.torch_extra import check_torch
+from pdhef_logtool.records.extras import required
 
-check_torch()
+required("torch", "train", "trains networks", "torch")
 
 import torch  # noqa: E402
 from torch import nn  # noqa: E402

@@ -164,7 +164,7 @@ def estimate_drive(
         if computation in computations[number + 1 :]:
             shared[computation] = track
         track = without_impossible_states(replace(track, name=estimator.name))
-        track = watched_track(track, signals, vehicle)
+        track = watched_track(track, signals, vehicle, corrected.noise)
         track = track if intervals is None else intervals.apply(track, signals)
         if varied:
             track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)

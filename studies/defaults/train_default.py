@@ -32,7 +32,7 @@ from pdhef_logtool.car.car import (
     Car,
     read_fit,
 )
-from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file, vehicle_toml
+from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
 from pdhef_logtool.learning.drives import DriveSet, LearnSettings
 from pdhef_logtool.learning.network.train_command import PAPER_RECIPE, Recipe, dataset_for, train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
@@ -96,9 +96,7 @@ def simulate(t: Training) -> None:
     """Write the vehicle file, the mapping and the drives."""
     t.work.mkdir(parents=True, exist_ok=True)
     t.car.mkdir(parents=True, exist_ok=True)
-    text = vehicle_toml(
-        read_vehicle_file(SAMPLE_VEHICLE).vehicle, "Written by python -m studies.defaults.train_default."
-    )
+    text = part_toml(read_vehicle_file(SAMPLE_VEHICLE).vehicle, "Written by python -m studies.defaults.train_default.")
     (t.car / VEHICLE_FILE).write_text(f"{text}\n[network]\ngain = {GAIN}\n", encoding="utf-8")
     if t.seed:
         shutil.copyfile(HOME / FIT_FILE, t.car / FIT_FILE)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -119,8 +119,14 @@ def time_s(track: pl.DataFrame) -> FloatArray:
 
 
 def on_the_road(car: Car, friction: float) -> Car:
-    """Return a car with the friction of a drive."""
-    return car.with_vehicle(car.vehicle.model_copy(update={"friction": friction}))
+    """Return a car with the friction of a drive; all else, including the residual gain, is unchanged."""
+    vehicle, datasheet = (v.model_copy(update={"friction": friction}) for v in (car.vehicle, car.datasheet))
+    physics = car.fitted_physics
+    if physics is not None:
+        values = physics.values.model_copy(update={"friction": None})
+        physics = physics.model_copy(update={"values": values})
+    gain = car.residual_gain
+    return replace(car, vehicle=vehicle, datasheet=datasheet, network_gain=gain, fitted_physics=physics)
 
 
 def read_log(log: Path, car: Car) -> WholeDrive:

@@ -11,7 +11,7 @@ from made_models import random_network
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedValues
-from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
+from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
 from tests.command_line import called
@@ -42,7 +42,7 @@ def test_a_network_acts_on_the_physics_that_it_was_trained_with() -> None:
 
 def test_the_file_decides_before_the_network_and_the_name_before_both(tmp_path: Path) -> None:
     for gain in (0.0, 0.25):
-        (tmp_path / "car.toml").write_text(f"{vehicle_toml(SEDAN.vehicle)}\n[network]\ngain = {gain}\n")
+        (tmp_path / "car.toml").write_text(f"{part_toml(SEDAN.vehicle)}\n[network]\ngain = {gain}\n")
         loaded = Car.load(tmp_path / "car.toml")
         for network in (OWN, FOREIGN):
             car = replace(loaded, network=network)
@@ -56,7 +56,7 @@ def test_a_run_says_the_gain_and_uses_it(sample_logs_dir: Path, tmp_path: Path) 
     vehicle = read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle
     car = tmp_path / "car"
     car.mkdir()
-    (car / "vehicle.toml").write_text(vehicle_toml(vehicle))
+    (car / "vehicle.toml").write_text(part_toml(vehicle))
     replace(random_network(), physics_sha256=Car.of(vehicle).physics_sha256).save(car / "network")
     random_network(1).save(tmp_path / "foreign")
     for out, network, gain, text in (

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import make_signals
 
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.divergence import watched_track, wrong_branch
@@ -106,6 +107,14 @@ def test_in_the_linear_range_bank_and_bias_are_no_divergence() -> None:
     signals, truth = motion(share=0.3)
     banked = replace(signals, ay_m_s2=signals.ay_m_s2 + 1.0)  # 10 % of bank
     assert not flags(truth, banked).any()
+
+
+def test_noise_that_the_drive_shows_is_no_divergence() -> None:
+    signals, truth = motion()
+    noisy = replace(signals, ay_m_s2=signals.ay_m_s2 + np.random.default_rng(0).normal(0.0, 8.0, len(signals)))
+    shown = FilterNoise(r_std={"ay_m_s2": 8.0})
+    assert flags(truth, noisy).any() and not wrong_branch(truth, noisy, VEHICLE, shown).any()
+    assert wrong_branch(off_by(truth, 40.0, 5.0, 7.0), noisy, VEHICLE, shown).any()
 
 
 def test_what_comes_later_changes_no_flag() -> None:

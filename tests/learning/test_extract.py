@@ -17,7 +17,7 @@ from residual_car import PULL_M_S2, weaving
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
-from pdhef_logtool.car.toml_files import vehicle_toml
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
@@ -76,7 +76,7 @@ def _log(made: Drive, sigma: float = 0.0) -> FakeLog:
 def _extract(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: FakeLog, **settings: Any) -> ExtractResult:
     (tmp_path / "drive.mcap").write_bytes(b"in memory")
     (tmp_path / "m.toml").write_text(MAPPING)
-    (tmp_path / "v.toml").write_text(vehicle_toml(default_vehicle()))
+    (tmp_path / "v.toml").write_text(part_toml(default_vehicle()))
     monkeypatch.setattr(reading, "open_log", lambda *_, **__: log)
     monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
     monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
+from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 
@@ -29,7 +29,7 @@ field = "friction"
 def files(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("files")
     vehicle = read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle.model_copy(update={"friction": None})
-    (folder / "car.toml").write_text(vehicle_toml(vehicle))
+    (folder / "car.toml").write_text(part_toml(vehicle))
     (folder / "told.toml").write_text(TOLD)
     return folder
 

@@ -64,12 +64,11 @@ def write_drive(path: Path, rows: ResidualRows, entry: Mapping[str, Any], *, tru
     """
     chosen = np.ones(len(rows), dtype=np.bool_) if rows.chosen is None else rows.chosen
     schema = arrow_schema(_SCHEMA)
-    columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
-    columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
-    columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
+    names = (*FEATURES, *(name for name, _ in TARGETS), *TRUTH)
+    numbers = np.hstack([rows.features, rows.targets, rows.truth_velocity])
+    columns: dict[str, Any] = dict(zip(names, numbers.T, strict=True))
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
-    columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": chosen}
-    columns |= {"truth_source": np.full(len(rows), truth_source)}
+    columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": chosen, "truth_source": np.full(len(rows), truth_source)}
     table = pa.Table.from_arrays([arrow_array(columns[f.name], f.type) for f in schema], schema=schema)
     with parquet_writer(path, schema, ["segment"]) as writer:
         writer.write_table(table, row_group_size=ROWS_A_GROUP)
@@ -270,24 +269,14 @@ def read_dataset(folder: Path) -> Dataset:
         The folder contains no dataset, or one of another format or with other features.
     """
     path = folder / MANIFEST
-    try:
-        document = read_sealed(path, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
-        kind = (document["format"], document["version"])
-        if kind[0] != FORMAT or kind[1] != FORMAT_VERSION or document["features"] != list(FEATURES):
-            raise OutputError(
-                expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
-                got=f"{kind[0]} {kind[1]} with {', '.join(document['features'])}",
-                where=str(path),
-                remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
-            )
-        return Dataset(
-            folder=folder,
-            model=str(document["model"]),
-            sha256=str(document["sha256"]),
-            drives=tuple(DatasetDrive(folder / d["file"], d) for d in document["drives"]),
-            manifest=document,
-        )
-    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:  # format without a digest
+    document = read_sealed(path, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
+    kind, version, names = (document.get(key) for key in ("format", "version", "features"))
+    if (kind, version, names) != (FORMAT, FORMAT_VERSION, list(FEATURES)):
         raise OutputError(
-            expected=_EXPECTED, got=str(error) or type(error).__name__, where=str(folder), remedy=_REMEDY
-        ) from None
+            expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
+            got=f"{kind} {version} with {', '.join(names or ['none'])}",
+            where=str(path),
+            remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
+        )
+    drives = tuple(DatasetDrive(folder / d["file"], d) for d in document["drives"])
+    return Dataset(folder, document["model"], document["sha256"], drives, document)

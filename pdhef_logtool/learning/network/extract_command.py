@@ -393,8 +393,8 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
         dataset.write_drive(target, rows, entry, truth_source=truth["kind"])
         if not entry["usable_rows"]:
             drive.tell("not one usable target: no ground truth above the low-speed limit")
-        record = record_of(drive, split=split)
-    return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
+        record = replace(record_of(drive), split=split, seconds=entry["duration_s"])
+    return DriveResult(record, entry)
 
 
 def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str]:
@@ -467,23 +467,17 @@ def _strict_truth(plan: DrivePlan) -> DrivePlan:
 
 
 def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool = False) -> None:
-    where = str(job.log_input.path)
     needed = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
     if not estimated and (plan.truth is None or not needed <= plan.derivation.keys()):
-        raise EstimatorError(
-            expected="ground truth from which v_x, v_y and yaw rate follow",
-            got=", ".join(sorted(needed & plan.derivation.keys())) or "none",
-            where=where,
-            remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-        )
-    missing = sorted(FEATURES - plan.alignment.available)
-    if missing:
-        raise EstimatorError(
-            expected="the signals of the physics filter",
-            got=f"no {', '.join(missing)}",
-            where=where,
-            remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
-        )
+        expected = "ground truth from which v_x, v_y and yaw rate follow"
+        got = ", ".join(sorted(needed & plan.derivation.keys())) or "none"
+        remedy = "map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference"
+    elif missing := sorted(FEATURES - plan.alignment.available):
+        expected, got = "the signals of the physics filter", f"no {', '.join(missing)}"
+        remedy = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
+    else:
+        return
+    raise EstimatorError(expected=expected, got=got, where=str(job.log_input.path), remedy=remedy)
 
 
 def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:

@@ -101,31 +101,23 @@ def _nominal_rates(state, steer, friction, p, out):  # type: ignore[no-untyped-d
 
 
 def residual_increments(
-    stamps_ns: IntArray,
-    state: FloatArray,
-    steer_rad: FloatArray,
-    friction: FloatArray,
-    parameters: ModelParameters,
-    *,
-    max_step_s: float,
+    stamps_ns: IntArray, state: FloatArray, inputs: FloatArray, parameters: ModelParameters, *, max_step_s: float
 ) -> FloatArray:
     """Return the motion of the ground truth minus the nominal model's between stamps, [N − 1, 2].
 
     Parameters
     ----------
     stamps_ns : int64 [N]. state : true [v_x, v_y, r], [N, 3]; NaN where it must not be used.
-    steer_rad, friction : [N], NaN where missing. max_step_s : longer steps are gaps.
+    inputs : of the steps of the parallel filter, [N, 5]. max_step_s : longer steps are gaps.
 
     Returns
     -------
     Increments of v_y in m/s and r in rad/s; NaN across gaps, for missing values, for |β| > 45°, and below the low-speed
     limit, where the nominal model is not dynamic.
     """
-    n = int(stamps_ns.shape[0])
-    if n < 2:
-        return np.empty((0, 2))
+    steer_rad, friction = inputs[:, U_STEER], inputs[:, U_FRICTION]
     good = _dynamic(state, parameters) & np.isfinite(steer_rad) & np.isfinite(friction)
-    rates = np.empty((n, 2))
+    rates = np.empty((len(stamps_ns), 2))
     usable = (np.where(good[:, None], state, 1.0), np.where(good, steer_rad, 0.0), np.where(good, friction, 1.0))
     _nominal_rates(*usable, parameters, rates)
     step_s = np.diff(stamps_ns) * 1e-9
@@ -285,9 +277,8 @@ def residual_rows(
     if physics.equations == "forces":
         increments = physics_increments(stamps_ns, state, filtered.x, inputs, physics, max_step_s=gap_s)
     else:
-        steer, friction = inputs[:, U_STEER], inputs[:, U_FRICTION]
         nominal = model_parameters(physics.vehicle)
-        increments = residual_increments(stamps_ns, state, steer, friction, nominal, max_step_s=gap_s)
+        increments = residual_increments(stamps_ns, state, inputs, nominal, max_step_s=gap_s)
     targets, step_s = np.full((count, 2), np.nan), np.full(count, np.nan)
     targets[:-1] = smooth_increments(signals.stamps_ns, increments, half_window)
     step_s[:-1] = np.diff(signals.stamps_ns) * 1e-9

@@ -8,7 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +22,7 @@ from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
+    NO_MODEL,
     NOMINAL_MODEL,
     OUTPUT_COUNT,
     PHYSICS_MODEL,
@@ -123,40 +124,27 @@ class Epoch:
     seconds: float
 
 
-Progress = Callable[[Epoch, int], None]
+Progress = Callable[[str, float], None]
 
 
 def normalisation_of(
     sequences: Iterable[FeatureSequence], names: tuple[str, ...], *, odd: bool = False
 ) -> Normalisation:
-    """Return weighted mean and standard deviation of features and targets over the training sequences.
+    """Return mean and standard deviation of features and targets over the used samples of training sequences.
 
-    ``sequences`` is iterated twice. With ``odd``, features that change sign under mirroring have a mean of 0.
+    With ``odd``, features that change sign under mirroring have a mean of 0.
     """
     columns = [FEATURES.index(n) for n in names]
-    count, total, squares = 0, np.zeros(len(columns)), np.zeros(0)
-    for s in sequences:
-        use = s.weight > 0
-        total = _summed(total, s.features[use][:, columns])
-        squares = _summed(squares if squares.size else np.zeros(s.target.shape[1]), s.target[use] ** 2)
-        count += int(np.count_nonzero(use))
-    if count == 0:
+    parts = [(s.features[s.weight > 0][:, columns], s.target[s.weight > 0]) for s in sequences]
+    # Contiguous rows are summed one by one, so that rounding does not depend on the split into sequences.
+    features, target = (np.ascontiguousarray(np.concatenate(c)) for c in zip(*parts, strict=True))
+    if not len(features):
         raise ModelError(expected="training sequences with usable samples", got="none", where="train")
-    mean = total / count
+    mean = features.mean(axis=0)
     if odd:
         mean[[n in ODD_FEATURES for n in names]] = 0.0
-    deviations = np.zeros(len(columns))
-    for s in sequences:
-        deviations = _summed(deviations, (s.features[s.weight > 0][:, columns] - mean) ** 2)
-    std = np.maximum(np.sqrt(deviations / count), 1e-6)
-    spread = np.maximum(np.sqrt(squares / count), 1e-6)
-    return Normalisation(*(tuple(map(float, column)) for column in (mean, std, spread)))
-
-
-def _summed(before: FloatArray, rows: FloatArray) -> FloatArray:
-    """Add rows [N, k] one by one to a sum [k], so that rounding does not depend on the split into sequences."""
-    total: FloatArray = np.add.reduce(np.ascontiguousarray(np.concatenate([before[None], rows])), axis=0)
-    return total
+    std, spread = (np.maximum(np.sqrt(np.mean(v**2, axis=0)), 1e-6) for v in (features - mean, target))
+    return Normalisation(*(tuple(column.tolist()) for column in (mean, std, spread)))
 
 
 def train(
@@ -167,7 +155,7 @@ def train(
     *,
     init: ModelBundle | None = None,
     device: str = "cpu",
-    progress: Progress = lambda _epoch, _of: None,
+    progress: Progress = lambda _text, _share: None,
 ) -> tuple[ModelBundle, list[Epoch]]:
     """Train a network and return the bundle of the best validation epoch with the loss history.
 
@@ -197,36 +185,32 @@ def train(
         normalisation=init.normalisation if init else normalisation_of(training, recipe.feature_names, odd=recipe.odd),
         weights={},
     )
-    network = _new_network(recipe, init).to(device)
-    optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
-    signs = torch.tensor(empty.signs, dtype=torch.float32) if recipe.odd else None
+    run = _Training.start(recipe, init, empty.signs, device)
     train_pieces = Pieces(training, lambda s: _pieces(s, recipe.piece_steps, empty))
     validation_pieces = Pieces(validation, lambda s: [_balanced(_scaled(s, empty))])
-    document = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
-    document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
-    identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
-    history, best, best_loss = _resume(work, identity, network, optimiser, device)
-    for epoch in range(len(history), recipe.epochs):
-        if len(history) - 1 - _best_epoch(history) >= recipe.patience:
+    identity = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
+    identity |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
+    if (work / CHECKPOINT).is_file():
+        run.resume(work / CHECKPOINT, identity)
+    for epoch in range(len(run.history), recipe.epochs):
+        if len(run.history) - 1 - run.best_epoch >= recipe.patience:
             break
         began = time.perf_counter()
-        train_loss, rate = _train_epoch(network, optimiser, train_pieces, recipe, epoch, signs, device)
-        loss = _validate(network, validation_pieces, device, signs)
-        history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
-        if loss < best_loss:
-            best, best_loss = _weights(network), loss
-        _write_checkpoint(work, identity, history, network, optimiser, best)
-        progress(history[-1], recipe.epochs)
+        train_loss, rate = run.epoch(train_pieces, epoch)
+        loss = run.validate(validation_pieces)
+        run.end_epoch(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
+        run.save(work / CHECKPOINT, identity)
+        progress(f"epoch {epoch + 1}: train {train_loss:.4f}, validation {loss:.4f}", (epoch + 1) / recipe.epochs)
     provenance = {
         "recipe": asdict(recipe),
-        "epochs": len(history),
-        "best_epoch": _best_epoch(history) + 1,
-        "validation_loss": best_loss,
+        "epochs": len(run.history),
+        "best_epoch": run.best_epoch + 1,
+        "validation_loss": run.history[run.best_epoch].validation_loss,
         "training_sequences": train_pieces.sequences,
         "validation_sequences": validation_pieces.sequences,
         "training_hours": round(train_pieces.steps * recipe.period_s / 3600.0, 3),
     }
-    return replace(empty, weights=best, provenance=provenance), history
+    return replace(empty, weights={k: v.numpy() for k, v in run.best.items()}, provenance=provenance), run.history
 
 
 # ---- data ----
@@ -291,77 +275,158 @@ def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
 # ---- one epoch ----
 
 
-def _train_epoch(
-    network: ResidualNetwork,
-    optimiser: torch.optim.Optimizer,
-    pieces: Sequence[_Piece],
-    recipe: Recipe,
-    epoch: int,
-    signs: torch.Tensor | None,
-    device: str,
-) -> tuple[float, float]:
-    """Train once on the pieces of an epoch in a seeded random order; return mean loss and last learning rate.
+@dataclass(slots=True, eq=False)
+class _Training:
+    """A network in training. ``signs``: of its features when left and right are exchanged; None does not mirror.
 
-    ``signs``: of the features when left and right are exchanged, for pieces that are as often mirrored as not.
+    ``best`` : weights of the best epoch in ``history``.
     """
-    # All randomness of an epoch depends on seed and epoch number only, so that a resumed training is identical.
-    torch.manual_seed(recipe.seed * 1_000_003 + epoch)
-    order = torch.randperm(len(pieces)).tolist()[: recipe.pieces_per_epoch]
-    batches = max(1, math.ceil(len(order) / recipe.batch))
-    network.train()
-    losses = []
-    for b in range(batches):
-        rate = _learning_rate(recipe, (epoch + b / batches) / recipe.epochs)
-        for group in optimiser.param_groups:
-            group["lr"] = rate
-        chosen = [pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
-        if signs is not None:
-            mirrored = [p._replace(features=p.features * signs, target=-p.target) for p in chosen]
-            chosen = [m if torch.rand(()) < 0.5 else p for m, p in zip(mirrored, chosen, strict=True)]
-        losses.append(_train_batch(network, optimiser, chosen, recipe.chunk_steps, device))
-    return float(np.mean(losses)), rate
+
+    network: ResidualNetwork
+    optimiser: torch.optim.Optimizer
+    recipe: Recipe
+    signs: torch.Tensor | None
+    device: str
+    best: dict[str, torch.Tensor]
+    history: list[Epoch] = field(default_factory=list)
+
+    @classmethod
+    def start(cls, recipe: Recipe, init: ModelBundle | None, signs: FloatArray, device: str) -> _Training:
+        """Return a network with random weights by the seed of a recipe, or with the weights of a bundle."""
+        torch.manual_seed(recipe.seed)
+        sizes, outputs = (len(recipe.feature_names), recipe.hidden, recipe.layers), OUTPUT_COUNT[recipe.target]
+        network = ResidualNetwork(*sizes, recipe.head, recipe.dropout, outputs=outputs)
+        if init is not None:
+            network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})
+        network = network.to(device)
+        optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
+        mirror = torch.tensor(signs, dtype=torch.float32) if recipe.odd else None
+        return cls(network, optimiser, recipe, mirror, device, _weights(network))
+
+    @property
+    def best_epoch(self) -> int:
+        """Index of the epoch with the lowest validation loss; -1 before the first."""
+        return min(range(len(self.history)), key=lambda i: self.history[i].validation_loss, default=-1)
+
+    def epoch(self, pieces: Sequence[_Piece], number: int) -> tuple[float, float]:
+        """Train once on pieces in a seeded random order; return mean loss and last learning rate."""
+        recipe = self.recipe
+        # All randomness of an epoch depends on seed and epoch number only, so that a resumed training is identical.
+        torch.manual_seed(recipe.seed * 1_000_003 + number)
+        order = torch.randperm(len(pieces)).tolist()[: recipe.pieces_per_epoch]
+        batches = max(1, math.ceil(len(order) / recipe.batch))
+        self.network.train()
+        losses = []
+        for b in range(batches):
+            rate = _learning_rate(recipe, (number + b / batches) / recipe.epochs)
+            for group in self.optimiser.param_groups:
+                group["lr"] = rate
+            chosen = [pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
+            if self.signs is not None:  # pieces are as often mirrored as not
+                mirrored = [p._replace(features=p.features * self.signs, target=-p.target) for p in chosen]
+                chosen = [m if torch.rand(()) < 0.5 else p for m, p in zip(mirrored, chosen, strict=True)]
+            losses.append(self._batch(_padded(chosen, self.device)))
+        return float(np.mean(losses)), rate
+
+    def _batch(self, batch: _Piece) -> float:
+        """Train on a batch chunk by chunk, with the recurrent state carried on; return the mean loss."""
+        state: State | None = None
+        losses = []
+        chunks = (torch.split(column, self.recipe.chunk_steps, dim=1) for column in batch)
+        for features, target, weight in zip(*chunks, strict=True):
+            output, after = self.network(features, state)
+            state = (after[0].detach(), after[1].detach())
+            total = weight.sum()
+            if float(total) == 0.0:
+                continue
+            loss = ((output - target) ** 2).mean(dim=2).mul(weight).sum() / total
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_CLIP)
+            self.optimiser.step()
+            losses.append(float(loss.detach()))
+        return float(np.mean(losses)) if losses else 0.0
+
+    def validate(self, pieces: Iterable[_Piece]) -> float:
+        """Return the loss as in operation, over whole sequences; a network that is mirrored is made odd."""
+        self.network.eval()
+        total, weight = 0.0, 0.0
+        with torch.inference_mode():
+            for p in pieces:
+                state: State | None = None
+                parts = []
+                for features in torch.split(p.features, VALIDATION_STEPS):
+                    sides = features[None] if self.signs is None else torch.stack([features, features * self.signs])
+                    output, state = self.network(sides.to(self.device), state)
+                    parts.append((output[0] if self.signs is None else 0.5 * (output[0] - output[1])).cpu())
+                square = ((torch.cat(parts) - p.target) ** 2).mean(dim=1)
+                total += float((square * p.weight).sum())
+                weight += float(p.weight.sum())
+        return total / weight if weight else math.inf
+
+    def end_epoch(self, epoch: Epoch) -> None:
+        """Add an epoch to the history, and keep its weights if it is the best one."""
+        self.history.append(epoch)
+        if self.best_epoch == len(self.history) - 1:
+            self.best = _weights(self.network)
+
+    def save(self, path: Path, identity: dict[str, Any]) -> None:
+        """Write a checkpoint: tensors and document in one file, so that no write can leave an inconsistent pair.
+
+        ``identity`` of the training: its recipe and data.
+        """
+        from safetensors.torch import save
+
+        states = self.optimiser.state_dict()["state"]
+        optimiser = {f"{i}.{key}": value for i, of in states.items() for key, value in of.items()}
+        groups = {"network": self.network.state_dict(), "best": self.best, "optimiser": optimiser}
+        tensors = {f"{g}.{name}": value.cpu().contiguous() for g, of in groups.items() for name, value in of.items()}
+        document = seal(
+            {"identity": identity, "history": [asdict(e) for e in self.history], "sha256": _sha256(tensors)}
+        )
+        write_bytes(path, save(tensors, metadata={"document": json.dumps(document)}))
+
+    def resume(self, path: Path, identity: dict[str, Any]) -> None:
+        """Continue after a checkpoint; raises ModelError if it is damaged, or of another recipe or other data."""
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, framework="pt") as stored:
+                document = json.loads(stored.metadata()["document"])
+                tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
+            if not is_sealed(document) or document["sha256"] != _sha256(tensors):
+                raise ValueError("content that is not as it was written")
+        except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
+            expected = "a checkpoint of a training"
+            raise ModelError(
+                expected=expected, got=str(error), where=str(path), remedy="remove it to train again"
+            ) from None
+        if document["identity"] != json.loads(json.dumps(identity)):
+            expected, got = "a checkpoint of this recipe and data", "one of another"
+            remedy = "train into another folder, or remove the checkpoint"
+            raise ModelError(expected=expected, got=got, where=str(path), remedy=remedy)
+        groups: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
+        for name, value in tensors.items():
+            group, _, key = name.partition(".")
+            groups[group][key] = value
+        states: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in groups["optimiser"].items():
+            index, _, key = name.partition(".")
+            states.setdefault(int(index), {})[key] = value
+        self.network.load_state_dict(groups["network"])
+        self.optimiser.load_state_dict({"state": states, "param_groups": self.optimiser.state_dict()["param_groups"]})
+        self.history, self.best = [Epoch(**e) for e in document["history"]], groups["best"]
 
 
-def _train_batch(
-    network: ResidualNetwork, optimiser: torch.optim.Optimizer, pieces: Sequence[_Piece], chunk_steps: int, device: str
-) -> float:
-    batch = _padded(pieces, device)
-    state: State | None = None
-    losses = []
-    for first in range(0, batch.features.shape[1], chunk_steps):
-        part = slice(first, first + chunk_steps)
-        output, after = network(batch.features[:, part], state)
-        state = (after[0].detach(), after[1].detach())
-        weight = batch.weight[:, part]
-        total = weight.sum()
-        if float(total) == 0.0:
-            continue
-        loss = ((output - batch.target[:, part]) ** 2).mean(dim=2).mul(weight).sum() / total
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_CLIP)
-        optimiser.step()
-        losses.append(float(loss.detach()))
-    return float(np.mean(losses)) if losses else 0.0
+def _sha256(tensors: Mapping[str, torch.Tensor]) -> str:
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        total.update(name.encode() + tensors[name].numpy().tobytes())
+    return total.hexdigest()
 
 
-def _validate(network: ResidualNetwork, pieces: Iterable[_Piece], device: str, signs: torch.Tensor | None) -> float:
-    """Return the loss as in operation, over whole sequences; with ``signs`` the network is made odd."""
-    network.eval()
-    total, weight = 0.0, 0.0
-    with torch.inference_mode():
-        for p in pieces:
-            state: State | None = None
-            parts = []
-            for first in range(0, len(p.weight), VALIDATION_STEPS):
-                features = p.features[first : first + VALIDATION_STEPS]
-                sides = features[None] if signs is None else torch.stack([features, features * signs])
-                output, state = network(sides.to(device), state)
-                parts.append((output[0] if signs is None else 0.5 * (output[0] - output[1])).cpu())
-            square = ((torch.cat(parts) - p.target) ** 2).mean(dim=1)
-            total += float((square * p.weight).sum())
-            weight += float(p.weight.sum())
-    return total / weight if weight else math.inf
+def _weights(network: ResidualNetwork) -> dict[str, torch.Tensor]:
+    return {k: v.detach().cpu().clone() for k, v in network.state_dict().items()}
 
 
 def _learning_rate(recipe: Recipe, share: float) -> float:
@@ -371,95 +436,6 @@ def _learning_rate(recipe: Recipe, share: float) -> float:
     if share < 0.3:
         return recipe.learning_rate * (0.04 + 0.96 * (0.5 - 0.5 * math.cos(math.pi * share / 0.3)))
     return recipe.learning_rate * (1e-4 + (1.0 - 1e-4) * (0.5 + 0.5 * math.cos(math.pi * (share - 0.3) / 0.7)))
-
-
-# ---- state ----
-
-
-def _new_network(recipe: Recipe, init: ModelBundle | None) -> ResidualNetwork:
-    torch.manual_seed(recipe.seed)
-    sizes, outputs = (len(recipe.feature_names), recipe.hidden, recipe.layers), OUTPUT_COUNT[recipe.target]
-    network = ResidualNetwork(*sizes, recipe.head, recipe.dropout, outputs=outputs)
-    if init is not None:
-        network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})
-    return network
-
-
-def _weights(network: ResidualNetwork) -> dict[str, Any]:
-    return {k: v.detach().cpu().numpy().copy() for k, v in network.state_dict().items()}
-
-
-def _best_epoch(history: Sequence[Epoch]) -> int:
-    return int(np.argmin([e.validation_loss for e in history])) if history else -1
-
-
-def _write_checkpoint(
-    work: Path,
-    identity: dict[str, Any],
-    history: Sequence[Epoch],
-    network: ResidualNetwork,
-    optimiser: torch.optim.Optimizer,
-    best: dict[str, Any],
-) -> None:
-    from safetensors.numpy import save
-
-    states = optimiser.state_dict()["state"]
-    groups = {
-        "network": _weights(network),
-        "best": best,
-        "optimiser": {f"{i}.{key}": value.cpu().numpy() for i, of in states.items() for key, value in of.items()},
-    }
-    tensors = {f"{group}.{name}": np.array(value) for group, of in groups.items() for name, value in of.items()}
-    document = seal({"identity": identity, "history": [asdict(e) for e in history], "sha256": _sha256(tensors)})
-    # Tensors and document are in one file, so that an interrupted write cannot leave an inconsistent pair.
-    data = save(tensors, metadata={"document": json.dumps(document)})
-    write_bytes(work / CHECKPOINT, data)
-
-
-def _sha256(tensors: Mapping[str, Any]) -> str:
-    total = hashlib.sha256()
-    for name in sorted(tensors):
-        total.update(name.encode() + np.ascontiguousarray(tensors[name]).tobytes())
-    return total.hexdigest()
-
-
-def _resume(
-    work: Path, identity: dict[str, Any], network: ResidualNetwork, optimiser: torch.optim.Optimizer, device: str
-) -> tuple[list[Epoch], dict[str, Any], float]:
-    from safetensors import SafetensorError, safe_open
-
-    file = work / CHECKPOINT
-    if not file.is_file():
-        return [], _weights(network), math.inf
-    try:
-        with safe_open(file, framework="numpy") as stored:
-            document = json.loads(stored.metadata()["document"])
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
-        if not is_sealed(document) or document["sha256"] != _sha256(tensors):
-            raise ValueError("content that is not as it was written")
-    except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
-        raise ModelError(
-            expected="a checkpoint of a training", got=str(error), where=str(file), remedy="remove it to train again"
-        ) from None
-    if document["identity"] != identity:
-        raise ModelError(
-            expected="a checkpoint of this recipe and data",
-            got="one of another",
-            where=str(file),
-            remedy="train into another folder, or remove the checkpoint",
-        )
-    groups: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
-    for name, value in tensors.items():
-        group, _, key = name.partition(".")
-        groups[group][key] = value
-    network.load_state_dict({key: torch.from_numpy(value) for key, value in groups["network"].items()})
-    states: dict[int, dict[str, torch.Tensor]] = {}
-    for name, value in groups["optimiser"].items():
-        index, _, key = name.partition(".")
-        states.setdefault(int(index), {})[key] = torch.from_numpy(value).to("cpu" if key == "step" else device)
-    optimiser.load_state_dict({"state": states, "param_groups": optimiser.state_dict()["param_groups"]})
-    history = [Epoch(**e) for e in document["history"]]
-    return history, groups["best"], min(e.validation_loss for e in history)
 
 
 HISTORY_FILE = "history.parquet"
@@ -500,7 +476,7 @@ def run_training(
     seed: int = 0,
     epochs: int | None = None,
     device: str = "cpu",
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
+    progress: Progress = lambda _text, _share: None,
 ) -> TrainResult:
     """Train on a residual dataset and write the bundle, ``history.parquet`` to ``output``.
 
@@ -521,10 +497,9 @@ def run_training(
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
     dataset, output = Path(dataset), local_path(output)
-    init = None if init is None else Path(init)
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
     data = dataset_for(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
-    start = None if init is None else network_folder(init)
+    start = network_folder(NO_MODEL if init is None else init)
     bundle = None if start is None else load_bundle(start)
     if bundle is not None and bundle.model != data.model:
         raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=str(init))
@@ -569,20 +544,15 @@ def train_on(
     *,
     init: ModelBundle | None = None,
     device: str = "cpu",
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
+    progress: Progress = lambda _text, _share: None,
 ) -> TrainResult:
     """Train one network by a recipe, which contains the target; otherwise as :func:`run_training`."""
     import polars as pl
 
     splits = {name: SplitSequences(data, name, recipe.target, recipe.odd) for name in SPLITS}
 
-    def tell(epoch: Epoch, of: int) -> None:
-        losses = f"train {epoch.train_loss:.4f}, validation {epoch.validation_loss:.4f}"
-        progress(f"epoch {epoch.epoch}: {losses}", epoch.epoch / of)
-
-    bundle, history = train(
-        splits["train"], splits["validation"], recipe, output, init=init, device=device, progress=tell
-    )
+    settings: dict[str, Any] = {"init": init, "device": device, "progress": progress}
+    bundle, history = train(splits["train"], splits["validation"], recipe, output, **settings)
     test_loss = None if next(iter(splits["test"]), None) is None else mean_square(bundle, splits["test"])
     provenance = {
         **bundle.provenance,
