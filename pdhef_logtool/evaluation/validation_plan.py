@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -60,12 +61,24 @@ class ExposureNeed(BaseModel):
             raise ValueError("give drives or minutes")
         return self
 
+    def seconds_of(self, space: Mapping[tuple[float, float], float], friction: float, car: object) -> float:
+        """Return the duration of a drive in the conditions, of its seconds by the lower edges of speed and |a_y|."""
+        if not _inside(self.friction, friction) or self.car not in (None, car):
+            return 0.0
+        return math.fsum(
+            s for (speed, ay), s in space.items() if _inside(self.speed_m_s, speed) and _inside(self.ay_m_s2, ay)
+        )
+
     @property
     def label(self) -> str:
         """The conditions as text, for example ``20 to 30 m/s, μ 0 to 0.4``."""
         ranges = (("", self.speed_m_s, " m/s"), ("|a_y| ", self.ay_m_s2, " m/s²"), ("μ ", self.friction, ""))
         words = [f"{name}{r[0]:g} to {r[1]:g}{unit}" for name, r, unit in ranges if r is not None]
         return ", ".join([*words, *([] if self.car is None else [f"car {self.car}"])])
+
+
+def _inside(bounds: Sequence[float] | None, value: float) -> bool:
+    return bounds is None or bounds[0] <= value < bounds[1]
 
 
 @dataclass(frozen=True, slots=True)

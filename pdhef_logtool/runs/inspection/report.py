@@ -24,26 +24,12 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.mapping import (
-    Ambiguity,
-    ClockModel,
-    Mapping,
-    QualityGate,
-    SignalSource,
-    auto_map,
-    clock_key,
-    fit_clocks,
-    mapping_of,
-    mapping_to_toml,
-    merge_losses,
-    read_signals,
-    resolve_mapping,
-    tables_for,
-)
+from pdhef_logtool.mapping import Ambiguity, Mapping, QualityGate, SignalSource, auto_map, resolve_mapping
 from pdhef_logtool.mapping.candidates import Candidate
-from pdhef_logtool.mapping.choosing import choose_mapping
-from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
-from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.mapping.channels import merge_losses, read_signals
+from pdhef_logtool.mapping.choosing import choose_mapping, tables_for
+from pdhef_logtool.mapping.clocks import ClockModel, clock_key, fit_clocks, sources_by_clock, survey_windows
+from pdhef_logtool.mapping.mapping_file import mapping_of, mapping_to_toml, missing_signals
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, IntArray, Loss
@@ -157,12 +143,7 @@ _IN_DOCUMENT = (
 )  # fmt: skip
 
 
-_FIGURES: dict[str, Callable[[FloatArray], Any]] = {
-    "mean": np.mean,
-    "std": np.std,
-    "minimum": np.min,
-    "maximum": np.max,
-}
+_FIGURES: dict[str, Any] = {"mean": np.mean, "std": np.std, "minimum": np.min, "maximum": np.max}
 
 
 @dataclass(frozen=True, slots=True)
