@@ -32,21 +32,8 @@ _Key: TypeAlias = tuple[str, str, str]
 _Column: TypeAlias = tuple[str, float, int]
 
 _NIS_RATIO: _Key = ("state", "all", "nis_ratio")
-#: Columns of the narrowest terminal, and columns in the order of their omission, after all columns that are not listed.
-_KEPT: tuple[_Key, ...] = (("sideslip_rad", "all", "rmse"), ("sideslip_rad", "all", "coverage95"))
-_LEAVE_LAST: tuple[_Key, ...] = (
-    ("vx_m_s", "all", "rmse"),
-    ("sideslip_rad", "all", "max_abs"),
-    ("lateral_1s_m", "all", "rmse"),
-    ("vy_m_s", "all", "rmse"),
-    ("sideslip_rad", "all", "p95_abs"),
-    ("ay_m_s2", "all", "rmse"),
-    _NIS_RATIO,
-    ("sideslip_rad", "all", "lag_s"),
-    ("sideslip_rad", "linear", "rmse"),
-    ("yaw_rate_rad_s", "all", "rmse"),
-    ("sideslip_rad", "nonlinear", "rmse"),
-)
+#: Columns in the order of their omission in a narrow terminal, after all columns that are not listed; two are kept.
+_LEAVE_LAST = ["vx_m_s.all.rmse", "sideslip_rad.all.max_abs", "lateral_1s_m.all.rmse", "vy_m_s.all.rmse", "sideslip_rad.all.p95_abs", "ay_m_s2.all.rmse", "state.all.nis_ratio", "sideslip_rad.all.lag_s", "sideslip_rad.linear.rmse", "yaw_rate_rad_s.all.rmse", "sideslip_rad.nonlinear.rmse", "sideslip_rad.all.rmse", "sideslip_rad.all.coverage95"]
 #: Largest number of logs with the same failure in a line.
 _MOST_FAILED = 5
 _TEXTS = {
@@ -64,7 +51,8 @@ def render_run(result: RunResult, console: Console) -> None:
     reports_by_log = [(r, all_printable(r.report)) for r in result.results]
     reports = [report for _, report in reports_by_log if report is not None]
     is_joint = len(reports) > 1 and all(report["answer"] for report in reports)
-    assumed = _assumed(reports)
+    first, *others = [assumptions_of(report) for report in reports] or [[]]
+    assumed = [clause for clause in first if all(clause in clauses for clauses in others)]
     console.print(_head(result, reports, assumed))
     console.print()
     if is_joint:
@@ -84,12 +72,6 @@ def render_run(result: RunResult, console: Console) -> None:
         console.print(f"{len(result.results)} logs: {done}")
     if result.place is not None:
         _print_outputs(result.place, console, [r.outcome.log for r in result.results])
-
-
-def _assumed(reports: Sequence[_Report]) -> list[str]:
-    """Return the common assumptions of all logs as clauses."""
-    first, *others = [assumptions_of(report) for report in reports] or [[]]
-    return [clause for clause in first if all(clause in clauses for clauses in others)]
 
 
 def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
@@ -241,9 +223,9 @@ def _table(report: _Report, console: Console) -> Table:
     shown = [e for e in _shown(report) if any(name == e["name"] for name, *_ in values)]  # --keep metrics has less
     asked = _columns(truth=truth["available"], main=report["selected_estimate"] or "").items()
     columns = [(k, c) for k, c in asked if any(values.get((e["name"], *k)) is not None for e in shown)]
-    others = [k for k, _ in columns if k not in (*_KEPT, *_LEAVE_LAST)] if truth["available"] else []
-    for leave in (None, *others, *_LEAVE_LAST):
-        columns = [(k, c) for k, c in columns if k != leave]
+    others = [".".join(k) for k, _ in columns if ".".join(k) not in _LEAVE_LAST] if truth["available"] else []
+    for leave in (None, *others, *_LEAVE_LAST[:-2]):
+        columns = [(k, c) for k, c in columns if ".".join(k) != leave]
         heads = (f">{head}" + (" †" if k[0] in truth["not_independent"] else "") for k, (head, *_) in columns)
         made = table("\nestimator", *heads)
         for column in made.columns:

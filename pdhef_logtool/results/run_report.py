@@ -24,7 +24,7 @@ from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, TEMPLATES, Mai
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
-from pdhef_logtool.storage.templates import template
+from pdhef_logtool.storage.templates import lines, template
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("estimator", "signal", "segment", "metric", "value", "unit", "n")
@@ -195,5 +195,4 @@ def _lines() -> Any:
 
 def lines_of(about: str, report: Mapping[str, Any], *more: Any) -> list[str]:
     """Return the lines of ``lines.txt`` about a part of a report: ``diverged``, ``faults``, ``losses`` and others."""
-    text: str = getattr(_lines(), about)(report, *more)
-    return [stripped for line in text.split("\n") if (stripped := line.strip())]
+    return lines(getattr(_lines(), about)(report, *more))
