@@ -24,21 +24,6 @@ from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
 
-MANOEUVRES = (
-    "steady-circle",
-    "step-steer",
-    "ramp-steer",
-    "sine-steer",
-    "continuous-sine",
-    "sine-sweep",
-    "dlc",
-    "dlc-3888-2",
-    "sine-with-dwell",
-    "fishhook",
-    "slalom",
-    "brake-in-turn",
-    "power-off-in-turn",
-)
 _STEP_NS, _STEP_S = 20_000_000, 0.02
 #: The zero of the steering is computed from one row in this many.
 _ZERO_EVERY = 10
@@ -46,6 +31,7 @@ _ZERO_EVERY = 10
 
 #: Thresholds of the rules: ``manoeuvres.toml``.
 RULES = SimpleNamespace(**tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")))
+MANOEUVRES: tuple[str, ...] = tuple(RULES.names)
 
 
 @dataclass(frozen=True, slots=True)

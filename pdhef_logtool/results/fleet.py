@@ -217,15 +217,16 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
         for r in done
     )
     errors = np.array([d.error() for d in drives])
-    scored = [d for d in drives if d.truth]
-    names = _estimators(scored)
+    scored, use = [d for d in drives if d.truth], errors > 0.0
+    counts = Counter(e for d in scored for e, s in d.errors if s == JUDGED)
+    names = sorted(counts, key=lambda e: (-counts[e], e))  # the most frequent first
     return Fleet(
         logs=len(rows),
         drives=drives,
         distributions=tuple(_distributions(scored, names)),
         ranking=tuple(_ranking(scored, names)) if len(scored) >= least_to_rank(len(names)) else (),
         least_to_rank=least_to_rank(len(names)),
-        dependence=_dependence(scored),
+        dependence=statistics.dependence(np.log(errors[use]), _of_all(drives, use)),
         breakdowns=breakdowns(errors, [d.keys for d in drives], _of_all(drives), by),
         space=_space(run),
         failed=grouped([(r["log"], r["reason"]) for r in rows if r["outcome"] == "failed"]),
@@ -308,23 +309,10 @@ def _keys(row: Mapping[str, Any], kinds: Sequence[str] | None) -> dict[str, str]
     return {k: v for k, v in from_log.items() if v}
 
 
-def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
-    """Return the estimators with an error in the judged signal, the most frequent first."""
-    counts = Counter(e for d in drives for e, s in d.errors if s == JUDGED)
-    return sorted(counts, key=lambda e: (-counts[e], e))
-
-
 def _of_all(drives: Sequence[FleetDrive], use: BoolArray | None = None) -> dict[str, list[str | None]]:
     """Return day, car and route of the drives to use (None: all)."""
     used = drives if use is None else [drives[i] for i in np.flatnonzero(use).tolist()]
     return {f: [d.factors.get(f) for d in used] for f in statistics.FACTORS}
-
-
-def _dependence(drives: Sequence[FleetDrive]) -> statistics.Dependence:
-    """Return the dependence of the selected estimate's errors."""
-    errors = np.array([d.error() for d in drives])
-    use = errors > 0.0
-    return statistics.dependence(np.log(errors[use]), _of_all(drives, use))
 
 
 def _median(change: statistics.PairedChange, scale: Callable[[float], float] = float) -> Median:
