@@ -327,31 +327,23 @@ def comparable() -> tuple[str, ...]:
 
 def _limit(table: RequirementTable, where: str, problems: list[str]) -> float | None:
     """Return the limit in the unit of metrics.parquet, None for a ratio; append its errors to ``problems``."""
-    unit = registered()[table.metric].unit_of(table.signal)
-    given = {
-        "limit": (table.limit, unit, 1.0),
-        "limit_deg": (table.limit_deg, "rad", 1.0 / DEGREES),
-        "limit_deg_s": (table.limit_deg_s, "rad/s", 1.0 / DEGREES),
+    metric, ratio, is_limit = registered()[table.metric], table.max_ratio, table.baseline is None
+    unit = metric.unit_of(table.signal)
+    units = {"limit": (unit, 1.0), "limit_deg": ("rad", 1.0 / DEGREES), "limit_deg_s": ("rad/s", 1.0 / DEGREES)}
+    given: dict[str, float] = {key: value for key in units if (value := getattr(table, key)) is not None}
+    others = [(key, units[key][0]) for key in given if units[key][0] != unit]
+    wrong = {
+        ".max_ratio: needs a baseline, for example baseline = 'zero'": is_limit and ratio is not None,
+        ": give one of limit, limit_deg, limit_deg_s, or baseline with max_ratio": (
+            is_limit and ratio is None and len(given) != 1
+        ),
+        f": give {next(iter(given), '')} or baseline, not both": not is_limit and given,
+        ".max_ratio: is missing, for example 1.0": not is_limit and ratio is None,
+        f".baseline: {table.metric} has no ratio; use a metric such as rmse": not is_limit and metric.best != "lower",
     }
-    matches = {key: entry for key, entry in given.items() if entry[0] is not None}
-    if table.baseline is None:
-        if table.max_ratio is not None:
-            problems.append(f"{where}.max_ratio: needs a baseline, for example baseline = 'zero'")
-        elif len(matches) != 1:
-            problems.append(f"{where}: give one of limit, limit_deg, limit_deg_s, or baseline with max_ratio")
-    else:
-        if matches:
-            problems.append(f"{where}: give {next(iter(matches))} or baseline, not both")
-        if table.max_ratio is None:
-            problems.append(f"{where}.max_ratio: is missing, for example 1.0")
-        if registered()[table.metric].best != "lower":
-            problems.append(f"{where}.baseline: {table.metric} has no ratio; use a metric such as rmse")
-    for key, (value, needed, factor) in matches.items():
-        if needed != unit:
-            problems.append(f"{where}.{key}: {table.signal} {table.metric} is in {unit}, not in {needed}")
-        elif value is not None and table.baseline is None:
-            return value * factor
-    return None
+    problems += [f"{where}{text}" for text, is_wrong in wrong.items() if is_wrong]
+    problems += [f"{where}.{key}: {table.signal} {table.metric} is in {unit}, not in {of}" for key, of in others]
+    return next((value * units[key][1] for key, value in given.items()), None) if is_limit else None
 
 
 #: The requirement on sideslip of the default plan.

@@ -114,7 +114,7 @@ def _by_section(
 def _sources_table(inspection: Inspection) -> Table:
     rows = "recognised types and candidates" if any(c.taken for c in inspection.candidates) else "recognised types"
     origin = rows if inspection.mapping.origin == "auto" else "mapping file"
-    stamps = {clock.topic: clock.stamp for clock in inspection.clocks}
+    stamps = {clock["topic"]: clock["stamp"] for clock in inspection.clocks}
 
     def row(report: SignalReport) -> tuple[str | Text, ...]:
         return report.name, Text(report.topic), Text(_short(report.field)), stamps.get(report.topic, "")
