@@ -14,11 +14,12 @@ from typing import Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
+from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import LABELS
-from pdhef_logtool.records.printable import listed
+from pdhef_logtool.records.printable import listed, printable
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, TEMPLATES, MainFacts, answer_of, failed_checks
 from pdhef_logtool.results.sink import TRUTH
@@ -189,8 +190,9 @@ def report_markdown(report: Mapping[str, Any]) -> str:
 
 @cache
 def _lines() -> Any:
-    words = {"LABELS": LABELS, "NEARLY_HOLDS": NEARLY_HOLDS, "listed": listed, "gathered": gathered}
-    return template(TEMPLATES / "lines.txt", failed_checks=failed_checks, **words).module
+    words = {"LABELS": LABELS, "MANOEUVRES": MANOEUVRES, "NEARLY_HOLDS": NEARLY_HOLDS}
+    functions = {f.__name__: f for f in (failed_checks, gathered, listed, printable)}
+    return template(TEMPLATES / "lines.txt", **words, **functions).module
 
 
 def lines_of(about: str, report: Mapping[str, Any], *more: Any) -> list[str]:
