@@ -211,10 +211,8 @@ def write_run(
     """Write run.json beside the tables, with the configuration as JSON-able values; arguments as of build_run."""
     if verdicts is not None:
         add_verdicts(output / opened_run.TABLES_FOLDER, verdicts.to_dict())
-    files = {
-        name: file_sha256(output / name)
-        for name in (opened_run.METRICS_FILE, *map(opened_run.table_file, opened_run.TABLES))
-    }
+    names = (opened_run.METRICS_FILE, *map(opened_run.table_file, opened_run.TABLES))
+    files = {name: file_sha256(output / name) for name in names}
     outcomes = [r.outcome for r in results]
     write_json(output / RUN_FILE, build_run(config, network, outcomes, remaining=remaining, files=files, plan=verdicts))
 

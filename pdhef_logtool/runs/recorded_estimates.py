@@ -95,10 +95,8 @@ def score_log(
     car = Car.load(config.car, network=NO_MODEL, sensors=config.sensor_profile)
     mapping = mapping_of(config.mapping)
     if mapping is not None and mapping.recorders:
-        reading = config.read_options
-        with closing(
-            open_log(log_input.path, reading.limits, reading.msgs, Wanted(frozenset()), reading.tables)
-        ) as log:
+        reading, nothing = config.read_options, Wanted(frozenset())
+        with closing(open_log(log_input.path, reading.limits, reading.msgs, nothing, reading.tables)) as log:
             mapping = mapping_for_recorder(log, mapping)
     plan = read_validation_plan(config.plan, junit)
     drive_outputs.check_places([log_input], output, config, mapping, junit)

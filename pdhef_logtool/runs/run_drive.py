@@ -316,14 +316,5 @@ def outcome_of(drive: Drive, losses: Sequence[Loss], *, neutral: bool = False, *
     texts: dict[str, Any] = {"file": drive.file, "lost": lost_texts(losses)}
     if neutral:
         texts, route = without_names(texts, drive.path, drive.name), route and digest(route)[:SHOWN_DIGITS]
-    return LogOutcome(
-        log=drive.name,
-        sha256=drive.sha256,
-        signals_sha256=drive.signals_sha256,
-        truth_sha256=drive.truth_sha256,
-        mapping_sha256=drive.mapping.sha256,
-        day=day,
-        route=route,
-        **texts,
-        **changes,
-    )
+    texts |= {key: getattr(drive, key) for key in ("sha256", "signals_sha256", "truth_sha256")}
+    return LogOutcome(drive.name, mapping_sha256=drive.mapping.sha256, day=day, route=route, **texts, **changes)
