@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
@@ -17,8 +16,6 @@ from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results import comparing
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.events import FoundEvents
-from pdhef_logtool.results.junit import Case, cases_bytes, plan_cases
-from pdhef_logtool.storage.files import write_bytes
 
 #: Number of drives at either end of a list.
 _MOST_DRIVES = 5
@@ -94,28 +91,6 @@ def _print_others(others: Sequence[ComparedFigure], console: Console) -> None:
         median, changed = comparing.percent(math.expm1(row.change.median)), "changed" if p < 0.05 else ""
         rows.append([row.requirement.name, str(row.change.drives), median, f"{p:.2g}", changed])
     _print(rows, console, "other figures", ">drives", ">median", ">p (Holm)", "")
-
-
-def write_comparison_junit(path: Path, comparison: Comparison) -> None:
-    """Write the verdicts of the figures, and of the drives' partners, as JUnit XML; raises OutputError."""
-    cases = [_figure_case(row, comparison) for row in comparison.figures]
-    lost = () if comparison.allow_unpaired or not comparison.gated else comparison.unpaired
-    reason = "; ".join(comparison.unpaired)
-    partners = "drives without partner"
-    cases.append(Case("compare", "drives", "every drive has a partner", partners, bool(lost), reason, reason or None))
-    plan = {} if comparison.requirements is None else plan_cases(comparison.requirements)
-    write_bytes(path, cases_bytes({**plan, "compare": cases}))
-
-
-def _figure_case(row: ComparedFigure, comparison: Comparison) -> Case:
-    name = row.requirement.name
-    closed = any(line.startswith(f"{name}: ") for line in comparison.failures)
-    median = comparing.percent(math.expm1(row.change.median))
-    limit = "no limit" if row.limit is None else f"limit {comparing.percent(row.limit)}"
-    text = (
-        f"{row.verdict}: median {median} (95 %: {comparing.interval_text(row)}) of {row.change.drives} drives, {limit}"
-    )
-    return Case("compare", row.requirement.estimator or comparing.MAIN, name, row.verdict, closed, text, text)
 
 
 #: Largest number of events in the output.

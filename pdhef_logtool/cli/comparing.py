@@ -28,8 +28,9 @@ def compare(
     junit: Path | None = None,
 ) -> None:
     """Compare two runs drive by drive: better, worse, or no significant difference; more runs as a history."""
-    from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
+    from pdhef_logtool.cli.compare_tables import render_comparison
     from pdhef_logtool.results import comparing
+    from pdhef_logtool.storage.files import write_bytes
     from pdhef_logtool.storage.object_store import is_url
     from pdhef_logtool.storage.outputs import check_no_input
 
@@ -43,10 +44,9 @@ def compare(
         allow_unpaired=allow_unpaired, strict=strict,
     )  # fmt: skip
     if junit is not None:
-        write_comparison_junit(junit, comparison)
+        write_bytes(junit, comparing.comparison_junit(comparison))
     if html is not None:
         from pdhef_logtool.reports.comparison import comparison_page
-        from pdhef_logtool.storage.files import write_bytes
 
         write_bytes(html, comparison_page(comparison))
     console.finish(comparison, render_comparison)

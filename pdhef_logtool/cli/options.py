@@ -57,12 +57,8 @@ def command(name: str | None = None) -> Callable[[Callable[..., None]], Callable
     """
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        called, given, shared = (
-            name or function.__name__.rstrip("_"),
-            signature(function).parameters,
-            _texts()["shared"],
-        )
-        texts = _texts()[called]
+        called, given = name or function.__name__.rstrip("_"), signature(function).parameters
+        shared, texts = _texts()["shared"], _texts()[called]
         wanted = (*texts.get("settings", "").split(), *_FILE_AND_SETTINGS)
         settings = [
             Parameter(key, Parameter.KEYWORD_ONLY, default=None, annotation=_KINDS[option["kind"]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,20 +16,13 @@ from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, 
 from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
-from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
+from pdhef_logtool.results import selected_estimate as selected
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
-from pdhef_logtool.results.run_report import diverged_line, faults_line
-from pdhef_logtool.results.selected_estimate import (
-    NEARLY_HOLDS,
-    assumptions_of,
-    degrees,
-    failed_checks,
-    is_worse,
-    result_of,
-)
+from pdhef_logtool.results.run_report import lines_of
+from pdhef_logtool.results.selected_estimate import Figures, assumptions_of, degrees, figures_of
 from pdhef_logtool.runs.run_result import RunResult
 
 _Report: TypeAlias = Mapping[str, Any]
@@ -39,23 +32,12 @@ _Key: TypeAlias = tuple[str, str, str]
 _Column: TypeAlias = tuple[str, float, int]
 
 _NIS_RATIO: _Key = ("state", "all", "nis_ratio")
-#: Columns of the narrowest terminal, and columns in the order of their omission, after all columns that are not listed.
-_KEPT: tuple[_Key, ...] = (("sideslip_rad", "all", "rmse"), ("sideslip_rad", "all", "coverage95"))
-_LEAVE_LAST: tuple[_Key, ...] = (
-    ("vx_m_s", "all", "rmse"),
-    ("sideslip_rad", "all", "max_abs"),
-    ("lateral_1s_m", "all", "rmse"),
-    ("vy_m_s", "all", "rmse"),
-    ("sideslip_rad", "all", "p95_abs"),
-    ("ay_m_s2", "all", "rmse"),
-    _NIS_RATIO,
-    ("sideslip_rad", "all", "lag_s"),
-    ("sideslip_rad", "linear", "rmse"),
-    ("yaw_rate_rad_s", "all", "rmse"),
-    ("sideslip_rad", "nonlinear", "rmse"),
-)
-#: Largest number of channels with the same loss, and of undecided checks, in a line.
-_MOST_PLACES, _MOST_UNDECIDED = 3, 4
+#: Columns in the order of their omission in a narrow terminal, after all columns that are not listed; two are kept.
+_LEAVE_LAST = """
+    vx_m_s.all.rmse sideslip_rad.all.max_abs lateral_1s_m.all.rmse vy_m_s.all.rmse sideslip_rad.all.p95_abs
+    ay_m_s2.all.rmse state.all.nis_ratio sideslip_rad.all.lag_s sideslip_rad.linear.rmse yaw_rate_rad_s.all.rmse
+    sideslip_rad.nonlinear.rmse sideslip_rad.all.rmse sideslip_rad.all.coverage95
+""".split()  # noqa: SIM905 - a list with quotes is longer
 #: Largest number of logs with the same failure in a line.
 _MOST_FAILED = 5
 _TEXTS = {
@@ -73,7 +55,8 @@ def render_run(result: RunResult, console: Console) -> None:
     reports_by_log = [(r, all_printable(r.report)) for r in result.results]
     reports = [report for _, report in reports_by_log if report is not None]
     is_joint = len(reports) > 1 and all(report["answer"] for report in reports)
-    assumed = _assumed(reports)
+    first, *others = [assumptions_of(report) for report in reports] or [[]]
+    assumed = [clause for clause in first if all(clause in clauses for clauses in others)]
     console.print(_head(result, reports, assumed))
     console.print()
     if is_joint:
@@ -95,18 +78,12 @@ def render_run(result: RunResult, console: Console) -> None:
         _print_outputs(result.place, console, [r.outcome.log for r in result.results])
 
 
-def _assumed(reports: Sequence[_Report]) -> list[str]:
-    """Return the common assumptions of all logs as clauses."""
-    first, *others = [assumptions_of(report) for report in reports] or [[]]
-    return [clause for clause in first if all(clause in clauses for clauses in others)]
-
-
 def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
     """Return the first three lines: result, assumptions, next step."""
     given, texts = result.requirements, [_texts(report) for report in reports]
     failed = [r.outcome.log for r in result.results if r.report is None]
     alone = len(result.results) == 1
-    said = _range(reports) if not alone else result_of(reports[0]) if reports else "the log failed"
+    said = _range(reports) if not alone else selected.result_of(reports[0]) if reports else "the log failed"
     steps = [f"{', '.join(failed[:_MOST_FAILED])} failed: read the cause below"] if failed else []
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
     steps = next_steps(None if given is None else given.to_dict(), steps)
@@ -189,13 +166,13 @@ def _render_log(report: _Report, console: Console, common: Sequence[str] | None 
         later = _clauses(texts, "next")[1:]  # the head contains the first one
         shown = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
         shown |= {"next": "; ".join(later)} if later else {}
-        lines = [*_checks(report)]
+        lines = lines_of("checks", report, True)
     else:
         is_scored = _figures(report).get((report["selected_estimate"], "sideslip_rad", "all", "rmse")) is not None
         rest = [clause for clause in assumptions_of(report) if clause not in common]
         shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
         shown |= {"assumed": "; ".join(rest)} if rest else {}
-        lines = [*_checks(report, undecided=False), *_losses(report, notes=False)]
+        lines = [*lines_of("checks", report, False), *lines_of("losses", report, False)]
         if not (shown or lines or is_named):
             return
     log, has_table = report["log"], common is None or is_named
@@ -207,7 +184,7 @@ def _render_log(report: _Report, console: Console, common: Sequence[str] | None 
         console.print(named_lines({f"  {_TEXTS[key]}": text for key, text in shown.items()}))
     if has_table:
         console.print(_table(report, console))
-    for line in _below(report) if common is None else ():
+    for line in lines_of("below", report, _shown(report)) if common is None else ():
         print_indented(line, console)
     console.print()
 
@@ -223,50 +200,6 @@ def _clauses(texts: Mapping[str, str], key: str) -> list[str]:
     return texts[key].split("; ") if texts.get(key) else []
 
 
-def _checks(report: _Report, *, undecided: bool = True) -> Iterable[str]:
-    yield from failed_checks(report)
-    names = [check["name"] for check in report.get("checks") or () if check["verdict"] == "undecided"]
-    if names and undecided:
-        yield f"Not observable in this drive: {listed(names, _MOST_UNDECIDED)}"
-
-
-def _losses(report: _Report, *, notes: bool = True) -> Iterable[str]:
-    """Yield the losses of the input, then its notes, with one line for several channels with the same one."""
-
-    def text(loss: Mapping[str, Any]) -> tuple[str, str, str]:
-        has_count = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
-        what = loss["what"] if has_count else f"{loss['count']} × {loss['what']}"
-        span = ""
-        if loss["start_ns"] is not None and loss["end_ns"] is not None:
-            start = report["log"]["start_ns"]
-            span = f", {(loss['start_ns'] - start) / 1e9:.2f} to {(loss['end_ns'] - start) / 1e9:.2f} s"
-        return ("lost" if loss["severity"] == "lost" else "note"), what, span
-
-    losses = sorted(report["losses"], key=lambda x: x["severity"] != "lost")
-    for (word, what, span), places in gathered((text(x), x["where"]) for x in losses).items():
-        if word == "lost" or notes:
-            yield f"{word}: {what} ({listed(places, _MOST_PLACES)}{span})"
-
-
-def _below(report: _Report) -> Iterable[str]:
-    """Yield the lines below the table: footnotes, estimators that did not run, events, and remarks."""
-    shown = _shown(report)
-    if report["truth"]["not_independent"]:
-        yield "† the ground truth is an input or the estimate itself: not an independent check"
-    if any(not e["causal"] for e in shown):
-        yield "* not causal: uses later measurements"
-    estimators = report["estimators"]
-    skipped = gathered((e["reason"], e["name"]) for e in estimators if e["outcome"] == "skipped")
-    yield from (f"{', '.join(names)} skipped: {reason}" for reason, names in skipped.items())
-    yield from (f"{e['name']} {e['reason']}" for e in estimators if e["outcome"] == "failed")
-    diverged = gathered((diverged_line(report, e["name"]), e["name"]) for e in shown)
-    yield from (f"{', '.join(names)}: {event}" for event, names in diverged.items() if event)
-    if faults := faults_line(report):
-        yield f"faults of the sensors: {faults}"
-    yield from _losses(report)
-    yield from (f"note: {remark}" for remark in report["remarks"])
-
-
 def _shown(report: _Report) -> list[Mapping[str, Any]]:
     """Return the displayed estimators: the selected estimate first, estimators that are not causal last."""
     answer = report["answer"]
@@ -276,10 +209,9 @@ def _shown(report: _Report) -> list[Mapping[str, Any]]:
     return sorted(ran.values(), key=lambda e: not e["causal"])
 
 
-def _figures(report: _Report) -> dict[tuple[str, str, str, str], float | None]:
-    """Return the metrics by estimator, signal, segment and name, including ratios and differences of two."""
-    values = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
-    main = report["selected_estimate"]
+def _figures(report: _Report) -> Figures:
+    """Return the figures of a report, including ratios and differences of two."""
+    values, main = figures_of(report), report["selected_estimate"]
     for (name, signal, segment, metric), value in list(values.items()):
         if metric == "nis" and value is not None and (dof := values.get((name, signal, segment, "nis_dof"))):
             values[name, signal, segment, "nis_ratio"] = value / dof
@@ -295,9 +227,9 @@ def _table(report: _Report, console: Console) -> Table:
     shown = [e for e in _shown(report) if any(name == e["name"] for name, *_ in values)]  # --keep metrics has less
     asked = _columns(truth=truth["available"], main=report["selected_estimate"] or "").items()
     columns = [(k, c) for k, c in asked if any(values.get((e["name"], *k)) is not None for e in shown)]
-    others = [k for k, _ in columns if k not in (*_KEPT, *_LEAVE_LAST)] if truth["available"] else []
-    for leave in (None, *others, *_LEAVE_LAST):
-        columns = [(k, c) for k, c in columns if k != leave]
+    others = [".".join(k) for k, _ in columns if ".".join(k) not in _LEAVE_LAST] if truth["available"] else []
+    for leave in (None, *others, *_LEAVE_LAST[:-2]):
+        columns = [(k, c) for k, c in columns if ".".join(k) != leave]
         heads = (f">{head}" + (" †" if k[0] in truth["not_independent"] else "") for k, (head, *_) in columns)
         made = table("\nestimator", *heads)
         for column in made.columns:
@@ -352,25 +284,6 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
         compared = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, "zero"))
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))
         seconds = f"{report['log']['duration_s']:.0f}"
-        notes = _look_at(report, inside, main if len(mains) > 1 else "", is_worse(*compared))
-        joint.add_row(report["log"]["name"], seconds, *errors, cell(inside), notes)
+        notes = lines_of("look_at", report, inside, main if len(mains) > 1 else "", selected.is_worse(*compared))
+        joint.add_row(report["log"]["name"], seconds, *errors, cell(inside), *(notes or [""]))
     return joint
-
-
-def _look_at(report: _Report, inside: float | None, main: str, worse: bool) -> str:
-    """Return the points of a log to check as a short text.
-
-    ``main``: its selected estimate if logs differ in it. ``worse``: whether it is worse than a constant.
-    """
-    failed = sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks") or [])
-    scored = any(m["signal"] == "sideslip_rad" and m["metric"] == "rmse" for m in report["metrics"])
-    hints = [
-        f"by {main}" if main else "",
-        f"{failed} check{'s' * (failed > 1)} failed" if failed else "",
-        "input lost" if any(x["severity"] == "lost" for x in report["losses"]) else "",
-        "no ground truth" if not report["truth"]["available"] else "" if scored else "not scored",
-        "diverged" if diverged_line(report, report["selected_estimate"]) else "",
-        "worse than a constant" if worse else "",
-        "interval too narrow" if inside is not None and inside < NEARLY_HOLDS else "",
-    ]
-    return ", ".join(filter(None, hints))

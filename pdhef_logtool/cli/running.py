@@ -114,9 +114,7 @@ def _finish(result: RunResult) -> NoReturn:
         summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
         console.show(summary, render_fleet)
     else:
-        if (
-            not console.as_json
-        ):  # the tables read the reports; a copy of all metric rows for the terminal would be unused
+        if not console.as_json:  # the tables read the reports: a copy of all metric rows would be unused
             result = replace(result, results=tuple(replace(entry, rows=()) for entry in result.results))
         console.show(result, render_run)
         for entry in result.results:

@@ -3,16 +3,19 @@
 The rules use sensors only, never ground truth. The steering angle is converted to a *demand*: the lateral acceleration
 of a linear car in steady state, ``δ v² / (L (1 + v²/v_ch²))``. One threshold then suits all speeds and sizes of cars,
 and does not depend on friction. A *swing* is the time in which the demand stays to one side; its duration is measured
-at half its peak. All rules are mirror symmetric. :class:`ManoeuvreRules` contains the thresholds, docs/metrics.md the
-rules.
+at half its peak. All rules are mirror symmetric. ``manoeuvres.toml`` contains the thresholds, docs/metrics.md the
+RULES.
 """
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -21,119 +24,14 @@ from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
 
-MANOEUVRES = (
-    "steady-circle",
-    "step-steer",
-    "ramp-steer",
-    "sine-steer",
-    "continuous-sine",
-    "sine-sweep",
-    "dlc",
-    "dlc-3888-2",
-    "sine-with-dwell",
-    "fishhook",
-    "slalom",
-    "brake-in-turn",
-    "power-off-in-turn",
-)
 _STEP_NS, _STEP_S = 20_000_000, 0.02
 #: The zero of the steering is computed from one row in this many.
 _ZERO_EVERY = 10
 
 
-@dataclass(frozen=True, slots=True)
-class ManoeuvreRules:
-    """All thresholds; the module docstring defines demand and swing.
-
-    Attributes
-    ----------
-    characteristic_speed_m_s : nominal v_ch. least_speed_m_s : lowest speed of a manoeuvre.
-    swing_m_s2, least_peak_m_s2 : demand at the ends of a swing, and least demand at its peak.
-    peak_m_s2, strong_m_s2 : least peak demand of steps and repeated swings; of sine steer, sine with dwell, fishhook
-        and lane changes.
-    slack_m_s2 : demand by which held steering may differ in addition to ``held``: noise and corrections of the driver.
-    straight_m_s2, straight_s : largest mean |v r| and least duration of straight driving before a manoeuvre.
-    wheels_straight_rad : largest steering angle for the gyro's zero.
-    swing_gap_s, swing_s : longest time between two swings of one manoeuvre; longest swing of repeated ones.
-    equal_peaks : smallest ratio of the peaks of two swings that count as equal.
-    sine_hz, sine_equal : frequencies of a single sine (ISO 7401), smallest ratio of the durations of its swings.
-    dwell_s : additional duration of the second swing of a sine with dwell (FMVSS 126: 0.5 s).
-    fishhook_s, fishhook_first_s : shortest second and longest first swing of a fishhook (NHTSA: second held for 3 s).
-    repeated, sweep_repeated : least number of swings of a slalom; of a continuous sine or sweep.
-    regular : largest relative difference between successive spacings of swings.
-    slalom_hz, sweep_ratio : highest frequency of a slalom; least growth of the frequency in a sweep.
-    side_m : distance over which the path of a double lane change is beyond half its offset (24 m on the course of ISO
-        3888-2, 52 m of ISO 3888-1). severe_m, severe_m_s : a manoeuvre below both is ISO 3888-2.
-    offset_m, exit_m, returned, overshoot, sideways, heading_left : of a double lane change: lateral offset; length of
-        the exit lane; largest remaining share of the offset, averaged over the exit lane, and weight of an overshoot to
-        the other side; allowance for lateral distance above 1.2 times one way out and back, as a share of it for each
-        swing above three; largest remaining share of the peak heading, averaged over the exit lane.
-    step_rise_s, held, held_s : 10 to 90 % rise time of a step; tolerance of held steering, and its duration.
-    ramp_s, ramp_m_s2, ramp_misfit, ramp_speed : of a ramp: duration, demand at its end, largest RMS deviation from a
-        line over its height, largest change of speed.
-    circle_rad, circle_s, circle_m_s2, circle_share : of a circle: change of heading, duration, least |v r|, and
-        relative tolerance of the curvature.
-    turn_m_s2, turn_s, turn_speed : steady cornering before the car slows: |v r|, duration, largest change of speed.
-    brake_m_s2, gentle_brake_m_s2, brake_share : braking is a fall of a_x by the first, or by the second and this share
-        of |v r| (low friction). power_off_m_s2 : least fall of a_x when the throttle is released.
-    slowing_s, longest_slowing_s : shortest and longest deceleration of one manoeuvre.
-    """
-
-    characteristic_speed_m_s: float = 25.0
-    least_speed_m_s: float = 3.0
-    swing_m_s2: float = 0.3
-    least_peak_m_s2: float = 0.6
-    slack_m_s2: float = 0.15
-    peak_m_s2: float = 1.0
-    straight_m_s2: float = 0.8
-    straight_s: float = 0.4
-    wheels_straight_rad: float = 0.006
-    swing_gap_s: float = 0.6
-    swing_s: float = 2.5
-    equal_peaks: float = 0.6
-    sine_hz: tuple[float, float] = (0.4, 1.6)
-    sine_equal: float = 0.7
-    strong_m_s2: float = 2.0
-    dwell_s: tuple[float, float] = (0.25, 0.9)
-    fishhook_s: float = 1.5
-    fishhook_first_s: float = 1.2
-    repeated: int = 4
-    sweep_repeated: int = 6
-    regular: float = 0.35
-    slalom_hz: float = 0.7
-    sweep_ratio: float = 1.25
-    side_m: tuple[float, float] = (12.0, 80.0)
-    severe_m: float = 37.0
-    severe_m_s: float = 24.0
-    offset_m: tuple[float, float] = (1.0, 10.0)
-    returned: float = 0.65
-    overshoot: float = 0.8
-    sideways: float = 0.2
-    exit_m: float = 30.0
-    heading_left: float = 0.25
-    step_rise_s: float = 0.35
-    held: float = 0.15
-    held_s: float = 1.5
-    ramp_s: float = 3.5
-    ramp_m_s2: float = 2.0
-    ramp_misfit: float = 0.03
-    ramp_speed: float = 0.15
-    circle_rad: float = 1.8
-    circle_s: float = 8.0
-    circle_m_s2: float = 0.8
-    circle_share: float = 0.15
-    turn_m_s2: float = 1.2
-    turn_s: float = 1.5
-    turn_speed: float = 0.05
-    brake_m_s2: float = 1.7
-    gentle_brake_m_s2: float = 0.65
-    brake_share: float = 0.48
-    power_off_m_s2: float = 0.28
-    slowing_s: float = 1.0
-    longest_slowing_s: float = 10.0
-
-
-RULES = ManoeuvreRules()
+#: Thresholds of the rules: ``manoeuvres.toml``.
+RULES = SimpleNamespace(**tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")))
+MANOEUVRES: tuple[str, ...] = tuple(RULES.names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,11 +56,11 @@ class Manoeuvre(Event):
     lowest_ax_m_s2: float
 
 
-def find_manoeuvres(signals: Signals, vehicle: VehicleParameters, rules: ManoeuvreRules = RULES) -> list[Manoeuvre]:
+def find_manoeuvres(signals: Signals, vehicle: VehicleParameters) -> list[Manoeuvre]:
     """Return the manoeuvres of a drive in order of time, without overlaps."""
     wheelbase_m = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
-    zeros = _zeros(signals, wheelbase_m, rules)
-    manoeuvres = [m for run in _runs_of(signals, wheelbase_m, zeros, rules) for m in _manoeuvres_of(run, rules)]
+    zeros = _zeros(signals, wheelbase_m)
+    manoeuvres = [m for run in _runs_of(signals, wheelbase_m, zeros) for m in _manoeuvres_of(run)]
     return sorted(manoeuvres, key=lambda m: m.start_ns)
 
 
@@ -225,36 +123,36 @@ def _speed(signals: Signals) -> FloatArray:
     return np.abs(last_known(signals.stamps_ns, speed))
 
 
-def _gain(speed_m_s: FloatArray, wheelbase_m: float, rules: ManoeuvreRules) -> FloatArray:
+def _gain(speed_m_s: FloatArray, wheelbase_m: float) -> FloatArray:
     squared = speed_m_s**2
-    return np.asarray(squared / (wheelbase_m * (1.0 + squared / rules.characteristic_speed_m_s**2)))
+    return np.asarray(squared / (wheelbase_m * (1.0 + squared / RULES.characteristic_speed_m_s**2)))
 
 
-def _zeros(signals: Signals, wheelbase_m: float, rules: ManoeuvreRules) -> tuple[float, float]:
+def _zeros(signals: Signals, wheelbase_m: float) -> tuple[float, float]:
     """Return the readings of steering (rad) and gyro (rad/s) straight ahead.
 
     Steering: the median after subtraction of the steady-state angle; gyro: the median with straight wheels.
     """
     speed, rate = _speed(signals), signals.yaw_rate_rad_s
-    straight = (np.abs(rate * speed) < rules.straight_m_s2) & (speed > rules.least_speed_m_s)
+    straight = (np.abs(rate * speed) < RULES.straight_m_s2) & (speed > RULES.least_speed_m_s)
     rows = np.flatnonzero(straight[::_ZERO_EVERY]) * _ZERO_EVERY
     steer, rates = signals.steer_rad[rows], rate[rows]
-    left = steer - rates * speed[rows] / _gain(speed[rows], wheelbase_m, rules)
+    left = steer - rates * speed[rows] / _gain(speed[rows], wheelbase_m)
     finite = left[np.isfinite(left)]
     zero = float(np.median(finite)) if finite.size else 0.0
-    ahead = rates[np.abs(steer - zero) < rules.wheels_straight_rad]
+    ahead = rates[np.abs(steer - zero) < RULES.wheels_straight_rad]
     return zero, float(np.median(ahead)) if ahead.size else 0.0
 
 
-def _runs_of(signals: Signals, wheelbase_m: float, zeros: tuple[float, float], rules: ManoeuvreRules) -> Iterator[_Run]:
+def _runs_of(signals: Signals, wheelbase_m: float, zeros: tuple[float, float]) -> Iterator[_Run]:
     """Yield the runs without gaps in which speed, yaw rate and steering are known."""
     stamps = signals.stamps_ns
     speed, yaw_rate = _speed(signals), signals.yaw_rate_rad_s - zeros[1]
     steer = signals.steer_rad - zeros[0]
     if not np.isfinite(steer).any():  # curvature of the path instead
         with np.errstate(divide="ignore", invalid="ignore"):
-            steer = yaw_rate * speed / _gain(speed, wheelbase_m, rules)
-    finite = np.isfinite(speed) & np.isfinite(yaw_rate) & np.isfinite(steer) & (speed > rules.least_speed_m_s)
+            steer = yaw_rate * speed / _gain(speed, wheelbase_m)
+    finite = np.isfinite(speed) & np.isfinite(yaw_rate) & np.isfinite(steer) & (speed > RULES.least_speed_m_s)
     for a, b in runs(stamps, _bridged(stamps, finite)):
         rows = np.flatnonzero(finite[a:b]) + a
         first, last = -(-int(stamps[rows[0]]) // _STEP_NS), int(stamps[rows[-1]]) // _STEP_NS
@@ -270,7 +168,7 @@ def _runs_of(signals: Signals, wheelbase_m: float, zeros: tuple[float, float], r
             yaw_rate=r,
             ax=smoothed(signals.ax_m_s2[rows], 2.0),
             ay=smoothed(signals.ay_m_s2[rows], 3.0),
-            gain=_gain(v, wheelbase_m, rules),
+            gain=_gain(v, wheelbase_m),
             turn=v * r,
             curvature=smoothed(yaw_rate[rows], 1.0) / v,
         )
@@ -295,13 +193,13 @@ def _bridged(stamps_ns: IntArray, finite: BoolArray) -> BoolArray:
     return filled
 
 
-def _manoeuvres_of(run: _Run, rules: ManoeuvreRules) -> list[Manoeuvre]:
+def _manoeuvres_of(run: _Run) -> list[Manoeuvre]:
     """Return the manoeuvres of a run; of two that overlap, the earlier rule of this list applies."""
-    swings = _swings(run, rules)
+    swings = _swings(run)
     spans: list[tuple[str, int, int]] = []
     taken = np.zeros(len(run), dtype=np.bool_)
     for rule in (_lane_changes, _repeated, _two_swings, _slowing, _steps, _ramps, _circles):
-        for name, start, end in rule(run, swings, rules):
+        for name, start, end in rule(run, swings):
             a, b = max(start, 0), min(end, len(run))
             if b - a > 1 and not taken[a:b].any():
                 taken[a:b] = True
@@ -329,77 +227,77 @@ def _spans(mask: BoolArray) -> Iterator[tuple[int, int]]:
 # ---- swings ----
 
 
-def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
+def _swings(run: _Run) -> list[_Swing]:
     """Return the swings with a sufficient peak, in order."""
     demand = run.steer * run.gain
     swings = []
     for sign in (1, -1):
         side = sign * demand
-        for a, b in _spans(side > rules.swing_m_s2):
+        for a, b in _spans(side > RULES.swing_m_s2):
             row = a + int(np.argmax(side[a:b]))
-            if side[row] >= rules.least_peak_m_s2:
+            if side[row] >= RULES.least_peak_m_s2:
                 half = side[a:b] >= 0.5 * side[row]
                 first, last = int(np.argmax(half)), len(half) - int(np.argmax(half[::-1]))
                 swings.append(_Swing(a, b, row, sign, float(side[row]), (last - first) * _STEP_S))
     return sorted(swings, key=lambda s: s.start)
 
 
-def _repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
+def _repeated(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
     """Yield slalom, continuous sine, sine sweep: swings of alternating sign with regular spacing, long series first."""
-    parts = _regular_parts(swings, rules)
-    long = [p for p in parts if len(p) >= rules.sweep_repeated]
+    parts = _regular_parts(swings)
+    long = [p for p in parts if len(p) >= RULES.sweep_repeated]
     steady = [p for p in long if min(s.peak for s in p[-2:]) >= 0.5 * max(s.peak for s in p)]
     for part in (*steady, *parts):
-        yield _name_of_repeated(part, rules), part[0].start, part[-1].end
+        yield _name_of_repeated(part), part[0].start, part[-1].end
 
 
-def _regular_parts(swings: Sequence[_Swing], rules: ManoeuvreRules) -> list[list[_Swing]]:
+def _regular_parts(swings: Sequence[_Swing]) -> list[list[_Swing]]:
     """Return the chains of short swings to alternating sides, with regular spacing and enough swings."""
-    short = [s for s in swings if s.half_s <= rules.swing_s]
+    short = [s for s in swings if s.half_s <= RULES.swing_s]
     part = short[:1]
     parts = [part]
     for before, swing in pairwise(short):
-        follows = swing.sign != before.sign and (swing.start - before.end) * _STEP_S <= rules.swing_gap_s
+        follows = swing.sign != before.sign and (swing.start - before.end) * _STEP_S <= RULES.swing_gap_s
         spacing = np.diff([_middle(s) for s in (*part[-2:], swing)])
-        if not follows or np.ptp(spacing) > rules.regular * spacing.max():
+        if not follows or np.ptp(spacing) > RULES.regular * spacing.max():
             part = [before] if follows else []
             parts.append(part)
         part.append(swing)
-    high = 0.8 * rules.peak_m_s2
-    return [p for p in parts if len(p) >= rules.repeated and np.mean([s.peak for s in p]) >= high]
+    high = 0.8 * RULES.peak_m_s2
+    return [p for p in parts if len(p) >= RULES.repeated and np.mean([s.peak for s in p]) >= high]
 
 
 def _middle(swing: _Swing) -> float:
     return 0.5 * (swing.start + swing.end)
 
 
-def _name_of_repeated(part: Sequence[_Swing], rules: ManoeuvreRules) -> str:
+def _name_of_repeated(part: Sequence[_Swing]) -> str:
     spacing_s = np.diff([_middle(s) for s in part]) * _STEP_S
     frequency = 0.5 / spacing_s
     quarter = max(1, len(frequency) // 4)
     grown = float(frequency[-quarter:].mean() / frequency[:quarter].mean())
-    if len(part) >= rules.sweep_repeated and grown >= rules.sweep_ratio:
+    if len(part) >= RULES.sweep_repeated and grown >= RULES.sweep_ratio:
         return "sine-sweep"
-    is_slow = len(part) < rules.sweep_repeated or frequency.mean() < rules.slalom_hz
+    is_slow = len(part) < RULES.sweep_repeated or frequency.mean() < RULES.slalom_hz
     return "slalom" if is_slow else "continuous-sine"
 
 
-def _lane_changes(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+def _lane_changes(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:
     """Yield double lane changes: out, back, and straight at the end, within the length of a course."""
     for i in range(len(swings)):
-        before = swings[i - 1] if i and (swings[i].start - swings[i - 1].end) * _STEP_S < rules.swing_gap_s else None
-        if before is not None and before.peak > rules.equal_peaks * swings[i].peak:
+        before = swings[i - 1] if i and (swings[i].start - swings[i - 1].end) * _STEP_S < RULES.swing_gap_s else None
+        if before is not None and before.peak > RULES.equal_peaks * swings[i].peak:
             continue
         for last in range(i + 3, min(i + 7, len(swings)) + 1):
-            side_m = _side_lane_m(run, swings[i:last], rules)
-            if rules.side_m[0] <= side_m <= rules.side_m[1]:
+            side_m = _side_lane_m(run, swings[i:last])
+            if RULES.side_m[0] <= side_m <= RULES.side_m[1]:
                 start, end = swings[i].start, swings[last - 1].end
-                is_severe = side_m < rules.severe_m and run.speed[start] < rules.severe_m_s
+                is_severe = side_m < RULES.severe_m and run.speed[start] < RULES.severe_m_s
                 yield "dlc-3888-2" if is_severe else "dlc", start, end
                 break
 
 
-def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> float:
+def _side_lane_m(run: _Run, swings: Sequence[_Swing]) -> float:
     """Return the distance over which the path is beyond half its offset; 0 if it is not a double lane change.
 
     In a double lane change, the path leaves to one side and returns once. Heading and offset return on average over the
@@ -407,9 +305,9 @@ def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> 
     """
     sides = [s.sign for s in swings if s.peak >= 0.25 * max(w.peak for w in swings)]
     changes = sum(a != b for a, b in pairwise(sides))
-    if changes < 2 or sides[0] != sides[-1] or max(s.peak for s in swings) < rules.strong_m_s2:
+    if changes < 2 or sides[0] != sides[-1] or max(s.peak for s in swings) < RULES.strong_m_s2:
         return 0.0
-    exit_rows = max(round(rules.exit_m / float(run.speed[swings[-1].end - 1]) / _STEP_S), 1)
+    exit_rows = max(round(RULES.exit_m / float(run.speed[swings[-1].end - 1]) / _STEP_S), 1)
     here = run.rows(swings[0].start - 10, swings[-1].end + exit_rows)
     speed = run.speed[here]
     heading = np.cumsum(run.yaw_rate[here]) * _STEP_S
@@ -418,37 +316,37 @@ def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> 
     way, left = offset[: after.start + 1], float(offset[after].mean())
     peak = float(way.max())
     is_one = (
-        rules.offset_m[0] <= peak <= rules.offset_m[1]
-        and max(left, -left * rules.overshoot, way[-1]) <= rules.returned * peak
-        and np.abs(np.diff(way)).sum() <= (1.2 + rules.sideways * (len(swings) - 3)) * (2.0 * peak - way[-1])
-        and abs(heading[after].mean()) <= rules.heading_left * np.abs(heading).max()
+        RULES.offset_m[0] <= peak <= RULES.offset_m[1]
+        and max(left, -left * RULES.overshoot, way[-1]) <= RULES.returned * peak
+        and np.abs(np.diff(way)).sum() <= (1.2 + RULES.sideways * (len(swings) - 3)) * (2.0 * peak - way[-1])
+        and abs(heading[after].mean()) <= RULES.heading_left * np.abs(heading).max()
     )
     return float(speed[: len(way)][way > 0.5 * peak].sum()) * _STEP_S if is_one else 0.0
 
 
-def _straight_before(run: _Run, row: int, rules: ManoeuvreRules) -> bool:
+def _straight_before(run: _Run, row: int) -> bool:
     """Return whether the car drove straight before a row; True at the start of the run."""
-    before = run.turn[max(row - round(rules.straight_s / _STEP_S), 0) : max(row, 1)]
-    return bool(np.mean(np.abs(before)) < rules.straight_m_s2)
+    before = run.turn[max(row - round(RULES.straight_s / _STEP_S), 0) : max(row, 1)]
+    return bool(np.mean(np.abs(before)) < RULES.straight_m_s2)
 
 
-def _two_swings(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+def _two_swings(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:
     """Yield sine steer, sine with dwell, fishhook: from straight ahead, two equally high swings to opposite sides."""
     for first, second in pairwise(swings):
-        close = (second.start - first.end) * _STEP_S <= 0.5 * rules.swing_gap_s
+        close = (second.start - first.end) * _STEP_S <= 0.5 * RULES.swing_gap_s
         low, high = sorted((first.peak, second.peak))
-        if not close or first.sign == second.sign or low < rules.equal_peaks * high or high < rules.strong_m_s2:
+        if not close or first.sign == second.sign or low < RULES.equal_peaks * high or high < RULES.strong_m_s2:
             continue
-        if not _straight_before(run, first.start, rules):
+        if not _straight_before(run, first.start):
             continue
         longer_s, period_s = second.half_s - first.half_s, 3.0 * first.half_s
-        if first.half_s <= rules.fishhook_first_s and second.half_s >= max(rules.fishhook_s, 2.0 * first.half_s):
+        if first.half_s <= RULES.fishhook_first_s and second.half_s >= max(RULES.fishhook_s, 2.0 * first.half_s):
             yield "fishhook", first.start, second.end
-        elif not rules.sine_hz[0] <= 1.0 / period_s <= rules.sine_hz[1]:
+        elif not RULES.sine_hz[0] <= 1.0 / period_s <= RULES.sine_hz[1]:
             continue
-        elif rules.dwell_s[0] <= longer_s <= rules.dwell_s[1] and _has_dwell(run, first, second):
+        elif RULES.dwell_s[0] <= longer_s <= RULES.dwell_s[1] and _has_dwell(run, first, second):
             yield "sine-with-dwell", first.start, second.end
-        elif min(first.half_s, second.half_s) >= rules.sine_equal * max(first.half_s, second.half_s):
+        elif min(first.half_s, second.half_s) >= RULES.sine_equal * max(first.half_s, second.half_s):
             yield "sine-steer", first.start, second.end
 
 
@@ -465,67 +363,67 @@ def _has_dwell(run: _Run, first: _Swing, second: _Swing) -> bool:
 # ---- steps, ramps, circles, slowing in a turn ----
 
 
-def _steps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+def _steps(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:
     """Yield steps (ISO 7401): from straight ahead to an angle within a short time, then held."""
-    held_rows = round(rules.held_s / _STEP_S)
+    held_rows = round(RULES.held_s / _STEP_S)
     for swing in swings:
-        if swing.end - swing.start < held_rows or swing.peak < rules.peak_m_s2:
+        if swing.end - swing.start < held_rows or swing.peak < RULES.peak_m_s2:
             continue
-        if not _straight_before(run, swing.start, rules):
+        if not _straight_before(run, swing.start):
             continue
         side = swing.sign * run.steer
-        settle = swing.start + round(rules.step_rise_s / _STEP_S)
+        settle = swing.start + round(RULES.step_rise_s / _STEP_S)
         held = side[settle : settle + held_rows]
         if len(held) < held_rows:
             continue
         level = float(np.median(held))
         before = side[max(swing.start - 25, 0) : settle]
         rise = np.flatnonzero(before >= 0.9 * level), np.flatnonzero(before <= 0.1 * level)
-        tolerance = _tolerance(level, float(run.gain[settle]), rules)
+        tolerance = _tolerance(level, float(run.gain[settle]))
         if not rise[0].size or not rise[1].size or np.abs(held - level).max() > tolerance:
             continue
-        if (rise[0][0] - rise[1][rise[1] < rise[0][0]].max(initial=0)) * _STEP_S <= rules.step_rise_s:
+        if (rise[0][0] - rise[1][rise[1] < rise[0][0]].max(initial=0)) * _STEP_S <= RULES.step_rise_s:
             rest = np.abs(side[settle : swing.end] - level) > tolerance
             end = settle + int(np.argmax(rest)) if rest.any() else swing.end
             yield "step-steer", swing.start, end
 
 
-def _ramps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+def _ramps(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:
     """Yield ramps: the angle grows along a line for seconds, from straight ahead, at one speed."""
     for swing in swings:
         row = swing.start + int(np.argmax(np.abs(run.steer[swing.start : swing.end]))) + 1
         speed = run.speed[swing.start : row]
-        n = int(np.argmin(np.append(np.abs(speed / speed[0] - 1.0) <= rules.ramp_speed, False)))
+        n = int(np.argmin(np.append(np.abs(speed / speed[0] - 1.0) <= RULES.ramp_speed, False)))
         row = swing.start + n
-        if n * _STEP_S < rules.ramp_s or not _straight_before(run, swing.start, rules):
+        if n * _STEP_S < RULES.ramp_s or not _straight_before(run, swing.start):
             continue
         side = swing.sign * run.steer[swing.start : row]
         t = np.linspace(-1.0, 1.0, n)
         slope = float((t * side).mean() / (t * t).mean())
         misfit = np.sqrt(np.mean((side - side.mean() - slope * t) ** 2))
-        rises = slope > 0.0 and 2.0 * slope >= 0.6 * side[-1] and side[-1] * run.gain[row - 1] >= rules.ramp_m_s2
-        if rises and misfit <= rules.ramp_misfit * 2.0 * slope + 0.5 * rules.slack_m_s2 / run.gain[row - 1]:
+        rises = slope > 0.0 and 2.0 * slope >= 0.6 * side[-1] and side[-1] * run.gain[row - 1] >= RULES.ramp_m_s2
+        if rises and misfit <= RULES.ramp_misfit * 2.0 * slope + 0.5 * RULES.slack_m_s2 / run.gain[row - 1]:
             yield "ramp-steer", swing.start, row
 
 
-def _circles(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
+def _circles(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
     """Yield circles (ISO 4138): half a circle or more with a curvature within a share of its median."""
     for sign in (1, -1):
-        for a, b in _spans(sign * run.turn > rules.circle_m_s2):
+        for a, b in _spans(sign * run.turn > RULES.circle_m_s2):
             start = a
             while start < b:
                 level = float(np.median(run.curvature[start : min(start + 150, b)]))
-                off = np.abs(run.curvature[start:b] / level - 1.0) > rules.circle_share
+                off = np.abs(run.curvature[start:b] / level - 1.0) > RULES.circle_share
                 end = start + int(np.argmax(off)) if off.any() else b
                 turned_rad = abs(float(run.yaw_rate[start:end].sum())) * _STEP_S
-                if turned_rad >= rules.circle_rad and (end - start) * _STEP_S >= rules.circle_s:
+                if turned_rad >= RULES.circle_rad and (end - start) * _STEP_S >= RULES.circle_s:
                     yield "steady-circle", start, end
                 start = max(end, start + 25)
 
 
-def _slowing(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
+def _slowing(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
     """Yield braking (ISO 7975) and power-off (ISO 9816): the car slows in a steady turn while the steering is held."""
-    pre, ahead, lag = round(rules.turn_s / _STEP_S), round(rules.slowing_s / _STEP_S), 15
+    pre, ahead, lag = round(RULES.turn_s / _STEP_S), round(RULES.slowing_s / _STEP_S), 15
     n = len(run)
     if n < pre + ahead + lag:
         return
@@ -533,15 +431,15 @@ def _slowing(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iter
     rows = np.arange(pre, n - ahead - lag)
     before = (total[rows] - total[rows - pre]) / pre
     change = (total[rows + lag + ahead] - total[rows + lag]) / ahead - before
-    for a, b in _spans(change < -rules.power_off_m_s2):
+    for a, b in _spans(change < -RULES.power_off_m_s2):
         row = a + int(np.argmin(change[a:b]))
         onset = _onset(run, int(rows[row]), float(before[row]), float(change[row]), pre)
         fall, turn = -float(change[row]), float(np.mean(np.abs(run.turn[onset - pre : onset])))
-        if turn < rules.turn_m_s2 or not _steady_before(run, onset, pre, ahead, rules):
+        if turn < RULES.turn_m_s2 or not _steady_before(run, onset, pre, ahead):
             continue
-        end = _slowing_end(run, onset, float(before[row]) - 0.5 * fall, rules)
-        if (end - onset) * _STEP_S >= rules.slowing_s:
-            braked = fall >= min(rules.brake_m_s2, max(rules.gentle_brake_m_s2, rules.brake_share * turn))
+        end = _slowing_end(run, onset, float(before[row]) - 0.5 * fall)
+        if (end - onset) * _STEP_S >= RULES.slowing_s:
+            braked = fall >= min(RULES.brake_m_s2, max(RULES.gentle_brake_m_s2, RULES.brake_share * turn))
             yield "brake-in-turn" if braked else "power-off-in-turn", onset - pre, end
 
 
@@ -551,29 +449,29 @@ def _onset(run: _Run, row: int, before: float, change: float, pre: int) -> int:
     return max(row + (int(np.argmax(here)) if here.any() else 0), pre)
 
 
-def _steady_before(run: _Run, onset: int, pre: int, ahead: int, rules: ManoeuvreRules) -> bool:
+def _steady_before(run: _Run, onset: int, pre: int, ahead: int) -> bool:
     """Return whether speed, curvature and steering were held before, and the steering after."""
     speed = run.speed[onset - pre : onset]
     curvature = run.curvature[onset - pre : onset]
     level = float(np.mean(run.steer[onset - pre : onset]))
     steer = run.steer[onset - pre : onset + ahead]
-    tolerance = _tolerance(level, float(run.gain[onset]), rules)
+    tolerance = _tolerance(level, float(run.gain[onset]))
     return bool(
-        np.ptp(speed) <= rules.turn_speed * speed.mean()
-        and np.ptp(curvature) <= 2.0 * rules.held * abs(curvature.mean())
+        np.ptp(speed) <= RULES.turn_speed * speed.mean()
+        and np.ptp(curvature) <= 2.0 * RULES.held * abs(curvature.mean())
         and np.abs(steer - level).max() <= tolerance
     )
 
 
-def _tolerance(level_rad: float, gain: float, rules: ManoeuvreRules) -> float:
+def _tolerance(level_rad: float, gain: float) -> float:
     """Return the tolerance of a held steering angle in rad."""
-    return rules.held * abs(level_rad) + rules.slack_m_s2 / gain
+    return float(RULES.held * abs(level_rad) + RULES.slack_m_s2 / gain)
 
 
-def _slowing_end(run: _Run, onset: int, limit_m_s2: float, rules: ManoeuvreRules) -> int:
+def _slowing_end(run: _Run, onset: int, limit_m_s2: float) -> int:
     """Return the row at which the deceleration or the held steering ends."""
-    last = min(onset + round(rules.longest_slowing_s / _STEP_S), len(run))
+    last = min(onset + round(RULES.longest_slowing_s / _STEP_S), len(run))
     level = float(run.steer[onset])
-    over = (run.ax[onset:last] > limit_m_s2) | (np.abs(run.steer[onset:last] - level) > 2.0 * rules.held * abs(level))
+    over = (run.ax[onset:last] > limit_m_s2) | (np.abs(run.steer[onset:last] - level) > 2.0 * RULES.held * abs(level))
     over[:25] = False
     return onset + int(np.argmax(over)) if over.any() else last

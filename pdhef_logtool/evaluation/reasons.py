@@ -1,6 +1,6 @@
 """Intervals of the reasons for which an estimator did not use its sensors as usual.
 
-Stamps with the bit of a reason that are at most :data:`MERGE_S` apart form one interval: a gyro that is stuck for
+Stamps with the bit of a reason that are at most ``RUN_GAP_S`` apart form one interval: a gyro that is stuck for
 seconds gives one interval, even if single samples change.
 """
 
@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.smoothing import runs
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Stamps with the same reason up to this far apart are one interval.
-MERGE_S = 0.5
 #: Largest number of intervals in a list of faults.
 LISTED_INTERVALS = 50
 #: Signal by the ending of a reason's name.
@@ -51,10 +49,8 @@ def reason_intervals(track: StateTrack) -> dict[str, list[Interval]]:
     intervals = {}
     for reason in REASONS if len(track.reason) == len(track) else ():
         stamps_ns = track.stamps_ns[track.reason & reason.bit != 0]
-        if len(stamps_ns):
-            first, last = _runs(stamps_ns)
-            ends = (stamps_ns[last] + 1).tolist()
-            intervals[reason.name] = [Interval(a, b) for a, b in zip(stamps_ns[first].tolist(), ends, strict=True)]
+        if spans := runs(stamps_ns, np.ones(len(stamps_ns), dtype=np.bool_)):
+            intervals[reason.name] = [Interval(int(stamps_ns[a]), int(stamps_ns[b - 1]) + 1) for a, b in spans]
     return intervals
 
 
@@ -67,9 +63,3 @@ def sensor_faults(track: StateTrack) -> list[dict[str, Any]] | None:
         kind, _, sensor = name.partition("_")
         faults.append(sensor_fault(_SENSORS[sensor], kind, intervals))
     return sorted(faults, key=lambda f: str(f["sensor"]))
-
-
-def _runs(stamps_ns: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the first and last entries of runs of stamps [M] that are at most :data:`MERGE_S` apart."""
-    breaks = np.flatnonzero(np.diff(stamps_ns) > MERGE_S * 1e9)
-    return np.append(0, breaks + 1), np.append(breaks, len(stamps_ns) - 1)

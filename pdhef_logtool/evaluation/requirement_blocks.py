@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive
+from pdhef_logtool.evaluation.metrics.errors import errors_of
 from pdhef_logtool.evaluation.smoothing import median_step_ns
-from pdhef_logtool.evaluation.track_errors import NORMAL_95, raw_error, scorable, total_std, truth_speed
+from pdhef_logtool.evaluation.track_errors import NORMAL_95, scorable, truth_speed
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import MEANS, POOLED, SQUARES, Requirement
-from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
@@ -131,25 +131,20 @@ def _summands(
     requirement: Requirement, tracks: Sequence[StateTrack], truth: StateTrack, low_speed_m_s: float
 ) -> FloatArray:
     """Return the values [tracks, M] that the metric averages; NaN at stamps that are not scored."""
-    signal, metric = requirement.signal, requirement.metric
-    at_truth, estimated = scorable(truth, signal, low_speed_m_s), truth.name == REFERENCE
-    if estimated:
-        at_truth = truth.valid & (truth.vx_m_s > low_speed_m_s)
-    rows = []
+    used, rows = scorable(truth, requirement.signal, low_speed_m_s), []
     for track in tracks:
-        error = raw_error(track, truth, signal)
-        scored = used = track.valid & at_truth & np.isfinite(error)
-        if estimated:
-            used, error = scored & (track.vx_m_s > low_speed_m_s), wrap_angle(error)
-        if metric == "availability":
-            value, used = scored.astype(np.float64), at_truth
-        elif metric == "coverage95":
-            std = total_std(track, truth, signal)
-            std = np.full(len(error), np.nan) if std is None else std
-            value, used = (np.abs(error) <= NORMAL_95 * std).astype(np.float64), used & np.isfinite(std)
-        else:
-            value = {"rmse": error**2, "mae": np.abs(error), "bias": error}[metric]
-        rows.append(np.where(used, value, np.nan))
+        if truth.name == REFERENCE:
+            used = truth.valid & (truth.vx_m_s > low_speed_m_s) & (track.vx_m_s > low_speed_m_s)
+        columns = errors_of(track, truth, requirement.signal, used)
+        error, std = columns["error"], columns.get("std", np.full(len(track), np.nan))
+        values = {
+            "rmse": error**2,
+            "mae": np.abs(error),
+            "bias": error,
+            "availability": columns["available"],
+            "coverage95": np.where(np.isfinite(std), np.abs(error) <= NORMAL_95 * std, np.nan),
+        }
+        rows.append(values[requirement.metric])
     return np.stack(rows)
 
 

@@ -14,15 +14,7 @@ import numpy as np
 from pdhef_logtool.evaluation import statistics
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
 from pdhef_logtool.evaluation.units import AY_NOTE
-from pdhef_logtool.evaluation.validation_plan import (
-    AT_LEAST,
-    POOLED,
-    SQUARES,
-    WORST_DRIVE,
-    ExposureNeed,
-    Requirement,
-    shown,
-)
+from pdhef_logtool.evaluation.validation_plan import AT_LEAST, POOLED, SQUARES, WORST_DRIVE, Requirement, shown
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.storage.templates import clauses, one_line, template
 
@@ -60,18 +52,6 @@ class DriveValue:
     factors: Mapping[str, object] = field(default_factory=dict)
     space: Mapping[tuple[float, float], float] = field(default_factory=dict)
     friction: float = math.nan
-
-    def seconds_in(self, need: ExposureNeed) -> float:
-        """Return the duration of driving in conditions, s."""
-        if not _inside(need.friction, self.friction) or need.car not in (None, self.factors.get("car")):
-            return 0.0
-        return math.fsum(
-            s for (speed, ay), s in self.space.items() if _inside(need.speed_m_s, speed) and _inside(need.ay_m_s2, ay)
-        )
-
-
-def _inside(bounds: Sequence[float] | None, value: float) -> bool:
-    return bounds is None or bounds[0] <= value < bounds[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +309,7 @@ def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[Driv
         (exposure.km, requirement.exposure_km, "km"),
     ]
     for need in requirement.exposure:
-        seconds = [d.seconds_in(need) for d in drives]
+        seconds = [need.seconds_of(d.space, d.friction, d.factors.get("car")) for d in drives]
         needs.append((float(sum(s > 0.0 for s in seconds)), float(need.drives), f"drives at {need.label}"))
         needs.append((math.fsum(seconds) / 60.0, need.minutes, f"minutes at {need.label}"))
     return [(has, needed, what) for has, needed, what in needs if needed > 0.0 and (has is None or has < needed)]

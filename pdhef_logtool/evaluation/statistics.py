@@ -22,9 +22,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import combinations
-from typing import Any, Literal, TypeAlias, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,10 @@ from numpy.typing import NDArray
 from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.student import student_quantile
+from pdhef_logtool.storage.templates import one_line, template
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
@@ -95,16 +100,12 @@ class Dependence:
 
     def text(self, drives: int) -> str:
         """Return a sentence on the dependence of drives of one day, car or route."""
-        groups = [f"{count} {name}s" for name, count in self.levels if count > 1]
-        if not groups:
-            return "Drives are assumed independent: days, cars and routes are the same in all drives, or not recorded."
-        among = f"{drives} drives of {', '.join(groups)}"
-        if self.design_effect == 1.0:
-            return f"Design effect 1: no dependence between {among}."
-        return (
-            f"Design effect {self.design_effect:.2g} by {' and '.join(self.by)}: {among} have the evidence of "
-            f"{drives / self.design_effect:.0f} independent drives."
-        )
+        return one_line(_sentence().render(d=self, drives=drives))
+
+
+@cache
+def _sentence() -> Template:
+    return template(Path(__file__).with_name("templates") / "dependence.txt")
 
 
 def deviate(share: float, freedom: float) -> float:

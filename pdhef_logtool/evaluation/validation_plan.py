@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -60,12 +61,24 @@ class ExposureNeed(BaseModel):
             raise ValueError("give drives or minutes")
         return self
 
+    def seconds_of(self, space: Mapping[tuple[float, float], float], friction: float, car: object) -> float:
+        """Return the duration of a drive in the conditions, of its seconds by the lower edges of speed and |a_y|."""
+        if not _inside(self.friction, friction) or self.car not in (None, car):
+            return 0.0
+        return math.fsum(
+            s for (speed, ay), s in space.items() if _inside(self.speed_m_s, speed) and _inside(self.ay_m_s2, ay)
+        )
+
     @property
     def label(self) -> str:
         """The conditions as text, for example ``20 to 30 m/s, μ 0 to 0.4``."""
         ranges = (("", self.speed_m_s, " m/s"), ("|a_y| ", self.ay_m_s2, " m/s²"), ("μ ", self.friction, ""))
         words = [f"{name}{r[0]:g} to {r[1]:g}{unit}" for name, r, unit in ranges if r is not None]
         return ", ".join([*words, *([] if self.car is None else [f"car {self.car}"])])
+
+
+def _inside(bounds: Sequence[float] | None, value: float) -> bool:
+    return bounds is None or bounds[0] <= value < bounds[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,31 +327,23 @@ def comparable() -> tuple[str, ...]:
 
 def _limit(table: RequirementTable, where: str, problems: list[str]) -> float | None:
     """Return the limit in the unit of metrics.parquet, None for a ratio; append its errors to ``problems``."""
-    unit = registered()[table.metric].unit_of(table.signal)
-    given = {
-        "limit": (table.limit, unit, 1.0),
-        "limit_deg": (table.limit_deg, "rad", 1.0 / DEGREES),
-        "limit_deg_s": (table.limit_deg_s, "rad/s", 1.0 / DEGREES),
+    metric, ratio, is_limit = registered()[table.metric], table.max_ratio, table.baseline is None
+    unit = metric.unit_of(table.signal)
+    units = {"limit": (unit, 1.0), "limit_deg": ("rad", 1.0 / DEGREES), "limit_deg_s": ("rad/s", 1.0 / DEGREES)}
+    given: dict[str, float] = {key: value for key in units if (value := getattr(table, key)) is not None}
+    others = [(key, units[key][0]) for key in given if units[key][0] != unit]
+    wrong = {
+        ".max_ratio: needs a baseline, for example baseline = 'zero'": is_limit and ratio is not None,
+        ": give one of limit, limit_deg, limit_deg_s, or baseline with max_ratio": (
+            is_limit and ratio is None and len(given) != 1
+        ),
+        f": give {next(iter(given), '')} or baseline, not both": not is_limit and given,
+        ".max_ratio: is missing, for example 1.0": not is_limit and ratio is None,
+        f".baseline: {table.metric} has no ratio; use a metric such as rmse": not is_limit and metric.best != "lower",
     }
-    matches = {key: entry for key, entry in given.items() if entry[0] is not None}
-    if table.baseline is None:
-        if table.max_ratio is not None:
-            problems.append(f"{where}.max_ratio: needs a baseline, for example baseline = 'zero'")
-        elif len(matches) != 1:
-            problems.append(f"{where}: give one of limit, limit_deg, limit_deg_s, or baseline with max_ratio")
-    else:
-        if matches:
-            problems.append(f"{where}: give {next(iter(matches))} or baseline, not both")
-        if table.max_ratio is None:
-            problems.append(f"{where}.max_ratio: is missing, for example 1.0")
-        if registered()[table.metric].best != "lower":
-            problems.append(f"{where}.baseline: {table.metric} has no ratio; use a metric such as rmse")
-    for key, (value, needed, factor) in matches.items():
-        if needed != unit:
-            problems.append(f"{where}.{key}: {table.signal} {table.metric} is in {unit}, not in {needed}")
-        elif value is not None and table.baseline is None:
-            return value * factor
-    return None
+    problems += [f"{where}{text}" for text, is_wrong in wrong.items() if is_wrong]
+    problems += [f"{where}.{key}: {table.signal} {table.metric} is in {unit}, not in {of}" for key, of in others]
+    return next((value * units[key][1] for key, value in given.items()), None) if is_limit else None
 
 
 #: The requirement on sideslip of the default plan.

@@ -125,11 +125,6 @@ class Figure:
     kind: ClassVar[str]
     title: str
 
-    @property
-    def heading(self) -> str:
-        """Heading of the figure."""
-        return self.title
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeFigure(Figure):
@@ -147,11 +142,6 @@ class TimeFigure(Figure):
     resolution: float = 0.0
     height: int = 190
     time: Mapping[str, float] | None = None
-
-    @property
-    def heading(self) -> str:
-        """Heading of the figure, with its unit."""
-        return f"{self.title} [{self.unit}]" if self.unit else self.title
 
 
 @dataclass(frozen=True, slots=True, eq=False)

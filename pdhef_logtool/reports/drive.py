@@ -16,7 +16,7 @@ from pdhef_logtool.reports.page import render
 from pdhef_logtool.reports.pages import Page
 from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
-from pdhef_logtool.results.selected_estimate import NAIVE
+from pdhef_logtool.results.selected_estimate import NAIVE, figures_of
 from pdhef_logtool.results.sink import TRUTH
 
 #: The best filter with physics only; the errors of the baseline would hide all others in a figure.
@@ -65,7 +65,7 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
         segments=[] if roles is None else by_segment(report, roles),
         consistency=whole_figures(report, names, manoeuvres=False),
         key_figures=key_figures,
-        apart={} if roles is None else disagreements(report, roles),
+        apart={} if roles is None else disagreements(report, roles.main),
         definitions=definitions(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
@@ -98,12 +98,10 @@ def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
             figures.setdefault(m["estimator"], {})[m["signal"], m["metric"]] = m["value"]
     errors = figures.get(main, {})
     same = [n for n, f in figures.items() if n != main and "~" not in n and len(f) > 1 and f == errors]
-    apart = [m["estimator"] for m in report["metrics"] if m["metric"] == "disagreement_rms" and m["value"] == 0.0]
-    pairs = [n for pair in apart if main in (names := pair.split("~")) for n in names if n != main]
-    return [*dict.fromkeys([*same, *pairs])]
+    return [*dict.fromkeys([*same, *(n for n, apart in disagreements(report, main).items() if apart == 0.0)])]
 
 
-_Table = dict[str, Any]
+_Table: TypeAlias = dict[str, Any]
 _BySignal: TypeAlias = dict[str, dict[str, dict[str, Mapping[str, Any]]]]
 
 
@@ -167,14 +165,14 @@ def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres
     return {"heads": heads, "rows": rows} if rows else None
 
 
-def disagreements(report: Mapping[str, Any], roles: Roles) -> dict[str, float]:
+def disagreements(report: Mapping[str, Any], main: str) -> dict[str, float]:
     """Return the RMS sideslip difference in rad between each other estimator and the selected estimate."""
     values = {}
-    for m in report["metrics"]:
-        first, _, second = m["estimator"].partition("~")
-        if (m["metric"], m["segment"]) == ("disagreement_rms", "all") and roles.main in (first, second):
-            values[second if first == roles.main else first] = m["value"]
-    return {name: float(value) for name, value in values.items() if value is not None}
+    for (pair, _, segment, metric), value in figures_of(report).items():
+        first, _, second = pair.partition("~")
+        if (metric, segment) == ("disagreement_rms", "all") and main in (first, second) and value is not None:
+            values[second if first == main else first] = value
+    return values
 
 
 def _by_signal(report: Mapping[str, Any]) -> _BySignal:

@@ -84,10 +84,12 @@ def _environment() -> Environment:
         finalize=_printed,
     )
     of_results = result_of, assumptions_of, failed_checks, shown
-    of_numbers = number, duration, degrees, percent, change, stamp, seconds, unit
+    of_numbers = number, duration, degrees, percent, stamp, unit
     made.filters |= {function.__name__: function for function in (*of_results, *of_numbers)} | {
         "joint_notes": lambda plan: joint_notes({str(r["id"]): r.get("notes") or () for r in plan["requirements"]}),
         "reason": _reason,
+        "change": partial(percent, sign="+"),
+        "seconds": lambda value_s: DASH if value_s is None else f"{value_s:.3f} s",
         "minute": lambda stamp_ns: f"{stamp(stamp_ns)[:16].replace('T', ' ')} UTC" if is_dated(stamp_ns) else "",
         "range": _range,
         "signal": _signal,
@@ -176,19 +178,9 @@ def degrees(value_rad: float | None) -> str:
     return f"{value:.3f}°" if abs(value) < 1.0 else f"{value:.2f}°"
 
 
-def percent(share: float | None) -> str:
-    """Return a share in percent."""
-    return DASH if share is None or not math.isfinite(share) else f"{share:.1%}"
-
-
-def change(share: float | None) -> str:
-    """Return a relative change in percent with its sign."""
-    return DASH if share is None or not math.isfinite(share) else f"{share:+.1%}"
-
-
-def seconds(value_s: float | None) -> str:
-    """Return seconds with milliseconds."""
-    return DASH if value_s is None else f"{value_s:.3f} s"
+def percent(share: float | None, sign: str = "") -> str:
+    """Return a share in percent, with its sign if that is ``+``."""
+    return DASH if share is None or not math.isfinite(share) else f"{share:{sign}.1%}"
 
 
 def duration(seconds: float) -> str:

@@ -23,7 +23,7 @@ from pdhef_logtool.reports.charts import Charts, TimeFigure
 from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
-from pdhef_logtool.results.selected_estimate import assumptions_of, failed_checks
+from pdhef_logtool.results.selected_estimate import assumptions_of, failed_checks, figures_of
 from pdhef_logtool.storage.files import write_bytes
 
 PDF_FILE = "report.pdf"
@@ -140,9 +140,8 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
     if report is None:
         return (1, 0.0)
     fails = sum(r["outcome"] == "FAIL" for r in (report.get("plan") or {}).get("requirements") or ())
-    wanted = (report.get("selected_estimate"), "sideslip_rad", "all", "rmse")
-    figures = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
-    return -fails, -(figures.get(wanted) or 0.0)
+    wanted = (str(report.get("selected_estimate")), "sideslip_rad", "all", "rmse")
+    return -fails, -(figures_of(report).get(wanted) or 0.0)
 
 
 def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *, positions: bool) -> dict[str, Any]:

@@ -83,18 +83,14 @@ def _clips_of(
     wanted = {TRUTH, log.main(), *((report.get("answer") or {}).get("shown") or ()), *named}
     tracks = [read_track(estimates, name) for name in list_estimators(estimates) if name in wanted]
     for event in events:
-        span_ns = _span(source, event, pad_s)
+        pad_ns = round(pad_s * 1e9)
+        span_ns = max(event.start_ns - pad_ns, source.start_ns), min(event.end_ns + pad_ns, source.end_ns)
         name = f"{log.label}_{event.start_s:.2f}s.mcap"
         cut = [track.between(*span_ns) for track in tracks]
         with AnnotatedMcap(change.file(name), source, span_ns=span_ns) as clip:
             clip.write(cut)
             clip.finish(report, cut)
         yield name
-
-
-def _span(log: DriveLog, event: FoundEvent, pad_s: float) -> tuple[int, int]:
-    pad_ns = round(pad_s * 1e9)
-    return max(event.start_ns - pad_ns, log.start_ns), min(event.end_ns + pad_ns, log.end_ns)
 
 
 def _source_of(log: OpenedLog, folder: Path | None) -> Path:

@@ -27,6 +27,7 @@ from pdhef_logtool.evaluation.units import SIGNALS, share_of
 from pdhef_logtool.evaluation.validation_plan import MEANS, RUN, SQUARES, Requirement, ValidationPlan, load_plan, shown
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.printable import listed
+from pdhef_logtool.results.junit import junit_bytes
 from pdhef_logtool.results.opened_run import OpenedRun, open_run, table_file
 from pdhef_logtool.results.pairing import Pair, pair_logs, run_differences
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts, plan_verdicts_against
@@ -530,6 +531,12 @@ def history_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
         rows.append([row.run, row.version, str(of.units), value, between, change, interval, row.verdict or "-"])
     name = comparison.history[0].requirement.name if rows else ""
     return ["run", "version", ">drives", f">{name}", ">95 % interval", ">change", ">95 % interval", "verdict"], rows
+
+
+def comparison_junit(comparison: Comparison) -> bytes:
+    """Return the verdicts of the plan, of the figures, and of the drives' partners as JUnit XML."""
+    words: dict[str, Any] = {"percent": percent, "expm1": math.expm1, "interval_text": interval_text}
+    return junit_bytes(comparison.requirements, comparison=comparison, **words)
 
 
 def change_text(figure: ComparedFigure) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from pdhef_logtool.results.condition import Condition, Reference, parse_conditio
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.parquet_sink import list_estimators
 from pdhef_logtool.results.sink import TRUTH
+from pdhef_logtool.storage.documents import jsonable
 
 SPEED = "speed_m_s"
 #: Stored columns that are true or false.
@@ -80,15 +81,8 @@ class FoundEvents:
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON-able values."""
-        return {
-            "format": "pdhef.events",
-            "version": 1,
-            "where": self.where,
-            "searched": self.searched,
-            "events": [asdict(e) for e in self.events],
-            "left_out": dict(self.left_out),
-            "clips": self.clips,
-        }
+        shown = ("where", "searched", "events", "left_out", "clips")
+        return {"format": "pdhef.events", "version": 1, **{key: jsonable(getattr(self, key)) for key in shown}}
 
 
 def event_condition(text: str) -> Condition:

@@ -90,6 +90,10 @@ class FleetDrive:
         return self.errors.get((self.main if estimator == ANSWER else estimator, signal), math.nan)
 
 
+#: Its fields that are in the table of drives.
+_OF_ROW = ("label", "seconds", "main", "truth", "unscored", "coverage", "nis", "d2", "naive_d2", "failed_checks")
+
+
 @dataclass(frozen=True, slots=True)
 class Distribution:
     """Errors of one estimator in one signal over drives: ``values`` ascending, in ``unit``."""
@@ -213,22 +217,28 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     figures = sideslip_errors(run, [*SIGNALS]).collect().iter_rows()
     of_log = statistics.gathered((log, ((estimator, signal), value)) for log, estimator, signal, value in figures)
     drives = tuple(
-        _drive(r, dict(of_log.get(r["log"], ())), dict(metadata.get(r["log"], ())) | _keys(r, kinds.get(r["log"])))
+        FleetDrive(
+            **{key: r[key] for key in _OF_ROW},
+            errors=dict(of_log.get(r["label"], ())),
+            keys=dict(metadata.get(r["label"], ())) | _keys(r, kinds.get(r["label"])),
+            factors={factor: r[factor] for factor in statistics.FACTORS},
+        )
         for r in done
     )
     errors = np.array([d.error() for d in drives])
-    scored = [d for d in drives if d.truth]
-    names = _estimators(scored)
+    scored, use = [d for d in drives if d.truth], errors > 0.0
+    counts = Counter(e for d in scored for e, s in d.errors if s == JUDGED)
+    names = sorted(counts, key=lambda e: (-counts[e], e))  # the most frequent first
     return Fleet(
         logs=len(rows),
         drives=drives,
         distributions=tuple(_distributions(scored, names)),
         ranking=tuple(_ranking(scored, names)) if len(scored) >= least_to_rank(len(names)) else (),
         least_to_rank=least_to_rank(len(names)),
-        dependence=_dependence(scored),
+        dependence=statistics.dependence(np.log(errors[use]), _of_all(drives, use)),
         breakdowns=breakdowns(errors, [d.keys for d in drives], _of_all(drives), by),
         space=_space(run),
-        failed=grouped([(r["log"], r["reason"]) for r in rows if r["outcome"] == "failed"]),
+        failed=grouped([(r["label"], r["reason"]) for r in rows if r["outcome"] == "failed"]),
         losses=grouped(lost),
     )
 
@@ -268,7 +278,7 @@ def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.La
 
 
 def _rows(run: OpenedRun) -> list[dict[str, Any]]:
-    """Return the table of drives, with NIS per degree of freedom, v̇_y residual and the residual of sideslip 0."""
+    """Return the table of drives with fields of :class:`FleetDrive`; unknown figures are NaN, unknown texts empty."""
 
     def value(metric: str) -> pl.Expr:
         return pl.col("value").filter(pl.col("metric") == metric).first()
@@ -277,18 +287,11 @@ def _rows(run: OpenedRun) -> list[dict[str, Any]]:
     checks = metrics.group_by("log", "estimator").agg(nis=value("nis") / value("nis_dof"), d2=value("d2"))
     naive = checks.filter(estimator=NAIVE).select("log", naive_d2="d2")
     drives = run.table("drives").with_row_index("place").join(checks, on=["log", "estimator"], how="left")
-    return drives.join(naive, on="log", how="left").sort("place").collect().to_dicts()
-
-
-def _drive(row: Mapping[str, Any], errors: Mapping[tuple[str, str], float], keys: Mapping[str, str]) -> FleetDrive:
-    """Return a drive of its row."""
-    figures = (row[key] for key in ("sideslip_coverage95", "nis", "d2", "naive_d2"))
-    coverage, nis, d2, naive_d2 = (math.nan if x is None else float(x) for x in figures)
-    scored, factors = row["sideslip_rmse_rad"] is not None, {factor: row[factor] for factor in statistics.FACTORS}
-    main, unscored, failed = row["estimator"] or "", row["unscored"] or "", row["failed_checks"]
-    return FleetDrive(
-        row["log"], row["seconds"], main, scored, unscored, errors, coverage, nis, d2, naive_d2, failed, keys, factors
-    )
+    fields = {"label": "log", "main": "estimator", "coverage": "sideslip_coverage95"}
+    named = drives.join(naive, on="log", how="left").sort("place").with_columns(**fields)
+    scored = pl.col("sideslip_rmse_rad").is_not_null()
+    unknown = pl.col("coverage", "nis", "d2", "naive_d2").fill_null(math.nan), pl.col("main", "unscored").fill_null("")
+    return named.with_columns(*unknown, truth=scored).collect().to_dicts()
 
 
 def _keys(row: Mapping[str, Any], kinds: Sequence[str] | None) -> dict[str, str]:
@@ -308,23 +311,10 @@ def _keys(row: Mapping[str, Any], kinds: Sequence[str] | None) -> dict[str, str]
     return {k: v for k, v in from_log.items() if v}
 
 
-def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
-    """Return the estimators with an error in the judged signal, the most frequent first."""
-    counts = Counter(e for d in drives for e, s in d.errors if s == JUDGED)
-    return sorted(counts, key=lambda e: (-counts[e], e))
-
-
 def _of_all(drives: Sequence[FleetDrive], use: BoolArray | None = None) -> dict[str, list[str | None]]:
     """Return day, car and route of the drives to use (None: all)."""
     used = drives if use is None else [drives[i] for i in np.flatnonzero(use).tolist()]
     return {f: [d.factors.get(f) for d in used] for f in statistics.FACTORS}
-
-
-def _dependence(drives: Sequence[FleetDrive]) -> statistics.Dependence:
-    """Return the dependence of the selected estimate's errors."""
-    errors = np.array([d.error() for d in drives])
-    use = errors > 0.0
-    return statistics.dependence(np.log(errors[use]), _of_all(drives, use))
 
 
 def _median(change: statistics.PairedChange, scale: Callable[[float], float] = float) -> Median:

@@ -73,11 +73,5 @@ def _panel(
     title: str, field: str, tracks: Sequence[str], *, limits: Sequence[str] = (), topic: str = "plot"
 ) -> dict[str, Any]:
     """Return a plot of one field of tracks, and of the ``limits`` of its interval; ``panel``: its name in Foxglove."""
-    return {
-        "panel": f"Plot!{field}",
-        "title": title,
-        "field": field,
-        "tracks": tracks,
-        "limits": limits,
-        "topic": topic,
-    }
+    of = {"panel": f"Plot!{field}", "title": title, "field": field}
+    return of | {"tracks": tracks, "limits": limits, "topic": topic}

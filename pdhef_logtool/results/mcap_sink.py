@@ -7,6 +7,7 @@ import math
 import re
 import struct
 from collections.abc import Container, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
@@ -282,13 +283,10 @@ def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
 
 def _is_our_report(attachment: Attachment) -> bool:
     """Return whether an attachment is our report.json, not somebody else's of the same name."""
-    if attachment.name != REPORT_ATTACHMENT:
-        return False
-    try:
-        document = json.loads(attachment.data)
-    except (ValueError, RecursionError):
-        return False
-    return isinstance(document, dict) and document.get("format") == "pdhef.report"
+    with suppress(ValueError, RecursionError):
+        document = json.loads(attachment.data) if attachment.name == REPORT_ATTACHMENT else None
+        return isinstance(document, dict) and document.get("format") == "pdhef.report"
+    return False
 
 
 def _state_fields(track: StateTrack, use: IntArray) -> dict[str, NDArray[Any]]:

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
 from pdhef_logtool.evaluation.reasons import reason_intervals
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, truth_speed
 from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.results.run_report import lines_of
 from pdhef_logtool.results.sink import Event
 
 _SIDESLIP, _RATE = "sideslip_rad", "yaw_rate_rad_s"
@@ -120,8 +120,8 @@ def colour_rgb(name: str, colours: Mapping[str, int]) -> tuple[int, int, int]:
     return packed >> 16, packed >> 8 & 0xFF, packed & 0xFF
 
 
-DEBUG, INFO, WARN, ERROR = 10, 20, 30, 40  #: of rcl_interfaces/msg/Log
-LEVEL_NAMES = {DEBUG: "DEBUG", INFO: "INFO", WARN: "WARN", ERROR: "ERROR"}
+#: Levels of rcl_interfaces/msg/Log.
+LEVEL_NAMES = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR"}
 _REASON_TEXTS = {r.name: r.text for r in REASONS}
 
 
@@ -135,38 +135,12 @@ class LogLine:
     text: str
 
 
-def event_text(event: Event) -> str:
-    """Return an event with its duration."""
-    head = f"{event.name}, {(event.end_ns - event.start_ns) * 1e-9:.2f} s"
-    return f"{head}: {event.text}" if event.text else head
-
-
 def log_lines(report: Mapping[str, Any], events: Sequence[Event], tracks: Iterable[StateTrack]) -> list[LogLine]:
     """Return the lines in order of time: failed checks, losses, events and manoeuvres, and faults by estimator."""
-    start_ns, end_ns = (int(report["log"].get(key, 0)) for key in ("start_ns", "end_ns"))
-    lines = [LogLine(e.start_ns, _level(e), "pdhef", event_text(e)) for e in events]
-    for check in report.get("checks", ()):
-        if check["verdict"] == "failed":
-            level, end = (WARN, " (waived)") if check["waived"] else (ERROR, "")
-            text = f"check {check['name']} failed{end}: {check['evidence']}"
-            lines.append(LogLine(start_ns, level, "pdhef", text))
-    for loss in report.get("losses", ()):
-        level = WARN if loss["severity"] == "lost" else INFO
-        stamp_ns = start_ns if loss["start_ns"] is None else min(max(loss["start_ns"], start_ns), max(end_ns, start_ns))
-        lines.append(LogLine(stamp_ns, level, "pdhef", f"{loss['kind']}: {loss['what']} ({loss['where']})"))
-    for track in tracks:
-        for reason, spans in reason_intervals(track).items():
-            text = f"{track.name}: {_REASON_TEXTS[reason]}"
-            lines += [
-                LogLine(s.start_ns, WARN, track.name, f"{text}, {(s.end_ns - s.start_ns) * 1e-9:.2f} s") for s in spans
-            ]
+    reasons = [(t.name, _REASON_TEXTS[reason], spans) for t in tracks for reason, spans in reason_intervals(t).items()]
+    cells = (line.split("\t", 3) for line in lines_of("log", report, report["log"], events, reasons))
+    lines = [LogLine(int(stamp_ns), int(level), *texts) for stamp_ns, level, *texts in cells]
     return sorted(lines, key=lambda line: (line.stamp_ns, -line.level, line.text))
-
-
-def _level(event: Event) -> int:
-    if event.name.endswith(" diverged"):
-        return ERROR
-    return INFO if event.name in MANOEUVRES or event.text else DEBUG
 
 
 def log_message(line: LogLine) -> bytes:

@@ -20,6 +20,7 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.plotted import ERRORS, LEVEL_NAMES, STATES, Plot, colour_rgb, drawn, errors, log_lines
 from pdhef_logtool.results.run_report import report_markdown
+from pdhef_logtool.results.selected_estimate import figures_of
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots
 from pdhef_logtool.storage.files import open_new, writing
 
@@ -138,14 +139,12 @@ def write_recording(
 
 def _properties(report: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the properties by which a catalog of recordings can be filtered, None and empty lists if unknown."""
-    whole = [
-        m for m in report["metrics"] if (m["signal"], m["metric"], m["segment"]) == ("sideslip_rad", "rmse", "all")
-    ]
+    errors = [(name, x) for (name, *of), x in figures_of(report).items() if of == ["sideslip_rad", "all", "rmse"]]
     plan = report.get("plan") or {}
     failed = [c["name"] for c in report.get("checks", ()) if c["verdict"] == "failed"]
     faults = [f"{f['kind']} {f['sensor']}" for f in report.get("faults") or ()]
     return {
-        "sideslip_rmse_deg": {m["estimator"]: m["value"] * DEGREES for m in whole if m["value"] is not None},
+        "sideslip_rmse_deg": {name: error * DEGREES for name, error in errors if error is not None},
         "verdicts": {r["id"]: r["outcome"] for r in plan.get("requirements", ())},
         "drive": {
             "car": report["vehicle"]["name"],

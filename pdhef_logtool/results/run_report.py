@@ -14,15 +14,18 @@ from typing import Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
+from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.metric import registered
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import LABELS
+from pdhef_logtool.records.printable import listed, printable
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
-from pdhef_logtool.results.selected_estimate import TEMPLATES, MainFacts, answer_of
+from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, TEMPLATES, MainFacts, answer_of, failed_checks
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
-from pdhef_logtool.storage.templates import template
+from pdhef_logtool.storage.templates import lines, template
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("estimator", "signal", "segment", "metric", "value", "unit", "n")
@@ -182,38 +185,16 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 def report_markdown(report: Mapping[str, Any]) -> str:
     """Return the document of :func:`build_report` in a few words, as Markdown for viewers; the page has the figures."""
-    context = {"diverged_line": diverged_line, "faults_line": faults_line}
-    return template(TEMPLATES / "report.md", **context).render(report=report)
+    return template(TEMPLATES / "report.md", lines_of=lines_of).render(report=report)
 
 
-def diverged_line(report: Mapping[str, Any], name: str) -> str:
-    """Return when an estimator of a report diverged by its own account; empty if it did not."""
-    spans = [s for s in report["segments"] if s["name"] == f"{name} diverged"]
-    if not spans:
-        return ""
-    seconds = sum(s["end_ns"] - s["start_ns"] for s in spans) / 1e9
-    first = (min(s["start_ns"] for s in spans) - report["log"]["start_ns"]) / 1e9
-    often = "" if len(spans) == 1 else f" in {len(spans)} intervals"
-    return f"diverged for {seconds:.2f} s{often}, first at {first:.2f} s"
+@cache
+def _lines() -> Any:
+    words = {"LABELS": LABELS, "MANOEUVRES": MANOEUVRES, "NEARLY_HOLDS": NEARLY_HOLDS}
+    functions = {f.__name__: f for f in (failed_checks, gathered, listed, printable)}
+    return template(TEMPLATES / "lines.txt", **words, **functions).module
 
 
-#: A shorter interval is shown as one time, and so many intervals of a fault are shown.
-_SHORT_S, _MOST_INTERVALS = 0.1, 3
-
-
-def faults_line(report: Mapping[str, Any]) -> str:
-    """Return the faults and changes of the sensors, and when; empty without any.
-
-    ``a_y spike 1.20 s, 3.45 s, 7.00 s and 9 more; yaw rate stuck 12.3-16.3 s``.
-    """
-
-    def when(interval: Mapping[str, Any]) -> str:
-        start_s, end_s = ((interval[key] - report["log"]["start_ns"]) * 1e-9 for key in ("start_ns", "end_ns"))
-        return f"{start_s:.2f} s" if end_s - start_s < _SHORT_S else f"{start_s:.1f}-{end_s:.1f} s"
-
-    def text(fault: Mapping[str, Any]) -> str:
-        first = fault["intervals"][:_MOST_INTERVALS]
-        more = f" and {fault['count'] - len(first)} more" if fault["count"] > len(first) else ""
-        return f"{LABELS.get(fault['sensor'], fault['sensor'])} {fault['kind']} {', '.join(map(when, first))}{more}"
-
-    return "; ".join(map(text, report.get("faults") or ()))
+def lines_of(about: str, report: Mapping[str, Any], *more: Any) -> list[str]:
+    """Return the lines of ``lines.txt`` about a part of a report: ``diverged``, ``faults``, ``losses`` and others."""
+    return lines(getattr(_lines(), about)(report, *more))

@@ -24,8 +24,8 @@ from pdhef_logtool.storage.templates import clauses, one_line, template
 TEMPLATES = Path(__file__).parent / "templates"
 
 Report: TypeAlias = Mapping[str, Any]
-#: Figures of the whole drive by estimator, signal and metric; None if absent.
-_Figures: TypeAlias = Mapping[tuple[str, str, str], float | None]
+#: Values of metrics by estimator, signal, segment and metric.
+Figures: TypeAlias = dict[tuple[str, str, str, str], float | None]
 
 #: Coverage of the 95 % interval from which on it is nearly as stated.
 NEARLY_HOLDS = 0.90
@@ -59,12 +59,10 @@ class MainFacts:
 
 def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
     """Return the ``answer`` of a report: the reason of the selection, and the result in words."""
-    figures = {
-        (m["estimator"], m["signal"], m["metric"]): m["value"] for m in report["metrics"] if m["segment"] == "all"
-    }
+    figures = figures_of(report)
 
     def value(name: str | None, metric: str, signal: str = "sideslip_rad") -> float | None:
-        return None if name is None else figures.get((name, signal, metric))
+        return figures.get((name or "", signal, "all", metric))
 
     words = _words()
     intervals = next((e["intervals"] for e in report["estimators"] if e["name"] == main.name), ())
@@ -80,6 +78,11 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
     texts = {key: one_line(text) for key, text in texts.items()}
     chosen = {"why": main.why, "named": main.named, "shown": list(main.shown)}
     return {**chosen, "sideslip_rmse_ci_rad": interval, "texts": texts}
+
+
+def figures_of(report: Report) -> Figures:
+    """Return the figures of a document."""
+    return {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
 
 
 def _interval(report: Report) -> list[float] | None:
@@ -105,12 +108,9 @@ def result_of(report: Report) -> str:
     """Return the result of a document in a sentence: of the selected estimate, or of recorded estimates."""
     if report["answer"] is not None:
         return str(report["answer"]["texts"]["result"])
-    names = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
-    wanted = ("sideslip_rad", "all", "rmse")
-    errors = {
-        m["estimator"]: m["value"] for m in report["metrics"] if (m["signal"], m["segment"], m["metric"]) == wanted
-    }
-    scored = ", ".join(f"{name}: {degrees(errors[name])}" for name in names if errors.get(name) is not None)
+    names, figures = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"], figures_of(report)
+    errors = [(name, figures.get((name, "sideslip_rad", "all", "rmse"))) for name in names]
+    scored = ", ".join(f"{name}: {degrees(error)}" for name, error in errors if error is not None)
     if scored:
         return f"sideslip RMSE of {scored} ({truth_of(report, 'sideslip_rad')})"
     return f"sideslip of {', '.join(names)} is not scored" if names else "no estimate"
@@ -155,12 +155,9 @@ def truth_of(report: Report, name: str) -> str:
     return f"ground truth: {' and '.join(topics)}" if topics else "ground truth"
 
 
-def _best_in_hindsight(report: Report, main: MainFacts, figures: _Figures) -> dict[str, Any] | None:
+def _best_in_hindsight(report: Report, main: MainFacts, figures: Figures) -> dict[str, Any] | None:
     """Return the estimator with the least error against ground truth, None without it; for display only."""
-    ran = [e["name"] for e in report["estimators"] if e["outcome"] == "ran" and e["name"] != REFERENCE]
-    errors = {name: error for name in ran if (error := figures.get((name, "sideslip_rad", "rmse"))) is not None}
-    if not errors:
-        return None
-    best = min(errors, key=lambda name: (errors[name], name != main.name))
-    causal = next(e["causal"] for e in report["estimators"] if e["name"] == best)
-    return {"name": best, "causal": causal, "sideslip_rmse_rad": errors[best]}
+    ran = [e for e in report["estimators"] if e["outcome"] == "ran" and e["name"] != REFERENCE]
+    errors = [{**e, "sideslip_rmse_rad": figures.get((e["name"], "sideslip_rad", "all", "rmse"))} for e in ran]
+    scored = [e for e in errors if e["sideslip_rmse_rad"] is not None]
+    return min(scored, key=lambda e: (e["sideslip_rmse_rad"], e["name"] != main.name), default=None)

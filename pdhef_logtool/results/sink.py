@@ -14,22 +14,13 @@ TRUTH = "truth"
 LONGEST_WHOLE_NS = 600_000_000_000
 
 #: Rounding steps in files, far below the resolution of sensors: powers of two, so that the last bytes are zero.
-_STEPS = {
-    "x_m": 2.0**-10,
-    "y_m": 2.0**-10,
-    "yaw_rad": 2.0**-17,
-    "vx_m_s": 2.0**-13,
-    "vy_m_s": 2.0**-13,
-    "yaw_rate_rad_s": 2.0**-17,
-    "sideslip_rad": 2.0**-20,
-    "ay_m_s2": 2.0**-12,
-    "steer_rad": 2.0**-17,
-    "orientation": 2.0**-18,
-}
+STEPS = dict.fromkeys(("yaw_rad", "yaw_rate_rad_s", "steer_rad"), 2.0**-17)
+STEPS |= {"x_m": 2.0**-10, "y_m": 2.0**-10, "vx_m_s": 2.0**-13, "vy_m_s": 2.0**-13}
+STEPS |= {"sideslip_rad": 2.0**-20, "ay_m_s2": 2.0**-12, "orientation": 2.0**-18}
 #: Columns in single precision: values that a user has given, such as 0.85.
 _SINGLE = frozenset({"friction", "network_trust", "r_scale"})
 #: Bits that are cleared in single-precision values of other columns, which leaves 12 bits of mantissa.
-_BITS_OUT = 11
+BITS_OUT = 11
 
 
 def rounded(name: str, values: FloatArray) -> FloatArray:
@@ -38,21 +29,16 @@ def rounded(name: str, values: FloatArray) -> FloatArray:
     The zero bytes take no space in a compressed file.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond single precision; signalling NaN
-        step = _STEPS.get(name)
+        step = STEPS.get(name)
         if step is not None:
             return np.asarray(np.rint(values / step) * step + 0.0, dtype=np.float64)  # + 0.0: no negative zeros
         short = np.array(values, dtype=np.float32)
         if name not in _SINGLE:
             bits = short.view(np.uint32)
-            bits += np.uint32(1 << (_BITS_OUT - 1))
-            bits &= np.uint32((0xFFFFFFFF << _BITS_OUT) & 0xFFFFFFFF)
+            bits += np.uint32(1 << (BITS_OUT - 1))
+            bits &= np.uint32((0xFFFFFFFF << BITS_OUT) & 0xFFFFFFFF)
             short[np.isnan(values)] = np.nan  # clearing bits turns some NaN into numbers
         return short.astype(np.float64)
-
-
-def resolution(name: str) -> tuple[float, float]:
-    """Return the largest rounding error of a column in files: absolute and relative."""
-    return (_STEPS[name] / 2.0, 0.0) if name in _STEPS else (0.0, 2.0 ** (_BITS_OUT - 24))
 
 
 def first_of_slots(stamps_ns: IntArray, step_ns: int) -> IntArray:

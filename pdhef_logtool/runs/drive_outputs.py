@@ -18,19 +18,8 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.results import opened_run
 from pdhef_logtool.results.no_position import topics_with_position, without_pose
-from pdhef_logtool.results.opened_run import (
-    ESTIMATES_FILE,
-    LOGS,
-    METRICS_FILE,
-    MODEL_FILE,
-    PAGE_FILE,
-    RECORDING_FILE,
-    REPORT_FILE,
-    TABLES,
-    TABLES_FOLDER,
-    table_file,
-)
 from pdhef_logtool.results.parquet_sink import write_estimates
 from pdhef_logtool.results.plotted import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
@@ -51,14 +40,14 @@ if TYPE_CHECKING:
 _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER = "annotated.mcap", "foxglove.json", "plotjuggler.xml"
 #: Files of an earlier run, deleted unless the new run writes them.
 STALE_FILES = (
-    MODEL_FILE,
-    PAGE_FILE,
-    METRICS_FILE,
-    ESTIMATES_FILE,
-    RECORDING_FILE,
+    opened_run.MODEL_FILE,
+    opened_run.PAGE_FILE,
+    opened_run.METRICS_FILE,
+    opened_run.ESTIMATES_FILE,
+    opened_run.RECORDING_FILE,
 )
 #: All files that a run writes into the folder of a log.
-LOG_FILES = (*STALE_FILES, _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER, REPORT_FILE)
+LOG_FILES = (*STALE_FILES, _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER, opened_run.REPORT_FILE)
 
 _NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 
@@ -129,9 +118,9 @@ class DriveOutputs:
         if config.kept == "full":
             self._write_recording(report, events, colours)
         head = f"Sensors and car of {drive.name}, for pdhef run --model."
-        write_bytes(self._change.file(MODEL_FILE), self._run.model.file.toml(head).encode())
+        write_bytes(self._change.file(opened_run.MODEL_FILE), self._run.model.file.toml(head).encode())
         if config.kept == "metrics":
-            write_json(self._change.file(REPORT_FILE), report)
+            write_json(self._change.file(opened_run.REPORT_FILE), report)
         else:
             write_drive_tables(self._change, report, rows, self.tracks, self._main.name, self._causal_from_ns())
 
@@ -164,7 +153,7 @@ class DriveOutputs:
         identity = json.dumps([self._run.config.to_dict(), tool_versions()], sort_keys=True)
         run = f"pdhef-{self._run_folder.resolve().name}-{sha256(identity.encode()).hexdigest()[:SHOWN_DIGITS]}"
         write_recording(
-            self._change.file(RECORDING_FILE),
+            self._change.file(opened_run.RECORDING_FILE),
             self._signals,
             self.tracks,
             report,
@@ -189,14 +178,14 @@ def write_drive_tables(
     causal_from_ns: Mapping[str, int] | None = None,
 ) -> None:
     """Write estimates.parquet, metrics.parquet and report.json of a drive."""
-    write_estimates(change.file(ESTIMATES_FILE), tracks, selected=selected, causal_from_ns=causal_from_ns)
-    write_metrics(change.file(METRICS_FILE), rows)
-    write_json(change.file(REPORT_FILE), report)
+    write_estimates(change.file(opened_run.ESTIMATES_FILE), tracks, selected=selected, causal_from_ns=causal_from_ns)
+    write_metrics(change.file(opened_run.METRICS_FILE), rows)
+    write_json(change.file(opened_run.REPORT_FILE), report)
 
 
 def files_of(folder: Path) -> dict[str, str]:
     """Return the sha256 of the files in a log's folder that commands read back, by name."""
-    paths = (folder / name for name in (REPORT_FILE, ESTIMATES_FILE))
+    paths = (folder / name for name in (opened_run.REPORT_FILE, opened_run.ESTIMATES_FILE))
     return {path.name: file_sha256(path) for path in paths if path.is_file()}
 
 
@@ -206,9 +195,9 @@ def write_run_tables(output: Path, results: Sequence[LogResult]) -> None:
         drive_part(r.outcome, None) if r.part is None else read_part(r.part) if isinstance(r.part, Path) else r.part
         for r in results
     )
-    write_tables(output / TABLES_FOLDER, parts, [r.outcome.folder for r in results])
-    with writing(output / METRICS_FILE), PendingFile(output / METRICS_FILE) as pending:
-        copyfile(output / table_file("metrics"), pending.path)
+    write_tables(output / opened_run.TABLES_FOLDER, parts, [r.outcome.folder for r in results])
+    with writing(output / opened_run.METRICS_FILE), PendingFile(output / opened_run.METRICS_FILE) as pending:
+        copyfile(output / opened_run.table_file("metrics"), pending.path)
 
 
 def write_run(
@@ -221,15 +210,16 @@ def write_run(
 ) -> None:
     """Write run.json beside the tables, with the configuration as JSON-able values; arguments as of build_run."""
     if verdicts is not None:
-        add_verdicts(output / TABLES_FOLDER, verdicts.to_dict())
-    files = {name: file_sha256(output / name) for name in (METRICS_FILE, *map(table_file, TABLES))}
+        add_verdicts(output / opened_run.TABLES_FOLDER, verdicts.to_dict())
+    names = (opened_run.METRICS_FILE, *map(opened_run.table_file, opened_run.TABLES))
+    files = {name: file_sha256(output / name) for name in names}
     outcomes = [r.outcome for r in results]
     write_json(output / RUN_FILE, build_run(config, network, outcomes, remaining=remaining, files=files, plan=verdicts))
 
 
 def log_place(stem: str) -> str:
     """Return the folder of a log within the outputs."""
-    return f"{LOGS}/{stem}"
+    return f"{opened_run.LOGS}/{stem}"
 
 
 def check_places(
@@ -242,7 +232,9 @@ def check_places(
 ) -> None:
     """Refuse to write over an input; raises UsageError."""
     can = () if mapping is None else mapping.dbc
-    files = [] if output is None else [output / name for name in (METRICS_FILE, RUN_FILE, PAGE_FILE)]
+    files = (
+        [] if output is None else [output / name for name in (opened_run.METRICS_FILE, RUN_FILE, opened_run.PAGE_FILE)]
+    )
     folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
     files += [folder / name for folder in folders for name in LOG_FILES]
     read = [*(i.local for i in inputs), *config.files, *cars, *can]

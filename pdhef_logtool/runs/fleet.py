@@ -10,7 +10,7 @@ import itertools
 import json
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,7 @@ from pdhef_logtool.runs.journal import Entry, Journal
 from pdhef_logtool.runs.judging import judge, read_validation_plan, write_verdicts
 from pdhef_logtool.runs.planning import Plan, PlannedLog, plan_logs, settings_of, sweep_parts
 from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult, RunResult
+from pdhef_logtool.runs.stored_output import StoredOutput
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
 from pdhef_logtool.storage.object_store import is_url
 from pdhef_logtool.storage.outputs import OutputFolder
@@ -40,7 +41,6 @@ from pdhef_logtool.workers.supervisor import Ended, Limits, Tell, supervise
 
 if TYPE_CHECKING:
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
-    from pdhef_logtool.runs.stored_output import StoredOutput
 
 #: Drives with the largest errors that keep all files if the run keeps metrics only because of their number.
 FULL_WORST = 5
@@ -135,19 +135,10 @@ def run_logs(
     alone = len(inputs) == 1 and schedule == Schedule() and work is run_drive and not is_url(output)
     if alone and _given_limits(config) is None:
         return _run_alone(inputs[0], Path(output), job, reporter)
-    with _stored(output) as stored:
+    with StoredOutput(str(output)) if is_url(output) else nullcontext() as stored:
         fleet = _prepare(inputs, Path(output), job, schedule, work, reporter, stored)
         results, verdicts = fleet.run()
         return RunResult(fleet.plan.output, tuple(results), stored, verdicts)
-
-
-def _stored(output: Path | str) -> AbstractContextManager[StoredOutput | None]:
-    """Return the output in an object store if its URL is given."""
-    if not is_url(output):
-        return nullcontext()
-    from pdhef_logtool.runs.stored_output import StoredOutput
-
-    return StoredOutput(str(output))
 
 
 def _check_names(logs: Sequence[LogInput], output: Path, job: _Job, reporter: Reporter) -> None:
@@ -188,10 +179,9 @@ def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> Ru
                 log, outputs, config, car, job.mapping,
                 validation=job.validation, reporter=reporter,
             )  # fmt: skip
-        except Exception:
-            raise
         except BaseException as stop:
-            stop.add_note("0 of 1 logs are done")
+            if not isinstance(stop, Exception):
+                stop.add_note("0 of 1 logs are done")
             raise
         verdicts = judge(job.validation, [result], config.strict)
         write_run_tables(output, [result])
@@ -399,7 +389,12 @@ def collect(plan: Plan, config: RunConfig, validation: ValidationPlan) -> tuple[
     remaining = len(plan.logs) - len(entries)
     if not entries and remaining:
         return [], None
-    results = [_result(plan, entry, folder) for entry, folder in entries]
+    results = []
+    for entry, folder in entries:
+        part = None if entry.part is None else output / entry.part
+        place = None if part is None else output / log_place(entry.label)
+        outcome = replace(plan.journal.outcome(entry), folder=folder)
+        results.append(LogResult(outcome, place, part=part, failed_checks=entry.failed_checks))
     write_run_tables(output, results)
     cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
     networks = {cars[e.car]["network"] and tuple(cars[e.car]["network"]) for e, _ in entries if e.car is not None}
@@ -409,13 +404,6 @@ def collect(plan: Plan, config: RunConfig, validation: ValidationPlan) -> tuple[
     if remaining:
         (output / PAGE_FILE).unlink(missing_ok=True)  # it shows other drives
     return results, verdicts
-
-
-def _result(plan: Plan, entry: Entry, folder: str) -> LogResult:
-    outcome = replace(plan.journal.outcome(entry), folder=folder)
-    part = None if entry.part is None else plan.output / entry.part
-    output = None if part is None else plan.output / log_place(entry.label)
-    return LogResult(outcome, output, part=part, failed_checks=entry.failed_checks)
 
 
 def write_run_pages(output: Path, report: bool, labels: Collection[str] | None, reporter: Reporter) -> None:

@@ -27,28 +27,12 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import (
-    SignalSource,
-    check_mapping,
-    clock_key,
-    fit_clocks,
-    mapping_of,
-    merge_losses,
-    read_signals,
-    resolve_mapping,
-)
+from pdhef_logtool.mapping import check_mapping, mapping_of, read_signals, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, si_values
+from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, merge_losses, si_values
 from pdhef_logtool.mapping.choosing import mapping_for_recorder
-from pdhef_logtool.mapping.clocks import requests_of, stamps_on_log_clock
-from pdhef_logtool.mapping.estimates import (
-    BASE_ORDER,
-    STDS,
-    CovarianceSource,
-    EstimateSource,
-    choose_estimates,
-    sources_of,
-)
+from pdhef_logtool.mapping.clocks import clock_key, fit_clocks, requests_of, stamps_on_log_clock
+from pdhef_logtool.mapping.estimates import BASE_ORDER, STDS, EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.errors import MappingError
@@ -111,10 +95,8 @@ def score_log(
     car = Car.load(config.car, network=NO_MODEL, sensors=config.sensor_profile)
     mapping = mapping_of(config.mapping)
     if mapping is not None and mapping.recorders:
-        reading = config.read_options
-        with closing(
-            open_log(log_input.path, reading.limits, reading.msgs, Wanted(frozenset()), reading.tables)
-        ) as log:
+        reading, nothing = config.read_options, Wanted(frozenset())
+        with closing(open_log(log_input.path, reading.limits, reading.msgs, nothing, reading.tables)) as log:
             mapping = mapping_for_recorder(log, mapping)
     plan = read_validation_plan(config.plan, junit)
     drive_outputs.check_places([log_input], output, config, mapping, junit)
@@ -369,7 +351,6 @@ def read_estimate(
     base = next(name for name in BASE_ORDER if name in mapping.signals)
     columns = log.read(requests, start_ns, end_ns)
     channels: dict[str, Channel] = {}
-    covariance = None
     for name, s in mapping.signals.items():
         topic = columns.get(s.read_topic)
         if topic is None or len(topic) == 0:
@@ -380,7 +361,9 @@ def read_estimate(
         stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
         stamps = stamps - np.int64(round(s.latency_s * 1e9))
         kept = _in_order(stamps, topic.log_time_ns, usable)
-        values = _in_range(si_values(topic, s), s)[kept]
+        values, low, high = si_values(topic, s)[kept], s.valid_min, s.valid_max
+        use = np.isfinite(values) & (low is None or values >= low) & (high is None or values <= high)
+        values = np.where(use, values, np.nan)
         channels[name] = Channel(name, ESTIMATE_UNITS[name], s.label, stamps[kept], topic.log_time_ns[kept], values)
         if name == base:
             if not usable.all():
@@ -388,8 +371,7 @@ def read_estimate(
             if repeated := int(np.count_nonzero(usable)) - len(kept):
                 text = LOSS_TEXTS["duplicate-stamp"]
                 losses.append(Loss("duplicate-stamp", text, s.topic, count=repeated, severity="note"))
-            if source.covariance is not None:
-                covariance = _planar_covariance(topic, source.covariance)[kept]
+            covariance = _planar_covariance(topic, source)[kept]
     if not any(np.isfinite(channel.values).any() for name, channel in channels.items() if name in BASE_ORDER):
         raise MappingError(
             expected="numbers in the recorded estimate",
@@ -402,16 +384,6 @@ def read_estimate(
     return RecordedEstimate(track, finite, frozenset(channels), notes), losses
 
 
-def _in_range(values: FloatArray, source: SignalSource) -> FloatArray:
-    with np.errstate(invalid="ignore"):
-        outside = np.zeros(values.shape[0], dtype=np.bool_)
-        if source.valid_min is not None:
-            outside |= values < source.valid_min
-        if source.valid_max is not None:
-            outside |= values > source.valid_max
-    return np.where(outside | ~np.isfinite(values), np.nan, values)
-
-
 def _in_order(stamps_ns: IntArray, arrival_ns: IntArray, usable: BoolArray) -> IntArray:
     """Return the places of usable samples in order of unique stamps; of equal stamps the first arrival."""
     places = np.flatnonzero(usable)
@@ -419,14 +391,14 @@ def _in_order(stamps_ns: IntArray, arrival_ns: IntArray, usable: BoolArray) -> I
     return order[np.diff(stamps_ns[order], prepend=stamps_ns[order[:1]] - 1) > 0]
 
 
-def _planar_covariance(topic: Columns, source: CovarianceSource) -> FloatArray:
-    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN if unknown (all zero, or −1 first, as in ROS)."""
-    raw = np.asarray(topic.fields[source.field], dtype=np.float64)
-    n = raw.shape[0]
-    if raw.ndim != 2 or raw.shape[1] != source.size**2:
+def _planar_covariance(topic: Columns, source: EstimateSource) -> FloatArray:
+    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN if unknown (no field, all zero, or −1 first, as in ROS)."""
+    n, of = len(topic), source.covariance
+    raw = np.empty(0) if of is None else np.asarray(topic.fields[of.field], dtype=np.float64)
+    if of is None or raw.ndim != 2 or raw.shape[1] != of.size**2:
         return np.full((n, 3, 3), np.nan)
-    places = np.array(source.planar)
-    planar = raw.reshape(n, source.size, source.size)[:, places[:, None], places]
+    places = np.array(of.planar)
+    planar = raw.reshape(n, of.size, of.size)[:, places[:, None], places]
     unknown = (planar == 0.0).all(axis=(1, 2)) | (raw[:, 0] < 0.0)
     return np.where(unknown[:, None, None], np.nan, planar)
 

@@ -156,15 +156,14 @@ def audit_truth(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) 
     uncertain = f"reference ± {np.degrees(np.sqrt(np.mean(std[beyond] ** 2))):.2f}°"
     share = f"{beyond.sum() * BLOCK_S:.0f} of {len(beyond) * BLOCK_S:.0f} s"
     contradiction = f"ground truth contradicts the estimated sideslip reference ({share}, {where}, {uncertain})"
+    mean, spread, how = float(np.mean(difference)), float(np.std(difference)), ""
     if np.median(held[beyond]) > HELD_SHARE:
-        return (f"{contradiction}: it repeats its values there",)
-    mean, spread = float(np.mean(difference)), float(np.std(difference))
-    slope, _ = np.polyfit(seconds, difference, 1)
-    if spread > 0.0 and abs(np.corrcoef(seconds, difference)[0, 1]) > DRIFT_CORRELATION:
-        return (f"{contradiction}: it drifts by {60.0 * slope:+.2f}° per minute",)
-    if spread < abs(mean) and beyond.mean() > 0.5:
-        return (f"{contradiction}: it is turned by {mean:+.2f}°",)
-    return (f"{contradiction}: mean difference {float(np.mean(difference[beyond])):+.2f}° there",)
+        how = "it repeats its values there"
+    elif spread > 0.0 and abs(np.corrcoef(seconds, difference)[0, 1]) > DRIFT_CORRELATION:
+        how = f"it drifts by {60.0 * np.polyfit(seconds, difference, 1)[0]:+.2f}° per minute"
+    elif spread < abs(mean) and beyond.mean() > 0.5:
+        how = f"it is turned by {mean:+.2f}°"
+    return (f"{contradiction}: {how or f'mean difference {np.mean(difference[beyond]):+.2f}° there'}",)
 
 
 def _blocks(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> FloatArray:

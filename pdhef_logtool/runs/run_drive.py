@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import PurePath
-from typing import Any
+from functools import cache
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
-from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import notes_of
@@ -44,6 +44,10 @@ from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.runs.selection import choose_main, contradiction
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.outputs import OutputFolder
+from pdhef_logtool.storage.templates import lines, template
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 _SILENT = "{} has no valid row although the car moves: {}"
 _ALL_SILENT = "no estimator has a valid row although the car moves: {}"
@@ -81,7 +85,9 @@ def run_log(
             scored = _score(run, estimated)
             named = run.config.estimators is not None
             main = choose_main(run.names, scored.rows, proven=drive.car.has_evidence, named=named)
-            judged = _judge(run, estimated, scored, main, validation)
+            blocks = drive_blocks([*validation.requirements, SIDESLIP], main.name, scored.drive)
+            space = operating_space(estimated.signals, estimated.truth, estimated.read(main.name), run.car.vehicle)
+            judged = judge_drive(validation, drive, main.name, scored.rows, blocks, space)
             files = DriveOutputs((change, outputs.path), run, estimated, main)
             with files.annotated() as annotated:
                 if annotated is not None:
@@ -153,16 +159,6 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     if not scored.moves:
         drive.tell(_NEVER_MOVES.format(run.car.vehicle.low_speed_blend_m_s))
     return scored
-
-
-def _judge(
-    run: PreparedDrive, estimated: Estimated, scored: Evaluation, main: MainFacts, plan: ValidationPlan
-) -> dict[str, Any]:
-    """Return the entries of the report on the requirements of a plan."""
-    drive, vehicle, truth = run.drive, run.car.vehicle, estimated.truth
-    blocks = drive_blocks([*plan.requirements, SIDESLIP], main.name, scored.drive)
-    space = operating_space(estimated.signals, truth, estimated.read(main.name), vehicle)
-    return judge_drive(plan, drive, main.name, scored.rows, blocks, space)
 
 
 #: Entries of a log's metadata that a report keeps, and signs of each.
@@ -278,7 +274,7 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
             "quantities": {n: sources[n].label if n in sources and not how else how for n, how in derivation.items()},
             "latency_s": None if plan.latency is None else plan.truth_latency_s,
             "not_independent": sorted({row.signal for row in rows if not row.independent}),
-            "notes": _truth_notes(plan),
+            "notes": lines(_truth_notes().render(p=plan)),
         },
         "model": {
             "source": "log" if drive.earlier is None else "file",
@@ -294,24 +290,9 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
     }
 
 
-def _truth_notes(plan: DrivePlan) -> list[str]:
-    """Return remarks on the ground truth: its latency, its dependence on signals, and its position."""
-    notes = []
-    if (latency := plan.latency) is not None:
-        std = f" ± {latency.std_error_s * 1e3:.1f} ms"
-        measured = f"{latency.latency_s * 1e3:.1f} ms{std}" if latency.reliable else "unknown"
-        verdict = "applied" if plan.truth_latency_s else "not applied: it is within its uncertainty"
-        if latency.gyro_delay_s:
-            verdict = "so that the ground truth is not moved"
-        notes.append(f"latency {measured} ({latency.reason}), {verdict}")
-    elif plan.truth is not None:
-        notes.append("no gyro, or no true yaw rate, to measure the latency with: taken as 0")
-    notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
-    if "cg" in plan.derivation:
-        notes.append(plan.derivation["cg"])
-    if plan.truth is not None and not plan.has_truth_pose:
-        notes.append("no true position: the drawn ground truth trajectory is its velocity dead-reckoned")
-    return notes
+@cache
+def _truth_notes() -> Template:
+    return template(Path(__file__).with_name("templates") / "truth_notes.txt")
 
 
 def car_entry(car: Car) -> dict[str, Any]:
@@ -335,14 +316,5 @@ def outcome_of(drive: Drive, losses: Sequence[Loss], *, neutral: bool = False, *
     texts: dict[str, Any] = {"file": drive.file, "lost": lost_texts(losses)}
     if neutral:
         texts, route = without_names(texts, drive.path, drive.name), route and digest(route)[:SHOWN_DIGITS]
-    return LogOutcome(
-        log=drive.name,
-        sha256=drive.sha256,
-        signals_sha256=drive.signals_sha256,
-        truth_sha256=drive.truth_sha256,
-        mapping_sha256=drive.mapping.sha256,
-        day=day,
-        route=route,
-        **texts,
-        **changes,
-    )
+    texts |= {key: getattr(drive, key) for key in ("sha256", "signals_sha256", "truth_sha256")}
+    return LogOutcome(drive.name, mapping_sha256=drive.mapping.sha256, day=day, route=route, **texts, **changes)

@@ -47,11 +47,6 @@ class LogResult:
         """The log as commands read it back from its files."""
         return OpenedLog(self.outcome.log, self.outcome.outcome, self.output or Path(), asdict(self.outcome))
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether all of the log was used and no check failed without a waiver."""
-        return self.outcome.outcome == "ok" and not self.failed_checks
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
@@ -85,7 +80,7 @@ class RunResult:
             return EXIT_FAILURE
         if self.requirements is not None and self.requirements.closes_gate:
             return EXIT_GATE
-        return EXIT_OK if all(r.is_whole for r in self.results) else EXIT_PARTIAL
+        return EXIT_OK if all(r.outcome.outcome == "ok" and not r.failed_checks for r in self.results) else EXIT_PARTIAL
 
     def _shown(self, folder: Path) -> str:
         return str(folder) if self.output is None else str(folder).replace(str(self.output), str(self.place), 1)

@@ -32,3 +32,8 @@ def one_line(text: object) -> str:
 def clauses(text: object) -> list[str]:
     """Return the clauses of a rendered text, which have a bar between them, each in one line."""
     return [clause for part in str(text).split("|") if (clause := one_line(part))]
+
+
+def lines(text: object) -> list[str]:
+    """Return the lines of a rendered text that are not empty, without space around them."""
+    return [stripped for line in str(text).split("\n") if (stripped := line.strip())]

@@ -20,7 +20,7 @@ from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.divergence import watched_track, wrong_branch
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.results.run_report import diverged_line
+from pdhef_logtool.results.run_report import lines_of
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.command_line import rendered
@@ -176,6 +176,6 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
         assert said[wrong].mean() > 0.7
         spans = [s for s in report["segments"] if s["name"] == f"{name} diverged"]
         assert (spans[0]["start_ns"] - int(of["stamp_ns"][0])) * 1e-9 == pytest.approx(first, abs=1e-6)
-        line = diverged_line(report, name)
+        (line,) = lines_of("diverged", report, name)
         assert line.startswith("diverged for ") and line in text
     assert not table.filter(pl.col("estimator") == "zero")["diverged"].any()

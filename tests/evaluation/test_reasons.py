@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.reasons import (
     LISTED_INTERVALS,
-    MERGE_S,
     Interval,
     reason_intervals,
     sensor_faults,
 )
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S
 from pdhef_logtool.records.reasons import REASONS, SPIKE_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
@@ -34,7 +34,7 @@ def by_hand(stamps_ns: np.ndarray, reason: np.ndarray, bit: int) -> list[Interva
     spans: list[list[int]] = []
     for t, mask in zip(stamps_ns.tolist(), reason.tolist(), strict=True):
         if mask & bit:
-            if spans and t - spans[-1][1] <= MERGE_S * 1e9:
+            if spans and t - spans[-1][1] <= RUN_GAP_S * 1e9:
                 spans[-1][1] = t
             else:
                 spans.append([t, t])

@@ -17,7 +17,7 @@ from pdhef_logtool.results.plotted import colour_rgb
 from pdhef_logtool.results.run_report import (
     LogOutcome,
     build_run,
-    diverged_line,
+    lines_of,
     report_markdown,
     tool_versions,
     write_json,
@@ -137,8 +137,8 @@ def test_the_report_for_people_is_this() -> None:
         "- **ukf** (causal): a; b; diverged for 1.25 s in 2 intervals, first at 2.00 s",
         "- **smooth** (not causal)",
     ]  # fmt: skip
-    assert diverged_line(_report(segments=spans[:1]), "ukf") == "diverged for 1.00 s, first at 5.00 s"
-    assert diverged_line(_report(segments=spans), "smooth") == ""
+    assert lines_of("diverged", _report(segments=spans[:1]), "ukf") == ["diverged for 1.00 s, first at 5.00 s"]
+    assert lines_of("diverged", _report(segments=spans), "smooth") == []
     assert "Warnings" not in report_markdown(_report(warnings=[], losses=[]))
     verdict = {"id": "S", "label": "sideslip RMSE ≤ 1°", "reason": "1.2° (95 % CI 1.1° to 1.3°)", "next": ""}
     verdict["outcome"] = "FAIL"

@@ -22,17 +22,11 @@ To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`
     )
 """
 
-from pdhef_logtool.evaluation.metrics.metric import ALL, EvaluatedDrive, MetricRow, evaluate_drive, score_track
-from pdhef_logtool.evaluation.track_errors import NORMAL_95, signal_error
-from pdhef_logtool.evaluation.units import SCORED_SIGNALS
-
-__all__ = [
-    "ALL",
-    "NORMAL_95",
-    "SCORED_SIGNALS",
-    "EvaluatedDrive",
-    "MetricRow",
-    "evaluate_drive",
-    "score_track",
-    "signal_error",
-]
+from pdhef_logtool.evaluation.metrics.metric import ALL as ALL
+from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive as EvaluatedDrive
+from pdhef_logtool.evaluation.metrics.metric import MetricRow as MetricRow
+from pdhef_logtool.evaluation.metrics.metric import evaluate_drive as evaluate_drive
+from pdhef_logtool.evaluation.metrics.metric import score_track as score_track
+from pdhef_logtool.evaluation.track_errors import NORMAL_95 as NORMAL_95
+from pdhef_logtool.evaluation.track_errors import signal_error as signal_error
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS as SCORED_SIGNALS

@@ -9,9 +9,10 @@ without that shift and a constant.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.drive.correlation import find_shift, on_common_grid
 from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, pose_known, position_error
@@ -33,19 +34,17 @@ def errors_of_drive(drive: EvaluatedDrive) -> Iterator[Columns]:
     has_pose = bool(pose_known(truth).any())
     for track in drive.tracks.values():
         for signal, has_truth in at_truth.items():
-            columns = _errors(track, truth, signal, has_truth, since_start_ns)
+            values = errors_of(track, truth, signal, has_truth) | {"since_start_ns": since_start_ns}
             if signal == "sideslip_rad" and "straight" in drive.masks:
-                columns = replace(columns, values={**columns.values, "straight": drive.masks["straight"]})
-            yield columns
+                values["straight"] = drive.masks["straight"]
+            yield Columns(track.name, signal, values)
         if has_pose:
             lateral = lateral_errors(track, truth)
             yield Columns(track.name, "position_m", {"error": position_error(track, truth)}, whole=True)
             yield Columns(track.name, "lateral_1s_m", {"error": lateral, "signed": lateral}, whole=True)
 
 
-def _errors(
-    track: StateTrack, truth: StateTrack, signal: str, has_truth: BoolArray, since_start_ns: IntArray
-) -> Columns:
+def errors_of(track: StateTrack, truth: StateTrack, signal: str, has_truth: BoolArray) -> dict[str, NDArray[Any]]:
     """Return ``available`` (0 or 1 where ground truth is known) and the other columns at the scored stamps.
 
     ``std`` is the 1-sigma of the error; it is absent if the estimate provides none.
@@ -59,12 +58,11 @@ def _errors(
         "signed": error,
         "truth": getattr(truth, signal),
         "estimate": getattr(track, signal),
-        "since_start_ns": since_start_ns,
     }
     std = total_std(track, truth, signal)
     if std is not None:
         values["std"] = np.where(scored, std, np.nan)
-    return Columns(track.name, signal, values)
+    return values
 
 
 def _p95(error: FloatArray) -> float:

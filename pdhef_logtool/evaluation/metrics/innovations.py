@@ -8,10 +8,10 @@ import numpy as np
 
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.records.tracks import StateTrack
 
 #: Least number of pairs of stamps for an autocorrelation.
 LEAST_PAIRS = 10
+_STATE = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")
 
 
 def _errors(drive: EvaluatedDrive) -> Iterator[Columns]:
@@ -19,13 +19,11 @@ def _errors(drive: EvaluatedDrive) -> Iterator[Columns]:
         return
     for track in drive.tracks.values():
         if track.covariance.shape[0]:
-            yield Columns(track.name, "state", {"nees": _nees_of(track, drive.truth)})
-
-
-def _nees_of(estimate: StateTrack, truth: StateTrack) -> FloatArray:
-    error = np.stack([getattr(estimate, s) - getattr(truth, s) for s in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")], axis=1)
-    error[~(estimate.valid & truth.valid)] = np.nan
-    return nees(error, estimate.covariance + truth.covariance if truth.covariance.shape[0] else estimate.covariance)
+            error = np.stack([getattr(track, s) - getattr(drive.truth, s) for s in _STATE], axis=1)
+            error[~(track.valid & drive.truth.valid)] = np.nan
+            covariance, of_truth = track.covariance, drive.truth.covariance
+            values = nees(error, covariance + of_truth if of_truth.shape[0] else covariance)
+            yield Columns(track.name, "state", {"nees": values})
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -15,8 +16,10 @@ from rich.text import Text
 from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.records.dates import is_dated
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
+from pdhef_logtool.records.printable import all_printable
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
 from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport, number_text
+from pdhef_logtool.storage.templates import template
 
 #: Candidates of a signal that are shown beside the one that was taken.
 CANDIDATES_SHOWN = 2
@@ -113,7 +116,7 @@ def _by_section(
 def _sources_table(inspection: Inspection) -> Table:
     rows = "recognised types and candidates" if any(c.taken for c in inspection.candidates) else "recognised types"
     origin = rows if inspection.mapping.origin == "auto" else "mapping file"
-    stamps = {clock.topic: clock.stamp for clock in inspection.clocks}
+    stamps = {clock["topic"]: clock["stamp"] for clock in inspection.clocks}
 
     def row(report: SignalReport) -> tuple[str | Text, ...]:
         return report.name, Text(report.topic), Text(_short(report.field)), stamps.get(report.topic, "")
@@ -147,39 +150,11 @@ def _statistics_table(inspection: Inspection) -> Table:
     return table_of("Values in SI units", headings, _by_section(inspection, row), words=1)
 
 
-def findings_of(inspection: Inspection) -> list[tuple[str, str, str]]:
+def findings_of(inspection: Inspection) -> list[list[str]]:
     """Return lines of findings: a heading, its style and the text."""
-    rows: list[tuple[str, str, str]] = []
-    if inspection.missing:
-        rows.append(("missing", "yellow", ", ".join(inspection.missing)))
-    if not inspection.truth:
-        rows.append(("missing", "yellow", "ground truth: needed to score an estimate"))
-    rows += [("ambiguous", "yellow", str(a)) for a in inspection.ambiguities]
-    for verdict, style in (("failed", "red"), ("undecided", "yellow")):
-        checks = [c for c in inspection.checks if c.verdict == verdict]
-        rows += [(verdict, style, f"{c.name}: {c.evidence}; {c.remedy}") for c in checks]
-    if passed := [c for c in inspection.checks if c.verdict == "passed"]:
-        subjects = ", ".join(dict.fromkeys(c.subject for c in passed))
-        rows.append(("passed", "green", f"{len(passed)} checks of {subjects}"))
-    rows += [_loss_row(loss, inspection.start_ns) for loss in inspection.lost]
-    rows += [("note", "cyan", n) for n in inspection.notes]
-    if inspection.mapping.quality is not None:
-        rows.append(("note", "cyan", f"ground truth is used where {inspection.mapping.quality.describe()}"))
-    rows.append(("can run", "green", ", ".join(inspection.estimators) or "no estimator"))
-    if inspection.missing and any(not c.taken for c in inspection.candidates):
-        rows.append(("next", "cyan", "pdhef map LOG builds a mapping.toml interactively from the candidates"))
-    elif inspection.missing:
-        rows.append(("next", "cyan", "pdhef inspect LOG --fields lists all numeric fields of the log"))
-    return rows
-
-
-def _loss_row(loss: Loss, start_ns: int) -> tuple[str, str, str]:
-    facts = [f"{loss.count} times"] if loss.count is not None and loss.count != 1 else []
-    if loss.start_ns is not None:
-        until = "" if loss.end_ns is None else f" to {(loss.end_ns - start_ns) * 1e-9:.2f} s"
-        facts.append(f"from {(loss.start_ns - start_ns) * 1e-9:.2f} s{until}")
-    head, style = ("lost", "red") if loss.severity == "lost" else ("note", "cyan")
-    return head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"
+    path = Path(__file__).parents[1] / "templates" / "findings.txt"
+    text = template(path).render(i=all_printable(inspection))
+    return [line.split("\t") for line in text.splitlines()]
 
 
 def _short(field: str) -> str:

@@ -24,31 +24,18 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.mapping import (
-    Ambiguity,
-    ClockModel,
-    Mapping,
-    QualityGate,
-    SignalSource,
-    auto_map,
-    clock_key,
-    fit_clocks,
-    mapping_of,
-    mapping_to_toml,
-    merge_losses,
-    read_signals,
-    resolve_mapping,
-    tables_for,
-)
+from pdhef_logtool.mapping import Ambiguity, Mapping, QualityGate, SignalSource, auto_map, resolve_mapping
 from pdhef_logtool.mapping.candidates import Candidate
-from pdhef_logtool.mapping.choosing import choose_mapping
-from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
-from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.mapping.channels import merge_losses, read_signals
+from pdhef_logtool.mapping.choosing import choose_mapping, tables_for
+from pdhef_logtool.mapping.clocks import ClockModel, clock_key, fit_clocks, sources_by_clock, survey_windows
+from pdhef_logtool.mapping.mapping_file import mapping_of, mapping_to_toml, missing_signals
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, IntArray, Loss
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.templates import template
 
 #: A gap is more than this many median steps, and more than ``MIN_GAP_S``.
 GAP_PERIODS = 5.0
@@ -157,12 +144,7 @@ _IN_DOCUMENT = (
 )  # fmt: skip
 
 
-_FIGURES: dict[str, Callable[[FloatArray], Any]] = {
-    "mean": np.mean,
-    "std": np.std,
-    "minimum": np.min,
-    "maximum": np.max,
-}
+_FIGURES: dict[str, Any] = {"mean": np.mean, "std": np.std, "minimum": np.min, "maximum": np.max}
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,20 +167,6 @@ class TopicReport:
     delay_median_s: float
     delay_p95_s: float
     fields: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ClockReport:
-    """The stamps that mapped signals use, against log time."""
-
-    topic: str
-    stamp: str
-    clock: str
-    delay_median_s: float
-    delay_p95_s: float
-    drift_ppm: float
-    residual_s: float
-    delay_known: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +220,7 @@ class Inspection:
 
     Attributes
     ----------
-    kind : of log. start_ns, end_ns : log time, [start, end).
+    kind : of log. start_ns, end_ns : log time, [start, end). clocks : stamps of mapped signals against log time.
     signals, truth : reports by name. missing : signals that an estimator uses and no topic provides.
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
     checks : of signals and ground truth by physics. proposals : certain corrections of the mapping.
@@ -265,7 +233,7 @@ class Inspection:
     start_ns: int
     end_ns: int
     topics: tuple[TopicReport, ...]
-    clocks: tuple[ClockReport, ...]
+    clocks: tuple[dict[str, Any], ...]
     mapping: Mapping
     signals: dict[str, SignalReport]
     truth: dict[str, SignalReport]
@@ -484,17 +452,17 @@ def _signal_report(
     )
 
 
-def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
-    return ClockReport(
-        topic=source.topic,
-        stamp="log_time" if clock.unusable else source.stamp,
-        clock=source.clock,
-        delay_median_s=clock.median_delay_s,
-        delay_p95_s=clock.p95_delay_s,
-        drift_ppm=clock.drift * 1e6,
-        residual_s=clock.residual_s,
-        delay_known=clock.delay_known,
-    )
+def _clock_report(source: SignalSource, clock: ClockModel) -> dict[str, Any]:
+    return {
+        "topic": source.topic,
+        "stamp": "log_time" if clock.unusable else source.stamp,
+        "clock": source.clock,
+        "delay_median_s": clock.median_delay_s,
+        "delay_p95_s": clock.p95_delay_s,
+        "drift_ppm": clock.drift * 1e6,
+        "residual_s": clock.residual_s,
+        "delay_known": clock.delay_known,
+    }
 
 
 def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
@@ -508,28 +476,17 @@ def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
 
 def mapping_comments(inspection: Inspection) -> dict[str, str]:
     """Return comments for :func:`pdhef_logtool.mapping.mapping_to_toml` that help to edit the mapping."""
-    types = {t.name: t.type for t in inspection.topics}
-    bad = [c for c in inspection.checks if c.verdict != "passed"]
-    comments: dict[str, str] = {}
+    words: Any = template(Path(__file__).parents[1] / "templates" / "mapping_comments.txt", number=number_text).module
+    types, mapped = {t.name: t.type for t in inspection.topics}, set(inspection.mapping.topics)
+    unmapped = [t for t in inspection.topics if t.name not in mapped and t.fields and t.messages]
+    comments = {"": words.head(inspection, Path(inspection.path).name, unmapped)}
+    bad, done = [c for c in inspection.checks if c.verdict != "passed"], {p.subject for p in inspection.proposals}
     for section, reports in (("signals", inspection.signals), ("truth", inspection.truth)):
         for name, report in reports.items():
-            text = ", ".join(t for t in (types.get(report.topic), f"{number_text(report.rate_hz)} Hz") if t)
-            if math.isfinite(report.minimum):
-                text += f", {number_text(report.minimum)} to {number_text(report.maximum)} {report.unit}"
             subject = name if section == "signals" else f"truth.{name}"
-            doubts = [c for c in bad if subject in (c.subject, c.name.removesuffix(".candidate"))]
-            done = any(p.subject == subject for p in inspection.proposals)
-            lines = [] if done else [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
-            comments[f"{section}.{name}"] = "\n".join([text, *lines])
-    head = [f"Written from {Path(inspection.path).name}."]
-    head += [f"Ambiguous: {a}" for a in inspection.ambiguities]
-    mapped = set(inspection.mapping.topics)
-    unmapped = [t for t in inspection.topics if t.name not in mapped and t.fields and t.messages]
-    if unmapped and (inspection.missing or not inspection.truth):
-        head.append("Topics with numbers that no signal uses:")
-        head += [f"  {t.name} ({t.type}): {', '.join(t.fields[:12])}" for t in unmapped[:50]]
-    comments[""] = "\n".join(head)
-    return comments
+            of = [c for c in bad if subject not in done and subject in (c.subject, c.name.removesuffix(".candidate"))]
+            comments[f"{section}.{name}"] = words.signal(report, types.get(report.topic), of)
+    return {key: text.strip() for key, text in comments.items()}
 
 
 def mapping_text(inspection: Inspection) -> str:
