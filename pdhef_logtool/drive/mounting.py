@@ -19,7 +19,7 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.check_table import result
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
 from pdhef_logtool.drive.measured import Measured
-from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
+from pdhef_logtool.drive.relations import compare, gentle_at, law, steering_references, yaw_references
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.checking import has_path
@@ -377,9 +377,9 @@ def _along(measured: FloatArray, driven: FloatArray) -> bool:
 
 def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tuple[float, str]:
     """Return the correlation of the yaw rate with its best other measurement, and a text; 0 and empty without one."""
-    everywhere, best, said = np.ones(rate.shape, np.bool_), 0.0, ""
+    best, said = 0.0, ""
     for text, reference in references:
-        for relation in compare(text, {}, reference, rate, everywhere, GAIN_RANGE, bias=BIAS_RAD_S):
+        for relation in compare(law("gnss_path", name=""), reference, rate):
             if relation.samples >= MIN_SAMPLES and abs(relation.correlation) > max(SIGN_CORRELATION, abs(best)):
                 best, said = relation.correlation, f", yaw rate against {text} {relation.correlation:.2f}"
     return best, said
