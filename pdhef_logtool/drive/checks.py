@@ -363,13 +363,10 @@ def _scales_of_positions(drive: CheckedDrive) -> Iterator[Check]:
 
 def _radius(drive: CheckedDrive) -> Iterator[Check]:
     """Compare the ratio of speed and wheel speed with the wheel radius of the file."""
-    columns, speed, file = drive.columns, drive.speed, drive.vehicle.wheel_radius_m
-    if not drive.has_file or speed is None or "speed_m_s" not in columns:
-        return
-    wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_rad_s") in columns]
-    turning = [(w, moving_at(speed) & np.isfinite(w) & (w != 0.0)) for w in wheels]
-    if ratios := [float(np.median(speed[k] / w[k])) for w, k in turning if k.any()]:
-        radius = float(np.median(ratios))
+    file, wheels = drive.vehicle.wheel_radius_m, {f"wheel_speed_{w}_rad_s" for w in WHEELS}
+    per_wheel = [r.gain for r in drive.measured.relations if wheels & r.powers.keys() and "speed_m_s" in r.powers]
+    if drive.has_file and drive.speed is not None and any(per_wheel):
+        radius = 1.0 / float(np.median(per_wheel))
         yield judge("vehicle.wheel_radius", radius / file, radius=radius, file=file)
 
 

@@ -8,27 +8,33 @@ wheel spin or a bank change some blocks only, and a wrong unit changes all. Prob
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from itertools import combinations
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.mapping.naming import CACHED_NAMES, G_M_S2
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-DEGREE = float(np.pi / 180.0)
 #: Least correlation at which a gain gives information (the true gain is between the two regressions), least Fisher z
 #: of the correlation, and least number of independent samples (3 s).
 MIN_CORRELATION, MIN_CHANCE_Z, MIN_SAMPLES = 0.6, 3.0, 6.0
 #: Two sides that move with a lower correlation are unrelated: another field is mapped.
 UNRELATED_CORRELATION = 0.25
-#: Typical values that recognise one quantity recorded as another.
-TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M = 16.0, 0.3
-_TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
+#: Relations and units as tables, here and in :mod:`~.relations`.
+TABLE: dict[str, Any] = tomllib.loads(Path(__file__).with_name("relations.toml").read_text(encoding="utf-8"))
+#: Correction factors with their texts by unit, and units in which mappings confuse a signal. A typical steering ratio
+#: or wheel radius recognises one quantity recorded as another.
+FACTORS: dict[str, list[tuple[float, str]]] = TABLE.pop("factors")
+UNITS: dict[str, list[str]] = TABLE.pop("units")
+_TYPICAL = {factor for unit, factors in FACTORS.items() if unit.startswith("typical") for factor, _ in factors}
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
-FOREIGN = (1.0 / DEGREE, G_M_S2, 3.6)
+FOREIGN = (180.0 / math.pi, G_M_S2, 3.6)
 #: Logarithms of factors that differ by less are one unit (km/h and mph are 0.48 apart). A range of gains with a smaller
 #: ratio of its ends rules out all units but one; wider ranges are lengths of any car.
 SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
@@ -327,22 +333,7 @@ def _together(names: Sequence[str]) -> str:
 @cache
 def units_of(name: str) -> list[tuple[float, str]]:
     """Return the correction factors for the units in which a signal may be recorded, each with its text."""
-
-    def both_ways(unit: str, factor: float, inverse: float) -> list[tuple[float, str]]:
-        return [(factor, f"is in {unit}"), (inverse, f"was converted from {unit} twice")]
-
-    radians, g = both_ways("degrees", DEGREE, 1.0 / DEGREE), both_ways("g", G_M_S2, 1.0 / G_M_S2)
-    speeds = [*both_ways("km/h", 1.0 / 3.6, 3.6), *both_ways("mph", 0.44704, 1.0 / 0.44704)]
-    units = {
-        **dict.fromkeys(("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad", "yaw_rad"), radians),
-        "steer_rad": [*radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")],
-        "steering_wheel_rad": [*radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")],
-        **dict.fromkeys(("ax_m_s2", "ay_m_s2"), g),
-        **{key: [*speeds, (1e-3, "is in mm/s")] for key in ("vx_m_s", "vy_m_s", "speed_m_s")},
-        "wheel_rad_s": [(2.0 * np.pi / 60.0, "is in rpm"), (1.0 / TYPICAL_WHEEL_RADIUS_M, "is in m/s")],
-        "wheel_m_s": [*speeds, (TYPICAL_WHEEL_RADIUS_M, "is in rad/s")],
-    }
-    return units.get(kind_of(name), [])
+    return [(factor, words) for unit in UNITS.get(kind_of(name), ()) for factor, words in FACTORS[unit]]
 
 
 def kind_of(name: str) -> str:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ from pdhef_logtool.drive.columns import derivative, fit, independent_samples, me
 from pdhef_logtool.drive.hypotheses import (
     BLOCKS,
     MIN_SAMPLES,
+    TABLE,
     Law,
     Relation,
     block_gains,
@@ -25,9 +24,8 @@ from pdhef_logtool.drive.hypotheses import (
 from pdhef_logtool.mapping.naming import CACHED_NAMES
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
-_TABLE = tomllib.loads(Path(__file__).with_name("relations.toml").read_text(encoding="utf-8"))
-LENGTHS: dict[str, Any] = _TABLE.pop("lengths")
-MOST: dict[str, float] = _TABLE.pop("most")
+LENGTHS: dict[str, Any] = TABLE.pop("lengths")
+MOST: dict[str, float] = TABLE.pop("most")
 #: Least correlation of two residuals of a regression: they are small, and sliding changes their relation.
 MIN_PARTIAL_CORRELATION = 0.8
 #: Column of the ground-truth v_y at the CG if v_y is mapped. The mapped v_y has its own column, because the lever-arm
@@ -72,7 +70,7 @@ SHARE, WHEEL_SHARE = 0.95, 0.5
 @lru_cache(maxsize=CACHED_NAMES)
 def law(key: str, **signals: str) -> Law:
     """Return an entry of the table for these signals; one without a name is left out."""
-    entry: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in _TABLE[key].items()}
+    entry: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in TABLE[key].items()}
     powers = {name.format(**signals): power for name, power in entry.pop("powers").items()}
     powers.pop("", None)
     late = tuple(name.format(**signals) for name in entry.pop("late", ()))
