@@ -42,7 +42,7 @@ MAX_ERROR_DEG = 7.5
 #: Grade, crossfall and bias are 0.5 m/s^2 over 20 s, 3 degrees of tilt; sideslip causes 2 degrees of yaw.
 TURNED_DEG = 4.0
 ASKEW_SAMPLES, SURE_STD = 40.0, 3.0
-ASKEW_CORRELATION = 0.85
+ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
 #: Least correlation of the yaw rate with another measurement that decides its sign, and its independent samples (5 s).
 SIGN_CORRELATION, MIN_SAMPLES = 0.5, 10.0
 #: The same for a left-handed sensor: the wheels' difference changes its sign when a car understeers strongly.
@@ -270,13 +270,15 @@ def named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | Non
 class _Turn:
     """A rotation for one choice of the vertical, with its fit to the drive.
 
-    ``errors_deg``: standard errors of yaw and of the tilt by blocks of the drive, infinite on a short one.
+    ``error_deg``: standard error of yaw by the residual. ``errors_deg``: of yaw and of the tilt by blocks of the drive,
+    infinite on a short one.
     ``sign``: correlation of the yaw rate with another measurement, 0 without one. ``along``: the speed alone shows
     which way is forward. ``rate``: yaw rate.
     """
 
     rotation: FloatArray
     correlation: float
+    error_deg: float
     errors_deg: tuple[float, float]
     sign: float
     along: bool
@@ -346,7 +348,7 @@ def _turned(
     fits = correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG
     ahead = compare(law("longitudinal", of="", pace=""), driven[0].real, f @ rotation[0], used)
     along = any(r.correlation > SIGN_CORRELATION for r in ahead)
-    return _Turn(rotation, correlation, by_blocks, sign, along, fits, evidence, rate)
+    return _Turn(rotation, correlation, error, by_blocks, sign, along, fits, evidence, rate)
 
 
 def _sides(column: NDArray[Any]) -> FloatArray:
@@ -367,7 +369,7 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
 def _snapped(turn: _Turn) -> FloatArray:
     """Return the nearest multiple of 90 degrees, with the remaining tilt and yaw if the drive shows them."""
     step = nearest_step(turn.rotation)
-    if turn.correlation < ASKEW_CORRELATION:
+    if turn.correlation < ASKEW_CORRELATION or turn.error_deg > ASKEW_ERROR_DEG:
         return step
     rest = turn.rotation @ step.T
     yaw = math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1])
