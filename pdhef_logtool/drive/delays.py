@@ -1,7 +1,7 @@
 """Delays: of ground truth against the gyro, and of sensors relative to one another without ground truth.
 
 No sensor shows a motion before it happens. Of two sensors that follow one motion, the later one is late if their shift
-is larger than for correct sensors. Only the difference of the rear wheel speeds follows the gyro without a delay. Other
+is larger than for correct sensors. Only the difference of an axle's wheel speeds follows the gyro without a delay. Other
 pairs also differ by sideslip, pitch and the vehicle's response; they detect only large delays.
 """
 
@@ -165,7 +165,7 @@ def late_sensors(measured: Measured) -> tuple[LateSensor, ...]:
         name = law.late[shift_s >= low]
         late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift_s, error_s, low, high))
         evidence = (
-            f"{law.text}: late by {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
+            f"{law.text}: delay {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
         )
         delay_s = abs(shift_s) if law.exact else beyond_s
         wheels = tuple(n for n in measured.topics if n.startswith("wheel_speed_")) if name.startswith("wheel") else ()
