@@ -1,7 +1,7 @@
 """Delays: of ground truth against the gyro, and of sensors relative to one another without ground truth.
 
 No sensor shows a motion before it happens. Of two sensors that follow one motion, the later one is late if their shift
-is larger than for correct sensors. Only the difference of an axle's wheel speeds follows the gyro without a delay. Other
+is larger than for correct sensors. Only the difference of the rear wheel speeds follows the gyro without a delay. Other
 pairs also differ by sideslip, pitch and the vehicle's response; they detect only large delays.
 """
 

@@ -334,7 +334,9 @@ def _wheel_differences(pace: _Pace) -> Iterator[Relation]:
         laws = [law(f"axle_{name}", axle=text, pace=pace.name) for text, _ in pairs if name in pace.columns]
         sides = [(pace.columns[name], factor * difference) for _, difference in pairs if name in pace.columns]
         both = zip(laws, sides, strict=True)
-        yield from _best([r for a, b in both for r in compare(a, *b, pace.moving, pace.gentle)])
+        related = [r for a, b in both for r in compare(a, *b, pace.moving, pace.gentle)]
+        # The rear axle shows a delay: the front wheels also move with the steering.
+        yield from (replace(r, sides=related[0].sides) for r in _best(related))
 
 
 def _scaled_to(wheel: FloatArray, pace: _Pace) -> FloatArray:
