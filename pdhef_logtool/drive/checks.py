@@ -32,7 +32,7 @@ from pdhef_logtool.drive.delays import LatencyEstimate, LateSensor
 from pdhef_logtool.drive.measured import Measured
 from pdhef_logtool.drive.mounting import IS_GRAVITY_M_S2
 from pdhef_logtool.drive.relation_checks import relation_checks
-from pdhef_logtool.drive.relations import CG_VY, GAIN_RANGE, SAME_RANGE, gentle_at, position_factors
+from pdhef_logtool.drive.relations import CG_VY, gentle_at, law, position_factors
 from pdhef_logtool.drive.sensor_changes import SensorChange
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.running_mean import running_mean
@@ -244,7 +244,8 @@ def _accelerometer(drive: CheckedDrive) -> Iterator[Check]:
     yield judge("ay_m_s2.place", place - file, std, doubt=doubt, place=place, file=file)
     if np.nanstd(drive.columns["truth.vx_m_s"] * drive.columns["truth.yaw_rate_rad_s"]) > LEAST_LATERAL_M_S2:
         unit_is_right = any(c.name == "ay_m_s2.unit" and c.verdict == "passed" for c in drive.related)
-        is_other = not GAIN_RANGE[0] < errors.ay_gain[0] < GAIN_RANGE[1]
+        low, high = law("lateral", of="", pace="").gains
+        is_other = not low < errors.ay_gain[0] < high
         yield judge("ay_m_s2.gain", *errors.ay_gain, doubt="ground_truth" if is_other and unit_is_right else "")
     delay = ay_delay(errors, drive.latency)
     if delay is not None and 1e3 * delay[1] <= TABLE["ay_m_s2.delay"]["limits"][1]:
@@ -322,7 +323,8 @@ def _is_speed(drive: CheckedDrive, column: FloatArray) -> bool:
         return False
     with np.errstate(divide="ignore", invalid="ignore"):
         share = median_known(np.where(moving_at(drive.speed), np.abs(column / drive.speed), np.nan))
-    return SAME_RANGE[0] < share < SAME_RANGE[1]
+    low, high = law("speed", name="", pace="").gains
+    return low < share < high
 
 
 def sideslip_offset(columns: Mapping[str, FloatArray]) -> Figure:
@@ -361,13 +363,10 @@ def _scales_of_positions(drive: CheckedDrive) -> Iterator[Check]:
 
 def _radius(drive: CheckedDrive) -> Iterator[Check]:
     """Compare the ratio of speed and wheel speed with the wheel radius of the file."""
-    columns, speed, file = drive.columns, drive.speed, drive.vehicle.wheel_radius_m
-    if not drive.has_file or speed is None or "speed_m_s" not in columns:
-        return
-    wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_rad_s") in columns]
-    turning = [(w, moving_at(speed) & np.isfinite(w) & (w != 0.0)) for w in wheels]
-    if ratios := [float(np.median(speed[k] / w[k])) for w, k in turning if k.any()]:
-        radius = float(np.median(ratios))
+    file, wheels = drive.vehicle.wheel_radius_m, {f"wheel_speed_{w}_rad_s" for w in WHEELS}
+    per_wheel = [r.gain for r in drive.measured.relations if wheels & r.powers.keys() and "speed_m_s" in r.powers]
+    if drive.has_file and drive.speed is not None and any(per_wheel):
+        radius = 1.0 / float(np.median(per_wheel))
         yield judge("vehicle.wheel_radius", radius / file, radius=radius, file=file)
 
 

@@ -23,8 +23,6 @@ SPIKE_RANGES, SPIKE_S = 5.0, 0.2
 LONGEST_GAP_S = 2.5
 #: 21 hours about the middle of the drive. One wrong stamp could otherwise make a grid of decades.
 MAX_CELLS = 1_500_000
-#: Length of the alternating blocks of the two parts of a drive (longer than a manoeuvre), and their maximum number.
-PART_S, MOST_PARTS = 4.0, 12
 #: Moving: faster than this share of the drive's fast speeds, and than a speed that is too low for the relations.
 MOVING_SHARE, MIN_MOVING_M_S = 0.25, 0.5
 #: Number of blocks of a drive for the jackknife: minimum and maximum.
@@ -87,13 +85,6 @@ def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray
         return np.asarray(np.abs(speed) > limit, dtype=np.bool_)
 
 
-def halves(cells: int) -> tuple[BoolArray, BoolArray]:
-    """Return two independent parts of a drive, bool [cells] each: alternate blocks, so that both contain driving."""
-    block = max(round(PART_S / GRID_S), cells // MOST_PARTS)
-    first = (np.arange(cells) // max(block, 1)) % 2 == 0
-    return first, ~first
-
-
 def independent_samples(count: int) -> float:
     """Return how many independent samples this many cells contain after the low pass."""
     return 2.0 * LOW_PASS_HZ * GRID_S * count
@@ -146,9 +137,9 @@ def median_known(column: FloatArray) -> float:
 
 
 def fit(
-    measured: FloatArray, regressors: Sequence[FloatArray], use: BoolArray
+    measured: FloatArray, regressors: Sequence[FloatArray], use: BoolArray, least: float = 4.0
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    """Regress a column on others where ``use`` and all are known.
+    """Regress a column on others where ``use`` and all are known; ``least``: independent samples per coefficient.
 
     Returns
     -------
@@ -158,7 +149,7 @@ def fit(
     matrix = np.stack(regressors, axis=1)
     usable = use & np.isfinite(measured) & np.isfinite(matrix).all(axis=1)
     samples = independent_samples(int(np.count_nonzero(usable)))
-    if samples < 4.0 * len(regressors):
+    if samples < least * len(regressors):
         return None
     a, b = matrix[usable], measured[usable]
     scale = np.linalg.norm(a, axis=0)

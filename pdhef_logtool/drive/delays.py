@@ -8,11 +8,10 @@ pairs also differ by sideslip, pitch and the vehicle's response; they detect onl
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-from pdhef_logtool.drive.columns import GRID_S, columns_on_grid, derivative
+from pdhef_logtool.drive.columns import GRID_S
 from pdhef_logtool.drive.correlation import (
     CommonGrid,
     find_shift,
@@ -21,8 +20,9 @@ from pdhef_logtool.drive.correlation import (
     shift_error,
     without_trend,
 )
+from pdhef_logtool.drive.measured import Measured
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, channel_of, same_share
-from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
+from pdhef_logtool.records.signals import Channel
 
 #: Search range of the latency.
 MAX_LATENCY_S = 0.5
@@ -30,13 +30,6 @@ MAX_LATENCY_S = 0.5
 MAX_LATENCY_ERROR_S = 0.005
 #: Ground truth cannot lead the gyro by more than this: the gyro's stamps are late.
 LATE_GYRO_S = 0.005
-#: Plausible delay of the second of two correct signals relative to the first, s. On simulated and recorded drives the
-#: delay of the wheels after the gyro is -10 to 24 ms, of a_y after v r 0 to 132 ms, of v-dot after a_x -121 to 11 ms,
-#: of the yaw rate after the steering 16 to 152 ms.
-WHEELS_AFTER_GYRO_S = (-0.045, 0.06)
-A_Y_AFTER_TURNING_S = (-0.3, 0.22)
-SPEED_AFTER_A_X_S = (-0.2, 0.12)
-YAW_RATE_AFTER_STEERING_S = (-0.02, 0.45)
 #: Largest standard error of a shift, and how many standard errors the shift must be outside the plausible range.
 MAX_SHIFT_ERROR_S, SURE = 0.015, 4.0
 #: Least correlation at the shift: of ground truth; of sensors, which differ where the car slides; of exact pairs.
@@ -156,67 +149,25 @@ def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) 
     return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
 
 
-def late_sensors(signals: Mapping[str, Channel]) -> tuple[LateSensor, ...]:
-    """Return the sensors with late stamps; pairs that do not show a delay are ignored."""
+def late_sensors(measured: Measured) -> tuple[LateSensor, ...]:
+    """Return the sensors with late stamps; relations that do not show a delay are ignored."""
     late: dict[str, LateSensor] = {}
-    for pair in _pairs(columns_on_grid(signals)):
-        grid = CommonGrid(GRID_S, without_trend(pair.first), without_trend(pair.second))
-        lag = lag_of(grid, LEAST_CORRELATION[1 + pair.exact], MAX_SHIFT_ERROR_S)
-        (low, high), shift_s, error_s = pair.plausible_s, lag.latency_s, lag.std_error_s
+    timed = [(r.law, r.law.delay_s, r.sides) for r in measured.relations if r.law.delay_s and r.sides]
+    for law, (low, high), sides in sorted(timed, key=lambda x: not x[0].exact):
+        grid = CommonGrid(GRID_S, *map(without_trend, sides))
+        lag = lag_of(grid, LEAST_CORRELATION[1 + law.exact], MAX_SHIFT_ERROR_S)
+        shift_s, error_s = lag.latency_s, lag.std_error_s
         beyond_s = max(low - shift_s, shift_s - high)
         # A sine also correlates with itself a period later.
         is_late = lag.reliable and error_s <= beyond_s / SURE
         if not is_late or has_peak_within(grid, low, high, AS_HIGH * lag.correlation):
             continue
-        name = pair.names[shift_s >= low]
+        name = law.late[shift_s >= low]
         late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift_s, error_s, low, high))
-        evidence = f"{pair.text} by {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
-        delay_s = abs(shift_s) if pair.exact else beyond_s
-        wheels = tuple(n for n in signals if n.startswith("wheel_speed_")) if name.startswith("wheel_speed_") else ()
-        sensor = LateSensor(wheels or (name,), delay_s, pair.exact, evidence)
-        late.setdefault(sensor.names[0], sensor)
-    return tuple(late.values())
-
-
-class _Pair(NamedTuple):
-    """Two signals that follow one motion.
-
-    Attributes
-    ----------
-    names : name to report if the first or the second signal is late. plausible_s : range of the second's delay, s.
-    exact : the vehicle adds no delay between the two.
-    """
-
-    text: str
-    first: FloatArray
-    second: FloatArray
-    names: tuple[str, str]
-    plausible_s: tuple[float, float]
-    exact: bool = False
-
-
-def _pairs(columns: Mapping[str, FloatArray]) -> Iterator[_Pair]:
-    """Yield the pairs of columns that follow one motion."""
-    gyro, ax, ay = (columns.get(n) for n in ("yaw_rate_rad_s", "ax_m_s2", "ay_m_s2"))
-    for unit in ("m_s", "rad_s"):
-        names = [f"wheel_speed_r{side}_{unit}" for side in "lr"]
-        if gyro is not None and columns.keys() >= {*names}:
-            text = "the difference of the rear wheel speeds follows the yaw rate"
-            difference = columns[names[1]] - columns[names[0]]
-            yield _Pair(text, gyro, difference, ("yaw_rate_rad_s", names[0]), WHEELS_AFTER_GYRO_S, exact=True)
-    wheels = [n for u in ("rad_s", "m_s") for w in WHEELS[::-1] if (n := f"wheel_speed_{w}_{u}") in columns]
-    pace = next((n for n in ("speed_m_s", *wheels) if n in columns), "")
-    if not pace:
-        return
-    speed = columns[pace]
-    if ax is not None:
-        yield _Pair(
-            f"the derivative of {pace} follows ax_m_s2", ax, derivative(speed), ("ax_m_s2", pace), SPEED_AFTER_A_X_S
+        evidence = (
+            f"{law.text}: delay {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
         )
-    if gyro is not None and ay is not None:
-        text = "ay_m_s2 follows yaw_rate_rad_s x speed"
-        yield _Pair(text, gyro * speed, ay, ("yaw_rate_rad_s", "ay_m_s2"), A_Y_AFTER_TURNING_S)
-    steer = next((n for n in ("steer_rad", "steering_wheel_rad") if n in columns), "")
-    if gyro is not None and steer:
-        text = f"yaw_rate_rad_s follows {steer} x speed"
-        yield _Pair(text, columns[steer] * speed, gyro, (steer, "yaw_rate_rad_s"), YAW_RATE_AFTER_STEERING_S)
+        delay_s = abs(shift_s) if law.exact else beyond_s
+        wheels = tuple(n for n in measured.topics if n.startswith("wheel_speed_")) if name.startswith("wheel") else ()
+        late.setdefault(name, LateSensor(wheels or (name,), delay_s, law.exact, evidence))
+    return tuple(late.values())

@@ -8,27 +8,33 @@ wheel spin or a bank change some blocks only, and a wrong unit changes all. Prob
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from itertools import combinations
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.mapping.naming import CACHED_NAMES, G_M_S2
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-DEGREE = float(np.pi / 180.0)
 #: Least correlation at which a gain gives information (the true gain is between the two regressions), least Fisher z
 #: of the correlation, and least number of independent samples (3 s).
 MIN_CORRELATION, MIN_CHANCE_Z, MIN_SAMPLES = 0.6, 3.0, 6.0
 #: Two sides that move with a lower correlation are unrelated: another field is mapped.
 UNRELATED_CORRELATION = 0.25
-#: Typical values that recognise one quantity recorded as another.
-TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M = 16.0, 0.3
-_TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
+#: Relations and units as tables, here and in :mod:`~.relations`.
+TABLE: dict[str, Any] = tomllib.loads(Path(__file__).with_name("relations.toml").read_text(encoding="utf-8"))
+#: Correction factors with their texts by unit, and units in which mappings confuse a signal. A typical steering ratio
+#: or wheel radius recognises one quantity recorded as another.
+FACTORS: dict[str, list[tuple[float, str]]] = TABLE.pop("factors")
+UNITS: dict[str, list[str]] = TABLE.pop("units")
+_TYPICAL = {factor for unit, factors in FACTORS.items() if unit.startswith("typical") for factor, _ in factors}
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
-FOREIGN = (1.0 / DEGREE, G_M_S2, 3.6)
+FOREIGN = (180.0 / math.pi, G_M_S2, 3.6)
 #: Logarithms of factors that differ by less are one unit (km/h and mph are 0.48 apart). A range of gains with a smaller
 #: ratio of its ends rules out all units but one; wider ranges are lengths of any car.
 SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
@@ -53,42 +59,68 @@ BLOCKS = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Relation:
-    """One relation with its measured gain; ``powers`` are the exponents of the signals' scales in the gain.
+class Law:
+    """A relation as data (``relations.toml``): the measured side is a plausible gain times the predicted side.
 
     Attributes
     ----------
-    expected : range of plausible gains. samples : number of independent samples. moves : whether the signals vary
-        by more than disturbances cause: both, or one of two that must vary together. signless : one side has no sign.
-    least_correlation : below it the gain gives no information.
-    typical : the likeliest gain. blocks : gains of blocks of the drive, each without the block's means. most_energy :
-        largest energy of a gain.
+    powers : exponents of the signals' scales in the gain. gains : range of plausible gains. typical : the likeliest.
+    moves : a side that varies by more, 1-sigma, must vary with the other; with ``either`` False only the predicted side
+        must. bias : 1-sigma of the offset between the sides. signless : one side has no sign.
+    delay_s : plausible delay of the measured side. late : the late signals below and above it.
+    exact : the vehicle adds no delay. least_correlation : below it the gain gives no information.
+    most_energy : largest energy of a gain.
     """
 
     text: str
     powers: dict[str, int]
+    gains: tuple[float, float]
+    typical: float = 1.0
+    moves: float = math.inf
+    either: bool = True
+    bias: float = math.inf
+    signless: bool = False
+    delay_s: tuple[float, float] | None = None
+    late: tuple[str, ...] = ()
+    exact: bool = False
+    least_correlation: float = MIN_CORRELATION
+    most_energy: float = MOST_ENERGY
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Relation:
+    """One relation with its measured gain.
+
+    Attributes
+    ----------
+    samples : number of independent samples. moves : whether the signals vary by more than disturbances cause.
+    blocks : gains of blocks of the drive, each without the block's means. sides : predicted and measured [N].
+    """
+
+    law: Law
     correlation: float
     gain: float
-    expected: tuple[float, float]
     samples: float
     moves: bool = False
-    signless: bool = False
-    least_correlation: float = MIN_CORRELATION
-    typical: float = 1.0
     blocks: tuple[float, ...] = ()
-    most_energy: float = MOST_ENERGY
+    sides: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def powers(self) -> dict[str, int]:
+        """Exponents of the signals' scales in the gain."""
+        return self.law.powers
 
     @property
     def decides_unit(self) -> bool:
         """Return whether the plausible range is narrow enough to exclude all other units."""
-        return self.expected[1] < DECIDES_UNIT * self.expected[0] * self.correlation**2
+        return self.law.gains[1] < DECIDES_UNIT * self.law.gains[0] * self.correlation**2
 
     @property
     def tells(self) -> bool:
         """Return whether the drive excites the relation enough for a verdict."""
         bounded = min(abs(self.correlation), 1.0 - 1e-9)
         chance_z = math.atanh(bounded) * math.sqrt(max(self.samples - 3.0, 0.0))
-        return abs(self.correlation) >= self.least_correlation and chance_z >= MIN_CHANCE_Z
+        return abs(self.correlation) >= self.law.least_correlation and chance_z >= MIN_CHANCE_Z
 
     @property
     def unrelated(self) -> bool:
@@ -101,8 +133,8 @@ class Relation:
         The true gain is between the two regressions, correlation x gain and gain / correlation.
         """
         gain, size = self.gain * factor, abs(self.correlation)
-        gain = abs(gain) if self.signless else gain
-        return size > 0.0 and gain / size >= self.expected[0] and gain * size <= self.expected[1]
+        gain = abs(gain) if self.law.signless else gain
+        return size > 0.0 and gain / size >= self.law.gains[0] and gain * size <= self.law.gains[1]
 
     def energies(self, factors: FloatArray) -> FloatArray:
         """Return the negative log likelihoods [N] of the blocks' gains times each factor [N].
@@ -110,7 +142,7 @@ class Relation:
         A NaN factor means a wrong field, for which any gain is possible.
         """
         gains = factors[:, None] * (self.blocks or (self.gain,))
-        low, high = (math.log(max(e, 1e-12)) for e in self.expected)
+        low, high = (math.log(max(e, 1e-12)) for e in self.law.gains)
         with np.errstate(divide="ignore"):
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
@@ -121,19 +153,19 @@ class Relation:
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
         energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
-            middle = math.log(self.typical) if low < math.log(self.typical) < high else 0.5 * (low + high)
+            middle = math.log(self.law.typical) if low < math.log(self.law.typical) < high else 0.5 * (low + high)
             off = np.maximum(np.abs(size - middle) - room, 0.0)
             energy += 0.5 * (off / math.hypot(max((high - low) / 6.0, LEAST_WIDTH), apart)) ** 2
-        energy = np.minimum(energy, self.most_energy)
-        mean = (energy if self.signless else np.where(gains > 0.0, energy, self.most_energy)).mean(axis=1)
+        energy = np.minimum(energy, self.law.most_energy)
+        mean = (energy if self.law.signless else np.where(gains > 0.0, energy, self.law.most_energy)).mean(axis=1)
         return np.where(np.isnan(factors), _ANY_GAIN, mean)
 
     @property
     def evidence(self) -> str:
         """The measured gain and correlation as text."""
-        low, high = self.expected
+        low, high = self.law.gains
         return (
-            f"{self.text}: gain {self.gain:.3g} where {low:.3g} to {high:.3g} is plausible, correlation "
+            f"{self.law.text}: gain {self.gain:.3g} where {low:.3g} to {high:.3g} is plausible, correlation "
             f"{self.correlation:.2f}"
         )
 
@@ -301,23 +333,13 @@ def _together(names: Sequence[str]) -> str:
 @cache
 def units_of(name: str) -> list[tuple[float, str]]:
     """Return the correction factors for the units in which a signal may be recorded, each with its text."""
+    return [(factor, words) for unit in UNITS.get(kind_of(name), ()) for factor, words in FACTORS[unit]]
 
-    def both_ways(unit: str, factor: float, inverse: float) -> list[tuple[float, str]]:
-        return [(factor, f"is in {unit}"), (inverse, f"was converted from {unit} twice")]
 
-    radians, g = both_ways("degrees", DEGREE, 1.0 / DEGREE), both_ways("g", G_M_S2, 1.0 / G_M_S2)
-    speeds = [*both_ways("km/h", 1.0 / 3.6, 3.6), *both_ways("mph", 0.44704, 1.0 / 0.44704)]
-    units = {
-        **dict.fromkeys(("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad", "yaw_rad"), radians),
-        "steer_rad": [*radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")],
-        "steering_wheel_rad": [*radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")],
-        **dict.fromkeys(("ax_m_s2", "ay_m_s2"), g),
-        **{key: [*speeds, (1e-3, "is in mm/s")] for key in ("vx_m_s", "vy_m_s", "speed_m_s")},
-        "wheel_rad_s": [(2.0 * np.pi / 60.0, "is in rpm"), (1.0 / TYPICAL_WHEEL_RADIUS_M, "is in m/s")],
-        "wheel_m_s": [*speeds, (TYPICAL_WHEEL_RADIUS_M, "is in rad/s")],
-    }
+def kind_of(name: str) -> str:
+    """Return the name of a signal, for all wheels the same."""
     wheels = "wheel_rad_s" if name.endswith("_rad_s") else "wheel_m_s"
-    return units.get(wheels if name.startswith("wheel_speed") else name, [])
+    return wheels if name.startswith("wheel_speed") else name
 
 
 def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations, product
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.check_table import result
-from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
+from pdhef_logtool.drive.columns import derivative, fit, independent_samples, moving_at
 from pdhef_logtool.drive.measured import Measured
-from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
+from pdhef_logtool.drive.relations import compare, gentle_at, law, steering_references, yaw_references
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.checking import has_path
@@ -32,23 +34,17 @@ COMPENSATED_M_S2 = 3.0
 #: Least correlation of the level accelerations with speed and yaw rate in the correct axes; the rest is sideslip, roll,
 #: grade, crossfall and noise.
 MIN_CORRELATION = 0.75
-#: Least number of independent samples: 5 s of driving.
-MIN_SAMPLES = 10.0
 #: Plausible gain of the regression. Outside, a unit is wrong and the angle is unknown.
 GAIN_RANGE = (0.5, 2.0)
 #: Largest standard error of the angle for a multiple of 90 degrees: three errors are half of 45 degrees.
 MAX_ERROR_DEG = 7.5
-#: A mounting is a multiple of 90 degrees unless it differs by more than this and by more than three standard errors.
+#: A mounting is a multiple of 90 degrees unless it differs by more than this and by ``SURE_STD`` standard errors.
 #: Grade, crossfall and bias are 0.5 m/s^2 over 20 s, 3 degrees of tilt; sideslip causes 2 degrees of yaw.
 TURNED_DEG = 4.0
-ASKEW_SAMPLES = 40.0
-#: Least correlation of each part of a drive. If the parts are too short, the drive needs ``ASKEW_CORRELATION``.
-PART_CORRELATION = 0.6
-#: Largest difference between two parts of a drive, and condition number above which the regressors are not separable.
-PARTS_AGREE_DEG, PARTS_AGREE_SHARE, WELL_CONDITIONED = 2.5, 0.2, 60.0
+ASKEW_SAMPLES, SURE_STD = 40.0, 3.0
 ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
-#: Least correlation of the yaw rate with another measurement that decides its sign.
-SIGN_CORRELATION = 0.5
+#: Least correlation of the yaw rate with another measurement that decides its sign, and its independent samples (5 s).
+SIGN_CORRELATION, MIN_SAMPLES = 0.5, 10.0
 #: The same for a left-handed sensor: the wheels' difference changes its sign when a car understeers strongly.
 HAND_CORRELATION = 0.8
 #: Words for the axes of a rate, x first.
@@ -246,13 +242,9 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
-    parts = [
-        _turned(f, hand * w, np.where(part, speed, np.nan), best.rotation[2], references) for part in halves(len(speed))
-    ]
-    is_shown = _is_shown(best, hand, measured)
-    mounting = Mounting(_snapped(best, parts), named, best.evidence, is_shown, hand)
-    is_sure = mounting.is_as_named or _parts_agree(best, parts)
-    return replace(mounting, confident=is_shown and is_sure)
+    mounting = Mounting(_snapped(best), named, best.evidence, _is_shown(best, hand, measured), hand)
+    is_sure = best.correlation >= ASKEW_CORRELATION or best.errors_deg[0] <= MAX_ERROR_DEG or mounting.is_as_named
+    return replace(mounting, confident=mounting.confident and is_sure)
 
 
 def _is_shown(turn: _Turn, hand: float, measured: Measured) -> bool:
@@ -263,13 +255,6 @@ def _is_shown(turn: _Turn, hand: float, measured: Measured) -> bool:
     if turn.sign != 0.0 or turn.along or hand < 0.0:
         return turn.sign > 0.0 or turn.along
     return _sign_of(turn.rate, steering_references(measured.columns, measured.speed_name))[0] > 0.0
-
-
-def _parts_agree(whole: _Turn, parts: Sequence[_Turn | None]) -> bool:
-    """Return whether the parts of a drive give the same multiple of 90°; a short drive must correlate as a whole."""
-    step, fitted = nearest_step(whole.rotation), [p for p in parts if p is not None]
-    agree = all(p.correlation >= PART_CORRELATION and np.allclose(nearest_step(p.rotation), step) for p in fitted)
-    return agree and (len(fitted) == len(parts) or whole.correlation >= ASKEW_CORRELATION)
 
 
 def named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | None) -> FloatArray:
@@ -285,6 +270,8 @@ def named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | Non
 class _Turn:
     """A rotation for one choice of the vertical, with its fit to the drive.
 
+    ``error_deg``: standard error of yaw by the residual. ``errors_deg``: of yaw and of the tilt by blocks of the drive,
+    infinite on a short one.
     ``sign``: correlation of the yaw rate with another measurement, 0 without one. ``along``: the speed alone shows
     which way is forward. ``rate``: yaw rate.
     """
@@ -292,7 +279,7 @@ class _Turn:
     rotation: FloatArray
     correlation: float
     error_deg: float
-    samples: float
+    errors_deg: tuple[float, float]
     sign: float
     along: bool
     fits: bool
@@ -322,41 +309,35 @@ def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
 def _turned(
     f: FloatArray, w: FloatArray, speed: FloatArray, up: FloatArray, references: list[tuple[str, FloatArray]]
 ) -> _Turn | None:
-    moving = moving_at(speed)
-    rotation, correlation, gain, error = np.zeros((3, 3)), 0.0, 0.0, math.inf
-    axis, mean = up, up
+    moving, axis, mean = moving_at(speed), up, up
     for _ in range(3):  # iterates, because the accelerations of the drive tilt the mean slightly
         e1 = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
         e1 /= np.linalg.norm(e1)
         e2 = np.cross(axis, e1)
-        rate = w @ axis
-        driven = derivative(speed) + 1j * speed * rate
-        level = f @ e1 + 1j * (f @ e2)
-        use = moving & np.isfinite(driven) & np.isfinite(level)
-        samples = independent_samples(int(np.count_nonzero(use)))
-        if samples < MIN_SAMPLES:
-            return None
+        rate, level = w @ axis, f @ e1 + 1j * (f @ e2)
         # A sensor away from the CG also measures a term in proportion to the yaw acceleration.
-        turning = 1j * derivative(rate)
-        use &= np.isfinite(turning)
-        a = np.stack([driven[use] - driven[use].mean(), turning[use] - turning[use].mean()], axis=1)
-        z = level[use] - level[use].mean()
-        power = float(np.sum(np.abs(z) ** 2))
-        if np.linalg.matrix_rank(a) < 2 or power <= 0.0:
+        driven = [derivative(speed) + 1j * speed * rate, 1j * derivative(rate)]
+        used = moving & np.isfinite(level + driven[0] + driven[1])
+        sides = [_sides(k * c) for c in (*driven, np.ones(len(rate), np.complex128)) for k in (1.0 + 0j, 1j)]
+        solved = fit(_sides(level), sides, np.repeat(used, 2), 2.5)
+        if solved is None:
             return None
-        factors = np.linalg.lstsq(a, z, rcond=None)[0]
-        factor, left_over = complex(factors[0]), z - a @ factors
-        spread = float(np.mean(np.abs(left_over) ** 2)) / 2.0
-        variance = float(np.linalg.inv((a.conj().T @ a).real / a.shape[0])[0, 0]) * spread / samples
-        gain = abs(factor)
-        error = math.degrees(math.sqrt(variance) / max(gain, 1e-9))
-        correlation = math.sqrt(max(0.0, 1.0 - float(np.sum(np.abs(left_over) ** 2)) / power))
-        angle = float(np.angle(factor))
-        forward = math.cos(angle) * e1 + math.sin(angle) * e2
+        (real, imaginary, *_, left1, left2), errors, spread = solved
+        factor, cosine_error, sine_error = complex(real, imaginary), *errors[:2]
+        forward = (factor.real * e1 + factor.imag * e2) / abs(factor)
         rotation = np.stack([forward, np.cross(axis, forward), axis])
-        mean = np.mean(f[use], axis=0) - rotation.T @ np.array([driven[use].real.mean(), driven[use].imag.mean(), 0.0])
+        upward = float(np.mean(f[used] @ axis))
+        mean = upward * axis + left1 * e1 + left2 * e2
         if np.linalg.norm(mean) > COMPENSATED_M_S2:
             axis = mean / np.linalg.norm(mean)
+    gain, samples = abs(factor), independent_samples(int(np.count_nonzero(used)))
+    power = float(np.var(level[used])) / 2.0
+    unexplained = spread**2 * (1.0 - len(errors) / (2.0 * samples)) / power if power > 0.0 else 1.0
+    correlation = math.sqrt(max(0.0, 1.0 - unexplained))
+    error = math.degrees(math.sqrt(unexplained / (2.0 * samples)) / max(correlation, 1e-9))
+    turn_error = math.degrees(math.hypot(imaginary * cosine_error, real * sine_error) / max(gain, 1e-9) ** 2)
+    tilt_error = math.degrees(math.hypot(*errors[-2:]) / GRAVITY_M_S2)
+    by_blocks = (turn_error, tilt_error) if samples >= ASKEW_SAMPLES else (math.inf, math.inf)
     sign, said = _sign_of(np.where(gentle_at(speed * rate, moving), rate, np.nan), references)
     if sign == 0.0:
         sign, said = _sign_of(rate, references)
@@ -365,50 +346,40 @@ def _turned(
         f"yaw known to {error:.1f} deg{said}"
     )
     fits = correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG
-    along = _along(rotation[0] @ f[use].T, driven[use].real)
-    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence, rate)
+    ahead = compare(law("longitudinal", of="", pace=""), driven[0].real, f @ rotation[0], used)
+    along = any(r.correlation > SIGN_CORRELATION for r in ahead)
+    return _Turn(rotation, correlation, error, by_blocks, sign, along, fits, evidence, rate)
 
 
-def _along(measured: FloatArray, driven: FloatArray) -> bool:
-    """Return whether accelerating and braking alone show which way is forward."""
-    spread = float(measured.std() * driven.std())
-    return spread > 0.0 and float(np.mean((measured - measured.mean()) * (driven - driven.mean()))) / spread > 0.5
+def _sides(column: NDArray[Any]) -> FloatArray:
+    """Return the real and imaginary parts of a column [N] in turn, [2 N]."""
+    return np.stack([column.real, column.imag], axis=1).ravel()
 
 
 def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tuple[float, str]:
     """Return the correlation of the yaw rate with its best other measurement, and a text; 0 and empty without one."""
-    everywhere, best, said = np.ones(rate.shape, np.bool_), 0.0, ""
+    best, said = 0.0, ""
     for text, reference in references:
-        for relation in compare(text, {}, reference, rate, everywhere, GAIN_RANGE, bias=BIAS_RAD_S):
+        for relation in compare(law("gnss_path", name=""), reference, rate):
             if relation.samples >= MIN_SAMPLES and abs(relation.correlation) > max(SIGN_CORRELATION, abs(best)):
                 best, said = relation.correlation, f", yaw rate against {text} {relation.correlation:.2f}"
     return best, said
 
 
-def _snapped(whole: _Turn, parts: Sequence[_Turn | None]) -> FloatArray:
-    """Return the nearest multiple of 90 degrees, with the remaining tilt and yaw if both parts of the drive agree."""
-    step = nearest_step(whole.rotation)
-    rests = [p.rotation @ step.T for p in parts if p is not None]
-    is_precise = whole.correlation >= ASKEW_CORRELATION and whole.error_deg <= ASKEW_ERROR_DEG
-    if not is_precise or whole.samples < ASKEW_SAMPLES or len(rests) < 2:
+def _snapped(turn: _Turn) -> FloatArray:
+    """Return the nearest multiple of 90 degrees, with the remaining tilt and yaw if the drive shows them."""
+    step = nearest_step(turn.rotation)
+    if turn.correlation < ASKEW_CORRELATION or turn.error_deg > ASKEW_ERROR_DEG:
         return step
-    rest = whole.rotation @ step.T
-    yaw, *yaws = (math.degrees(math.atan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1])) for r in (rest, *rests))
-    angles = [math.copysign(y, y * yaw) for y in yaws]
-    is_turned = all(a > TURNED_DEG for a in angles) and abs(yaw) > max(TURNED_DEG, 3.0 * whole.error_deg)
-    is_turned &= abs(angles[0] - angles[1]) < max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw))
-    # One of the parts may be a hill.
-    *tilts, apart = (
-        angle_deg(float(x)) for x in (rest[2, 2], rests[0][2, 2], rests[1][2, 2], rests[0][2] @ rests[1][2])
-    )
-    if min(tilts) > TURNED_DEG and apart < PARTS_AGREE_DEG:
+    rest = turn.rotation @ step.T
+    yaw = math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1])
+    is_turned = abs(math.degrees(yaw)) > max(TURNED_DEG, SURE_STD * turn.errors_deg[0])
+    if angle_deg(float(rest[2, 2])) > max(TURNED_DEG, SURE_STD * turn.errors_deg[1]):
         from scipy.spatial.transform import Rotation
 
         level_only = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest[2]])[0].as_matrix()
-        return whole.rotation if is_turned else np.asarray(level_only @ step)
-    if not is_turned:
-        return step
-    c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
+        return turn.rotation if is_turned else np.asarray(level_only @ step)
+    c, s = (math.cos(yaw), math.sin(yaw)) if is_turned else (1.0, 0.0)
     return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ step)
 
 

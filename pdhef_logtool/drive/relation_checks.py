@@ -57,7 +57,7 @@ def relation_checks(measured: Measured) -> tuple[Check, ...]:
         unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
         judged = _judged(name, [r for r in mine if r.tells], probable, measured)
         for r in unrelated[:1]:
-            evidence = TEXTS["unrelated"].format(pair=r.text, correlation=r.correlation)
+            evidence = TEXTS["unrelated"].format(pair=r.law.text, correlation=r.correlation)
             checks.append(result("SIGNAL.axis", "failed", name, evidence=evidence))
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(_of_place(c, *measured.positions) if c.subject == COURSE_RATE else c for c in checks)
@@ -79,13 +79,13 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         likely = [h for p, h in mistakes if p > NAMED * wrong]
         contradicted = [r for r in relations if not r.accepts()] or relations
         return _wrong(name, likely, contradicted, measured, wrong)
-    factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
-    usable = [r for r in relations if not math.isnan(factors[r.text])]
+    factors = {r.law.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
+    usable = [r for r in relations if not math.isnan(factors[r.law.text])]
     if not usable:
         others = " and ".join(sorted({n for h in chosen for n in h.factors} & set(relations[0].powers)))
         remedy = TEXTS["rest"].format(others=others)
         return [result(UNIT, "undecided", name, evidence=relations[0].evidence, remedy=remedy)]
-    if not any(r.accepts(factors[r.text]) for r in usable):
+    if not any(r.accepts(factors[r.law.text]) for r in usable):
         return [result(UNIT, "undecided", name, evidence=usable[0].evidence, remedy=TEXTS["unexplained"])]
     return _passed(name, usable, factors)
 
@@ -97,7 +97,7 @@ def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) ->
     units = {f for f, said in units_of(name.removeprefix("truth.")) if said not in ("is in m/s", "is in rad/s")}
     units |= {f**p for f in foreign for p in (1.0, -1.0)}
     units = {f for f in units if name not in NEEDS["units"] or max(f, 1.0 / f) > 3.0}
-    is_open = any(all(r.accepts(factors[r.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units)
+    is_open = any(all(r.accepts(factors[r.law.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units)
     return [
         result(SIGN, "passed", name, evidence=best.evidence),
         result(UNIT, "undecided" if is_open else "passed", name, evidence=best.evidence, remedy=_needs(name, "unit")),
@@ -119,7 +119,7 @@ def _wrong(
     name: str, likely: Sequence[Hypothesis], relations: Sequence[Relation], measured: Measured, probability: float
 ) -> list[Check]:
     """Return the failed or undecided checks of a signal with likely mistakes."""
-    counts = TEXTS["counts"] if relations[0].most_energy > MOST_ENERGY else ""
+    counts = TEXTS["counts"] if relations[0].law.most_energy > MOST_ENERGY else ""
     mistakes = [h for h in likely if not math.isnan(h.factors[name])]
     if math.isnan(likely[0].factors[name]):
         names, evidence = [UNIT], relations[0].evidence
@@ -155,7 +155,7 @@ def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
     evidence = TEXTS["alone"]
     if relations:
         best = max(relations, key=lambda r: abs(r.correlation))
-        evidence = TEXTS["quiet"].format(pair=best.text, correlation=best.correlation, samples=best.samples)
+        evidence = TEXTS["quiet"].format(pair=best.law.text, correlation=best.correlation, samples=best.samples)
     return result(SIGN, "undecided", name, evidence=evidence, remedy=_needs(name, "sign"))
 
 

@@ -1,10 +1,11 @@
-"""Relations between pairs of signals, from rigid-body kinematics and rolling wheels."""
+"""Relations between signals by rigid-body kinematics and rolling wheels: their sides, and ``relations.toml``."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,18 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import (
     BLOCKS,
-    MIN_CORRELATION,
     MIN_SAMPLES,
-    MOST_ENERGY,
+    TABLE,
+    Law,
     Relation,
     block_gains,
+    kind_of,
 )
+from pdhef_logtool.mapping.naming import CACHED_NAMES
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
+LENGTHS: dict[str, Any] = TABLE.pop("lengths")
+MOST: dict[str, float] = TABLE.pop("most")
 #: Least correlation of two residuals of a regression: they are small, and sliding changes their relation.
 MIN_PARTIAL_CORRELATION = 0.8
 #: Column of the ground-truth v_y at the CG if v_y is mapped. The mapped v_y has its own column, because the lever-arm
@@ -36,21 +41,11 @@ GNSS_COURSE_RATE = "gnss_course_rate_rad_s"
 GNSS_PATH = "gnss_path_rate_rad_s", "gnss_path_speed_m_s"
 #: Columns of the velocity along the axes of the ground-truth positions.
 POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
-#: A side that moves by more than this must also move the other side. Crossfall and grade alone move an accelerometer by
-#: less (5 % are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
-MOVES_M_S2 = 1.0
-MOVES_RAD_S = 0.06
-#: 1-sigma of the offset of a gyro, and of an accelerometer on a crossfall; the share of it that changes in a drive.
-BIAS_RAD_S, BIAS_M_S2, DISTURBED = 0.01, 0.5, 0.6
-#: Gains that tyres, roll, bank, grade and noise explain; outside, a unit is wrong.
-GAIN_RANGE = (0.55, 1.8)
-#: The same quantity measured twice.
-SAME_RANGE = (0.75, 1.33)
-#: a_y - v_x r over the derivative of v_y: small differences of large quantities, with body roll.
-SIDESLIP_RANGE = (0.5, 2.0)
-#: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less for a drifting model
-#: car. The range decides a sign, but not a unit.
-COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
+#: A signal that moves by more, 1-sigma, shows that the car is driven.
+DRIVEN = {"yaw_rate_rad_s": 0.06, "ay_m_s2": 1.0, "ax_m_s2": 1.0}
+#: Share of the offset between two sides that changes in a drive.
+DISTURBED = 0.6
+_STEERING = ("steer_rad", "steering_wheel_rad")
 #: Above this, sideslip times lateral acceleration is not small compared to the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
 #: Least share of v_x in the speed if the heading is right.
@@ -62,41 +57,24 @@ SHOWN_STD = 8.0
 REVERSE_M_S = 10.0
 #: In a bend, wheels differ by less; a wheel that differs by more spins or locks.
 SPIN_SHARE = 0.2
-#: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
-WHEEL_RANGE = (0.88, 1.14)
-WHEEL_PER_RADIAN_RANGE = (1.25, 25.0)
-#: Effective wheelbase L (1 + K v²), m, from road-wheel and from steering-wheel angles: from a model car to a truck, and
-#: for speeds that only full-size vehicles reach.
-ROAD_WHEEL_LENGTH_M, FULL_SIZE_LENGTH_M = (0.15, 12.0), (1.2, 12.0)
-STEERING_WHEEL_LENGTH_M, FULL_SIZE_STEERING_WHEEL_LENGTH_M = (12.0, 240.0), (22.0, 240.0)
-FULL_SIZE_M_S = (12.0, 70.0)
-#: The same divided by L + K v² of the vehicle file, and sideslip by that of its rear axle; the range includes a wrong
-#: ratio in the file, and sliding front tyres, which lengthen it several times. A wrong speed must not lengthen it: the
-#: lowest of speed, ground truth and a_y / r counts, up to ``FAST_M_S``.
-KNOWN_LENGTH, KNOWN_SIDESLIP, FAST_M_S = (0.4, 6.0), (0.4, 2.5), 40.0
-#: Track from a 1:10 car to a truck.
-TRACK_M = (0.12, 3.0)
+#: Speeds of full-size vehicles. A wrong speed must not lengthen the wheelbase by the vehicle file: the lowest of speed,
+#: ground truth and a_y / r counts, up to ``FAST_M_S``.
+FULL_SIZE_M_S, FAST_M_S = (12.0, 70.0), 40.0
 #: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature; above, the
 #: front tyres slip.
 STEERING_SHARE = 0.6
-
-#: Values that no road car, race car or model car exceeds for more than a second: model cars spin at 5 rad/s and corner
-#: at 15 m/s²; a body that keeps rolling at 4 rad/s overturns; a wheel of 5 cm radius turns with 600 rad/s at 30 m/s;
-#: trucks have five turns of the steering wheel.
-MOST = {
-    **dict.fromkeys(("ax_m_s2", "ay_m_s2", "truth.ay_m_s2"), 30.0),
-    **dict.fromkeys(("yaw_rate_rad_s", "truth.yaw_rate_rad_s"), 10.0),
-    **dict.fromkeys(("roll_rate_rad_s", "pitch_rate_rad_s"), 4.0),
-    "steer_rad": 1.3,
-    "steering_wheel_rad": 20.0,
-    **dict.fromkeys(("speed_m_s", "truth.vx_m_s"), 120.0),
-    **{f"wheel_speed_{w}_m_s": 150.0 for w in WHEELS},
-    **{f"wheel_speed_{w}_rad_s": 700.0 for w in WHEELS},
-    "truth.vy_m_s": 40.0,
-    "truth.sideslip_rad": math.pi,
-}
 #: Least share of the low-passed values below the limit: shocks and spins are short; a wheel spins in the air.
 SHARE, WHEEL_SHARE = 0.95, 0.5
+
+
+@lru_cache(maxsize=CACHED_NAMES)
+def law(key: str, **signals: str) -> Law:
+    """Return an entry of the table for these signals; one without a name is left out."""
+    entry: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in TABLE[key].items()}
+    powers = {name.format(**signals): power for name, power in entry.pop("powers").items()}
+    powers.pop("", None)
+    late = tuple(name.format(**signals) for name in entry.pop("late", ()))
+    return Law(entry.pop("text").format(**signals), powers, late=late, **entry)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,21 +108,19 @@ def measured_relations(
     """
     relations = list(_limits(columns))
     of_path = {} if any(map(is_misscaled, position_factors(columns))) else columns
-    for prefix in ("", "truth."):
-        pace_name = f"{prefix}vx_m_s" if f"{prefix}vx_m_s" in columns else speed_name
+    for of in ("", "truth."):
+        pace_name = f"{of}vx_m_s" if f"{of}vx_m_s" in columns else speed_name
         if pace_name is not None:
-            relations += _motion(columns, prefix, pace_name)
+            relations += _motion(columns, of, pace_name)
     if speed_name is not None:
         pace = _Pace.of(columns, speed_name)
         relations += [*_steering(pace, vehicle), *_speeds(pace), *_wheel_differences(pace), *_courses(of_path, pace)]
     relations += _poses(of_path)
-    rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S, BIAS_RAD_S)
-    lateral = ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2, BIAS_M_S2)
-    for other, name, expected, moves, bias in (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), lateral):
-        if name in columns and other in columns:
-            text, everywhere = f"{other} against {name}", np.ones(columns[name].shape[0], np.bool_)
-            sides = columns[name], columns[other]
-            relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves, bias=bias)
+    twice = (("rate", "truth.yaw_rate_rad_s"), ("rate", TURNING), ("acceleration", "truth.ay_m_s2"))
+    for key, other in twice:
+        name = "yaw_rate_rad_s" if key == "rate" else "ay_m_s2"
+        if {name, other} <= columns.keys():
+            relations += compare(law(key, other=other, name=name), columns[name], columns[other])
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
     agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
     axle = _axle_sideslips(columns, vehicle, speed_name, agree)
@@ -155,49 +131,42 @@ def measured_relations(
 
 
 def compare(
-    text: str,
-    powers: dict[str, int],
-    reference: FloatArray,
+    law: Law,
+    predicted: FloatArray,
     measured: FloatArray,
-    use: BoolArray,
-    expected: tuple[float, float],
-    *,
-    moves: float | None = None,
-    either: bool = True,
+    use: BoolArray | None = None,
     gentle: BoolArray | None = None,
-    bias: float = math.inf,
-) -> list[Relation]:  # positional: the two sides of a relation and their expected gain
+) -> list[Relation]:
     """Return the relation between two columns where ``use`` and both are finite; an empty list without driving.
 
-    ``moves``: both sides have one unit, and a side that moves by more than this, 1-sigma, must move the other; with
-    ``either`` False only the reference must move the measured side. ``gentle``: samples of gentle driving. The relation
-    of these is returned if only it is plausible: a wrong sign, unit or axis is wrong everywhere, sliding is not.
-    ``bias``: 1-sigma of the offset between the sides. The means count as far as they exceed it: on a circle the mean is
-    the signal. Sides that move by less count as fewer samples: the crossfall of a straight road moves them, too.
+    ``gentle``: samples of gentle driving. The relation of these is returned if only it is plausible: a wrong sign, unit
+    or axis is wrong everywhere, sliding is not. The means of the sides count as far as they exceed the ``bias`` of the
+    law: on a circle the mean is the signal. Sides that move by less count as fewer samples: the crossfall of a straight
+    road moves them, too.
     """
     if gentle is not None:
-        relations = compare(text, powers, reference, measured, use, expected, moves=moves, bias=bias)
-        at_ease = compare(text, powers, reference, measured, gentle, expected, moves=moves, bias=bias)
+        relations, at_ease = (compare(law, predicted, measured, where) for where in (use, gentle))
         is_right = all(r.accepts() and not r.unrelated for r in relations)
         return at_ease if not is_right and at_ease and all(r.tells and r.accepts() for r in at_ease) else relations
-    use = use & np.isfinite(reference) & np.isfinite(measured)
+    sides, finite = (predicted, measured), np.isfinite(predicted) & np.isfinite(measured)
+    use = finite if use is None else use & finite
     samples = independent_samples(int(np.count_nonzero(use)))
     if samples < MIN_SAMPLES:
         return []
-    a, b = reference[use] - reference[use].mean(), measured[use] - measured[use].mean()
+    a, b = predicted[use] - predicted[use].mean(), measured[use] - measured[use].mean()
     spread_a, spread_b = float(a.std()), float(b.std())
     if max(spread_a, spread_b) <= 1e-12:
         return []
-    both = moves is not None and (max(spread_a, spread_b) if either else spread_a) > moves
+    both = (max(spread_a, spread_b) if law.either else spread_a) > law.moves
     if min(spread_a, spread_b) <= 1e-12:
-        return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
-    if math.isfinite(bias):  # below the disturbances, both sides follow the road
-        samples *= min(1.0, max(spread_a, spread_b) / (DISTURBED * bias)) ** 2
+        return [Relation(law, 0.0, float("nan"), samples, both)]
+    if math.isfinite(law.bias):  # below the disturbances, both sides follow the road
+        samples *= min(1.0, max(spread_a, spread_b) / (DISTURBED * law.bias)) ** 2
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
     left = max(0.0, 1.0 - correlation**2) * spread_b**2
     # Weight of the means in a regression with a normal prior of the offset.
-    weight = left / (left + samples * bias**2)
-    of_means = [math.sqrt(weight) * float(side[use].mean()) for side in (reference, measured)]
+    weight = left / (left + samples * law.bias**2)
+    of_means = [math.sqrt(weight) * float(side[use].mean()) for side in sides]
     rms_a, rms_b = math.hypot(spread_a, of_means[0]), math.hypot(spread_b, of_means[1])
     correlation = (correlation * spread_a * spread_b + of_means[0] * of_means[1]) / (rms_a * rms_b)
     # The ratio of the sizes lies between the two regressions, because either side may be noisy.
@@ -205,42 +174,35 @@ def compare(
     # The gain of a block with fewer samples is random, and a block on a circle has none.
     by_means = abs(of_means[0]) > spread_a
     blocks = () if by_means else block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
-    return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
+    return [Relation(law, correlation, gain, samples, both, blocks, sides)]
 
 
 def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
     """Yield a relation for each signal with values that no vehicle reaches; it needs no second signal."""
-    for name, most in MOST.items():
-        column = columns.get(name, np.empty(0))
-        finite = np.abs(column[np.isfinite(column)])
+    for name in (n for n in columns if kind_of(n) in MOST):
+        most, finite = MOST[kind_of(name)], np.abs(columns[name][np.isfinite(columns[name])])
         share = WHEEL_SHARE if name.startswith("wheel") else SHARE
         if finite.size and (large := float(np.quantile(finite, share))) > most:
-            text = f"{1.0 - share:.0%} of {name} are above {large:.3g}, vehicles reach {most:.3g}"
-            samples = independent_samples(finite.size)
-            ratio = large / most  # no sliding explains it
-            yield Relation(text, {name: 1}, 1.0, ratio, (0.0, 1.0), samples, signless=True, most_energy=2 * MOST_ENERGY)
+            reached = law("limit", name=name, share=f"{1.0 - share:.0%}", large=f"{large:.3g}", most=f"{most:.3g}")
+            yield Relation(reached, 1.0, large / most, independent_samples(finite.size))
 
 
-def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str) -> Iterator[Relation]:
+def _motion(columns: Mapping[str, FloatArray], of: str, pace_name: str) -> Iterator[Relation]:
     """Relate the accelerations to speed and yaw rate, of the sensors or of ground truth."""
     pace = columns[pace_name]
     moving = _moving(columns, pace)
-    yaw, left, forward = (columns.get(f"{prefix}{n}") for n in ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"))
+    yaw, left, forward = (columns.get(f"{of}{n}") for n in ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"))
     turns = None if yaw is None else yaw * pace
     if turns is not None and left is not None:
-        powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
-        text, gentle = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed", gentle_at(turns, moving)
-        moves = MOVES_M_S2
-        yield from compare(text, powers, turns, left, moving, GAIN_RANGE, moves=moves, gentle=gentle, bias=BIAS_M_S2)
+        yield from compare(law("lateral", of=of, pace=pace_name), turns, left, moving, gentle_at(turns, moving))
     if forward is not None:
-        powers = {f"{prefix}ax_m_s2": 1, pace_name: -1}
-        text = f"{prefix}ax_m_s2 against the derivative of the speed"
+        along = law("longitudinal", of=of, pace=pace_name)
         straight = moving if turns is None else moving & (np.abs(turns) < STRAIGHT_M_S2)
         if turns is not None and not moving_at(pace).any():  # unknown unit
             straight = gentle_at(turns, moving)
-        # Pitch changes a_x at constant speed, and noise changes the derivative of a GNSS speed.
-        least = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
-        yield from compare(text, powers, derivative(pace), forward, straight, GAIN_RANGE, moves=least, either=False)
+        # Noise changes the derivative of a GNSS speed.
+        along = replace(along, moves=math.inf) if pace_name == "truth.vx_m_s" else along
+        yield from compare(along, derivative(pace), forward, straight)
 
 
 def _best(either: list[Relation]) -> list[Relation]:
@@ -262,29 +224,30 @@ def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
     moving = moving_at(speed)
     if moving.any():
         return moving
-    moves = {"yaw_rate_rad_s": MOVES_RAD_S, "ay_m_s2": MOVES_M_S2, "ax_m_s2": MOVES_M_S2}
-    finite = [(columns[n][np.isfinite(columns[n])], least) for n, least in moves.items() if n in columns]
+    finite = [(columns[n][np.isfinite(columns[n])], least) for n, least in DRIVEN.items() if n in columns]
     others = (c for n, c in columns.items() if n.startswith("wheel_speed_") or n in ("speed_m_s", "truth.vx_m_s"))
     is_driven = any(c.size and c.std() > least for c, least in finite) or any(moving_at(c).any() for c in others)
     return moving_at(speed, 0.0) if is_driven else moving
 
 
-def _lengths(pace: _Pace, vehicle: VehicleParameters | None) -> tuple[tuple[float, float], tuple[float, float]]:
+def _lengths(pace: _Pace, vehicle: VehicleParameters | None) -> dict[str, tuple[float, float]]:
     """Return the plausible effective wheelbases by road-wheel and by steering-wheel angle, m."""
     columns, speed = pace.columns, pace.speed
     if vehicle is None:
         finite = np.abs(speed[np.isfinite(speed)])
         is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, 0.9) < FULL_SIZE_M_S[1]
-        full_size = FULL_SIZE_LENGTH_M, FULL_SIZE_STEERING_WHEEL_LENGTH_M
-        return full_size if is_full_size else (ROAD_WHEEL_LENGTH_M, STEERING_WHEEL_LENGTH_M)
+        lengths = LENGTHS["full_size"] if is_full_size else LENGTHS
+        return {name: tuple(lengths[name]) for name in _STEERING}
     paces = [median_known(np.abs(c)) for c in (speed, columns.get("truth.vx_m_s")) if c is not None]
     if "ay_m_s2" in columns:
         ay, rate = (columns[n] for n in ("ay_m_s2", "yaw_rate_rad_s"))
         finite = np.isfinite(ay) & np.isfinite(rate)
         paces.append(float(ay[finite].std() / max(rate[finite].std(), 1e-9)) if finite.any() else FAST_M_S)
     gradient = max(0.0, vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction))
-    low, high = (f * (vehicle.wheelbase_m + gradient * min(*paces, FAST_M_S) ** 2) for f in KNOWN_LENGTH)
-    return (low, high), (low * vehicle.steering_ratio, high * vehicle.steering_ratio)
+    low, high = (f * (vehicle.wheelbase_m + gradient * min(*paces, FAST_M_S) ** 2) for f in LENGTHS["file"])
+    return {
+        name: (low * ratio, high * ratio) for name, ratio in zip(_STEERING, (1.0, vehicle.steering_ratio), strict=True)
+    }
 
 
 def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relation]:
@@ -293,31 +256,30 @@ def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relati
     if yaw is None:
         return
     driven = yaw[gentle & np.isfinite(yaw)]
-    is_turning = driven.size > 0 and bool(driven.std() > max(MOVES_RAD_S, abs(driven.mean())))  # to both sides
-    for name, lengths in zip(("steer_rad", "steering_wheel_rad"), _lengths(pace, vehicle), strict=True):
+    is_turning = driven.size > 0 and bool(
+        driven.std() > max(DRIVEN["yaw_rate_rad_s"], abs(driven.mean()))
+    )  # both sides
+    curvature = np.where(pace.moving, yaw / speed, np.nan)
+    for name, lengths in _lengths(pace, vehicle).items():
         steer, typical = columns.get(name), float(np.sqrt(lengths[0] * lengths[1]))
         if steer is None:
             continue
-        powers, text = {name: 1, "yaw_rate_rad_s": -1, pace.name: 1}, f"{name} against yaw_rate_rad_s / speed"
-        either = [r for use in (pace.moving, gentle) for r in compare(text, powers, yaw / speed, steer, use, lengths)]
-        either = [replace(r, typical=typical, moves=r.correlation == 0.0 and is_turning) for r in either]  # dead sensor
+        by_rate, by_ay = (law(key, steer=name, pace=pace.name) for key in ("steering", "steering_lateral"))
+        by_rate = replace(by_rate, gains=lengths, typical=typical)
+        either = [r for use in (pace.moving, gentle) for r in compare(by_rate, curvature, steer, use)]
         # Sliding front tyres break the relation at large angles, and noise breaks it at small ones.
-        yield from _best(either)
+        yield from _best([replace(r, moves=r.correlation == 0.0 and is_turning) for r in either])  # dead sensor
         if "ay_m_s2" in columns:
-            powers, text = {"ay_m_s2": 1, name: -1, pace.name: -2}, f"ay_m_s2 against {name} x speed^2"
-            inverse = (1.0 / lengths[1], 1.0 / lengths[0])
-            lateral = compare(text, powers, steer * speed**2, columns["ay_m_s2"], gentle, inverse)
-            yield from (replace(r, typical=1.0 / typical) for r in lateral)
+            by_ay = replace(by_ay, gains=(1.0 / lengths[1], 1.0 / lengths[0]), typical=1.0 / typical)
+            yield from compare(by_ay, steer * speed**2, columns["ay_m_s2"], gentle)
 
 
 def _speeds(pace: _Pace) -> Iterator[Relation]:
     """Relate wheel speeds and ground-truth speeds to the speed: their ratio needs no manoeuvre."""
-    wanted = {f"wheel_speed_{w}_m_s": WHEEL_RANGE for w in WHEELS}
-    wanted |= {f"wheel_speed_{w}_rad_s": WHEEL_PER_RADIAN_RANGE for w in WHEELS}
-    of_paths = ("truth.position_speed_m_s", GNSS_PATH[1])
-    wanted |= dict.fromkeys(("truth.vx_m_s", *of_paths), SAME_RANGE)
+    keys = {f"wheel_speed_{w}_{unit}": f"wheel_{unit}" for unit in ("m_s", "rad_s") for w in WHEELS}
+    keys |= {"truth.vx_m_s": "speed", "truth.position_speed_m_s": "path_speed", GNSS_PATH[1]: "path_speed"}
     speed = pace.speed
-    for name in (n for n in wanted if n in pace.columns and n != pace.name):
+    for name in (n for n in keys if n in pace.columns and n != pace.name):
         column = pace.columns[name]
         if name.startswith("wheel"):
             column = np.where(np.isfinite(_scaled_to(column, pace)), column, np.nan)
@@ -328,17 +290,15 @@ def _speeds(pace: _Pace) -> Iterator[Relation]:
         if use is None:
             continue
         ratios = column[use] / speed[use]
-        powers = {pace.name: -1} | ({} if name == GNSS_PATH[1] else {name: 1})
+        over = law(keys[name], name=name, pace=pace.name, mapped="" if name == GNSS_PATH[1] else name)
         blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
-        gain, signless, text = float(np.median(ratios)), name in of_paths, f"{name} over {pace.name}"
-        yield Relation(text, powers, 1.0, gain, wanted[name], samples, signless=signless, blocks=blocks)
+        yield Relation(over, 1.0, float(np.median(ratios)), samples, blocks=blocks)
     of_wheels = (
         any(n.startswith("wheel") and n.endswith("_rad_s") for n in pace.columns) and pace.name == "wheel_speeds"
     )
     fast = speed[np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)]
     if (samples := independent_samples(fast.size)) >= 2.0 * MIN_SAMPLES:
-        text, ahead = f"{pace.name} at speeds too high for reversing", float(np.sign(np.median(fast)))
-        yield Relation(text, {pace.name: 1}, 1.0, ahead, (0.0, np.inf), samples)
+        yield Relation(law("ahead", pace=pace.name), 1.0, float(np.sign(np.median(fast))), samples)
 
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
@@ -370,13 +330,13 @@ def _axle_differences(pace: _Pace) -> list[tuple[str, FloatArray]]:
 def _wheel_differences(pace: _Pace) -> Iterator[Relation]:
     """Relate yaw rate and a_y to the speed differences of the axles, which have no mounting error."""
     pairs = _axle_differences(pace)
-    for name, power in (("yaw_rate_rad_s", 1), ("ay_m_s2", 2)):
-        powers, factor, either = {name: -1, pace.name: power}, pace.speed ** (power - 1), list[Relation]()
-        for text, difference in pairs if name in pace.columns else ():
-            sides = pace.columns[name], factor * difference
-            said = f"{text} against {name}"
-            either += compare(said, powers, *sides, pace.moving, TRACK_M, gentle=pace.gentle)
-        yield from _best(either)
+    for name, factor in (("yaw_rate_rad_s", 1.0), ("ay_m_s2", pace.speed)):
+        laws = [law(f"axle_{name}", axle=text, pace=pace.name) for text, _ in pairs if name in pace.columns]
+        sides = [(pace.columns[name], factor * difference) for _, difference in pairs if name in pace.columns]
+        both = zip(laws, sides, strict=True)
+        related = [r for a, b in both for r in compare(a, *b, pace.moving, pace.gentle)]
+        # The rear axle shows a delay: the front wheels also move with the steering.
+        yield from (replace(r, sides=related[0].sides) for r in _best(related))
 
 
 def _scaled_to(wheel: FloatArray, pace: _Pace) -> FloatArray:
@@ -391,27 +351,19 @@ def _scaled_to(wheel: FloatArray, pace: _Pace) -> FloatArray:
 
 def _courses(columns: Mapping[str, FloatArray], pace: _Pace) -> Iterator[Relation]:
     """Relate the yaw rates to the course rates of the ground truth, and of a GNSS receiver's velocity and positions."""
-    # Positions of a receiver are too noisy to show that something does not turn.
-    paths: tuple[tuple[str, dict[str, int], float | None], ...] = (
-        (COURSE_RATE, {COURSE_RATE: -1}, MOVES_RAD_S),
-        (GNSS_COURSE_RATE, {}, MOVES_RAD_S),
-        (GNSS_PATH[0], {"gnss_longitude_deg": -1}, None),
-    )
-    for path, signs, moves in (p for p in paths if p[0] in columns):
-        turnings = [columns[path]]
-        if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin, the sideslip changes as well
+    for path, key in ((COURSE_RATE, "course"), (GNSS_COURSE_RATE, "course"), (GNSS_PATH[0], "gnss_path")):
+        turnings = [columns[path]] if path in columns else []
+        if (
+            turnings and "truth.vx_m_s" in columns and "truth.vy_m_s" in columns
+        ):  # in a spin, the sideslip changes as well
             turnings.append(columns[path] - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
+        line, mapped = ("course", "") if path == GNSS_COURSE_RATE else ("path", COURSE_RATE)
         for name in (n for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns):
-            text = f"{name} against the turning of the {'course' if path == GNSS_COURSE_RATE else 'path'} over ground"
-            yaw, powers, either = columns[name], {name: 1, **signs}, list[Relation]()
-            limits: dict[str, Any] = {
-                "moves": moves,
-                "gentle": gentle_at(yaw * pace.speed, pace.moving),
-                "bias": BIAS_RAD_S,
-            }
-            for turning in turnings:
-                either += compare(text, powers, turning, yaw, pace.moving, GAIN_RANGE, **limits)
-            yield from _best(either)
+            its, gentle = (
+                law(key, name=name, line=line, mapped=mapped),
+                gentle_at(columns[name] * pace.speed, pace.moving),
+            )
+            yield from _best([r for t in turnings for r in compare(its, t, columns[name], pace.moving, gentle)])
 
 
 def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
@@ -448,15 +400,15 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     if median_known(ahead / speed) < AHEAD_SHARE:
         return []  # the heading is not the car's
     yaws = [columns[n] for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
-    signs = [np.sign(r.gain) for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
+    anything = Law("", {}, (0.0, math.inf))
+    signs = [np.sign(r.gain) for yaw in yaws for r in compare(anything, turning, yaw, moving) if r.tells]
     is_vy = subject == "truth.vy_m_s"
-    powers = {subject: 1} | ({"truth.position_speed_m_s": -1} if is_vy else {})
-    expected = min(signs, default=1.0) * (left if is_vy else left / speed)
-    sides = (f"{subject} against ground-truth positions and heading", powers, expected, columns[subject])
+    its = law("pose", subject=subject, scaled="truth.position_speed_m_s" if is_vy else "")
+    its = replace(its, signless=len(signs) < 2 or len(set(signs)) > 1)
+    sides = (min(signs, default=1.0) * (left if is_vy else left / speed), columns[subject])
     # Velocity and position may refer to different points of the car; yaw adds a velocity between them.
-    apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
-    best = _best([*compare(*sides, moving, SAME_RANGE), *apart])
-    return [replace(r, signless=len(signs) < 2 or len(set(signs)) > 1) for r in best]
+    apart = _partial(its, *sides, [turning, np.ones_like(turning)], moving)
+    return _best([*compare(its, *sides, moving), *apart])
 
 
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
@@ -482,18 +434,15 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     ay, vx, vy, rate = (columns[n] for n in names)
     subject = "truth.sideslip_rad" if "truth.sideslip_rad" in columns else "truth.vy_m_s"
     moving, ones = _moving(columns, vx), np.ones_like(ay)
-    text = f"ay_m_s2 - v_x r against the derivative of {subject}"
     of_vx = subject != "truth.sideslip_rad"  # sideslip from v_y and v_x, otherwise v_y from sideslip and v_x
-    powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
-    relations = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving, SIDESLIP_RANGE)
+    by_rate = law("sideslip_rate", subject=subject, scaled="" if of_vx else "truth.vx_m_s")
+    relations = _partial(by_rate, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
     if is_known:
         return relations
     curvature, ratio = rate / vx, vy / vx  # linear in a wrong v_y, unlike the angle
-    sideslip = columns.get("truth.sideslip_rad", ratio)
-    text = f"{subject} against -ay_m_s2, apart from curvature"
-    gentle = gentle_at(vx * rate, moving)
-    powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
-    return relations + _partial(text, powers, -ay, sideslip, [curvature, ones], gentle, COMPLIANCE_RAD_PER_M_S2)
+    by_ay = law("compliance", subject=subject, scaled="truth.vx_m_s" if of_vx else "")
+    sides = (-ay, columns.get("truth.sideslip_rad", ratio))
+    return relations + _partial(by_ay, *sides, [curvature, ones], gentle_at(vx * rate, moving))
 
 
 def _axle_sideslips(
@@ -511,7 +460,7 @@ def _axle_sideslips(
     lever = vehicle.cg_to_rear_axle_m + (0.0 if is_moved else vehicle.truth_position_m[0])
     stiffness = vehicle.cornering_stiffness_n_per_rad(False, vehicle.assumed_friction)
     compliance = vehicle.mass_kg * vehicle.cg_to_front_axle_m / (vehicle.wheelbase_m * stiffness)
-    speed, text = columns[speed_name], f"{subject} against the rear axle of the vehicle file"
+    speed, its = columns[speed_name], law("axle", subject=subject)
     slip, gentle = compliance * ay * speed, gentle_at(speed * rate, _moving(columns, speed))
     expected, used = lever * rate - slip, gentle & np.isfinite(slip) & np.isfinite(rate)
     # Where the two terms cancel, the file's compliance, known to a quarter, decides the sign.
@@ -519,33 +468,28 @@ def _axle_sideslips(
         return []
     if subject == "truth.sideslip_rad":
         expected /= speed
-    low, high = KNOWN_SIDESLIP
     # Files without a position of ground truth imply the CG, but it may be at any axle.
-    high *= max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
-    return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, (low, high))
+    high = its.gains[1] * max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
+    return compare(replace(its, gains=(its.gains[0], high)), expected, sideslip, gentle)
 
 
 def _partial(
-    text: str,
-    powers: dict[str, int],
-    reference: FloatArray,
-    measured: FloatArray,
-    others: list[FloatArray],
-    use: BoolArray,
-    expected: tuple[float, float],
-) -> list[Relation]:  # positional: the two sides of a relation and their expected gain
+    law: Law, predicted: FloatArray, measured: FloatArray, others: list[FloatArray], use: BoolArray
+) -> list[Relation]:
     """Return the relation between the residuals of two columns after regression on others; none with few samples."""
-    finite = use & np.isfinite(np.stack([reference, measured, *others])).all(axis=0)
+    finite = use & np.isfinite(np.stack([predicted, measured, *others])).all(axis=0)
     if independent_samples(int(np.count_nonzero(finite))) < 2.0 * MIN_SAMPLES:
         return []
     aside = np.stack(others, axis=1)[finite]
     left = []
-    for column in (reference, measured):
+    for column in (predicted, measured):
         out = np.full(column.shape[0], np.nan)
         out[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
         left.append(out)
-    relations = compare(text, powers, left[0], left[1], finite, expected)
+    relations = compare(law, left[0], left[1], finite)
     # Agreement of most blocks on the sign is not random.
     is_steady = [len(r.blocks) > BLOCKS // 2 and len(set(np.sign(r.blocks))) == 1 for r in relations]
-    least = [MIN_CORRELATION if steady else MIN_PARTIAL_CORRELATION for steady in is_steady]
-    return [replace(r, least_correlation=n) for r, n in zip(relations, least, strict=True)]
+    return [
+        r if steady else replace(r, law=replace(law, least_correlation=MIN_PARTIAL_CORRELATION))
+        for r, steady in zip(relations, is_steady, strict=True)
+    ]

@@ -111,7 +111,7 @@ class Survey:
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
         """Sensors with late time stamps, from the signals alone."""
-        return late_sensors(self.channels.signals)
+        return late_sensors(self.measured.without_truth())
 
     def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
         """Yield the mapping's undecided checks that the drive does not decide either."""

@@ -18,7 +18,7 @@ from pdhef_logtool.drive.checks import check_drive, sideslip_offset
 from pdhef_logtool.drive.delays import LatencyEstimate, booked_on_the_late, truth_latency
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.relation_checks import relation_checks
-from pdhef_logtool.drive.relations import BIAS_RAD_S, GAIN_RANGE, compare
+from pdhef_logtool.drive.relations import compare, law
 from pdhef_logtool.drive.truth import TruthTrack, derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks, load_mapping, read_signals
@@ -372,11 +372,11 @@ def test_signs_that_nothing_decides_are_undecided(sign: float) -> None:
 
 
 def test_on_a_circle_the_mean_is_the_signal() -> None:
-    rng, everywhere = np.random.default_rng(0), np.ones(1200, np.bool_)
+    rng, course = np.random.default_rng(0), law("gnss_path", name="")
     turning = 0.3 + 0.001 * np.cumsum(rng.standard_normal(1200)) / 3.0
     mirrored = -turning + 0.02 * rng.standard_normal(1200)
-    for bias, is_shown in ((np.inf, False), (BIAS_RAD_S, True)):
-        (relation,) = compare("", {}, turning, mirrored, everywhere, GAIN_RANGE, bias=bias)
+    for its, is_shown in ((replace(course, bias=np.inf), False), (course, True)):
+        (relation,) = compare(its, turning, mirrored)
         assert bool(relation.correlation < -0.9) is is_shown
         assert bool(abs(relation.gain + 1.0) < 0.1) is is_shown
 

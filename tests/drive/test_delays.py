@@ -20,6 +20,7 @@ from pdhef_logtool.drive.correlation import (
 )
 from pdhef_logtool.drive.delays import LatencyEstimate, late_sensors
 from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.survey import mapping_proposals, survey_log
 from pdhef_logtool.logs.open_log import open_log
@@ -43,12 +44,12 @@ def delayed(found: MappedChannels, names: tuple[str, ...], delay_s: float) -> di
 
 @pytest.mark.parametrize("name", ["dlc", "sweep", "fishhook", "step"])
 def test_sound_sensors_are_not_late(sample_logs_dir: Path, name: str) -> None:
-    assert late_sensors(survey(sample_logs_dir / f"{name}.mcap").signals) == ()
+    assert late_sensors(measure(survey(sample_logs_dir / f"{name}.mcap").signals)) == ()
 
 
 @pytest.mark.parametrize("names", [("yaw_rate_rad_s",), WHEEL_NAMES])
 def test_gyro_and_wheels_are_told_apart_and_known_to_20_ms(dlc: MappedChannels, names: tuple[str, ...]) -> None:
-    (late,) = late_sensors(delayed(dlc, names, 0.12))
+    (late,) = late_sensors(measure(delayed(dlc, names, 0.12)))
     assert set(late.names) == set(names)
     assert late.exact
     assert late.delay_s == pytest.approx(0.12, abs=0.02)
@@ -59,7 +60,7 @@ def test_gyro_and_wheels_are_told_apart_and_known_to_20_ms(dlc: MappedChannels, 
 def test_what_the_car_stands_between_is_late_by_at_least_so_much(
     dlc: MappedChannels, name: str, delay_s: float
 ) -> None:
-    (late,) = late_sensors(delayed(dlc, (name,), delay_s))
+    (late,) = late_sensors(measure(delayed(dlc, (name,), delay_s)))
     assert late.names == (name,)
     assert not late.exact
     assert 0.0 < late.delay_s < delay_s

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.hypotheses import Relation, known_hypotheses, posterior
+from pdhef_logtool.drive.hypotheses import Law, Relation, known_hypotheses, posterior
 from pdhef_logtool.drive.plan import plan_drive
 from pdhef_logtool.drive.survey import scaled_source
 from pdhef_logtool.logs.open_log import open_log
@@ -25,7 +25,7 @@ TURN = {"ay_m_s2": 1, "yaw_rate_rad_s": -1, "speed_m_s": -1}
 
 def relation(*gains: float, powers: dict[str, int] = TURN, text: str = "a_y") -> Relation:
     size = math.exp(float(np.mean(np.log(np.abs(gains)))))
-    return Relation(text, powers, 0.99, math.copysign(size, gains[0]), (0.55, 1.8), 200.0, blocks=gains)
+    return Relation(Law(text, powers, (0.55, 1.8)), 0.99, math.copysign(size, gains[0]), 200.0, blocks=gains)
 
 
 def probabilities(*relations: Relation) -> dict[str, float]:

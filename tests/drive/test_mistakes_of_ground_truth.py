@@ -98,8 +98,8 @@ def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back() -> None
     """A file without the place of ground truth means the CG; the lever of its front axle is no other unit."""
     back = VEHICLE.model_copy(update={"cg_to_rear_axle_m": 0.8, "cg_to_front_axle_m": 1.8})
     signals, truth = with_truth(back, 1.0)
-    (axle,) = (r for r in measure(signals, truth, derive_truth(truth), back).relations if r.text == TEXT)
-    assert axle.expected[1] > (0.8 + 1.8) / 0.8
+    (axle,) = (r for r in measure(signals, truth, derive_truth(truth), back).relations if r.law.text == TEXT)
+    assert axle.law.gains[1] > (0.8 + 1.8) / 0.8
 
 
 def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
