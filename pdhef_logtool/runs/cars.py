@@ -78,8 +78,8 @@ class RunCars:
         raw = read_toml(config.cars, "a TOML table of cars", UsageError)
         table = validated(CarTable, raw, str(config.cars), UsageError, expected="the entries of cars.toml")
         cars = cls(config, warn, table)
-        own = [path for path in filter(None, cars.paths) if str(path) not in SHIPPED_CARS]
-        if missing := [str(path) for path in own if not path.exists()]:
+        given = [path for path in filter(None, cars.paths) if str(path) not in SHIPPED_CARS]
+        if missing := [str(path) for path in given if not path.exists()]:
             raise UsageError(expected="cars that are there", got=f"no {', '.join(missing)}", where=str(config.cars))
         return cars
 
