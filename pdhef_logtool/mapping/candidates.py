@@ -115,6 +115,7 @@ class Field:
     sign_path : path of the field that contains its sign.
     is_weak : its values cannot identify the quantity, so that it is never taken.
     is_turned : its axis and sign are those of a usual mounting.
+    has_gravity : its device shows gravity, so that its axes are the device's.
     """
 
     topic: TopicInfo
@@ -135,6 +136,7 @@ class Field:
     offset: float = 0.0
     is_weak: bool = False
     is_turned: bool = False
+    has_gravity: bool = False
     sign_path: str = ""
 
     @property
@@ -221,8 +223,10 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         for info in (f for f in fields if f.path not in no_values):
             if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or _is_setpoint(topic, info):
                 continue
-            if info.path in documented.fields:
-                results.append((topic, role, info, documented.fields[info.path].meaning, True))
+            elements = [p for p in documented.fields if info.path.endswith("[]") and p.startswith(info.path[:-1])]
+            if elements or info.path in documented.fields:
+                its = ((p, documented.fields[p].meaning) for p in elements or [info.path])
+                results += [(topic, role, replace(info, path=path), meaning, True) for path, meaning in its]
             elif not documented.fields or info.path.count(".") or documented.has:
                 meaning = meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
@@ -279,7 +283,7 @@ def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tu
 
 def _units_without_name(info: FieldInfo) -> Units:
     """Return the possible units of a field by quantity, if its name contains no word with another meaning."""
-    words = set(words_of(info.path))
+    words = set(words_of(info.path)) - STATES  # a state vector holds quantities
     unit = plain_unit(info.unit)
     named = f"{info.path.rpartition('.')[2]}_{unit}"
     kinds = {"speed": "speed", "acceleration": "acceleration", "rate": "rate", "steering": "angle"}
@@ -365,8 +369,8 @@ def _weighable(
             item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
         if its.strength < LEAST_NAMED:
             item.doubts.append("its values alone identify it")
-        if _may_be_share(item):
-            item.is_weak = _has_pedals_beside(item, fields)
+        if _may_be_share(item) or (info.code == "i1" and not item.unit_known):
+            item.is_weak = info.code == "i1" or _has_pedals_beside(item, fields)
             item.doubts.append("it may be a share of the largest angle, which needs a scale")
         if item.is_downward and not documented:
             item.sign = -1.0

@@ -220,8 +220,9 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
         return None
     scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
     scopes.append((0.9, (*inner, *leaf_words), path))
-    # The topic's name describes its fields only if the leaf identifies no quantity.
-    if all(w in _BARE or not w.isalpha() for w in leaf_words):
+    # The topic's name describes its fields only if the leaf identifies no quantity, and if it names measurements.
+    is_value = not NOT_VALUES & _described(words_of(topic.rpartition("/")[2]))
+    if is_value and all(w in _BARE or not w.isalpha() for w in leaf_words):
         scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
         quantity = _quantity(words, leaf_words, column, strength, named)

@@ -32,7 +32,7 @@ from pdhef_logtool.mapping.navigation import (
 )
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
-from pdhef_logtool.mapping.weighing import Weighing, weigh
+from pdhef_logtool.mapping.weighing import FROM_COMMAND, LACKS, Weighing, weigh
 from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
@@ -41,8 +41,6 @@ _FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
 #: Path of the velocity by type, and first covariance entries; −1 there marks a quantity as not provided (REP 145).
 TWIST_FIELDS, TWIST_COVARIANCES = _FIELDS["twist"], _FIELDS["twist_covariance"]
 NO_SENSORS = tuple(VOCABULARY["topics"]["no_sensors"].split())
-#: Start of the note on a steering angle that is a command instead of a measurement.
-FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
@@ -282,12 +280,12 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     """Take candidates for signals without a well-known type."""
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
     # A measured steering angle has priority over a command, regardless of its type.
-    command = draft.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in draft.notes) else None
-    weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
+    command = draft.signals.pop("steer_rad", None) if any(n.endswith(LACKS) for n in draft.notes) else None
+    weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors, by_command=command is None)
     if command is not None and not {"steer_rad", "steering_wheel_rad"} & set(weighed.signals):
         draft.signals["steer_rad"] = command
     elif command is not None:
-        draft.notes = [n for n in draft.notes if not n.startswith(FROM_COMMAND)]
+        draft.notes = [n for n in draft.notes if not n.endswith(LACKS)]
         measured = next(s.label for n, s in weighed.signals.items() if n.startswith("steer"))
         draft.doubt("steering", (measured, command.label), measured, "a measured angle is preferred to a command")
     draft.signals.update(weighed.signals)
@@ -427,19 +425,21 @@ def _role(topic: TopicInfo) -> Role:
         return "command"
     if words & TRUTH_WORDS:
         return "truth"
-    if words & _TOPICS["estimate"]:
+    navigates = (words | _words(topic.type_name)) & NAVIGATION_WORDS
+    if words & _TOPICS["estimate"] and not navigates:
         return "estimate"
     if words & _TOPICS["device"]:
         return "device"
-    return "navigation" if (words | _words(topic.type_name)) & NAVIGATION_WORDS else "sensor"
+    return "navigation" if navigates else "sensor"
 
 
 def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Without a sensor, take the yaw rate from an odometry and the speed from navigation or a twist, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
-    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"] | _TOPICS["estimate"])]
+    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"])]
     if "yaw_rate_rad_s" not in draft.signals:
         odometries = [t for t in twists if not _is_truth(t) and _words(t.name) & _TOPICS["vehicle"]]
+        odometries = [t for t in odometries if not _words(t.name) & _TOPICS["estimate"]]
         odometries = [t for t in odometries if _span(draft.values(t.name, _twist(t, "angular", "z"))) > 0.0]
         chosen = draft.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
         if chosen is not None:
@@ -586,8 +586,7 @@ def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     if not measured:
-        lacks = "actuator lag and steering play are missing"
-        draft.notes.append(f"{FROM_COMMAND} {chosen.name}, not from a measured angle: {lacks}")
+        draft.notes.append(f"{FROM_COMMAND.format('steer_rad')} {chosen.name}, {LACKS}")
     draft.take(draft.signals, "steer_rad", chosen.name, _FIELDS["steering"][_type(chosen)])
 
 

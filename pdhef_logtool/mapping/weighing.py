@@ -20,6 +20,7 @@ from pdhef_logtool.mapping.candidates import (
     Field,
     Role,
     anchor_of,
+    leaf_group,
     look,
     named_fields,
     proposed_fields,
@@ -50,6 +51,11 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray
 _TRUTH = ("vx_m_s", "vy_m_s", "sideslip_rad", "yaw_rate_rad_s", "lat_deg", "lon_deg", "course_rad", "yaw_rad")
 _POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
 _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
+#: Note on a steering angle that is a command instead of a measurement.
+FROM_COMMAND = "{} comes from the command"
+LACKS = "not from a measured angle: actuator lag and steering play are missing"
+#: Words of a velocity in the body's axes by convention.
+_OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Words of a forward velocity; the struct may contain a lateral velocity, too.
 _ALONG = frozenset({"lng", "long", "longitudinal", "forward"})
 #: Signals of a single field: name, quantity and parts, in the order of their selection.
@@ -85,6 +91,8 @@ def weigh(
     signals: Mapping[str, SignalSource],
     truth: Mapping[str, SignalSource],
     vendors: Vendors,
+    *,
+    by_command: bool = False,
 ) -> Weighing:
     """Select fields for the missing signals, and for ground truth if there is none.
 
@@ -92,22 +100,27 @@ def weigh(
     ----------
     topics : topics that may contain candidates, with their kinds of data.
     signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
+    by_command : whether a steering command that the car follows replaces a missing angle.
     """
     named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
     if log.end_ns > log.start_ns and not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
         named += proposed_fields(log, topics, named)
     wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
     if not wanted:
-        return Weighing(Fields(Pieces(log), {}, [], []), "")
+        return Weighing(Fields(Pieces(log), {}, [], []))
     positions = [s for n, s in truth.items() if n in _POSITIONS]
     pieces, weighable = look(log, wanted, vendors, [*signals.values(), *positions])
     anchors = {n: f for n, s in signals.items() if (f := anchor_of(s, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
+    weighing = Weighing(fields)
+    weighing.drop_vectors_over_ground()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
-    weighing = Weighing(fields, truth_topic(may_be_true))
+    weighing.truth_from = truth_topic(may_be_true)
     weighing.choose_signals(set(signals))
+    if by_command and not {"steer_rad", "steering_wheel_rad"} & {*signals, *weighing.taken}:
+        weighing.steer_by_command()
     weighing.choose_truth()
     return weighing
 
@@ -143,7 +156,7 @@ class Weighing:
     """
 
     fields: Fields
-    truth_from: str
+    truth_from: str = ""
     taken: dict[str, Field] = field(default_factory=dict)
     true: dict[str, Field] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -154,7 +167,6 @@ class Weighing:
 
     def choose_signals(self, have: set[str]) -> None:
         """Take the best candidate of each signal that is missing."""
-        self._drop_vectors_over_ground()
         usable = self._usable()
         wheels = any(n.startswith("wheel_speed") for n in have)
         for name, quantity, part in _SENSORS:
@@ -178,17 +190,24 @@ class Weighing:
             item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
         return usable
 
-    def _drop_vectors_over_ground(self) -> None:
+    def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
             length, speeds = np.hypot(x.si, y.si), [f.si for f in self.fields.open("speed") if f is not x]
-            if axes in ("", "body") and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
+            is_named = bool(_OF_BODY & set(words_of(x.path)) or x.path.endswith("]"))
+            if axes in ("", "body")[not is_named :] and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
+                its = [f for f in self.fields.candidates if f.has_gravity and f.topic.name == y.topic.name]
+                if any(f.meaning.part == "z" == words_of(f.path)[-1] and f.sign < 0.0 for f in its):
+                    y.sign = -1.0
+                    y.doubts.append("its message has axes forward, right, down, as gravity shows")
                 continue
-            self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
+            beside = [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and not f.has_gravity]
+            beside = [f for f in beside if axes not in ("", "body") and f.is_axis and leaf_group(f) == leaf_group(x)]
+            self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y, *beside)]
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
-            if axes in ("east, north", "north, east") and x.role in ("sensor", "navigation"):
+            if axes in ("east, north", "north, east") and x.role in ("sensor", "navigation") and (is_named or steps):
                 for name, item in zip(axes.split(", "), (x, y), strict=True):
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
@@ -293,8 +312,9 @@ class Weighing:
 
     def _steering(self, candidates: Sequence[Field]) -> None:
         speed, *turning = (self._speed(), self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2"))
-        wheels = [f.si for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
-        # Wheel speeds are in their likeliest unit.
+        # Wheel speeds are in their likeliest unit, rotational ones of usual wheels.
+        spun = [f for n, f in self.taken.items() if n.startswith("wheel_speed")]
+        wheels = [f.si * (USUAL_RADIUS_M if f.meaning.quantity == "wheel rate" else 1.0) for f in spun]
         pace = speed.si if speed is not None else mean_of(wheels) if wheels else None
         curvature = self.fields.curvature(pace, *(None if f is None else f.si for f in turning))
         judged: list[tuple[float, str, Field]] = []
@@ -315,6 +335,19 @@ class Weighing:
         _, name, best = judged[0]
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
+
+    def steer_by_command(self) -> None:
+        """Take a steering command whose ratio to the path's curvature is that of an angle, with a note."""
+        commands = [f for f in self.fields.candidates if f.role == "command" and f.meaning.quantity == "steering"]
+        for item in commands:
+            item.bonus -= 0.3
+        self._steering([f for f in commands if f.seen.changes])
+        for name in [n for n, f in self.taken.items() if f in commands]:
+            if any("a share" in doubt for doubt in self.taken[name].doubts):
+                del self.taken[name]
+                continue
+            self.notes.append(f"{FROM_COMMAND.format(name)} {self.taken[name].topic.name}, {LACKS}")
+            self._tell(name, self.taken[name])
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal for a steering angle, and whether it follows the car's turning (None: unknown)."""
