@@ -51,7 +51,7 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 #: Words in field names of navigation systems.
 _NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
 #: Words for the axes of a car, for which only the sign is unknown.
-_CAR_AXES = frozenset({"lat", "lateral", "long", "longitudinal", "lng", "trans", "transverse", "transversal", "down"})
+_CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
 #: Controls; a steering signal in the same struct may be a control, too.
 _PEDALS = frozenset({"throttle", "brake", "gas"})
 #: Affix that distinguishes the name of a sign from the name of its magnitude.

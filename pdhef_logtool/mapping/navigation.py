@@ -249,7 +249,7 @@ class _Instrument:
     @cached_property
     def velocities(self) -> list[dict[str, str]]:
         """Velocities over ground that a car can have in the unit of their names, or else in m/s, by direction."""
-        reach = {p: seen.largest * (self.meanings[p].scale or 1.0) for p, seen in self.seen.items() if p in self.meanings}
+        reach = {p: self.seen[p].largest * (m.scale or 1.0) for p, m in self.meanings.items() if p in self.seen}
         return [v for v in self.named_velocities if not any(reach.get(p, 0.0) > MOST["speed"] for p in v.values())]
 
     @cached_property
@@ -401,13 +401,8 @@ def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
 def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
     """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
     relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
-    if (
-        relation is None
-        or abs(relation.correlation) <= CLEAR
-        or not SAME_STEPS[0] < abs(relation.slope) < SAME_STEPS[1]
-    ):
-        return 0.0
-    return math.copysign(1.0, relation.slope)
+    slope = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.slope
+    return math.copysign(float(SAME_STEPS[0] < abs(slope) < SAME_STEPS[1]), slope)
 
 
 def _is_place(seen: Seen | None, most: float, scale: float | tuple[float, ...]) -> bool:

@@ -47,22 +47,15 @@ from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
-#: Ground truth quantities of a single field, and quantities that give the path.
+#: Ground truth quantities of a single field.
 _TRUTH = ("vx_m_s", "vy_m_s", "sideslip_rad", "yaw_rate_rad_s", "lat_deg", "lon_deg", "course_rad", "yaw_rad")
-_POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
 _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
-#: Note on a steering angle that is a command instead of a measurement.
-FROM_COMMAND = "{} comes from the command"
-LACKS = "not from a measured angle: actuator lag and steering play are missing"
 #: Words of a velocity in the body's axes by convention.
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Words of a forward velocity; the struct may contain a lateral velocity, too.
 _ALONG = frozenset({"lng", "long", "longitudinal", "forward"})
-#: Signals of a single field: name, quantity and parts, in the order of their selection.
-_SENSORS = (
-    ("speed_m_s", "speed", ("", "x")), ("ax_m_s2", "acceleration", ("x",)), ("ay_m_s2", "acceleration", ("y",)),
-    ("yaw_rate_rad_s", "rate", ("z",)),
-)  # fmt: skip
+#: Signals of a single field, in the order of their selection.
+_SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
@@ -91,8 +84,6 @@ def weigh(
     signals: Mapping[str, SignalSource],
     truth: Mapping[str, SignalSource],
     vendors: Vendors,
-    *,
-    by_command: bool = False,
 ) -> Weighing:
     """Select fields for the missing signals, and for ground truth if there is none.
 
@@ -100,7 +91,6 @@ def weigh(
     ----------
     topics : topics that may contain candidates, with their kinds of data.
     signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
-    by_command : whether a steering command that the car follows replaces a missing angle.
     """
     named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
     if log.end_ns > log.start_ns and not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
@@ -108,7 +98,7 @@ def weigh(
     wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
     if not wanted:
         return Weighing(Fields(Pieces(log), {}, [], []))
-    positions = [s for n, s in truth.items() if n in _POSITIONS]
+    positions = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m")]
     pieces, weighable = look(log, wanted, vendors, [*signals.values(), *positions])
     anchors = {n: f for n, s in signals.items() if (f := anchor_of(s, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
@@ -119,8 +109,6 @@ def weigh(
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     weighing.choose_signals(set(signals))
-    if by_command and not {"steer_rad", "steering_wheel_rad"} & {*signals, *weighing.taken}:
-        weighing.steer_by_command()
     weighing.choose_truth()
     return weighing
 
@@ -169,21 +157,25 @@ class Weighing:
         """Take the best candidate of each signal that is missing."""
         usable = self._usable()
         wheels = any(n.startswith("wheel_speed") for n in have)
-        for name, quantity, part in _SENSORS:
-            if name not in have and not (wheels and quantity == "speed"):
-                self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
+        for name in _SENSORS:
+            if name not in have and not (wheels and name == "speed_m_s"):
+                self._take(name, [f for f in usable if name in names_of(f.meaning.quantity, f.meaning.part)])
         self._turn_about()
         self._turn_level()
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
+            self._steer_by_command()
         for name, item in self.taken.items():
             self._tell(name, item)
 
     def _usable(self) -> list[Field]:
         """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
+        given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
+        lacking = {"speed", "steering"} - given
+        usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
@@ -197,11 +189,12 @@ class Weighing:
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
             length, speeds = np.hypot(x.si, y.si), [f.si for f in self.fields.open("speed") if f is not x]
             is_named = bool(_OF_BODY & set(words_of(x.path)) or x.path.endswith("]"))
-            if axes in ("", "body")[not is_named :] and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
-                its = [f for f in self.fields.candidates if f.has_gravity and f.topic.name == y.topic.name]
+            is_length = any(agree(v, length) and not agree(v, x.si) for v in speeds)
+            if not is_length and (axes == "body" or (is_named and not axes)):
+                its = [f for f in self.fields.candidates if f.has_gravity and _driver(f) == _driver(y)]
                 if any(f.meaning.part == "z" == words_of(f.path)[-1] and f.sign < 0.0 for f in its):
                     y.sign = -1.0
-                    y.doubts.append("its message has axes forward, right, down, as gravity shows")
+                    y.doubts.append("its driver has axes forward, right, down, as gravity shows")
                 continue
             beside = [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and not f.has_gravity]
             beside = [f for f in beside if axes not in ("", "body") and f.is_axis and leaf_group(f) == leaf_group(x)]
@@ -336,18 +329,17 @@ class Weighing:
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
 
-    def steer_by_command(self) -> None:
-        """Take a steering command whose ratio to the path's curvature is that of an angle, with a note."""
+    def _steer_by_command(self) -> None:
+        """Without a measured angle, take a documented command, or one whose ratio to the curvature is an angle's."""
         commands = [f for f in self.fields.candidates if f.role == "command" and f.meaning.quantity == "steering"]
+        if measured := [n for n in self.taken if n.startswith("steer")]:
+            self._choose(measured[0], self.taken[measured[0]], [f for f in commands if f.fixed])
+            return
         for item in commands:
             item.bonus -= 0.3
-        self._steering([f for f in commands if f.seen.changes])
-        for name in [n for n, f in self.taken.items() if f in commands]:
-            if any("a share" in doubt for doubt in self.taken[name].doubts):
-                del self.taken[name]
-                continue
-            self.notes.append(f"{FROM_COMMAND.format(name)} {self.taken[name].topic.name}, {LACKS}")
-            self._tell(name, self.taken[name])
+        self._steering([f for f in commands if f.seen.changes or f.fixed])
+        for name in [n for n, f in self.taken.items() if f in commands and any("a share" in d for d in f.doubts)]:
+            del self.taken[name]
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal for a steering angle, and whether it follows the car's turning (None: unknown)."""
@@ -448,7 +440,11 @@ class Weighing:
 
     def _tell(self, name: str, item: Field) -> None:
         """Add an undecided check for the doubts about a field; note a speed from the navigation system."""
-        item.doubts = [d for d in item.doubts if d]
+        if item.role == "command":
+            lacks = "actuator lag and steering play are missing"
+            self.notes.append(f"{name} comes from the command {item.topic.name}, not from a measured angle: {lacks}")
+        if item.role == "estimate":
+            self.notes.append(f"{name} comes from the estimate {item.topic.name}.{item.path}, as no sensor gives it")
         if name == "speed_m_s" and item.role == "navigation":
             self.notes.append(
                 f"speed_m_s comes from the navigation system's {item.topic.name}.{item.path}: "
@@ -490,6 +486,11 @@ class Weighing:
 def _has_open_sign(item: Field) -> bool:
     """Return whether the sign of a field is unknown from documentation, name and mounting."""
     return not (item.fixed or item.is_downward) and (item.meaning.quantity == "steering" or not item.is_axis)
+
+
+def _driver(item: Field) -> str:
+    """Return the package of a field's type, without one the topic: what shares its axes."""
+    return item.topic.type_name.rpartition("/")[0] or item.topic.name
 
 
 def _share_axis(first: Field, second: Field) -> bool:
