@@ -563,10 +563,13 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         for name, path in zip(("ax_m_s2", "ay_m_s2"), _GRAVITY_PATHS, strict=False):
             if draft.is_given(imu.name, path):
                 draft.take(draft.signals, name, imu.name, path, G_M_S2 if in_g else 1.0)
+    _map_rates(draft, gyro, float(np.radians(1.0)) if in_deg else 1.0)
+
+
+def _map_rates(draft: _Draft, gyro: TopicInfo, scale: float) -> None:
     if draft.is_disowned(gyro.name, "angular_velocity_covariance[0]"):
         draft.notes.append(f"{gyro.name} provides no angular rate (covariance -1)")
     elif draft.is_given(gyro.name, "angular_velocity.z"):
-        scale = float(np.radians(1.0)) if in_deg else 1.0
         draft.take(draft.signals, "yaw_rate_rad_s", gyro.name, "angular_velocity.z", scale)
         for name, axis in (("roll_rate_rad_s", "x"), ("pitch_rate_rad_s", "y")):
             if _span(draft.values(gyro.name, f"angular_velocity.{axis}")) > 0.0:  # fillers are constant
@@ -575,7 +578,6 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     reports = [t for t in topics if _type(t) in _FIELDS["speed"] and not is_command(t.name)]
-    reports = [t for t in reports if has_path(draft.log.fields(t.name), _FIELDS["speed"][_type(t)])]
     twists = []
     for topic in topics:
         if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & _TOPICS["command"]:

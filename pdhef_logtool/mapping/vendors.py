@@ -131,6 +131,10 @@ class VendorType:
     has: frozenset[str] = frozenset()
     without: frozenset[str] = frozenset()
 
+    def entries(self, path: str) -> dict[str, VendorField]:
+        """Return the entry of a field, or of the elements of an array of unknown length, by path."""
+        return {p: e for p, e in self.fields.items() if p in (path, path.replace("[]", p[len(path) - 2 :]))}
+
 
 @dataclass(frozen=True, slots=True)
 class Vendors:

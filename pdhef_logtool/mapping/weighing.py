@@ -23,6 +23,7 @@ from pdhef_logtool.mapping.candidates import (
     leaf_group,
     look,
     named_fields,
+    place_of,
     proposed_fields,
     triad_of,
 )
@@ -50,10 +51,8 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray
 #: Ground truth quantities of a single field.
 _TRUTH = ("vx_m_s", "vy_m_s", "sideslip_rad", "yaw_rate_rad_s", "lat_deg", "lon_deg", "course_rad", "yaw_rad")
 _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
-#: Words of a velocity in the body's axes by convention.
+#: Words of a velocity x, y, z in the body's axes by convention.
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
-#: Words of a forward velocity; the struct may contain a lateral velocity, too.
-_ALONG = frozenset({"lng", "long", "longitudinal", "forward"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: Least correlation of a yaw rate about the right axis.
@@ -187,14 +186,9 @@ class Weighing:
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
-            length, speeds = np.hypot(x.si, y.si), [f.si for f in self.fields.open("speed") if f is not x]
-            is_named = bool(_OF_BODY & set(words_of(x.path)) or x.path.endswith("]"))
-            is_length = any(agree(v, length) and not agree(v, x.si) for v in speeds)
-            if not is_length and (axes == "body" or (is_named and not axes)):
-                its = [f for f in self.fields.candidates if f.has_gravity and _driver(f) == _driver(y)]
-                if any(f.meaning.part == "z" == words_of(f.path)[-1] and f.sign < 0.0 for f in its):
-                    y.sign = -1.0
-                    y.doubts.append("its driver has axes forward, right, down, as gravity shows")
+            is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
+            if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
+                self._turn_down(y)
                 continue
             beside = [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and not f.has_gravity]
             beside = [f for f in beside if axes not in ("", "body") and f.is_axis and leaf_group(f) == leaf_group(x)]
@@ -205,6 +199,18 @@ class Weighing:
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
+
+    def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
+        """Return whether another speed is the length of x and y, and not x."""
+        speeds = [f.si for f in self.fields.open("speed") if f is not x]
+        return any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
+
+    def _turn_down(self, y: Field) -> None:
+        """Turn the y of a body's velocity to the left if the accelerometer beside it has gravity along -z."""
+        down = [f for f in self.fields.candidates if f.has_gravity and words_of(f.path)[-1:] == ("z",) and f.sign < 0.0]
+        if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
+            y.sign = -1.0
+            y.doubts.append("its device has axes forward, right, down, as gravity shows")
 
     def _vectors(self) -> Iterator[tuple[Field, Field]]:
         """Yield the x and y of velocities that change."""
@@ -488,11 +494,6 @@ def _has_open_sign(item: Field) -> bool:
     return not (item.fixed or item.is_downward) and (item.meaning.quantity == "steering" or not item.is_axis)
 
 
-def _driver(item: Field) -> str:
-    """Return the package of a field's type, without one the topic: what shares its axes."""
-    return item.topic.type_name.rpartition("/")[0] or item.topic.name
-
-
 def _share_axis(first: Field, second: Field) -> bool:
     """Return whether two undocumented fields of one topic name their axis with the same word."""
     axes = (set(words_of(f.path)) & {"lat", "lateral", "trans", "y", "right"} for f in (first, second))
@@ -502,7 +503,8 @@ def _share_axis(first: Field, second: Field) -> bool:
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
     """Return the ground truth quantities of one topic; empty without sideslip, lateral velocity or a position."""
     truth: dict[str, Field] = {}
-    for item in sorted(candidates, key=lambda f: (-f.score, not _ALONG & set(words_of(f.path)))):
+    along = {"lng", "long", "longitudinal", "forward"}
+    for item in sorted(candidates, key=lambda f: (-f.score, along.isdisjoint(words_of(f.path)))):
         name = _truth_name(item)
         if name and item.seen.changes:
             truth.setdefault(name, item)
