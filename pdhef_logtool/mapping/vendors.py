@@ -157,7 +157,7 @@ class Vendors:
 
 
 def _plain(type_name: str) -> str:
-    return type_name.replace("/msg/", "/").replace("::", "/")
+    return type_name.removeprefix("ros.").replace("::", "/").replace(".", "/").replace("/msg/", "/")
 
 
 def load_vendors(path: Path | None = None) -> Vendors:
