@@ -48,12 +48,8 @@ Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command"
 #: A field with a meaning from its name or documented type. The last entry is True for a documented type.
 Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
-#: Words in field names of navigation systems.
-_NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
 #: Words for the axes of a car, for which only the sign is unknown.
-_CAR_AXES = frozenset({"lat", "lateral", "long", "longitudinal", "lng", "trans", "transverse", "transversal", "down"})
-#: Controls; a steering signal in the same struct may be a control, too.
-_PEDALS = frozenset({"throttle", "brake", "gas"})
+_CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
 #: Affix that distinguishes the name of a sign from the name of its magnitude.
 _SIGN = re.compile(r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
 #: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
@@ -115,6 +111,7 @@ class Field:
     sign_path : path of the field that contains its sign.
     is_weak : its values cannot identify the quantity, so that it is never taken.
     is_turned : its axis and sign are those of a usual mounting.
+    has_gravity : its device shows gravity, so that its axes are the device's.
     """
 
     topic: TopicInfo
@@ -135,6 +132,7 @@ class Field:
     offset: float = 0.0
     is_weak: bool = False
     is_turned: bool = False
+    has_gravity: bool = False
     sign_path: str = ""
 
     @property
@@ -221,8 +219,8 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         for info in (f for f in fields if f.path not in no_values):
             if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or _is_setpoint(topic, info):
                 continue
-            if info.path in documented.fields:
-                results.append((topic, role, info, documented.fields[info.path].meaning, True))
+            if its := documented.entries(info.path):
+                results += [(topic, role, replace(info, path=p), entry.meaning, True) for p, entry in its.items()]
             elif not documented.fields or info.path.count(".") or documented.has:
                 meaning = meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
@@ -279,7 +277,7 @@ def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tu
 
 def _units_without_name(info: FieldInfo) -> Units:
     """Return the possible units of a field by quantity, if its name contains no word with another meaning."""
-    words = set(words_of(info.path))
+    words = set(words_of(info.path)) - STATES
     unit = plain_unit(info.unit)
     named = f"{info.path.rpartition('.')[2]}_{unit}"
     kinds = {"speed": "speed", "acceleration": "acceleration", "rate": "rate", "steering": "angle"}
@@ -351,7 +349,7 @@ def _weighable(
             its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
         if seen is None or its is None or not _is_measured(name, seen):
             continue
-        if role == "sensor" and set(words_of(name)) & _NAVIGATION:
+        if role == "sensor" and {"gps", "gnss", "ins", "rtk"} & set(words_of(name)):
             role = "navigation"
         factors = _factors(its, seen)
         if its.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
@@ -365,8 +363,8 @@ def _weighable(
             item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
         if its.strength < LEAST_NAMED:
             item.doubts.append("its values alone identify it")
-        if _may_be_share(item):
-            item.is_weak = _has_pedals_beside(item, fields)
+        if _may_be_share(item, info):
+            item.is_weak = _is_control(item, info, fields)
             item.doubts.append("it may be a share of the largest angle, which needs a scale")
         if item.is_downward and not documented:
             item.sign = -1.0
@@ -380,16 +378,17 @@ def _is_measured(name: str, seen: Seen) -> bool:
     return bool(np.isfinite(seen.values).any()) and not is_state
 
 
-def _may_be_share(item: Field) -> bool:
-    """Return whether a steering signal in [-1, 1] has neither a unit nor the name of an angle."""
-    is_open = item.meaning.quantity == "steering" and not item.unit_known and item.seen.largest <= 1.0
-    return is_open and not {"angle", "ang", "delta"} & set(words_of(item.path))
+def _may_be_share(item: Field, info: FieldInfo) -> bool:
+    """Return whether a signed byte has no unit, or a steering signal in [-1, 1] not the name of an angle, either."""
+    is_angle = item.meaning.quantity != "steering" or {"angle", "ang", "delta"} & set(words_of(item.path))
+    return not item.unit_known and (info.code == "i1" or not (is_angle or item.seen.largest > 1.0))
 
 
-def _has_pedals_beside(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
-    """Return whether the same struct contains pedals, so that the steering signal is a control, too."""
-    places = (f.path.rpartition(".") for f in fields)
-    return any(struct == item.path.rpartition(".")[0] and _PEDALS & set(words_of(leaf)) for struct, _, leaf in places)
+def _is_control(item: Field, info: FieldInfo, fields: tuple[FieldInfo, ...]) -> bool:
+    """Return whether a field is a signed byte, or its struct contains pedals, which are controls, too."""
+    struct, places = item.path.rpartition(".")[0], (f.path.rpartition(".") for f in fields)
+    beside = {word for place, _, leaf in places if place == struct for word in words_of(leaf)}
+    return info.code == "i1" or bool({"throttle", "brake", "gas"} & beside)
 
 
 def _document(item: Field, entry: VendorField) -> None:

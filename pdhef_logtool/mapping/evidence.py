@@ -24,7 +24,7 @@ LARGEST = 1e12
 #: Longest gap that is interpolated, for sensors with a few samples per second.
 BRIDGED_CELLS = 5
 #: Maximum number of columns to read of an array of unknown length.
-MOST_COLUMNS = 8
+MOST_COLUMNS = 16
 #: Smallest number of cells that gives information.
 FEWEST_CELLS = 40
 

@@ -43,10 +43,10 @@ KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
 _WHOLE, _BARE = KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS
 _CORNERS: dict[str, str] = VOCABULARY["corners"]
 _GERMAN: dict[str, str] = VOCABULARY["german_corners"]
-#: Names of the wheels in the order of WHEELS, and a name of a wheel in the name of a field.
+#: Names of the wheels in the order of WHEELS.
 _WHEEL_CODES = tuple(tuple(codes.split()) for codes in VOCABULARY["wheel_codes"]["codes"])
-_CODE = re.compile(r"(?<![A-Za-z])(?:[a-z]{2,3}|[A-Z]{2,3}|[LR]\d)(?![A-Za-z0-9])")
 _AXES: dict[str, str] = {word: axis for axis, words in VOCABULARY["axes"].items() for word in words.split()}
+_PATTERNS = {name: re.compile("|".join(either)) for name, either in VOCABULARY["patterns"].items()}
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
 
@@ -54,8 +54,8 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
-    name = _SIDES.sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
-    name = _CORNER_AT_END.sub(r"_\g<0>_", name)
+    name = _PATTERNS["sides"].sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
+    name = _PATTERNS["corner_at_end"].sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
         for piece in [part] if part.lower() in _WHOLE else _CAMEL.findall(part):
             words += [english for word in _unglued(piece.lower()) for english in _SYNONYMS.get(word, word).split()]
@@ -66,24 +66,11 @@ def words_of(name: str) -> tuple[str, ...]:
 STATES = frozenset({"state", "states", "status"})
 #: An element of a vector, and words of vectors.
 _NUMBERED, _VECTORS = re.compile(r"(.*?)_?([0-4])"), _WORDS["vectors"]
-#: A wheel as ``FrL``, ``BckRi`` or ``LeFrnt`` in the capitals of a name.
-_END, _SIDE = "(Fro?n?t|Fr|Front|Bck|Back|Rear|Rr|Re)", "(Lft|Left|Le|Lt|L|Rght|Right|Ri|Rt|R)"
-_SIDES = re.compile(rf"(?<=[a-z_]){_END}{_SIDE}(?![a-z])|(?<=[a-z_]){_SIDE}{_END}(?![a-z])")
-#: A wheel before or after a word without a capital between: ``LFspeed``, ``WHEELSPEEDFL``.
-_CORNER_AT_END = re.compile(
-    r"(?<![A-Za-z])(?:[LR][FR]|[FR][LR])(?=[a-z]{2})|(?<=SPEED|speed)(?:[FR][LR]|[fr][lr])(?![A-Za-z])"
-)
-#: A wheel, an axis or g after a word without a capital between: ``wsfl``, ``accx``, ``lateralg``.
-_CORNER_SPEED = re.compile(
-    r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)|(?:acc|accel|gyro?|vel|speed)(?=[xyz]$)"
-    r"|(?:lat|lateral|long?|longitudinal|lineal|inline|vert|vertical)(?=g$)"
-    r"|[avgn](?=(?:lat|long?|lateral|longitudinal|quer|laengs|steer|steering|yaw|car|veh|wheel|gps)$)"
-)
 
 
 def _unglued(piece: str) -> list[str]:
     """Split a piece into known words; return the piece itself if it contains other letters."""
-    if piece not in KNOWN and (letters := _CORNER_SPEED.match(piece)):
+    if piece not in KNOWN and (letters := _PATTERNS["glued"].match(piece)):
         return [letters[0], piece[letters.end() :]]
     if piece in KNOWN or len(piece) < 5:
         return [piece]
@@ -189,7 +176,7 @@ def _spelled_out(path: str, there: Collection[str]) -> str:
 
 def _with_wheel(leaf: str, beside: Collection[str]) -> str:
     """Return a name with the wheel in words if it differs by the side of the wheel only from another one beside it."""
-    for place in _CODE.finditer(leaf):
+    for place in _PATTERNS["code"].finditer(leaf):
         code = place[0].lower()
         for wheels in _WHEEL_CODES:
             partner = wheels[wheels.index(code) ^ 1] if code in wheels else ""
@@ -220,8 +207,9 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
         return None
     scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
     scopes.append((0.9, (*inner, *leaf_words), path))
-    # The topic's name describes its fields only if the leaf identifies no quantity.
-    if all(w in _BARE or not w.isalpha() for w in leaf_words):
+    # The topic's name describes its fields only if the leaf identifies no quantity, and if it names measurements.
+    is_value = not NOT_VALUES & _described(words_of(topic.rpartition("/")[2]))
+    if is_value and all(w in _BARE or not w.isalpha() for w in leaf_words):
         scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
         quantity = _quantity(words, leaf_words, column, strength, named)

@@ -9,6 +9,7 @@ A source that also has a heading (two antennas, INS) or sideslip is ground truth
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -17,7 +18,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.candidates import Field, anchors_of
+from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
@@ -181,8 +182,11 @@ def component(vector: SignalSource, name: str, column: int) -> SignalSource:
 def receiver_signals(
     topic: str, stamp: str, paths: Collection[str], vendors: Vendors | None = None
 ) -> dict[str, SignalSource]:
-    """Return the GNSS signals of a topic if it contains, at any depth, the fields of a receiver; empty otherwise."""
-    there = set(paths)
+    """Return the GNSS signals of a topic if it contains, at any depth, the fields of a receiver; empty otherwise.
+
+    Names in camel case (``gSpeed``) are those in lower case (``g_speed``).
+    """
+    there = {re.sub(r"(?<=[a-z])(?=[A-Z])", "_", path).lower(): path for path in paths}
     for receiver in (vendors or load_vendors()).receivers:
         leaf = min(receiver.has)
         for base in sorted(p.removesuffix(leaf) for p in there if p == leaf or p.endswith(f".{leaf}")):
@@ -191,12 +195,13 @@ def receiver_signals(
             if any(f"{base}{name}" in there for name in receiver.without):
                 return {}
             sources = {
-                f.name: SignalSource(f.name, topic, f"{base}{path}", stamp, f.scale, f.offset)
+                f.name: SignalSource(f.name, topic, there[f"{base}{path}"], stamp, f.scale, f.offset)
                 for path, f in receiver.fields.items()
                 if f"{base}{path}" in there
             }
             if "position_covariance_type" in receiver.has:  # 1 sigma: the root of the mean variance east and north
-                squared = tuple(f"{base}position_covariance[{i}]" for i in (0, 4))
+                struct = there[f"{base}latitude"].removesuffix("latitude")
+                squared = tuple(f"{struct}position_covariance[{i}]" for i in (0, 4))
                 accuracy = SignalSource("gnss_position_accuracy_m", topic, squared, stamp, (0.5, 0.5), combine="root")
                 sources[accuracy.name] = accuracy
             return sources
@@ -225,7 +230,7 @@ class _Instrument:
         first = {m.quantity: path for path, m in reversed(self.meanings.items())}
         places = {name: first[q] for name, q in _PLACES.items() if q in first}
         self.places = {name: self.source(name, p, self.meanings[p].scale or 1.0) for name, p in places.items()}
-        self.velocities = [*_horizontal(self.meanings)]
+        self.named_velocities = [*_horizontal(self.meanings)]
         angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
         self.angles = {path: meaning for meaning, path in angles}
 
@@ -236,10 +241,16 @@ class _Instrument:
     @cached_property
     def seen(self) -> dict[str, Seen]:
         """Values of velocities, angles and positions in a few pieces of the log, by path."""
-        paths = [*(p for v in self.velocities for p in v.values()), *self.angles]
+        paths = [*(p for v in self.named_velocities for p in v.values()), *self.angles]
         paths += [p for p, m in self.meanings.items() if m.quantity == "speed"]
         paths += [s.paths[0] for s in self.places.values()]
         return {path: seen for (_, path), seen in self.pieces.read((self.topic, p) for p in paths).items()}
+
+    @cached_property
+    def velocities(self) -> list[dict[str, str]]:
+        """Velocities over ground that a car can have in the unit of their names, or else in m/s, by direction."""
+        reach = {p: self.seen[p].largest * (m.scale or 1.0) for p, m in self.meanings.items() if p in self.seen}
+        return [v for v in self.named_velocities if not any(reach.get(p, 0.0) > MOST["speed"] for p in v.values())]
 
     @cached_property
     def pieces(self) -> Pieces:
@@ -390,13 +401,8 @@ def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
 def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
     """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
     relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
-    if (
-        relation is None
-        or abs(relation.correlation) <= CLEAR
-        or not SAME_STEPS[0] < abs(relation.slope) < SAME_STEPS[1]
-    ):
-        return 0.0
-    return math.copysign(1.0, relation.slope)
+    slope = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.slope
+    return math.copysign(float(SAME_STEPS[0] < abs(slope) < SAME_STEPS[1]), slope)
 
 
 def _is_place(seen: Seen | None, most: float, scale: float | tuple[float, ...]) -> bool:

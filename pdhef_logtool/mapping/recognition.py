@@ -33,7 +33,7 @@ from pdhef_logtool.mapping.navigation import (
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighing, weigh
-from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
+from pdhef_logtool.records.signals import FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
 TRUTH_WORDS, NAVIGATION_WORDS = _TOPICS["truth"], _TOPICS["navigation"]
@@ -41,8 +41,6 @@ _FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
 #: Path of the velocity by type, and first covariance entries; −1 there marks a quantity as not provided (REP 145).
 TWIST_FIELDS, TWIST_COVARIANCES = _FIELDS["twist"], _FIELDS["twist_covariance"]
 NO_SENSORS = tuple(VOCABULARY["topics"]["no_sensors"].split())
-#: Start of the note on a steering angle that is a command instead of a measurement.
-FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
@@ -53,7 +51,6 @@ NEAR_1_G = 0.08
 
 #: Types with velocities in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
-WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
 _GRAVITY_PATHS = tuple(f"linear_acceleration.{axis}" for axis in "xyz")
@@ -187,9 +184,7 @@ def auto_map(
     ]
     topics, decoded = _decode(draft, _of_one_run(draft, topics))
     _map_imu(draft, topics)
-    _map_steering(draft, topics)
     _map_speed(draft, topics)
-    _map_wheel_speeds(draft, topics)
     _map_truth(draft, topics, prefer_truth)
     _map_truth_friction(draft, topics, prefer_truth)
     _map_documented_truth(draft, topics, vendors)
@@ -281,15 +276,7 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighing:
     """Take candidates for signals without a well-known type."""
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
-    # A measured steering angle has priority over a command, regardless of its type.
-    command = draft.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in draft.notes) else None
     weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
-    if command is not None and not {"steer_rad", "steering_wheel_rad"} & set(weighed.signals):
-        draft.signals["steer_rad"] = command
-    elif command is not None:
-        draft.notes = [n for n in draft.notes if not n.startswith(FROM_COMMAND)]
-        measured = next(s.label for n, s in weighed.signals.items() if n.startswith("steer"))
-        draft.doubt("steering", (measured, command.label), measured, "a measured angle is preferred to a command")
     draft.signals.update(weighed.signals)
     steer = weighed.signals.get("steer_rad")
     both = None if steer is None else mean_of_sides(draft.log, {t.name: t for t in topics}, steer)
@@ -415,31 +402,34 @@ def _device(topic: str) -> str:
 
 def _is_well_known(topic: TopicInfo) -> bool:
     """Return whether a topic was mapped by its type already."""
-    tables = (TWIST_FIELDS, _FIELDS["pose"], _FIELDS["steering"], _FIELDS["speed"], _FIELDS["several_positions"])
+    tables = (TWIST_FIELDS, _FIELDS["pose"], _FIELDS["speed"], _FIELDS["several_positions"])
     kind = _type(topic)
-    return kind in IMU_TYPES | FIX_TYPES | WHEEL_SPEED_TYPES or any(kind in table for table in tables)
+    return kind in IMU_TYPES | FIX_TYPES or any(kind in table for table in tables)
 
 
 def _role(topic: TopicInfo) -> Role:
     """Return the kind of data in a topic by its name; a device of a navigation system is a sensor, too."""
     words = _words(topic.name)
-    if is_command(topic.name, topic.type_name.rpartition("/")[2]):
+    is_drive = _type(topic).startswith("ackermann_msgs/") and not words & _TOPICS["measured"]
+    if is_drive or is_command(topic.name, topic.type_name.rpartition("/")[2]):
         return "command"
     if words & TRUTH_WORDS:
         return "truth"
-    if words & _TOPICS["estimate"]:
+    navigates = (words | _words(topic.type_name)) & NAVIGATION_WORDS
+    if words & _TOPICS["estimate"] and not navigates:
         return "estimate"
     if words & _TOPICS["device"]:
         return "device"
-    return "navigation" if (words | _words(topic.type_name)) & NAVIGATION_WORDS else "sensor"
+    return "navigation" if navigates else "sensor"
 
 
 def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Without a sensor, take the yaw rate from an odometry and the speed from navigation or a twist, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
-    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"] | _TOPICS["estimate"])]
+    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"])]
     if "yaw_rate_rad_s" not in draft.signals:
         odometries = [t for t in twists if not _is_truth(t) and _words(t.name) & _TOPICS["vehicle"]]
+        odometries = [t for t in odometries if not _words(t.name) & _TOPICS["estimate"]]
         odometries = [t for t in odometries if _span(draft.values(t.name, _twist(t, "angular", "z"))) > 0.0]
         chosen = draft.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
         if chosen is not None:
@@ -552,16 +542,20 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     imus = [t for t in topics if _type(t) in IMU_TYPES and not _words(t.name) & TRUTH_WORDS]
     in_g = in_deg = False
     why = "an IMU of the vehicle is preferred to one of a camera or lidar"
-    imu = draft.choose("imu", imus, lambda t: (bool(_words(t.name) & _TOPICS["device"]),), why)
+    # Drivers with a message for each sensor leave the vectors of the other one at zero.
+    forces = [t for t in imus if any(_span(draft.values(t.name, path)) > 0.0 for path in _GRAVITY_PATHS)]
+    imu = draft.choose("imu", forces or imus, lambda t: (bool(_words(t.name) & _TOPICS["device"]),), why)
     if imu is None:
         return
+    gyros = [t for t in imus if _span(draft.values(t.name, "angular_velocity.z")) > 0.0]
+    gyro = imu if imu in gyros else next(iter(gyros), imu)
     if draft.is_disowned(imu.name, "linear_acceleration_covariance[0]"):
         draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
     else:
         means = [_mean(draft.values(imu.name, path)) for path in _GRAVITY_PATHS]
         in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
         if in_g:
-            fast = np.abs(draft.values(imu.name, "angular_velocity.z"))
+            fast = np.abs(draft.values(gyro.name, "angular_velocity.z"))
             in_deg = bool(np.isfinite(fast).any()) and float(np.nanquantile(fast, 0.995)) > MOST["rate"]
             also = ", its rates in deg/s, as no car turns so fast in rad/s" if in_deg else ""
             reason = f"its accelerations are in g, as gravity is 1{also}; its type's unit is m/s²"
@@ -569,37 +563,21 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         for name, path in zip(("ax_m_s2", "ay_m_s2"), _GRAVITY_PATHS, strict=False):
             if draft.is_given(imu.name, path):
                 draft.take(draft.signals, name, imu.name, path, G_M_S2 if in_g else 1.0)
-    if draft.is_disowned(imu.name, "angular_velocity_covariance[0]"):
-        draft.notes.append(f"{imu.name} provides no angular rate (covariance -1)")
-    elif draft.is_given(imu.name, "angular_velocity.z"):
-        scale = float(np.radians(1.0)) if in_deg else 1.0
-        draft.take(draft.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z", scale)
+    _map_rates(draft, gyro, float(np.radians(1.0)) if in_deg else 1.0)
+
+
+def _map_rates(draft: _Draft, gyro: TopicInfo, scale: float) -> None:
+    if draft.is_disowned(gyro.name, "angular_velocity_covariance[0]"):
+        draft.notes.append(f"{gyro.name} provides no angular rate (covariance -1)")
+    elif draft.is_given(gyro.name, "angular_velocity.z"):
+        draft.take(draft.signals, "yaw_rate_rad_s", gyro.name, "angular_velocity.z", scale)
         for name, axis in (("roll_rate_rad_s", "x"), ("pitch_rate_rad_s", "y")):
-            if _span(draft.values(imu.name, f"angular_velocity.{axis}")) > 0.0:  # fillers are constant
-                draft.take(draft.signals, name, imu.name, f"angular_velocity.{axis}", scale)
-
-
-def _map_steering(draft: _Draft, topics: list[TopicInfo]) -> None:
-    candidates = [t for t in topics if _type(t) in _FIELDS["steering"]]
-    measured = [t for t in candidates if not _is_command(t)]
-    chosen = draft.choose("steering", measured or candidates, lambda _: (), "the first of its kind")
-    if chosen is None:
-        return
-    if not measured:
-        lacks = "actuator lag and steering play are missing"
-        draft.notes.append(f"{FROM_COMMAND} {chosen.name}, not from a measured angle: {lacks}")
-    draft.take(draft.signals, "steer_rad", chosen.name, _FIELDS["steering"][_type(chosen)])
-
-
-def _is_command(topic: TopicInfo) -> bool:
-    words = _words(topic.name)
-    is_drive = _type(topic).startswith("ackermann_msgs/") and not words & _TOPICS["measured"]
-    return is_drive or bool(words & _TOPICS["command"])
+            if _span(draft.values(gyro.name, f"angular_velocity.{axis}")) > 0.0:  # fillers are constant
+                draft.take(draft.signals, name, gyro.name, f"angular_velocity.{axis}", scale)
 
 
 def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
-    reports = [t for t in topics if _type(t) in _FIELDS["speed"] and not _is_command(t)]
-    reports = [t for t in reports if has_path(draft.log.fields(t.name), _FIELDS["speed"][_type(t)])]
+    reports = [t for t in topics if _type(t) in _FIELDS["speed"] and not is_command(t.name)]
     twists = []
     for topic in topics:
         if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & _TOPICS["command"]:
@@ -611,10 +589,7 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
             continue
         if not is_body:
             continue  # a velocity over ground: _map_twist
-        neither = "a speed sensor nor ground truth"
-        if words & _TOPICS["estimate"]:
-            neither = "a sensor nor ground truth, but an estimate"
-        draft.doubt("speed", (topic.name,), None, f"its name suggests neither {neither}")
+        draft.doubt("speed", (topic.name,), None, "its name suggests neither a speed sensor nor ground truth")
     why = "a velocity report is preferred to an odometry or a twist"
     chosen = draft.choose("speed", [*reports, *twists], lambda t: (_type(t) not in _FIELDS["speed"],), why)
     if chosen is None:
@@ -625,15 +600,6 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
         why = "its name does not suggest ground truth"
         draft.notes.append(f"{chosen.name} contains a lateral velocity, which is not used: {why}")
-
-
-def _map_wheel_speeds(draft: _Draft, topics: list[TopicInfo]) -> None:
-    candidates = [t for t in topics if _type(t) in WHEEL_SPEED_TYPES and not _words(t.name) & TRUTH_WORDS]
-    chosen = draft.choose("wheel speeds", candidates, lambda _: (), "the first of its kind")
-    if chosen is None:
-        return
-    for wheel in WHEELS:
-        draft.take(draft.signals, f"wheel_speed_{wheel}_m_s", chosen.name, f"{wheel}_m_s")
 
 
 # ------------------------------------------------------------------------------------------------ ground truth

@@ -131,6 +131,10 @@ class VendorType:
     has: frozenset[str] = frozenset()
     without: frozenset[str] = frozenset()
 
+    def entries(self, path: str) -> dict[str, VendorField]:
+        """Return the entry of a field, or of the elements of an array of unknown length, by path."""
+        return {p: e for p, e in self.fields.items() if p in (path, path.replace("[]", p[len(path) - 2 :]))}
+
 
 @dataclass(frozen=True, slots=True)
 class Vendors:
@@ -153,7 +157,7 @@ class Vendors:
 
 
 def _plain(type_name: str) -> str:
-    return type_name.replace("/msg/", "/").replace("::", "/")
+    return type_name.removeprefix("ros.").replace("::", "/").replace(".", "/").replace("/msg/", "/")
 
 
 def load_vendors(path: Path | None = None) -> Vendors:

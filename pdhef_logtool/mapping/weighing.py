@@ -20,8 +20,10 @@ from pdhef_logtool.mapping.candidates import (
     Field,
     Role,
     anchor_of,
+    leaf_group,
     look,
     named_fields,
+    place_of,
     proposed_fields,
     triad_of,
 )
@@ -46,17 +48,13 @@ from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
-#: Ground truth quantities of a single field, and quantities that give the path.
+#: Ground truth quantities of a single field.
 _TRUTH = ("vx_m_s", "vy_m_s", "sideslip_rad", "yaw_rate_rad_s", "lat_deg", "lon_deg", "course_rad", "yaw_rad")
-_POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
 _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
-#: Words of a forward velocity; the struct may contain a lateral velocity, too.
-_ALONG = frozenset({"lng", "long", "longitudinal", "forward"})
-#: Signals of a single field: name, quantity and parts, in the order of their selection.
-_SENSORS = (
-    ("speed_m_s", "speed", ("", "x")), ("ax_m_s2", "acceleration", ("x",)), ("ay_m_s2", "acceleration", ("y",)),
-    ("yaw_rate_rad_s", "rate", ("z",)),
-)  # fmt: skip
+#: Words of a velocity x, y, z in the body's axes by convention.
+_OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
+#: Signals of a single field, in the order of their selection.
+_SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
@@ -98,15 +96,17 @@ def weigh(
         named += proposed_fields(log, topics, named)
     wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
     if not wanted:
-        return Weighing(Fields(Pieces(log), {}, [], []), "")
-    positions = [s for n, s in truth.items() if n in _POSITIONS]
+        return Weighing(Fields(Pieces(log), {}, [], []))
+    positions = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m")]
     pieces, weighable = look(log, wanted, vendors, [*signals.values(), *positions])
     anchors = {n: f for n, s in signals.items() if (f := anchor_of(s, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
+    weighing = Weighing(fields)
+    weighing.drop_vectors_over_ground()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
-    weighing = Weighing(fields, truth_topic(may_be_true))
+    weighing.truth_from = truth_topic(may_be_true)
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
     return weighing
@@ -143,7 +143,7 @@ class Weighing:
     """
 
     fields: Fields
-    truth_from: str
+    truth_from: str = ""
     taken: dict[str, Field] = field(default_factory=dict)
     true: dict[str, Field] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -154,45 +154,63 @@ class Weighing:
 
     def choose_signals(self, have: set[str]) -> None:
         """Take the best candidate of each signal that is missing."""
-        self._drop_vectors_over_ground()
         usable = self._usable()
         wheels = any(n.startswith("wheel_speed") for n in have)
-        for name, quantity, part in _SENSORS:
-            if name not in have and not (wheels and quantity == "speed"):
-                self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
+        for name in _SENSORS:
+            if name not in have and not (wheels and name == "speed_m_s"):
+                self._take(name, [f for f in usable if name in names_of(f.meaning.quantity, f.meaning.part)])
         self._turn_about()
         self._turn_level()
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
+            self._steer_by_command()
         for name, item in self.taken.items():
             self._tell(name, item)
 
     def _usable(self) -> list[Field]:
         """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
+        given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
+        lacking = {"speed", "steering"} - given
+        usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
             item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
         return usable
 
-    def _drop_vectors_over_ground(self) -> None:
+    def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
-            length, speeds = np.hypot(x.si, y.si), [f.si for f in self.fields.open("speed") if f is not x]
-            if axes in ("", "body") and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
+            is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
+            if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
+                self._turn_down(y)
                 continue
-            self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
+            beside = [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and not f.has_gravity]
+            beside = [f for f in beside if axes not in ("", "body") and f.is_axis and leaf_group(f) == leaf_group(x)]
+            self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y, *beside)]
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
-            if axes in ("east, north", "north, east") and x.role in ("sensor", "navigation"):
+            if axes in ("east, north", "north, east") and x.role in ("sensor", "navigation") and (is_named or steps):
                 for name, item in zip(axes.split(", "), (x, y), strict=True):
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
+
+    def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
+        """Return whether another speed is the length of x and y, and not x."""
+        speeds = [f.si for f in self.fields.open("speed") if f is not x]
+        return any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
+
+    def _turn_down(self, y: Field) -> None:
+        """Turn the y of a body's velocity to the left if the accelerometer beside it has gravity along -z."""
+        down = [f for f in self.fields.candidates if f.has_gravity and words_of(f.path)[-1:] == ("z",) and f.sign < 0.0]
+        if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
+            y.sign = -1.0
+            y.doubts.append("its device has axes forward, right, down, as gravity shows")
 
     def _vectors(self) -> Iterator[tuple[Field, Field]]:
         """Yield the x and y of velocities that change."""
@@ -293,8 +311,9 @@ class Weighing:
 
     def _steering(self, candidates: Sequence[Field]) -> None:
         speed, *turning = (self._speed(), self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2"))
-        wheels = [f.si for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
-        # Wheel speeds are in their likeliest unit.
+        # Wheel speeds are in their likeliest unit, rotational ones of usual wheels.
+        spun = [f for n, f in self.taken.items() if n.startswith("wheel_speed")]
+        wheels = [f.si * (USUAL_RADIUS_M if f.meaning.quantity == "wheel rate" else 1.0) for f in spun]
         pace = speed.si if speed is not None else mean_of(wheels) if wheels else None
         curvature = self.fields.curvature(pace, *(None if f is None else f.si for f in turning))
         judged: list[tuple[float, str, Field]] = []
@@ -315,6 +334,18 @@ class Weighing:
         _, name, best = judged[0]
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
+
+    def _steer_by_command(self) -> None:
+        """Without a measured angle, take a documented command, or one whose ratio to the curvature is an angle's."""
+        commands = [f for f in self.fields.candidates if f.role == "command" and f.meaning.quantity == "steering"]
+        if measured := [n for n in self.taken if n.startswith("steer")]:
+            self._choose(measured[0], self.taken[measured[0]], [f for f in commands if f.fixed])
+            return
+        for item in commands:
+            item.bonus -= 0.3
+        self._steering([f for f in commands if f.seen.changes or f.fixed])
+        for name in [n for n, f in self.taken.items() if f in commands and any("a share" in d for d in f.doubts)]:
+            del self.taken[name]
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal for a steering angle, and whether it follows the car's turning (None: unknown)."""
@@ -415,7 +446,11 @@ class Weighing:
 
     def _tell(self, name: str, item: Field) -> None:
         """Add an undecided check for the doubts about a field; note a speed from the navigation system."""
-        item.doubts = [d for d in item.doubts if d]
+        if item.role == "command":
+            lacks = "actuator lag and steering play are missing"
+            self.notes.append(f"{name} comes from the command {item.topic.name}, not from a measured angle: {lacks}")
+        if item.role == "estimate":
+            self.notes.append(f"{name} comes from the estimate {item.topic.name}.{item.path}, as no sensor gives it")
         if name == "speed_m_s" and item.role == "navigation":
             self.notes.append(
                 f"speed_m_s comes from the navigation system's {item.topic.name}.{item.path}: "
@@ -468,7 +503,8 @@ def _share_axis(first: Field, second: Field) -> bool:
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
     """Return the ground truth quantities of one topic; empty without sideslip, lateral velocity or a position."""
     truth: dict[str, Field] = {}
-    for item in sorted(candidates, key=lambda f: (-f.score, not _ALONG & set(words_of(f.path)))):
+    along = {"lng", "long", "longitudinal", "forward"}
+    for item in sorted(candidates, key=lambda f: (-f.score, along.isdisjoint(words_of(f.path)))):
         name = _truth_name(item)
         if name and item.seen.changes:
             truth.setdefault(name, item)

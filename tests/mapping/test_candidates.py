@@ -160,7 +160,8 @@ def test_commands_setpoints_and_estimates_are_no_sensors() -> None:
         ekf__state=topic(speed=V, yaw_rate=RATE, sideslip=0.1 * STEER),
         bus=topic(target_speed=V, vehicle_speed=3.6 * V, **imu_fields()),
     )
-    assert set(taken(auto)) == {"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}
+    assert set(taken(auto)) == {"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "steer_rad"}
+    assert any(n.startswith("steer_rad comes from the command") for n in auto.mapping.notes)
     assert taken(auto)["speed_m_s"] == ("/bus.vehicle_speed", round(1 / 3.6, 6))
     assert auto.mapping.truth == {}
 
@@ -437,7 +438,7 @@ def test_every_shipped_entry_names_its_page() -> None:
     vendors = load_vendors()
     assert len(vendors.types) > 20
     for f in (f for kind in vendors.types.values() for f in kind.fields.values()):
-        assert f.page.startswith("https://")
+        assert f.page.startswith(("https://", "truthsim/"))
         assert "read 20" in f.page
         assert f.meaning.quantity
 
