@@ -122,6 +122,43 @@ def _own_times(path: Path, topics: Sequence[Topic]) -> None:
     path.write_text("\n".join([*map(";".join, rows), ""]), encoding="utf-8")
 
 
+def _blocks(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a race data program's export: a block of times and values for each signal, one below the other."""
+    start = min(int(t.arrival_ns[0]) for t in topics)
+    lines = [
+        "PiToolboxVersionedASCIIDataSet",
+        "Version\t2",
+        "",
+        "{OutingInformation}",
+        "CarName\tcar 3",
+        "FirstLapNumber\t0",
+    ]
+    for topic in topics:
+        for title, values in topic.fields.items():
+            lines += ["", "{ChannelBlock}", f"Time\t{title.replace(' [', '[')}"]
+            lines += [
+                f"{(s - start) / 1e9:.3f}\t{v:.6g}" for s, v in zip(topic.arrival_ns.tolist(), values, strict=True)
+            ]
+    path.write_bytes("\r\n".join([*lines, ""]).encode("cp1252"))
+
+
+def _stamps(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a workshop tester's log: groups side by side, each with a column of its own times."""
+    start = min(int(t.arrival_ns[0]) for t in topics)
+    columns = [["", "", "", "Marker"]]
+    for number, topic in enumerate(topics):
+        times = [f"{(s - start) / 1e9:.2f}" for s in topic.arrival_ns.tolist()]
+        columns.append([f"Group {'ABC'[number]}:", "", "TIME", "STAMP", *times])
+        for i, (title, values) in enumerate(topic.fields.items(), 1):
+            name, unit = _split(title)
+            above = [f"'{number + 4:03d}" if i == 1 else "", name, "", f" {unit}"]
+            columns.append([*above, *(f"{v:.2f}" for v in values.tolist())])
+    length = max(map(len, columns))
+    rows = zip(*([*column, *[""] * (length - len(column))] for column in columns), strict=True)
+    head = ["Monday,24,November,2025,14:05:12:00125", "1K0 907 379 AC,ESP MK60EC1  H31 0121"]
+    path.write_text("\n".join([*head, *map(",".join, rows), ""]), encoding="latin-1")
+
+
 def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     """Return a row for each value: time in ns, signal, value, unit."""
     rows = [
@@ -273,6 +310,32 @@ def _mat_scope(path: Path, topics: Sequence[Topic]) -> None:
     savemat(path, scopes)
 
 
+def _mat_quantities(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a struct of quantities, each with data, unit and number of states, as a simulator's reader returns them."""
+    from scipy.io import savemat
+
+    quantities: dict[str, Any] = {}
+    for topic in topics:
+        seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
+        quantities["Time"] = {"data": seconds, "unit": "s", "nstates": 0.0}
+        for title, values in topic.fields.items():
+            name, unit = _split(title)
+            quantities[name] = {"data": values, "unit": unit, "nstates": 0.0}
+    savemat(path, {"data": quantities})
+
+
+def _json_lists(path: Path, topics: Sequence[Topic]) -> None:
+    """Write one document: a list of objects for each topic, with times in ms."""
+    document: dict[str, Any] = {"rideID": "7f", "startTime": int(topics[0].arrival_ns[0] // 10**6)}
+    for topic in topics:
+        columns = zip(*(values.tolist() for values in topic.fields.values()), strict=True)
+        document[topic.name.strip("/")] = [
+            {**dict(zip(topic.fields, row, strict=True)), "timestamp": stamp // 10**6}
+            for stamp, row in zip(topic.arrival_ns.tolist(), columns, strict=True)
+        ]
+    path.write_text(json.dumps(document), encoding="utf-8")
+
+
 def _mat_columns(path: Path, topics: Sequence[Topic]) -> None:
     """Write a matrix of times and values for each signal."""
     from scipy.io import savemat
@@ -379,6 +442,10 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
 _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     **{n: (d.get("suffix", ".csv"), partial(_text, n)) for n, d in _DIALECTS.items()},
     "csv-times": (".csv", _own_times),
+    "txt-blocks": (".txt", _blocks),
+    "csv-stamps": (".csv", _stamps),
+    "mat-quantities": (".mat", _mat_quantities),
+    "json-lists": (".json", _json_lists),
     "parquet-long": (".parquet", _long_parquet),
     "mat": (".mat", _mat),
     "mat-runs": (".mat", _mat_runs),
