@@ -86,7 +86,8 @@ FORMATS = (
     LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), libraries=("polars",)),
     LogFormat(
         "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
-        is_general=True, named=(".txt", ".dat", ".tab", ".prn", ".ascii", ".lvm", ".msl"), libraries=("polars",),
+        is_general=True, libraries=("polars",),
+        named=(".txt", ".dat", ".tab", ".prn", ".ascii", ".lvm", ".msl", ".pos", ".out", ".res", ".sol", ".nmea"),
     ),
     LogFormat(
         "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",

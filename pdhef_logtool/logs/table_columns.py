@@ -54,10 +54,12 @@ _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS
 _SYMBOL = rf"(?:{'|'.join(map(re.escape, CONSTANTS['table_units']['symbols'].split()))})(?:\^?\**[-+]?\d|[⁻¹²³]+)?"
 _COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/·.]|\bper\b|\s)\s*{_SYMBOL})+")
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
+#: A unit behind a comma, a word, a dash or a quotient (``v / (km/h)``).
+_BEHIND = re.compile(r"^(.+?)(?:[,;:]|\s(?:in|-|–|/)(?=\s))\s*([^\s,;:].*)$")
 #: Letters in ASCII.
 LATIN = str.maketrans(CONSTANTS["latin"])
 _ALPHABETS = {name: dict(pair.split("=") for pair in pairs.split()) for name, pairs in CONSTANTS["alphabets"].items()}
-_LETTERS = str.maketrans(
+LETTERS = str.maketrans(
     {u: latin for a in _ALPHABETS.values() for letter, latin in a.items() for u in (letter, letter.upper())}
 )
 #: Words, and single letters as symbols, of the Greek alphabet; a dot above the symbol of a quantity.
@@ -88,9 +90,9 @@ _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
     text = _OTHER_ALPHABET.sub(lambda match: f" {_TRANSLATIONS[match[0]]} ", text)
-    text = _GREEK_WORD.sub(lambda match: match[0].translate(_LETTERS), text.partition("\\")[0].translate(LATIN))
+    text = _GREEK_WORD.sub(lambda match: match[0].translate(LETTERS), text.partition("\\")[0].translate(LATIN))
     text = _DOT.sub("_dot", unicodedata.normalize("NFKD", text))
-    text = _GREEK.sub(lambda match: f"_{unicodedata.name(match[0]).split()[3].lower()}_", text).translate(_LETTERS)
+    text = _GREEK.sub(lambda match: f"_{unicodedata.name(match[0]).split()[3].lower()}_", text).translate(LETTERS)
     text = text.encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
     return f"n_{name}" if name[0].isdigit() else name
@@ -108,7 +110,7 @@ def unique(names: Iterable[str]) -> list[str]:
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit, with or without brackets."""
-    text = re.sub(r"^\s*units?\s*:|[\[\](){}]", "", text, flags=re.IGNORECASE).strip().lower()
+    text = re.sub(r"^\s*units?\s*:|[\[\](){}]", "", text, flags=re.IGNORECASE).strip().lower().translate(LETTERS)
     return text.replace(" ", "") in _UNITS or bool(_COMPOUND.fullmatch(text))
 
 
@@ -117,9 +119,11 @@ def split_unit(text: str) -> tuple[str, str]:
     if "|" in text:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
-    match = _BRACKETED.match(text.strip())
-    is_given = match and match[1] and is_unit(match[2]) and not match[2].isdigit()  # [1] is an index
-    return (match[1], match[2].strip()) if match and is_given else (text.strip(), "")
+    for pattern in (_BEHIND, _BRACKETED):
+        match = pattern.match(text.strip())
+        if match and match[1] and is_unit(match[2]) and not match[2].isdigit():  # [1] is an index
+            return match[1].rstrip(" /"), match[2].strip(" ()")
+    return text.strip(), ""
 
 
 def snake(name: str) -> str:

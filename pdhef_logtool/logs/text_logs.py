@@ -15,6 +15,7 @@ import datetime as dt
 import io
 import json
 import re
+import string
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -55,6 +56,8 @@ _VALUE = re.compile(
 _QUANTITY = re.compile(r"\s*[-+−]?\d[\d.,]*(?:e[-+]?\d+)?\s*([^\d\s.,][^\d]*)", re.IGNORECASE)
 #: The last line of the header of a file or of its channels.
 _END_OF_HEADER = re.compile(r"(?i)\W*(end[_ ]of[_ ]header|header[_ ]end)\W*")
+#: First letters of rows whose first cell gives their kind.
+_SENTENCE = f"$#{string.ascii_letters}"
 #: Marks of comments, and labels of the row of names where the first column contains no values.
 #: Labels of a rate, and of the time between rows.
 _RATES = {
@@ -93,6 +96,9 @@ def open_csv(file: TableFile) -> Tables:
     losses: list[Loss] = []
     with _text(file) as text:
         lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
+        if lines and lines[0].startswith("{"):
+            file.stream.seek(0)
+            return open_json_lines(file)
         given_separator = re.match(r"(?i)\ufeff?\"?sep=(.)", lines[0]) if lines else None
         separator = given_separator[1] if given_separator else _separator(lines)
         file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
@@ -111,15 +117,32 @@ def open_csv(file: TableFile) -> Tables:
         }
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
-        columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
-    sheets, rate_hz = by_times("csv", columns, given), file.settings.rate_hz or stated_hz
-    tables = [table for sheet in sheets for table in tables_of(sheet, file.name, losses, rate_hz=rate_hz)]
+        tables: list[Table] = []
+        rows = chain(head[first:], rows)
+        while titles:
+            following: list[str] = []
+            columns = _columns(_until_titles(rows, titles, following), fields, file, losses, decimal, given)
+            for sheet in by_times(f"csv_{len(tables) + 1}" if tables else "csv", columns, given):
+                tables += tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz or stated_hz)
+            titles, (fields, given) = following, read_head(following)
     return Tables("csv", tables, losses)
+
+
+def _until_titles(
+    rows: Iterable[tuple[int, list[str]]], titles: Sequence[str], following: list[str]
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a block of columns; ``following`` gets the titles of the next block, which begins alike."""
+    for number, row in rows:
+        if row and row[0] == titles[0].strip() and row[1:] != [*titles[1:]] and not any(map(_is_value, row)):
+            following += row
+            return
+        yield number, row
 
 
 def _stated_rate(head: Iterable[Sequence[str]]) -> float | None:
     """Return the rows per second that a line above the columns states; None without one."""
-    for label, *values in (row for row in head if len(row) > 1):
+    labelled = (row if len(row) > 1 else re.split("[:=]", row[0], maxsplit=1) for row in head if row)
+    for label, *values in labelled:
         number = next((cell for cell in values if cell.strip()), "")
         value = re.match(r"\s*(\d+(?:[.,]\d*)?(?:e[-+]?\d+)?)\s*(\w*)", number, re.IGNORECASE)
         of = next((kind for kind, pattern in _RATES.items() if re.fullmatch(pattern, label.strip(" \t:#").lower())), "")
@@ -139,7 +162,8 @@ def _titles_of_kinds(head: Sequence[Sequence[str]]) -> dict[str, list[str]]:
         row[0].lstrip("#% "): [c.strip() for c in row[1:]] for row in head if row and row[0].startswith(("#", "%"))
     }
     titles_of |= {row[3].strip(): [c.strip() for c in row[5:]] for row in head if len(row) > 5 and row[0] == "FMT"}
-    kinds = {row[0].strip() for row in head if len(row) > 1 and row[0][:1].isalpha() and row[0] != "FMT"}
+    kinds = {row[0].strip() for row in head if len(row) > 1 and row[0][:1] in _SENTENCE and row[0] != "FMT"}
+    titles_of |= {kind: t.split() for kind in kinds for end, t in CONSTANTS["sentences"].items() if kind.endswith(end)}
     return {k: titles for k, titles in titles_of.items() if k in kinds and len(titles) > 1}
 
 
@@ -149,7 +173,8 @@ def _tables_of_kinds(
     """Return a table for each kind of row with times."""
     lines: dict[str, list[tuple[int, list[str]]]] = {}
     for number, (kind, *cells) in ((n, row) for n, row in rows if row and row[0].strip() in titles_of):
-        lines.setdefault(kind.strip(), []).append((number, [cell.strip() for cell in cells]))
+        cells = [re.sub(r"\*[\dA-Fa-f]+\s*$", "", c).strip() for cell in cells for c in cell.split(";")]
+        lines.setdefault(kind.strip(), []).append((number, cells[: len(titles_of[kind.strip()])]))
     losses: list[Loss] = []
     tables: list[Table] = []
     for kind, its in lines.items():
@@ -216,9 +241,11 @@ def _separator(lines: Sequence[str]) -> str:
     """
     every = [re.sub(r'"[^"]*"', "", line) for line in lines]
     lines = every[-20:]
-    counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",")}
-    regular = next((s for s, n in counts.items() if n and min(n) > 0 and max(n) == min(n)), "")
-    frequent = max(counts, key=lambda s: sum(counts[s]))
+    if all(re.match(r"[$#%][A-Z\d]{3,},", line) for line in lines):  # sentences of a receiver
+        return ","
+    counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",", ":")}
+    regular = next((s for s, n in counts.items() if n and min(n) > 2 * (s == ":") and max(n) == min(n)), "")
+    frequent = max([*counts][:-1], key=lambda s: sum(counts[s]))
     widths = [len(re.split(_SPACES, line.strip())) for line in every]
     titles = (line for line, n in zip(every, widths, strict=True) if n == widths[-1] > 1)
     is_aligned = len({*widths[-20:]}) == 1 and any(re.search(r"[a-z.] [a-z(]", t, re.IGNORECASE) for t in titles)
@@ -256,7 +283,9 @@ def _head(
     of_units = next((i for i in above if i != names and _share(rows[i], is_unit) >= 0.5), -1)
     has_groups = names - 1 in above and not is_labelled and of_units != names - 1
     under = [rows[i] for i in above if names < i < first]
-    titles = _joined(rows[names][:width], rows[names - 1] if has_groups else [], under)
+    others = [rows[i] for i in reversed(above) if i != names and abs(i - names) <= len(last)]
+    named = [cell or _beside(others, i) for i, cell in enumerate(rows[names][:width])]
+    titles = _joined(named, rows[names - 1] if has_groups else [], under)
     if len(titles) < width and rows[full][-1].strip():  # names of the rows without a title, as R writes them
         titles = ["row", *titles]
     units = (
@@ -265,6 +294,12 @@ def _head(
         else ["" if re.search("unit|einheit", c, re.IGNORECASE) and not is_unit(c) else c for c in rows[of_units]]
     )
     return titles, units, first
+
+
+def _beside(rows: Sequence[Sequence[str]], column: int) -> str:
+    """Return the text of the first row that has one in a column without a title, ``TIME`` above ``STAMP``."""
+    cells = (row[column].strip() for row in rows if column < len(row))
+    return next((cell for cell in cells if cell and not is_unit(cell)), "")
 
 
 def _data_rows(rows: Sequence[Sequence[str]], width: int) -> list[int]:
@@ -299,7 +334,7 @@ def _is_value(cell: str) -> bool:
 
 def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
     """Return titles with the repeated titles of their groups in front, and the title of an index column below them."""
-    if groups and len({c.strip() for c in groups}) < len(titles) and all(groups):
+    if groups and len({c.strip() for c in groups}) < len(titles) and all(groups) and not any(map(_is_value, groups)):
         titles = [*titles[:1], *(f"{group}_{n}" for group, n in zip(groups[1:], titles[1:], strict=False))]
     return [next((row[0] for row in below if row[0] and not any(row[1:])), titles[0]), *titles[1:]]
 
@@ -350,6 +385,24 @@ def _columns(
                 cells, units[name] = read_cells(column.str.strip_suffix(unit), decimal), unit
             columns[name] = column.str.strip_chars() if cells.is_text else cells.values
             losses += cells.losses(name, file.name, lines)
+    return _with_hemispheres(columns)
+
+
+def _with_hemispheres(columns: dict[str, Any]) -> dict[str, Any]:
+    """Return columns with positions in degrees, south and west negative, of which others name the hemispheres.
+
+    Receivers write degrees and minutes as ``4807.038``.
+    """
+    for letters, place in (("NS", "(?i)(^|_)lat"), ("EW", "(?i)(^|_)(lon|lng)")):
+        named = (c for n, c in columns.items() if not isinstance(c, np.ndarray) and not re.search("(?i)heading", n))
+        side = next((c for c in named if {*c.drop_nulls().unique()} - {""} in ({*letters}, *map(set, letters))), None)
+        name = next((n for n, c in columns.items() if re.search(place, n) and isinstance(c, np.ndarray)), None)
+        if side is None or name is None:
+            continue
+        degrees, minutes = np.divmod(columns[name], 100.0)
+        has_minutes = np.nanmax(np.abs(columns[name]), initial=0.0) > 180.0
+        size = degrees + minutes / 60.0 if has_minutes else np.abs(columns[name])
+        columns[name] = np.where((side == letters[1]).fill_null(value=False).to_numpy(), -size, size)
     return columns
 
 
@@ -375,12 +428,12 @@ def _fitting(
             lines.append(line)
             data.write((text.replace("\n", " ") + "\n").encode())
         elif text.replace(_CELL_END, " ").strip():
-            (comments if text.startswith("#") else wrong).append(line)
+            (comments if text.startswith(("#", "{", "[")) else wrong).append(line)
     cut = [wrong.pop()] if wrong[-1:] == array("q", [line]) and len(row) < width else []
     for kind, what, numbers in (
         ("truncated", "the last row is incomplete", cut),
         ("bad-row", f"row without {width} cells", wrong),
-        ("comment", "row that begins with #", comments),
+        ("comment", "row that begins with #, { or [", comments),
     ):
         if numbers:
             place = f"{file.name}, from line {numbers[0]} on"
@@ -455,8 +508,13 @@ def open_json_lines(file: TableFile) -> Tables:
         with suppress(ValueError, RecursionError):
             document = json.load(file.stream)
         file.stream.seek(0)
-    if records := max(_lists_of_records(document, _DEEPEST), key=len, default=[]):
-        return _tables_of_records(records, file, "json")
+    if records := sorted(_lists_of_records(document, _DEEPEST), key=lambda named: -len(named[1])):
+        tables = _tables_of_records(records[0][1], file, "json", records[0][0] if records[1:] else "json")
+        for name, its in records[1:]:
+            with suppress(LogError):  # a list without times
+                others = _tables_of_records(its, file, "json", name)
+                tables = Tables("json", [*tables.tables, *others.tables], [*tables.losses, *others.losses])
+        return tables
     if not isinstance(document, dict) or not any(isinstance(value, dict | list) for value in document.values()):
         return _tables_of_records(map(_record_of_json, file.stream), file, "json-lines")
     losses: list[Loss] = []
@@ -466,7 +524,7 @@ def open_json_lines(file: TableFile) -> Tables:
 
 def open_line_protocol(file: TableFile) -> Tables:
     """Read lines of a measurement, its tags, its fields and a time in ns, as databases of time series take them."""
-    return _tables_of_records(map(_record_of_line, file.stream), file, "lines")
+    return _tables_of_records(map(_record_of_line, file.stream), file, "lines", "lines")
 
 
 def _record_of_json(line: bytes) -> dict[str, Any] | None:
@@ -488,22 +546,22 @@ def _record_of_line(line: bytes) -> dict[str, Any] | None:
     return {"time": int(parts[3]), parts[1]: {n: float(v) for n, v in fields.items()}} if parts and fields else None
 
 
-def _lists_of_records(value: Any, depth: int) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lists of objects in a document, and tables of their columns' names and rows."""
+def _lists_of_records(value: Any, depth: int, name: str = "json") -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Yield the names and lists of objects in a document, and tables of their columns' names and rows."""
     if isinstance(value, dict) and depth:
         if table := _named_rows(value):
-            yield table
+            yield name, table
             return
         if value and all(key.isdigit() and isinstance(inner, dict) for key, inner in value.items()):
-            value = [[*value.values()]]
-        for inner in value.values() if isinstance(value, dict) else value:
-            yield from _lists_of_records(inner, depth - 1)
+            value = {name: [*value.values()]}
+        for key, inner in value.items():
+            yield from _lists_of_records(inner, depth - 1, key)
     elif isinstance(value, list) and depth:
-        if len(value) > _MOST_ELEMENTS and all(isinstance(inner, dict) for inner in value):
-            yield value
+        if len(value) > _MOST_ELEMENTS and all(isinstance(inner, dict | None) for inner in value):
+            yield name, [inner for inner in value if inner is not None]
         else:
             for inner in value[:_MOST_ELEMENTS]:
-                yield from _lists_of_records(inner, depth - 1)
+                yield from _lists_of_records(inner, depth - 1, name)
 
 
 def _named_rows(value: dict[str, Any]) -> list[dict[str, Any]]:
@@ -533,7 +591,7 @@ def _array_of(value: Any, depth: int) -> Any:
     return value if isinstance(value, str) else None
 
 
-def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str) -> Tables:
+def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str, name: str = "json") -> Tables:
     """Return the tables of objects in the order of time; None counts as a damaged line."""
     losses: list[Loss] = []
     lines, wrong = array("q"), array("q")
@@ -556,10 +614,8 @@ def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str) -> Ta
         losses.append(Loss("bad-row", "line without an object", place, count=len(wrong)))
     file.limits.check_table(8 * len(lines) * len(cells), file.size, file.name)
     fields, units = read_head([*cells])
-    columns = {
-        name: _json_column(name, cells[path], lines, file, losses) for name, path in zip(fields, cells, strict=True)
-    }
-    sheet = Sheet("json" if kind != "lines" else "lines", columns, units)
+    columns = {f: _json_column(f, cells[path], lines, file, losses) for f, path in zip(fields, cells, strict=True)}
+    sheet = Sheet(field_name(name), columns, units)
     return Tables(kind, list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
 
 

@@ -35,6 +35,12 @@ SAME, BY_DRIVING = 0.03, 0.15
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
 CERTAIN = 0.9
+#: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
+#: the steering wheel; usual lengths.
+STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
+USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
+#: 1-sigma of the logarithm of these lengths among cars, and least share of the unit of speed that they show.
+USUAL_LENGTHS, LIKELY_UNIT = 0.4, 0.7
 #: Energies of rare units.
 RARE = {"mph": 1.5, "mg": 1.5, "ft/s²": 3.0}
 
@@ -205,6 +211,7 @@ def decide_units(fields: Fields) -> None:
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
+    _by_steering(fields)
     _by_siblings(fields)
 
 
@@ -275,6 +282,27 @@ def _by_turning(fields: Fields) -> None:
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
         if relation is not None and abs(relation.correlation) > CLEAR:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
+
+
+def _by_steering(fields: Fields) -> None:
+    """Determine the unit of the speed by the length that converts the path's curvature to a steering angle."""
+    speed, rate, steering = fields.best("speed"), fields.best("rate"), fields.best("steering")
+    if speed is None or rate is None or steering is None or speed.unit_known or speed.fixed:
+        return
+    curve = fields.curvature(speed.seen.cells, rate.seen.cells)
+    relation = None if curve is None else fit(fields.pieces.smooth(steering.seen.cells), curve)
+    if relation is None or abs(relation.correlation) < CLEAR:
+        return
+    odds = dict.fromkeys((unit for unit, _ in speed.units), 0.0)
+    for (unit, v), (_, r), (_, s) in itertools.product(speed.units, rate.units, steering.units):
+        for kind, (low, high) in STEERING_M.items():
+            length = abs(relation.slope) * s * v / r
+            off = math.log(length / USUAL_LENGTH_M[kind]) / USUAL_LENGTHS
+            odds[unit] += (low < length < high) * math.exp(-0.5 * off**2 - RARE.get(unit, 0.0))
+    best = max(odds, key=lambda unit: odds[unit])
+    if odds[best] > LIKELY_UNIT * sum(odds.values()):
+        speed.use(best)
+        speed.doubts.append(f"unit not given; taken as {best}, in which the steering has a usual ratio")
 
 
 def _by_siblings(fields: Fields) -> None:

@@ -30,6 +30,8 @@ from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
     SLOW_M_S,
+    STEERING_M,
+    USUAL_LENGTH_M,
     Fields,
     Gain,
     Unit,
@@ -59,15 +61,11 @@ _SENSORS = (
 )  # fmt: skip
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
-#: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
-#: the steering wheel.
-_STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
 #: Signals that may have an unknown sign; largest log ratio between the length of a steering angle and a usual length if
 #: the signal could also be a share of the largest angle.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
 USUAL = 0.6
-#: Usual lengths. Units of wheel speeds, which are mostly named as speeds; their energies where the rest is in SI units.
-USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
+#: Units of wheel speeds, which are mostly named as speeds; their energies where the rest is in SI units.
 #: Usual radius of a wheel, and 1-sigma of the logarithm of a radius that a car assumes for its wheel speeds.
 USUAL_RADIUS_M, WHEEL_RADIUS = 0.3, 0.015
 WHEEL_UNITS = (
@@ -186,7 +184,9 @@ class Weighing:
             length, speeds = np.hypot(x.si, y.si), [f.si for f in self.fields.open("speed") if f is not x]
             if axes in ("", "body") and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
                 continue
-            self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
+            over = [a for v, p in ((x, "x"), (y, "y")) for a in self.fields.open("acceleration", p) if _is_change(a, v, self.fields)]
+            out = [x, y, *(over if {a.meaning.part for a in over} == {"x", "y"} else ())]
+            self.fields.candidates = [f for f in self.fields.candidates if not any(f is o for o in out)]
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
             if axes in ("east, north", "north, east") and x.role in ("sensor", "navigation"):
                 for name, item in zip(axes.split(", "), (x, y), strict=True):
@@ -318,7 +318,7 @@ class Weighing:
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal for a steering angle, and whether it follows the car's turning (None: unknown)."""
-        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
+        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(STEERING_M))
         if relation is None or abs(relation.correlation) < CLEAR:
             return _steering_by_range(item, kinds, relation)
         metres = abs(relation.slope)
@@ -326,7 +326,7 @@ class Weighing:
         likely = _likely(ways, metres, BY_DRIVING, LIKELY, broken=1e-3)
         name, unit = likely[0].quantity, likely[0].name
         usual = metres * likely[0].factor
-        low, high = _STEERING_M[name]
+        low, high = STEERING_M[name]
         if not low <= (length := usual * USUAL_LENGTH_M[name]) <= high:
             item.doubts.append(f"its ratio to the path's curvature is {length:.3g} m, which no car has in this unit")
             return kinds[0], None
@@ -452,6 +452,12 @@ class Weighing:
             if name and item.role in ("truth", "navigation") and not self.true:
                 candidates.append(item.candidate(name, "truth", taken=False))
         return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
+
+
+def _is_change(acceleration: Field, velocity: Field, fields: Fields) -> bool:
+    """Return whether an acceleration is the derivative of a velocity, in its axes."""
+    change = fields.pieces.rate_of(velocity.si)
+    return correlation(fields.pieces.smooth(acceleration.si), change) > CLEAR
 
 
 def _has_open_sign(item: Field) -> bool:
