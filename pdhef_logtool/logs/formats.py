@@ -85,9 +85,13 @@ FORMATS = (
     LogFormat("a rosbag2 database", f"{__package__}.rosbag2_sqlite_log:SqliteContainer.open", (".db3",), SQLITE_MAGIC),
     LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), libraries=("polars",)),
     LogFormat(
+        "a candump log", f"{__package__}.can_logs:open_candump", (".log",), (b"(", b" (", b"  (", b" can", b"  can"),
+        needs_suffix=True, is_general=True, is_text=True, libraries=(),
+    ),
+    LogFormat(
         "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
         is_general=True, libraries=("polars",),
-        named=(".txt", ".dat", ".tab", ".prn", ".ascii", ".lvm", ".msl", ".pos", ".out", ".res", ".sol", ".nmea"),
+        named=(".txt", ".dat", ".tab", ".prn", ".ascii", ".lvm", ".msl", ".pos", ".out", ".res", ".sol", ".nmea", ".log"),
     ),
     LogFormat(
         "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",
@@ -107,10 +111,6 @@ FORMATS = (
     ),
     LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=()),
     LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=()),
-    LogFormat(
-        "a candump log", f"{__package__}.can_logs:open_candump", (".log",),
-        is_general=True, is_text=True, libraries=(),
-    ),
     LogFormat(
         "a file of line protocol", f"{__package__}.text_logs:open_line_protocol", (".lp", ".line", ".influx"),
         is_general=True, is_text=True, libraries=("polars",),

@@ -56,6 +56,9 @@ _VALUE = re.compile(
 _QUANTITY = re.compile(r"\s*[-+−]?\d[\d.,]*(?:e[-+]?\d+)?\s*([^\d\s.,][^\d]*)", re.IGNORECASE)
 #: The last line of the header of a file or of its channels.
 _END_OF_HEADER = re.compile(r"(?i)\W*(end[_ ]of[_ ]header|header[_ ]end)\W*")
+#: Time and numbers in a line of a program's log, and how many lines show one.
+_LOG_TIME = re.compile(r"\W*(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d+\.\d+)")
+_PAIR, _PAIRED = re.compile(r"(?<![\w.])([A-Za-z_][\w.]*)\s*[=:]\s*([-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?)(?![\w:])"), 20
 #: First letters of rows whose first cell gives their kind.
 _SENTENCE = f"$#{string.ascii_letters}"
 #: Marks of comments, and labels of the row of names where the first column contains no values.
@@ -99,6 +102,9 @@ def open_csv(file: TableFile) -> Tables:
         if lines and lines[0].startswith("{"):
             file.stream.seek(0)
             return open_json_lines(file)
+        if lines and all(map(_record_of_pairs, lines[-_PAIRED:])):
+            text.seek(0)
+            return _tables_of_records(map(_record_of_pairs, text), file, "csv", "csv")
         given_separator = re.match(r"(?i)\ufeff?\"?sep=(.)", lines[0]) if lines else None
         separator = given_separator[1] if given_separator else _separator(lines)
         file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
@@ -525,6 +531,16 @@ def open_json_lines(file: TableFile) -> Tables:
 def open_line_protocol(file: TableFile) -> Tables:
     """Read lines of a measurement, its tags, its fields and a time in ns, as databases of time series take them."""
     return _tables_of_records(map(_record_of_line, file.stream), file, "lines", "lines")
+
+
+def _record_of_pairs(line: str) -> dict[str, Any] | None:
+    """Return the numbers of a line of a program's log, ``2025-11-24 14:05:12 [imu] ax=0.1``, by device and name."""
+    time, pairs = _LOG_TIME.match(line), _PAIR.findall(line)
+    if time is None or not pairs:
+        return None if line.strip() else {}
+    device = re.search(r"\[([A-Za-z]\w*)\]", line)
+    values: dict[str, Any] = {name: float(value) for name, value in pairs}
+    return {"time": time[1].replace(",", "."), **({device[1]: values} if device else values)}
 
 
 def _record_of_json(line: bytes) -> dict[str, Any] | None:

@@ -22,13 +22,15 @@ from pdhef_logtool.mapping.candidates import (
     anchor_of,
     look,
     named_fields,
+    place_of,
     proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
+from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio, spread
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
+    EXCITED_A_M_S2,
     SLOW_M_S,
     STEERING_M,
     USUAL_LENGTH_M,
@@ -160,6 +162,7 @@ class Weighing:
                 self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
         self._turn_about()
         self._turn_level()
+        self._stand_up()
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
@@ -253,6 +256,32 @@ class Weighing:
             item.sign, item.is_turned = item.sign * factor, True
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
             self.taken[name] = item
+
+    def _stand_up(self) -> None:
+        """Turn a game's axes with z ahead and y upward, as the speed shows; leave out axes that are not the car's."""
+        ax, speed = self.taken.get("ax_m_s2"), self._speed()
+        if ax is None or speed is None or ax.fixed or not ax.is_axis:
+            return
+        pieces, near = self.fields.pieces, [f for f in self.fields.candidates if place_of(f) == place_of(ax)]
+        axes = {f.meaning.part: f for f in near if f.meaning.quantity == "acceleration" and triad_of(f) == triad_of(ax)}
+        change = pieces.rate_of(speed.si)
+        ahead = {part: correlation(pieces.smooth(f.si), change) for part, f in axes.items()}
+        if set(axes) != set("xyz") or spread(change) < EXCITED_A_M_S2 or abs(ahead["x"]) > FOLLOWS:
+            return
+        if max(map(abs, ahead.values())) < FOLLOWS:
+            self.taken = {n: f for n, f in self.taken.items() if f not in axes.values()}
+            self.notes.append(f"{ax.topic.name}.{ax.path} is not used: no axis of its vector follows the speed")
+        elif abs(ahead["z"]) > CLEAR:
+            rates = [f for f in near if f.meaning.quantity == "rate" and f.meaning.part == "y" and f.is_axis]
+            turned = {"ax_m_s2": axes["z"], "ay_m_s2": axes["x"], **{"yaw_rate_rad_s": f for f in rates[:1]}}
+            axes["z"].sign = math.copysign(1.0, ahead["z"])
+            for rate in rates[:1]:
+                relation = self.fields.turning(axes["x"].si, rate.si, speed.si)
+                rate.sign = math.copysign(1.0, relation.slope if relation is not None else 1.0)
+            for item in turned.values():
+                item.is_turned = True
+                item.doubts.append("y is upward and z ahead, as its accelerations and the speed show")
+            self.taken |= turned
 
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
