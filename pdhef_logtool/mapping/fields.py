@@ -35,9 +35,7 @@ SAME, BY_DRIVING = 0.03, 0.15
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
 CERTAIN = 0.9
-#: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
-#: the steering wheel; usual lengths.
-STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
+#: Usual lengths that convert curvature to an angle: a wheelbase, times a steering ratio for the steering wheel.
 USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
 #: 1-sigma of the logarithm of these lengths among cars, and least share of the unit of speed that they show.
 USUAL_LENGTHS, LIKELY_UNIT = 0.4, 0.7
@@ -293,16 +291,12 @@ def _by_steering(fields: Fields) -> None:
     relation = None if curve is None else fit(fields.pieces.smooth(steering.seen.cells), curve)
     if relation is None or abs(relation.correlation) < CLEAR:
         return
-    odds = dict.fromkeys((unit for unit, _ in speed.units), 0.0)
-    for (unit, v), (_, r), (_, s) in itertools.product(speed.units, rate.units, steering.units):
-        for kind, (low, high) in STEERING_M.items():
-            length = abs(relation.slope) * s * v / r
-            off = math.log(length / USUAL_LENGTH_M[kind]) / USUAL_LENGTHS
-            odds[unit] += (low < length < high) * math.exp(-0.5 * off**2 - RARE.get(unit, 0.0))
-    best = max(odds, key=lambda unit: odds[unit])
-    if odds[best] > LIKELY_UNIT * sum(odds.values()):
-        speed.use(best)
-        speed.doubts.append(f"unit not given; taken as {best}, in which the steering has a usual ratio")
+    ways = [Unit(u, f / m, k, USUAL_LENGTHS) for k, m in USUAL_LENGTH_M.items() for u, f in steering.units]
+    others = [[Unit(*u, energy=RARE.get(u[0], 0.0)) for u in f.units] for f in (rate, speed)]
+    share = posterior([ways, *others], [Gain((1, -1, 1), relation.slope, BY_DRIVING)]).sum(axis=(0, 1))
+    if share.max() > LIKELY_UNIT * share.sum():
+        speed.use(speed.units[int(share.argmax())][0])
+        speed.doubts.append(f"unit not given; taken as {speed.factors[0][0]}, with a usual ratio of the steering")
 
 
 def _by_siblings(fields: Fields) -> None:

@@ -22,17 +22,14 @@ from pdhef_logtool.mapping.candidates import (
     anchor_of,
     look,
     named_fields,
-    place_of,
     proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio, spread
+from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
-    EXCITED_A_M_S2,
     SLOW_M_S,
-    STEERING_M,
     USUAL_LENGTH_M,
     Fields,
     Gain,
@@ -63,6 +60,9 @@ _SENSORS = (
 )  # fmt: skip
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
+#: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
+#: the steering wheel.
+_STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
 #: Signals that may have an unknown sign; largest log ratio between the length of a steering angle and a usual length if
 #: the signal could also be a share of the largest angle.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
@@ -162,7 +162,6 @@ class Weighing:
                 self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
         self._turn_about()
         self._turn_level()
-        self._stand_up()
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
@@ -187,9 +186,15 @@ class Weighing:
             length, speeds = np.hypot(x.si, y.si), [f.si for f in self.fields.open("speed") if f is not x]
             if axes in ("", "body") and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
                 continue
-            over = [a for v, p in ((x, "x"), (y, "y")) for a in self.fields.open("acceleration", p) if _is_change(a, v, self.fields)]
-            out = [x, y, *(over if {a.meaning.part for a in over} == {"x", "y"} else ())]
-            self.fields.candidates = [f for f in self.fields.candidates if not any(f is o for o in out)]
+            self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
+            left = length * self.fields.pieces.turning(x.si + 1j * y.si)
+            for part, velocity, of_body in (("x", x, self.fields.pieces.rate_of(length)), ("y", y, left)):
+                changes = self.fields.pieces.rate_of(velocity.si), of_body
+                for item in [f for f in self.fields.open("acceleration", part) if f.is_axis and not f.fixed]:
+                    over, body = (correlation(self.fields.pieces.smooth(item.si), change) for change in changes)
+                    if over > max(CLEAR, abs(body)):
+                        self.fields.candidates.remove(item)
+                        self.notes.append(f"{item.topic.name}.{item.path} is not used: it is over ground")
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
             if axes in ("east, north", "north, east") and x.role in ("sensor", "navigation"):
                 for name, item in zip(axes.split(", "), (x, y), strict=True):
@@ -257,32 +262,6 @@ class Weighing:
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
             self.taken[name] = item
 
-    def _stand_up(self) -> None:
-        """Turn a game's axes with z ahead and y upward, as the speed shows; leave out axes that are not the car's."""
-        ax, speed = self.taken.get("ax_m_s2"), self._speed()
-        if ax is None or speed is None or ax.fixed or not ax.is_axis:
-            return
-        pieces, near = self.fields.pieces, [f for f in self.fields.candidates if place_of(f) == place_of(ax)]
-        axes = {f.meaning.part: f for f in near if f.meaning.quantity == "acceleration" and triad_of(f) == triad_of(ax)}
-        change = pieces.rate_of(speed.si)
-        ahead = {part: correlation(pieces.smooth(f.si), change) for part, f in axes.items()}
-        if set(axes) != set("xyz") or spread(change) < EXCITED_A_M_S2 or abs(ahead["x"]) > FOLLOWS:
-            return
-        if max(map(abs, ahead.values())) < FOLLOWS:
-            self.taken = {n: f for n, f in self.taken.items() if f not in axes.values()}
-            self.notes.append(f"{ax.topic.name}.{ax.path} is not used: no axis of its vector follows the speed")
-        elif abs(ahead["z"]) > CLEAR:
-            rates = [f for f in near if f.meaning.quantity == "rate" and f.meaning.part == "y" and f.is_axis]
-            turned = {"ax_m_s2": axes["z"], "ay_m_s2": axes["x"], **{"yaw_rate_rad_s": f for f in rates[:1]}}
-            axes["z"].sign = math.copysign(1.0, ahead["z"])
-            for rate in rates[:1]:
-                relation = self.fields.turning(axes["x"].si, rate.si, speed.si)
-                rate.sign = math.copysign(1.0, relation.slope if relation is not None else 1.0)
-            for item in turned.values():
-                item.is_turned = True
-                item.doubts.append("y is upward and z ahead, as its accelerations and the speed show")
-            self.taken |= turned
-
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
         if len(wheels) < 2:
@@ -347,7 +326,7 @@ class Weighing:
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
         """Return the signal for a steering angle, and whether it follows the car's turning (None: unknown)."""
-        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(STEERING_M))
+        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
         if relation is None or abs(relation.correlation) < CLEAR:
             return _steering_by_range(item, kinds, relation)
         metres = abs(relation.slope)
@@ -355,7 +334,7 @@ class Weighing:
         likely = _likely(ways, metres, BY_DRIVING, LIKELY, broken=1e-3)
         name, unit = likely[0].quantity, likely[0].name
         usual = metres * likely[0].factor
-        low, high = STEERING_M[name]
+        low, high = _STEERING_M[name]
         if not low <= (length := usual * USUAL_LENGTH_M[name]) <= high:
             item.doubts.append(f"its ratio to the path's curvature is {length:.3g} m, which no car has in this unit")
             return kinds[0], None
@@ -481,12 +460,6 @@ class Weighing:
             if name and item.role in ("truth", "navigation") and not self.true:
                 candidates.append(item.candidate(name, "truth", taken=False))
         return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
-
-
-def _is_change(acceleration: Field, velocity: Field, fields: Fields) -> bool:
-    """Return whether an acceleration is the derivative of a velocity, in its axes."""
-    change = fields.pieces.rate_of(velocity.si)
-    return correlation(fields.pieces.smooth(acceleration.si), change) > CLEAR
 
 
 def _has_open_sign(item: Field) -> bool:
