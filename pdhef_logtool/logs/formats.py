@@ -91,7 +91,7 @@ FORMATS = (
     LogFormat(
         "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
         is_general=True, libraries=("polars",),
-        named=(".txt", ".dat", ".tab", ".prn", ".ascii", ".lvm", ".msl", ".pos", ".out", ".res", ".sol", ".nmea", ".log"),
+        named=(".txt", ".dat", ".tab", ".prn", ".ascii", ".lvm", ".msl", ".pos", ".out", ".nmea", ".log"),
     ),
     LogFormat(
         "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.constants import CONSTANTS, numbered
+from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
 from pdhef_logtool.logs.recording_span import (
     BREAK_NS,
     NOTED_SHARE,
@@ -49,13 +49,6 @@ _DAYS_TO_1970: dict[int, str] = numbered(_CLOCKS["days_to_1970"])
 #: Names of other epochs by the ns of a unit, and the units from the epoch to 1970.
 _EPOCHS = {(ns, units): name for name, (ns, units) in _CLOCKS["epochs"].items()}
 _GPS_EPOCH_NS, _WEEK_S = _GPS["epoch_s"] * _SECONDS, _GPS["week_s"]
-
-#: A date, a time of day (of 12 hours with AM or PM) or ``minutes:seconds``, and an offset from UTC.
-_TIME_TEXT = (
-    r"^(?:(?P<a>\d{1,4})(?P<mark>[-./])(?P<b>\d{1,2})[-./](?P<c>\d{1,4}),?[T ]*)?"
-    r"(?:(?:(?P<hour>\d{1,3}):)?(?P<minute>\d{1,3}):(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d{1,9})\d*)?)?"
-    r"\s*(?:(?P<half>[AaPp])\.?[Mm]\.?)?\s*(?:[Zz]|UTC|(?P<sign>[-+])(?P<zone_hour>\d\d):?(?P<zone_minute>\d\d)?)?$"
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,13 +133,19 @@ def seconds_of_day(values: FloatArray) -> FloatArray | None:
 
     They step by 40 more at a full minute.
     """
-    hours, rest = np.divmod(values, 1e4)
-    minutes, seconds = np.divmod(rest, 1e2)
-    if not ((values >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)).all():
+    of_day, is_time = of_digits(values)
+    if not is_time.all():
         return None
-    of_day = unwrapped(3600.0 * hours + 60.0 * minutes + seconds)
     jumps = np.diff(values) - np.diff(of_day)
     return of_day if (jumps > 39.0).any() and np.diff(of_day).max() < _MINUTE_NS / _SECONDS else None
+
+
+def of_digits(values: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the seconds since midnight of ``hhmmss.sss`` [N], going on behind midnight, and where they are a time."""
+    hours, rest = np.divmod(values, 1e4)
+    minutes, seconds = np.divmod(rest, 1e2)
+    is_time = (values >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
+    return unwrapped(3600.0 * hours + 60.0 * minutes + seconds), is_time
 
 
 def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz: float | None) -> tuple[int, int, str]:
@@ -332,7 +331,7 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
     the month is first, with a note.
     """
     texts = _numbered_months(texts.str.strip_chars())
-    parts = texts.str.extract_groups(_TIME_TEXT).struct.unnest()
+    parts = texts.str.extract_groups(PATTERNS["time_text"].pattern).struct.unnest()
     if dates is not None and parts["a"].null_count() == len(parts):
         return text_clock(dates.str.strip_chars() + " " + texts)
     number = {n: parts[n].cast(int, strict=False).fill_null(-1).to_numpy() for n in parts.columns if n not in _WORDS}
@@ -362,24 +361,18 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
 
 _WORDS = frozenset({"mark", "half", "sign", "fraction"})
 _MONTHS = [names.replace(" ", "|") for names in CONSTANTS["asc"]["months"]]
-_NAMED_MONTH = r"(?i)^(\d{{1,2}})[-./ ](?:{})[a-z]*[-./, ]+(\d{{2,4}})"
-#: ``Mon, Nov 24, 2025 2:05:12 PM``, or with the year at the end.
-_MONTH_FIRST = (
-    r"(?i)^(?:[a-z]{{3,9}},? )?(?:{})[a-z]*\.? +(\d{{1,2}}),? (?:(\d{{4}}),? )?"
-    r"(\d+:\d+(?::\d+(?:[.,]\d+)?)?(?: ?[ap]m)?)(?: (?:[a-z]{{3,4}})?(?:[-+]\d\d:?\d\d)?)?(?: (\d{{4}}))?$"
-)
-_COMPACT = r"^(\d{4})(\d\d)(\d\d)[T _-]?(\d\d)(\d\d)(\d\d)"
 
 
 def _numbered_months(texts: Series) -> Series:
     """Return texts [N] in which a named month is a number between day and year, and dates of digits have marks."""
-    if texts.drop_nulls().head(1).str.contains(_COMPACT).any():
-        return texts.str.replace(_COMPACT, "${1}-${2}-${3} ${4}:${5}:${6}")
+    compact, *named = (PATTERNS[name].pattern for name in ("compact_date", "named_month", "month_first"))
+    if texts.drop_nulls().head(1).str.contains(compact).any():
+        return texts.str.replace(compact, "${1}-${2}-${3} ${4}:${5}:${6}")
     every = "|".join(_MONTHS)
-    for form, result in ((_NAMED_MONTH, "${{1}}.{}.${{2}}"), (_MONTH_FIRST, "${{1}}.{}.${{2}}${{4}} ${{3}}")):
-        if texts.drop_nulls().head(1).str.contains(form.format(every)).any():
+    for form, result in zip(named, ("${{1}}.{}.${{2}}", "${{1}}.{}.${{2}}${{4}} ${{3}}"), strict=True):
+        if texts.drop_nulls().head(1).str.contains(form.replace("MONTH", every)).any():
             for number, names in enumerate(_MONTHS, 1):
-                texts = texts.str.replace(form.format(names), result.format(number))
+                texts = texts.str.replace(form.replace("MONTH", names), result.format(number))
     return texts
 
 

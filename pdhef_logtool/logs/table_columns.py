@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.table_clocks import (
     NAMED_UNITS,
     NO_TIME,
@@ -71,20 +71,7 @@ _OTHER_ALPHABET = re.compile("|".join(_TRANSLATIONS))
 
 _TIME = re.compile(CONSTANTS["clocks"]["names"].format("|".join(TIME_UNITS_NS)))
 _TIME_LIKE = re.compile(CONSTANTS["clocks"]["like"])
-_WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
-_WEEK_TIME = re.compile(
-    r"(?:(?:gps|gnss)_)?(?:i?tow|sow|time_of_week|seconds_of_week|week_seconds|seconds|time)(?:_m?s)?"
-)
 _SECOND_NS = TIME_UNITS_NS["seconds"]
-#: Columns of a table in long form, with a row for each value.
-_SIGNAL = re.compile(
-    r"_?(?:signal|channel|variable|field|parameter|sensor|tag|key|telemetry|metric|measure|measurement|quantity|series|pid|name)"
-    r"(?:_?(?:name|id))?"
-)
-_VALUE = re.compile(
-    r"_?(?:physical_|signal_|phys_|telemetry_|metric_|measure_|measurement_)?(?:value|val|wert)(?:_double)?"
-)
-_DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 
 
 def field_name(text: str) -> str:
@@ -185,7 +172,8 @@ def _in_parts(sheet: Sheet, names: Mapping[str, str]) -> Clock | None:
     """Return the clock of GPS weeks and seconds, or of years, months and so on until the second; None without them."""
     import polars as pl
 
-    week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
+    of_gps = (PATTERNS[name] for name in ("week", "week_time"))
+    week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in of_gps)
     if week is not None and seconds is not None:
         clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
         return replace(clock, columns=frozenset({week, seconds}))
@@ -260,7 +248,7 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
         given = column.drop_nulls().head(20)
-        named = _TIME_LIKE.search(text) or _DATE.fullmatch(text)
+        named = _TIME_LIKE.search(text) or PATTERNS["date"].fullmatch(text)
         grade, others = (0, 0) if is_time else (1, 1) if named else (2, max(1, len(given) - 1))
         return grade if len({*text_clock(given).stamps_ns.tolist()} - {NO_TIME}) > others else None
     if column.dtype.kind not in "iufM":
@@ -300,7 +288,7 @@ def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float
         unit = sheet.units.get(name, "") or NAMED_UNITS.get(text, text.rpartition("_")[2])
         clock = number_clock(column, unit, name, others, rate_hz)
     else:
-        date = next((n for n in sheet.columns if n != name and _DATE.fullmatch(snake(n))), name)
+        date = next((n for n in sheet.columns if n != name and PATTERNS["date"].fullmatch(snake(n))), name)
         dates = sheet.columns[date]
         clock = text_clock(column, None if date == name or isinstance(dates, np.ndarray) else dates)
         columns = {name, date}
@@ -398,7 +386,8 @@ def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:
 def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
     """Return names, values and units of a table in long form, None for another table."""
     named = {snake(name): column for name, column in sheet.columns.items()}
-    signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in (_SIGNAL, _VALUE))
+    of_long = (PATTERNS[name] for name in ("signal", "long_value"))
+    signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in of_long)
     is_long = signal is not None and not isinstance(signal, np.ndarray) and isinstance(value, np.ndarray)
     return (signal, value, named.get("unit", named.get("units"))) if is_long else None
 

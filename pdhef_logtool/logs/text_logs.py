@@ -25,10 +25,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.mat_log import tables_of_variables
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
-from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, placed, unwrapped, whole_days
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, of_digits, placed, whole_days
 from pdhef_logtool.logs.table_columns import Sheet, by_times, field_name, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
@@ -46,43 +46,17 @@ _CELLS_OF_HEAD = 10_000
 #: Cells that are in memory as texts at the same time.
 _CELLS_AT_ONCE = 1 << 23
 _CELL_END, _SPACES = "\x1f", r"\s{2,}"
-#: Numbers, in any spelling, and times.
-_VALUE = re.compile(
-    r"\s*([-+−]?(0x[\da-f]+|[\d.,'’\s]*\d[.,]?(e[-+]?\d+)?)|true|false|"
-    r"\d{1,4}[./-]\d\d?[./-]\d{2,4}([T ].*)?|(\d\d?:)?\d\d?:\d\d([.,]\d+)?Z?(\s?[AP]M)?)\s*",
-    re.IGNORECASE,
-)
-#: A number and its unit in one cell.
-_QUANTITY = re.compile(r"\s*[-+−]?\d[\d.,]*(?:e[-+]?\d+)?\s*([^\d\s.,][^\d]*)", re.IGNORECASE)
-#: The last line of the header of a file or of its channels.
-_END_OF_HEADER = re.compile(r"(?i)\W*(end[_ ]of[_ ]header|header[_ ]end)\W*")
-#: Time and numbers in a line of a program's log, and how many lines show one.
-_LOG_TIME = re.compile(r"\W*(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d+\.\d+)")
-_PAIR, _PAIRED = re.compile(r"(?<![\w.])([A-Za-z_][\w.]*)\s*[=:]\s*([-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?)(?![\w:])"), 20
+#: Lines that show numbers with names.
+_PAIRED = 20
 #: First letters of rows whose first cell gives their kind.
 _SENTENCE = f"$#{string.ascii_letters}"
-#: Marks of comments, and labels of the row of names where the first column contains no values.
-#: Labels of a rate, and of the time between rows.
-_RATES = {
-    "rate": r"(?:(?:sampl\w*|data|log\w*)[ _]?(?:rate|freq\w*)|freq\w*|abtast(?:rate|frequenz)|fs)(?: ?[[(]k?hz[])])?",
-    "step": r"(?:sampl\w*[ _]?(?:interval|period|time|step)|h_?resolution|delta_?[xt]|dt|abtastzeit)(?: ?[[(]\w+[])])?",
-}
-_UNIT_LABEL = re.compile(r"(?i)^\s*units?\s*:")
-#: A channel in a list above the rows.
-_LISTED = re.compile(r"(?i)(?:channel|signal|name)(?: ?name)?\s*[:=]\s*(.+)")
-_COMMENT = re.compile(r"(?:[#%!;]|//)\s*")
+#: Labels of the row of names where the first column contains no values.
 _LABELS = frozenset(
     {"name", "names", "signal", "signals", "channel", "channels", "variable", "variables", "title", "label"}
 )
 codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
 
 VBO_TYPE = "vbox/msg/Vbo"
-#: Channels of the receiver itself, which ``[channel units]`` leaves out.
-_RECEIVER = re.compile(
-    r"(satellites|time|latitude|longitude|velocity.*|heading|height|vertical velocity.*|(trigger )?event.*|.*_raw|"
-    r"glonass.*|gps.*|beidou.*|solution type.*|long accel.*|lat accel.*|.*distance m|date|avi.*)",
-    re.IGNORECASE,
-)
 #: Share of the path that is along the heading if the signs of the positions are right.
 _ALONG_HEADING = 0.95
 _CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
@@ -117,7 +91,7 @@ def open_csv(file: TableFile) -> Tables:
         stated_hz = _stated_rate(row for _, row in head[:first])
         fields, given = read_head(titles)
         given |= {
-            name: _UNIT_LABEL.sub("", unit).strip("[](){} ")
+            name: PATTERNS["unit_label"].sub("", unit).strip("[](){} ")
             for name, unit in zip(fields, units, strict=False)
             if unit.strip()
         }
@@ -151,7 +125,8 @@ def _stated_rate(head: Iterable[Sequence[str]]) -> float | None:
     for label, *values in labelled:
         number = next((cell for cell in values if cell.strip()), "")
         value = re.match(r"\s*(\d+(?:[.,]\d*)?(?:e[-+]?\d+)?)\s*(\w*)", number, re.IGNORECASE)
-        of = next((kind for kind, pattern in _RATES.items() if re.fullmatch(pattern, label.strip(" \t:#").lower())), "")
+        text = label.strip(" \t:#").lower()
+        of = next((kind for kind in ("rate", "step") if PATTERNS[kind].fullmatch(text)), "")
         if value and of and (amount := float(value[1].replace(",", "."))) > 0.0:
             unit = (value[2] or re.sub(r".*\W(\w+)\W*", r"\1", label)).lower()
             seconds = TIME_UNITS_NS.get(unit, TIME_UNITS_NS["s"]) / TIME_UNITS_NS["s"]
@@ -208,7 +183,7 @@ def open_vbo(file: TableFile) -> Tables:
         what = "longitude is positive to the east, against the format, as the heading shows: its sign is changed"
         losses.append(Loss("mirrored", what, file.name, severity="note"))
         columns["longitude"] = -columns["longitude"]
-    modules = [f for f, title in zip(fields, titles, strict=True) if not _RECEIVER.fullmatch(title)]
+    modules = [f for f, title in zip(fields, titles, strict=True) if not PATTERNS["receiver"].fullmatch(title)]
     units = {f: "min" for f in fields if f.startswith(("latitude", "longitude"))}
     units |= _channel_units(sections.get("channel units", []), modules, fields, file.name, losses) | given
     sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
@@ -263,12 +238,12 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     lengths = Counter(len(row) for row in rows[-20:])
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
-    header = max((i for i, row in enumerate(rows) if row and _END_OF_HEADER.fullmatch(row[0])), default=-1)
+    header = max((i for i, row in enumerate(rows) if row and PATTERNS["end_of_header"].fullmatch(row[0])), default=-1)
     data = _data_rows(rows, width)
     numbers = [i for i in data if i > header and len(rows[i]) == width > 1 and _share(rows[i], _is_value) >= 0.5]
     # Above the titles there may be a row with the numbers of the channels.
     full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width, header))), (0, []))
-    listed = [m[1] for row in rows if (m := _LISTED.fullmatch(", ".join(row))) is not None]
+    listed = [m[1] for row in rows if (m := PATTERNS["listed"].fullmatch(", ".join(row))) is not None]
     if not above and numbers and width - len(listed) in (0, 1):
         return ["Time", *listed][-width:], [], numbers[0]
     if not above:
@@ -285,7 +260,7 @@ def _head(
     is_labelled = not any(row[0].strip() for row in rows[full : full + 3])
     names = _names_row(rows, last, above if is_labelled or len(above) > len(last) else [])
     below = (i for i in range(names + 1, full) if i in data)
-    first = next((i for i in below if any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i])), full)
+    first = next((i for i in below if any(PATTERNS["value"].fullmatch(c) and not is_unit(c) for c in rows[i])), full)
     of_units = next((i for i in above if i != names and _share(rows[i], is_unit) >= 0.5), -1)
     has_groups = names - 1 in above and not is_labelled and of_units != names - 1
     under = [rows[i] for i in above if names < i < first]
@@ -334,8 +309,8 @@ def _titles(rows: Sequence[Sequence[str]], width: int, header: int) -> list[int]
 
 def _is_value(cell: str) -> bool:
     """Return whether a cell is a number, a time, or a number with its unit."""
-    with_unit = _QUANTITY.fullmatch(cell)
-    return bool(_VALUE.fullmatch(cell) or (with_unit and is_unit(with_unit[1])))
+    with_unit = PATTERNS["quantity"].fullmatch(cell)
+    return bool(PATTERNS["value"].fullmatch(cell) or (with_unit and is_unit(with_unit[1])))
 
 
 def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
@@ -347,7 +322,7 @@ def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequen
 
 def _uncommented(row: Sequence[str], width: int) -> Sequence[str]:
     """Return a row of ``width`` cells, without the mark of a comment and an empty cell at its end."""
-    if row and (mark := _COMMENT.match(row[0])):
+    if row and (mark := PATTERNS["comment"].match(row[0])):
         title = row[0][mark.end() :].lstrip("# ")
         row = [title, *row[1:]] if title or len(row) <= width else row[1:]
     return row[:-1] if len(row) == width + 1 and not row[-1].strip() else row
@@ -494,11 +469,8 @@ def _vbo_stamps(columns: Mapping[str, Any], created: Iterable[tuple[str, str, st
     """Return the times [N] of ``hhmmss.sss`` on the day that the file was created."""
     clock: FloatArray = columns["time"]
     finite = np.isfinite(clock) & (clock >= 0.0) & (clock < 240_000.0)
-    hours, rest = np.divmod(np.where(finite, clock, 0.0), 1e4)
-    minutes, seconds = np.divmod(rest, 1e2)
     stamps = np.full(len(clock), NO_TIME, np.int64)
-    of_day = unwrapped((3600.0 * hours + 60.0 * minutes + seconds)[finite])
-    stamps[finite] = np.round(of_day * 1e6).astype(np.int64) * 1000
+    stamps[finite] = np.round(of_digits(clock[finite])[0] * 1e6).astype(np.int64) * 1000
     with suppress(ValueError):
         for day, month, year in created:
             return np.where(finite, stamps + whole_days(dt.date(int(year), int(month), int(day))), NO_TIME)
@@ -535,7 +507,7 @@ def open_line_protocol(file: TableFile) -> Tables:
 
 def _record_of_pairs(line: str) -> dict[str, Any] | None:
     """Return the numbers of a line of a program's log, ``2025-11-24 14:05:12 [imu] ax=0.1``, by device and name."""
-    time, pairs = _LOG_TIME.match(line), _PAIR.findall(line)
+    time, pairs = PATTERNS["log_time"].match(line), PATTERNS["pair"].findall(line)
     if time is None or not pairs:
         return None if line.strip() else {}
     device = re.search(r"\[([A-Za-z]\w*)\]", line)
