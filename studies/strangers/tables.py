@@ -67,8 +67,9 @@ def _text(dialect: str, path: Path, topics: Sequence[Topic]) -> None:
     cells = {f"{key}s": [p[key] for p in parts] for key in ("title", "source", "group")}
     cells |= {f"{key}s": [form[key].format(**p) for p in parts] for key in ("name", "unit")}
     cells["numbers"] = [str(i) for i in range(12, 12 + len(titles))]
+    cells["channels"] = [form["channel"].format(number=i, **p) for i, p in enumerate(parts, 1)]
     start = min(int(t.arrival_ns[0]) for t in topics)
-    above = {name: form["separator"].join(row) for name, row in cells.items()} | _times(start, start, 0)
+    above = {name: ("\n" if name == "channels" else form["separator"]).join(row) for name, row in cells.items()} | _times(start, start, 0)
     rows = {"table": _table_rows, "samples": _sample_rows}.get(form["rows"], _value_rows)(form, topics, start)
     rows = (row.replace(".", form["decimal"]) for row in rows)
     lines = [*(line.format(**above) for line in form["head"]), *rows, *form["tail"], ""]
@@ -366,6 +367,31 @@ def _json_signals(path: Path, topics: Sequence[Topic]) -> None:
     path.write_text(json.dumps(signals), encoding="utf-8")
 
 
+def _json_channels(path: Path, topics: Sequence[Topic]) -> None:
+    """Write one document: a list of channels with name, unit, rate and data."""
+    channels = []
+    for topic in topics:
+        rate_hz = round(1e9 / float(np.median(np.diff(topic.arrival_ns))), 3)
+        for title, values in topic.fields.items():
+            name, unit = _split(title)
+            channels.append({"name": name, "unit": unit, "samplerate": rate_hz, "data": values.tolist()})
+    meta = {"vehicle": "car 3", "start": "2025-11-24T14:05:12.125Z"}
+    path.write_text(json.dumps({"meta": meta, "channels": channels}), encoding="utf-8")
+
+
+def _mat_values(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a struct for each channel with its times, values and units."""
+    from scipy.io import savemat
+
+    channels: dict[str, Any] = {}
+    for topic in topics:
+        for title, values in topic.fields.items():
+            name, unit = _split(title)
+            seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
+            channels[name] = {"Time": seconds, "Value": values, "Units": unit}
+    savemat(path, channels)
+
+
 def _json_columns(path: Path, topics: Sequence[Topic]) -> None:
     """Write one document: an object for each topic, with a list for each column."""
     start = topics[0].arrival_ns[0]
@@ -458,6 +484,8 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "mat-groups": (".mat", _mat_groups),
     "json-signals": (".json", _json_signals),
     "json-columns": (".json", _json_columns),
+    "json-channels": (".json", _json_channels),
+    "mat-values": (".mat", _mat_values),
     "hdf5": (".h5", _hdf5),
     "parquet-measures": (".parquet", _measures_parquet),
     "mdf": (".mf4", _mdf),
