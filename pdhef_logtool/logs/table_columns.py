@@ -43,6 +43,8 @@ _REGULAR = 1.5
 _ENOUGH_ROWS = 0.9
 #: Lengths of two clocks of a table differ by less than this share.
 _ALIKE = 0.01
+#: Rows of a device in a table of several, and devices.
+_FEW_ROWS, _MOST_KINDS = 10, 50
 #: Share of steps that are not negative, of a column that may contain times.
 _ASCENDING_SHARE = 0.99
 
@@ -318,6 +320,11 @@ def tables_of(
             for name, (part, its) in zip(unique(part.name for part, _ in long), long, strict=True):
                 yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
             return
+        if kinds := dict(_kinds(sheet)):
+            for kind, its_rows in kinds.items():
+                its_columns = {n: c[its_rows] for n, c in sheet.columns.items()}
+                yield from tables_of(Sheet(field_name(kind), its_columns, sheet.units), where, losses, stamps[its_rows])
+            return
     rows, lost = ascending_rows(stamps, f"{where}, {sheet.name}")
     losses.extend(lost)
     times, note = spread(stamps[rows]) if used else (stamps[rows], "")
@@ -390,6 +397,17 @@ def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
     signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in of_long)
     is_long = signal is not None and not isinstance(signal, np.ndarray) and isinstance(value, np.ndarray)
     return (signal, value, named.get("unit", named.get("units"))) if is_long else None
+
+
+def _kinds(sheet: Sheet) -> Iterator[tuple[str, IntArray]]:
+    """Yield the rows of each kind of a table whose rows are samples of several devices, which a column names."""
+    names = [
+        n for n, c in sheet.columns.items() if PATTERNS["kind"].fullmatch(snake(n)) and not isinstance(c, np.ndarray)
+    ]
+    texts = sheet.columns[names[0]].fill_null("").to_numpy() if names else np.empty(0)
+    kinds, counts = np.unique(texts, return_counts=True)
+    if 1 < np.count_nonzero(counts >= _FEW_ROWS) <= _MOST_KINDS:
+        yield from ((str(kind), np.flatnonzero(texts == kind)) for kind in kinds[counts >= _FEW_ROWS])
 
 
 def _of_long_form(

@@ -570,13 +570,15 @@ def _array_of(value: Any, depth: int) -> Any:
         if len(value) > 1 and all(key.isdigit() for key in value):
             return _array_of([*value.values()], depth)
         return {name: _array_of(inner, depth - 1) for name, inner in value.items()}
+    if isinstance(value, list) and value and isinstance(value[0], dict) and depth:
+        return [_array_of(inner, depth - 1) for inner in value]
     if isinstance(value, list):
         with suppress(ValueError, TypeError):
             is_text = any(isinstance(v, str) for v in value[:2])
             return (
                 np.array([v.rstrip("Z") for v in value], "datetime64[ns]") if is_text else np.array(value, np.float64)
             )
-    return value if isinstance(value, str) else None
+    return value if isinstance(value, str | float | int) else None
 
 
 def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str, name: str = "json") -> Tables:

@@ -302,10 +302,11 @@ def _by_steering(fields: Fields) -> None:
 def _by_siblings(fields: Fields) -> None:
     """Use the unit of other accelerations, or velocities, of the same message."""
     for kinds in ({"acceleration"}, {"speed", "velocity"}):
-        settled = {leaf_group(f): f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known}
+        known = [f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known]
+        settled = {leaf_group(f): f for f in known} | {triad_of(f): f for f in known}
         mine = (f for f in fields.candidates if f.meaning.quantity in kinds and f.meaning.strength > 0.6)
         for item in [f for f in mine if not f.unit_known and leaf_group(f) in settled]:
-            other = settled[leaf_group(item)]
+            other = settled.get(triad_of(item), settled[leaf_group(item)])
             same = [u for u, s in item.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
             if same:
                 item.use(same[0])
