@@ -36,16 +36,12 @@ _TAG_BYTES = struct.calcsize("II")
 _ELEMENTS, _NUMBERS = numbered(_MAT["elements"]), numbered(_MAT["numbers"])
 _CELL, _STRUCT, _OBJECT, _CHARACTERS = range(1, 5)
 _UNUSABLE, _ENCODINGS = numbered(_MAT["unusable"]), numbered(_MAT["encodings"])
-#: Structs inside one another.
-_DEEPEST = 8
+#: Structs inside one another; columns of a matrix that become fields.
+_DEEPEST, _MOST_COLUMNS = 8, 16
 #: Filters of HDF5 that are a part of it: deflate, shuffle, checksum.
 _FILTERS = frozenset({1, 2, 3})
-#: Columns of a matrix that become fields.
-_MOST_COLUMNS = 16
-#: Names of the values of a struct that has the name of the signal.
-_DATA = frozenset({"data", "value", "values"})
-#: Separates the parts of a path.
-_SLASH = "/"
+#: Names of the values of a struct that has the name of the signal. What separates the parts of a path.
+_DATA, _SLASH = frozenset({"data", "value", "values"}), "/"
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +96,9 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
         losses.append(Loss("no-numbers", what, file.name, count=len(unusable), severity="note"))
     tables = list(_mat_tables(arrays, units, file, losses, rate_hz))
     if not tables:
-        raise LogError(
-            expected="a vector of times (t, time, ...) as long as the signals beside it",
-            got=", ".join(name for columns in arrays.values() for name in columns) or "no numeric variables",
-            where=file.name,
-            remedy="name the vector of times so; without one, state the samples per second: --set rate_hz=100, "
-            "or rate_hz in the mapping file",
-        )
+        expected = "a vector of times (t, time, ...) as long as the signals beside it"
+        got = ", ".join(name for columns in arrays.values() for name in columns) or "no numeric variables"
+        raise LogError(expected=expected, got=got, where=file.name, remedy=CONSTANTS["clocks"]["remedy"])
     return tables
 
 
@@ -366,10 +358,8 @@ def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 
 def _leaves(path: str, value: Any, depth: int, unit: str = "") -> Iterator[tuple[str, Any, str]]:
-    is_rate = (
-        isinstance(value, float | int) and value > 0 and PATTERNS["rate"].fullmatch(path.rpartition(_SLASH)[2].lower())
-    )
-    if is_rate or isinstance(value, np.ndarray | _Unusable):
+    is_rate = PATTERNS["rate"].fullmatch(path.rpartition(_SLASH)[2].lower())
+    if (is_rate and isinstance(value, float | int) and value > 0) or isinstance(value, np.ndarray | _Unusable):
         yield path, value, unit
     elif isinstance(value, dict | list) and depth >= _DEEPEST:
         yield path, _Unusable("too deep inside of structs"), unit

@@ -252,9 +252,8 @@ def _steps(values: NDArray[Any]) -> tuple[float, int]:
 def _scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:
     """Return values [N] since an epoch in ns; those that do not fit into int64 have no time."""
     stamps = np.full(values.shape, NO_TIME, np.int64)
-    has_time = has_time & (
-        np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch) < _CLOCKS["last_ns"] / factor
-    )
+    size = np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch)
+    has_time = has_time & (size < _CLOCKS["last_ns"] / factor)
     given = values[has_time]
     # The fraction apart: a product would lose the last digits of a date.
     whole = given if given.dtype.kind in "iu" else np.floor(given)
@@ -308,9 +307,8 @@ def week_clock(week: FloatArray, seconds: FloatArray) -> Clock:
         given = given + added
     within = within / per_second if within.max(initial=0.0) > _WEEK_S else within
     stamps = np.full(week.shape, NO_TIME, np.int64)
-    stamps[has_time] = (
-        _GPS_EPOCH_NS + given * (_WEEK_S * _SECONDS) + np.round(within * float(_SECONDS)).astype(np.int64)
-    )
+    of_week = np.round(within * float(_SECONDS)).astype(np.int64)
+    stamps[has_time] = _GPS_EPOCH_NS + given * (_WEEK_S * _SECONDS) + of_week
     return Clock(_to_utc(stamps, has_time), notes)
 
 
@@ -383,15 +381,12 @@ def _days(a: IntArray, b: IntArray, c: IntArray, mark: NDArray[Any]) -> tuple[In
     year = np.where(year_first, a, np.where(is_short, c + 2000, c))
     days, is_day = _civil(year, b, np.where(year_first, c, a))
     other, is_other = _civil(year, np.where(year_first, b, a), np.where(year_first, c, b))
-    day_first, month_first = ((-int(is_.sum()), _spread(of[is_])) for of, is_ in ((days, is_day), (other, is_other)))
+    orders = ((days, is_day), (other, is_other))
+    day_first, month_first = ((-int(is_.sum()), int(np.ptp(of[is_])) if is_.any() else 0) for of, is_ in orders)
     if (mark == ".").any() or year_first.any() or day_first < month_first:
         return days, is_day, ""
     is_open = day_first == month_first and bool((days != other)[is_day].any())
     return other, is_other, "no date shows whether day or month is first: read as month/day" if is_open else ""
-
-
-def _spread(values: IntArray) -> int:
-    return int(np.ptp(values)) if len(values) else 0
 
 
 def _civil(year: IntArray, month: IntArray, day: IntArray) -> tuple[IntArray, BoolArray]:

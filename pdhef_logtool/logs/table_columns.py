@@ -37,16 +37,12 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 if TYPE_CHECKING:
     from polars import Series
 
-#: Steps of a column's own clock are at most this multiple of its usual step.
-_REGULAR = 1.5
-#: A second clock is used if it has times in fewer rows than this share of another one.
-_ENOUGH_ROWS = 0.9
-#: Lengths of two clocks of a table differ by less than this share.
-_ALIKE = 0.01
+#: Steps of a column's own clock are at most this multiple of its usual step. A second clock is used if it has times in
+#: fewer rows than this share of another one. Lengths of two clocks of a table differ by less than this share. Share of
+#: steps that are not negative, of a column that may contain times.
+_REGULAR, _ENOUGH_ROWS, _ALIKE, _ASCENDING_SHARE = 1.5, 0.9, 0.01, 0.99
 #: Rows of a device in a table of several, and devices.
 _FEW_ROWS, _MOST_KINDS = 10, 50
-#: Share of steps that are not negative, of a column that may contain times.
-_ASCENDING_SHARE = 0.99
 
 #: Evidence of motion on the unit of a clock.
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
@@ -55,9 +51,6 @@ _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS
 #: Products and quotients of units, with exponents.
 _SYMBOL = rf"(?:{'|'.join(map(re.escape, CONSTANTS['table_units']['symbols'].split()))})(?:\^?\**[-+]?\d|[⁻¹²³]+)?"
 _COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/·.]|\bper\b|\s)\s*{_SYMBOL})+")
-_BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
-#: A unit behind a comma, a word, a dash or a quotient (``v / (km/h)``).
-_BEHIND = re.compile(r"^(.+?)(?:[,;:]|\s(?:in|-|–|/)(?=\s))\s*([^\s,;:].*)$")
 #: Letters in ASCII.
 LATIN = str.maketrans(CONSTANTS["latin"])
 _ALPHABETS = {name: dict(pair.split("=") for pair in pairs.split()) for name, pairs in CONSTANTS["alphabets"].items()}
@@ -108,8 +101,8 @@ def split_unit(text: str) -> tuple[str, str]:
     if "|" in text:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
-    for pattern in (_BEHIND, _BRACKETED):
-        match = pattern.match(text.strip())
+    for name in ("unit_behind", "unit_in_brackets"):
+        match = PATTERNS[name].match(text.strip())
         if match and match[1] and is_unit(match[2]) and not match[2].isdigit():  # [1] is an index
             return match[1].rstrip(" /"), match[2].strip(" ()")
     return text.strip(), ""
@@ -153,13 +146,9 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     if not chosen:
         if rate_hz:
             return rate_clock(max(map(len, sheet.columns.values()), default=0), rate_hz)
-        raise LogError(
-            expected="a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)",
-            got=", ".join([*sheet.columns][:8]) or "no columns",
-            where=f"{where}, {sheet.name}",
-            remedy="name the column of times so; without one, state the rows per second: --set rate_hz=100, or "
-            "rate_hz in the mapping file",
-        )
+        expected = "a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)"
+        got = ", ".join([*sheet.columns][:8]) or "no columns"
+        raise LogError(expected=expected, got=got, where=f"{where}, {sheet.name}", remedy=CONSTANTS["clocks"]["remedy"])
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
     clock = _read_clock(sheet, chosen, (*others, *certain), rate_hz) if certain else clocks[chosen]
     clock = _in_two_columns(clock, sheet, chosen, names)
@@ -275,11 +264,8 @@ def _grade_of_numbers(sheet: Sheet, name: str, given: NDArray[Any]) -> int | Non
     steps = np.diff(given)
     is_count = bool((steps == steps[0]).all()) and steps[0] == 1
     is_regular = np.quantile(np.abs(steps - np.median(steps)), _ENOUGH_ROWS) <= _ALIKE * np.median(steps)
-    is_alone = (
-        len(sheet.columns) < CONSTANTS["clocks"]["fewest_columns"]
-        or name != next(iter(sheet.columns))
-        or name in sheet.units
-    )
+    are_few = len(sheet.columns) < CONSTANTS["clocks"]["fewest_columns"]
+    is_alone = are_few or name != next(iter(sheet.columns)) or name in sheet.units
     return 4 if is_regular and not (is_count or is_alone) else None
 
 
@@ -316,14 +302,10 @@ def tables_of(
         clock = find_clock(sheet, where, rate_hz=None if named_values else rate_hz)
         stamps, used = clock.stamps_ns, clock.columns
         losses.extend(clock_notes(clock.notes, where))
-        if named_values and (long := list(_of_long_form(sheet, stamps, *named_values))):
-            for name, (part, its) in zip(unique(part.name for part, _ in long), long, strict=True):
-                yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
-            return
-        if kinds := dict(_kinds(sheet)):
-            for kind, its_rows in kinds.items():
-                its_columns = {n: c[its_rows] for n, c in sheet.columns.items()}
-                yield from tables_of(Sheet(field_name(kind), its_columns, sheet.units), where, losses, stamps[its_rows])
+        parts = list(_of_long_form(sheet, stamps, *named_values) if named_values else _of_kinds(sheet, stamps, used))
+        for name, (part, its) in zip(unique(part.name for part, _ in parts), parts, strict=True):
+            yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
+        if parts:
             return
     rows, lost = ascending_rows(stamps, f"{where}, {sheet.name}")
     losses.extend(lost)
@@ -399,30 +381,36 @@ def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
     return (signal, value, named.get("unit", named.get("units"))) if is_long else None
 
 
-def _kinds(sheet: Sheet) -> Iterator[tuple[str, IntArray]]:
-    """Yield the rows of each kind of a table whose rows are samples of several devices, which a column names."""
-    names = [
-        n for n, c in sheet.columns.items() if PATTERNS["kind"].fullmatch(snake(n)) and not isinstance(c, np.ndarray)
-    ]
-    texts = sheet.columns[names[0]].fill_null("").to_numpy() if names else np.empty(0)
-    kinds, counts = np.unique(texts, return_counts=True)
-    if 1 < np.count_nonzero(counts >= _FEW_ROWS) <= _MOST_KINDS:
-        yield from ((str(kind), np.flatnonzero(texts == kind)) for kind in kinds[counts >= _FEW_ROWS])
+def _rows_by(texts: Series) -> dict[str, IntArray]:
+    """Return the rows of each text of a column."""
+    import polars as pl
+
+    rows = (
+        pl.DataFrame({"text": texts}).with_row_index().drop_nulls().group_by("text", maintain_order=True).agg("index")
+    )
+    return {text: numbers.to_numpy() for text, numbers in zip(rows["text"], rows["index"], strict=True)}
+
+
+def _of_kinds(sheet: Sheet, stamps: IntArray, used: frozenset[str]) -> Iterator[tuple[Sheet, IntArray]]:
+    """Yield the parts of a table whose rows are samples of several devices, which a column names."""
+    for name in (n for n, c in sheet.columns.items() if PATTERNS["kind"].fullmatch(snake(n))):
+        texts, columns = sheet.columns[name], {n: c for n, c in sheet.columns.items() if n not in {name, *used}}
+        rows_of = {} if isinstance(texts, np.ndarray) else _rows_by(texts)
+        if len(rows_of) <= _MOST_KINDS and sum(len(rows) >= _FEW_ROWS for rows in rows_of.values()) > 1:
+            for kind, rows in rows_of.items():
+                yield Sheet(field_name(kind), {n: c[rows] for n, c in columns.items()}, sheet.units), stamps[rows]
+            return
 
 
 def _of_long_form(
     sheet: Sheet, stamps: IntArray, signal: Series, value: NDArray[Any], units: Any
 ) -> Iterator[tuple[Sheet, IntArray]]:
     """Yield the signals of a table with a row for each value; signals with equal times are one sheet."""
-    import polars as pl
-
-    rows_of = pl.DataFrame({"signal": signal}).with_row_index().drop_nulls().group_by("signal", maintain_order=True)
-    grouped = rows_of.agg("index")
-    if grouped.height**2 > 100 * len(signal):  # texts of another kind
+    rows_of = _rows_by(signal)
+    if len(rows_of) ** 2 > 100 * len(signal):  # texts of another kind
         return
     clocks: dict[bytes, tuple[Sheet, IntArray]] = {}
-    for title, numbers in zip(grouped["signal"], grouped["index"], strict=True):
-        rows = numbers.to_numpy()
+    for title, rows in rows_of.items():
         part, _ = clocks.setdefault(stamps[rows].tobytes(), (Sheet(sheet.name, {}, {}), stamps[rows]))
         (field,), given = read_head([title])
         cell = None if units is None or isinstance(units, np.ndarray) else units[int(rows[0])]

@@ -15,7 +15,6 @@ import datetime as dt
 import io
 import json
 import re
-import string
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -39,21 +38,10 @@ if TYPE_CHECKING:
 
     from pdhef_logtool.logs.table_log import Table
 
-#: Lines at the start of a CSV file in which its header must be.
-_HEAD_LINES = 200
-#: Cells below the header that show the decimal mark of the file.
-_CELLS_OF_HEAD = 10_000
-#: Cells that are in memory as texts at the same time.
-_CELLS_AT_ONCE = 1 << 23
+#: Lines at the start of a CSV file in which its header must be; cells below it that show the decimal mark; lines that
+#: show numbers with names; cells that are in memory as texts at the same time.
+_HEAD_LINES, _CELLS_OF_HEAD, _PAIRED, _CELLS_AT_ONCE = 200, 10_000, 20, 1 << 23
 _CELL_END, _SPACES = "\x1f", r"\s{2,}"
-#: Lines that show numbers with names.
-_PAIRED = 20
-#: First letters of rows whose first cell gives their kind.
-_SENTENCE = f"$#{string.ascii_letters}"
-#: Labels of the row of names where the first column contains no values.
-_LABELS = frozenset(
-    {"name", "names", "signal", "signals", "channel", "channels", "variable", "variables", "title", "label"}
-)
 codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
 
 VBO_TYPE = "vbox/msg/Vbo"
@@ -90,11 +78,7 @@ def open_csv(file: TableFile) -> Tables:
         titles, units, first = _layout([row for _, row in head], file.name)
         stated_hz = _stated_rate(row for _, row in head[:first])
         fields, given = read_head(titles)
-        given |= {
-            name: PATTERNS["unit_label"].sub("", unit).strip("[](){} ")
-            for name, unit in zip(fields, units, strict=False)
-            if unit.strip()
-        }
+        given |= {name: unit for name, unit in zip(fields, units, strict=False) if unit}
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         tables: list[Table] = []
@@ -143,7 +127,7 @@ def _titles_of_kinds(head: Sequence[Sequence[str]]) -> dict[str, list[str]]:
         row[0].lstrip("#% "): [c.strip() for c in row[1:]] for row in head if row and row[0].startswith(("#", "%"))
     }
     titles_of |= {row[3].strip(): [c.strip() for c in row[5:]] for row in head if len(row) > 5 and row[0] == "FMT"}
-    kinds = {row[0].strip() for row in head if len(row) > 1 and row[0][:1] in _SENTENCE and row[0] != "FMT"}
+    kinds = {row[0].strip() for row in head if len(row) > 1 and re.match("[$#A-Za-z]", row[0]) and row[0] != "FMT"}
     titles_of |= {kind: t.split() for kind in kinds for end, t in CONSTANTS["sentences"].items() if kind.endswith(end)}
     return {k: titles for k, titles in titles_of.items() if k in kinds and len(titles) > 1}
 
@@ -269,12 +253,9 @@ def _head(
     titles = _joined(named, rows[names - 1] if has_groups else [], under)
     if len(titles) < width and rows[full][-1].strip():  # names of the rows without a title, as R writes them
         titles = ["row", *titles]
-    units = (
-        []
-        if of_units < 0
-        else ["" if re.search("unit|einheit", c, re.IGNORECASE) and not is_unit(c) else c for c in rows[of_units]]
-    )
-    return titles, units, first
+    given = rows[of_units] if of_units >= 0 else []
+    units = ["" if re.search("(?i)unit|einheit", c) and not is_unit(c) else c for c in given]
+    return titles, [PATTERNS["unit_label"].sub("", c).strip("[](){} ") for c in units], first
 
 
 def _beside(rows: Sequence[Sequence[str]], column: int) -> str:
@@ -293,7 +274,7 @@ def _data_rows(rows: Sequence[Sequence[str]], width: int) -> list[int]:
 def _names_row(rows: Sequence[Sequence[str]], last: Sequence[int], labelled: Sequence[int]) -> int:
     """Return the row of titles: labelled so, or with most texts that are no units."""
     names = max(reversed(last), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
-    return next((i for i in labelled if rows[i][0].strip().lower() in _LABELS), names)
+    return next((i for i in labelled if PATTERNS["label"].fullmatch(rows[i][0].strip())), names)
 
 
 def _titles(rows: Sequence[Sequence[str]], width: int, header: int) -> list[int]:
@@ -374,16 +355,17 @@ def _with_hemispheres(columns: dict[str, Any]) -> dict[str, Any]:
 
     Receivers write degrees and minutes as ``4807.038``.
     """
+    texts = [(c, {*c.drop_nulls().unique()} - {""}) for c in columns.values() if not isinstance(c, np.ndarray)]
     for letters, place in (("NS", "(?i)(^|_)lat"), ("EW", "(?i)(^|_)(lon|lng)")):
-        named = (c for n, c in columns.items() if not isinstance(c, np.ndarray) and not re.search("(?i)heading", n))
-        side = next((c for c in named if {*c.drop_nulls().unique()} - {""} in ({*letters}, *map(set, letters))), None)
-        name = next((n for n, c in columns.items() if re.search(place, n) and isinstance(c, np.ndarray)), None)
-        if side is None or name is None:
-            continue
-        degrees, minutes = np.divmod(columns[name], 100.0)
-        has_minutes = np.nanmax(np.abs(columns[name]), initial=0.0) > 180.0
-        size = degrees + minutes / 60.0 if has_minutes else np.abs(columns[name])
-        columns[name] = np.where((side == letters[1]).fill_null(value=False).to_numpy(), -size, size)
+        sides = [c for c, values in texts if values and values <= {*letters}]
+        names = [n for n, c in columns.items() if re.search(place, n) and isinstance(c, np.ndarray)]
+        for name in names[:1] if sides else ():
+            size = columns[name]
+            if np.nanmin(size, initial=0.0) < 0.0:  # they are signed
+                continue
+            if np.nanmax(size, initial=0.0) > 180.0:
+                size = size // 100.0 + size % 100.0 / 60.0
+            columns[name] = np.where((sides[0] == letters[1]).fill_null(value=False).to_numpy(), -size, size)
     return columns
 
 

@@ -45,48 +45,32 @@ _CORNERS: dict[str, str] = VOCABULARY["corners"]
 _GERMAN: dict[str, str] = VOCABULARY["german_corners"]
 #: Names of the wheels in the order of WHEELS, and a name of a wheel in the name of a field.
 _WHEEL_CODES = tuple(tuple(codes.split()) for codes in VOCABULARY["wheel_codes"]["codes"])
-_CODE = re.compile(r"(?<![A-Za-z])(?:[a-z]{2,3}|[A-Z]{2,3}|[LR]\d)(?![A-Za-z0-9])")
 _AXES: dict[str, str] = {word: axis for axis, words in VOCABULARY["axes"].items() for word in words.split()}
-_CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+_PATTERNS = {name: re.compile(text) for name, text in VOCABULARY["patterns"].items()}
 
 
 @lru_cache(maxsize=CACHED_NAMES)
 def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
-    name = _NO_WORDS.sub("", name)
-    name = _SIDES.sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
-    name = _CORNER_AT_END.sub(r"_\g<0>_", name)
+    name = _PATTERNS["no_words"].sub("", name)
+    name = _PATTERNS["sides"].sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
+    name = _PATTERNS["corner_at_end"].sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
-        for piece in [part] if part.lower() in _WHOLE else _CAMEL.findall(part):
+        for piece in [part] if part.lower() in _WHOLE else _PATTERNS["camel"].findall(part):
             words += [english for word in _unglued(piece.lower()) for english in _SYNONYMS.get(word, word).split()]
     return tuple(words)
 
 
-#: The letter before a name that begins with a digit, and identifiers of a device's messages.
-_NO_WORDS = re.compile(r"^n_(?=\d)|(?<![A-Za-z0-9])x[0-9A-Fa-f]{3,}(?![A-Za-z0-9])")
 #: Last words of names of enumerations, and of what is measured.
 STATES = frozenset({"state", "states", "status"})
 #: An element of a vector, and words of vectors.
 _NUMBERED, _VECTORS = re.compile(r"(.*?)_?([0-4])"), _WORDS["vectors"]
-#: A wheel as ``FrL``, ``BckRi`` or ``LeFrnt`` in the capitals of a name.
-_END, _SIDE = "(Fro?n?t|Fr|Front|Bck|Back|Rear|Rr|Re)", "(Lft|Left|Le|Lt|L|Rght|Right|Ri|Rt|R)"
-_SIDES = re.compile(rf"(?<=[a-z_]){_END}{_SIDE}(?![a-z])|(?<=[a-z_]){_SIDE}{_END}(?![a-z])")
-#: A wheel before or after a word without a capital between: ``LFspeed``, ``WHEELSPEEDFL``.
-_CORNER_AT_END = re.compile(
-    r"(?<![A-Za-z])(?:[LR][FR]|[FR][LR])(?=[a-z]{2})|(?<=SPEED|speed)(?:[FR][LR]|[fr][lr])(?![A-Za-z])"
-)
-#: A wheel, an axis or g after a word without a capital between: ``wsfl``, ``accx``, ``lateralg``.
-_CORNER_SPEED = re.compile(
-    r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)|(?:acc|accel|gyro?|vel|speed)(?=[xyz]$)"
-    r"|(?:lat|lateral|long?|longitudinal|lineal|inline|vert|vertical)(?=g$)"
-    r"|[avgn](?=(?:lat|long?|lateral|longitudinal|quer|laengs|steer|steering|yaw|car|veh|wheel|gps)$)"
-)
 
 
 def _unglued(piece: str) -> list[str]:
     """Split a piece into known words; return the piece itself if it contains other letters."""
-    if piece not in KNOWN and (letters := _CORNER_SPEED.match(piece)):
+    if piece not in KNOWN and (letters := _PATTERNS["glued"].match(piece)):
         return [letters[0], piece[letters.end() :]]
     if piece in KNOWN or len(piece) < 5:
         return [piece]
@@ -192,7 +176,7 @@ def _spelled_out(path: str, there: Collection[str]) -> str:
 
 def _with_wheel(leaf: str, beside: Collection[str]) -> str:
     """Return a name with the wheel in words if it differs by the side of the wheel only from another one beside it."""
-    for place in _CODE.finditer(leaf):
+    for place in _PATTERNS["wheel_code"].finditer(leaf):
         code = place[0].lower()
         for wheels in _WHEEL_CODES:
             partner = wheels[wheels.index(code) ^ 1] if code in wheels else ""
