@@ -196,8 +196,9 @@ class Weighing:
                         self.fields.candidates.remove(item)
                         self.notes.append(f"{item.topic.name}.{item.path} is not used: it is over ground")
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
-            # By the yaw rate alone, the axes cannot show the sign of the yaw rate.
-            if axes in ("east, north", "north, east") and steps is not None and x.role in ("sensor", "navigation"):
+            # Axes by the yaw rate alone cannot show its sign: beside a speed, the vector is left out.
+            is_sure = steps is not None or not speeds
+            if axes in ("east, north", "north, east") and is_sure and x.role in ("sensor", "navigation"):
                 for name, item in zip(axes.split(", "), (x, y), strict=True):
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"

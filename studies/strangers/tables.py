@@ -69,7 +69,9 @@ def _text(dialect: str, path: Path, topics: Sequence[Topic]) -> None:
     cells["numbers"] = [str(i) for i in range(12, 12 + len(titles))]
     cells["channels"] = [form["channel"].format(number=i, **p) for i, p in enumerate(parts, 1)]
     start = min(int(t.arrival_ns[0]) for t in topics)
-    above = {name: ("\n" if name == "channels" else form["separator"]).join(row) for name, row in cells.items()} | _times(start, start, 0)
+    above = {
+        name: ("\n" if name == "channels" else form["separator"]).join(row) for name, row in cells.items()
+    } | _times(start, start, 0)
     rows = {"table": _table_rows, "samples": _sample_rows}.get(form["rows"], _value_rows)(form, topics, start)
     rows = (row.replace(".", form["decimal"]) for row in rows)
     lines = [*(line.format(**above) for line in form["head"]), *rows, *form["tail"], ""]
@@ -125,21 +127,10 @@ def _own_times(path: Path, topics: Sequence[Topic]) -> None:
 
 def _blocks(path: Path, topics: Sequence[Topic]) -> None:
     """Write a race data program's export: a block of times and values for each signal, one below the other."""
-    start = min(int(t.arrival_ns[0]) for t in topics)
-    lines = [
-        "PiToolboxVersionedASCIIDataSet",
-        "Version\t2",
-        "",
-        "{OutingInformation}",
-        "CarName\tcar 3",
-        "FirstLapNumber\t0",
-    ]
-    for topic in topics:
-        for title, values in topic.fields.items():
-            lines += ["", "{ChannelBlock}", f"Time\t{title.replace(' [', '[')}"]
-            lines += [
-                f"{(s - start) / 1e9:.3f}\t{v:.6g}" for s, v in zip(topic.arrival_ns.tolist(), values, strict=True)
-            ]
+    lines = ["PiToolboxVersionedASCIIDataSet", "Version\t2", "", "{OutingInformation}", "CarName\tcar 3"]
+    for seconds, name, unit, values in _signals(topics):
+        lines += ["", "{ChannelBlock}", f"Time\t{name}[{unit}]"]
+        lines += [f"{at:.3f}\t{v:.6g}" for at, v in zip(seconds.tolist(), values.tolist(), strict=True)]
     path.write_bytes("\r\n".join([*lines, ""]).encode("cp1252"))
 
 
@@ -251,20 +242,18 @@ def _mat_runs(path: Path, topics: Sequence[Topic]) -> None:
     savemat(path, runs)
 
 
+def _signals(topics: Sequence[Topic]) -> Iterator[tuple[NDArray[np.float64], str, str, NDArray[np.float64]]]:
+    """Yield times in s since the first one, name, unit and values of each signal."""
+    start = topics[0].arrival_ns[0]
+    for topic in topics:
+        yield from (((topic.arrival_ns - start) * 1e-9, *_split(title), v) for title, v in topic.fields.items())
+
+
 def _mat_series(path: Path, topics: Sequence[Topic]) -> None:
     """Write a struct for each signal, as MATLAB's timeseries become."""
     from scipy.io import savemat
 
-    signals = ((t, *_split(title), values) for t in topics for title, values in t.fields.items())
-    series = {
-        name: {
-            "Name": name,
-            "Time": (t.arrival_ns - topics[0].arrival_ns[0]) * 1e-9,
-            "Data": v,
-            "DataInfo": {"Units": u},
-        }
-        for t, name, u, v in signals
-    }
+    series = {n: {"Name": n, "Time": s, "Data": v, "DataInfo": {"Units": u}} for s, n, u, v in _signals(topics)}
     savemat(path, {"data": series})
 
 
@@ -273,11 +262,32 @@ def _mat_pairs(path: Path, topics: Sequence[Topic]) -> None:
     from scipy.io import savemat
 
     vectors: dict[str, Any] = {"Sample_rate": 100.0, "Start_time": "2025/11/24 14:05:12.125"}
-    for topic in topics:
-        for name, values in topic.fields.items():
-            vectors[f"Data1_time_{name}"] = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
-            vectors[f"Data1_{name}"] = values
+    for seconds, name, _, values in _signals(topics):
+        vectors |= {f"Data1_time_{name}": seconds, f"Data1_{name}": values}
     savemat(path, vectors)
+
+
+def _mat_quantities(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a struct of quantities, each with data, unit and number of states, as a simulator's reader returns them."""
+    from scipy.io import savemat
+
+    quantities = {n: {"data": v, "unit": u, "nstates": 0.0} for _, n, u, v in _signals(topics)}
+    seconds = next(_signals(topics))[0]
+    savemat(path, {"data": {"Time": {"data": seconds, "unit": "s", "nstates": 0.0}, **quantities}})
+
+
+def _mat_columns(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a matrix of times and values for each signal."""
+    from scipy.io import savemat
+
+    savemat(path, {name: np.stack([seconds, values], 1) for seconds, name, _, values in _signals(topics)})
+
+
+def _mat_values(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a struct for each channel with its times, values and units."""
+    from scipy.io import savemat
+
+    savemat(path, {n: {"Time": s, "Value": v, "Units": u} for s, n, u, v in _signals(topics)})
 
 
 def _mat_recorder(path: Path, topics: Sequence[Topic]) -> None:
@@ -311,20 +321,6 @@ def _mat_scope(path: Path, topics: Sequence[Topic]) -> None:
     savemat(path, scopes)
 
 
-def _mat_quantities(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a struct of quantities, each with data, unit and number of states, as a simulator's reader returns them."""
-    from scipy.io import savemat
-
-    quantities: dict[str, Any] = {}
-    for topic in topics:
-        seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
-        quantities["Time"] = {"data": seconds, "unit": "s", "nstates": 0.0}
-        for title, values in topic.fields.items():
-            name, unit = _split(title)
-            quantities[name] = {"data": values, "unit": unit, "nstates": 0.0}
-    savemat(path, {"data": quantities})
-
-
 def _json_lists(path: Path, topics: Sequence[Topic]) -> None:
     """Write one document: a list of objects for each topic, with times in ms."""
     document: dict[str, Any] = {"rideID": "7f", "startTime": int(topics[0].arrival_ns[0] // 10**6)}
@@ -335,15 +331,6 @@ def _json_lists(path: Path, topics: Sequence[Topic]) -> None:
             for stamp, row in zip(topic.arrival_ns.tolist(), columns, strict=True)
         ]
     path.write_text(json.dumps(document), encoding="utf-8")
-
-
-def _mat_columns(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a matrix of times and values for each signal."""
-    from scipy.io import savemat
-
-    start = topics[0].arrival_ns[0]
-    signals = ((name, (t.arrival_ns - start) * 1e-9, values) for t in topics for name, values in t.fields.items())
-    savemat(path, {name: np.stack([seconds, values], 1) for name, seconds, values in signals})
 
 
 def _mat_groups(path: Path, topics: Sequence[Topic]) -> None:
@@ -369,27 +356,10 @@ def _json_signals(path: Path, topics: Sequence[Topic]) -> None:
 
 def _json_channels(path: Path, topics: Sequence[Topic]) -> None:
     """Write one document: a list of channels with name, unit, rate and data."""
-    channels = []
-    for topic in topics:
-        rate_hz = round(1e9 / float(np.median(np.diff(topic.arrival_ns))), 3)
-        for title, values in topic.fields.items():
-            name, unit = _split(title)
-            channels.append({"name": name, "unit": unit, "samplerate": rate_hz, "data": values.tolist()})
+    rates = ((round(1.0 / float(np.median(np.diff(s))), 3), n, u, v) for s, n, u, v in _signals(topics))
+    channels = [{"name": n, "unit": u, "samplerate": rate, "data": v.tolist()} for rate, n, u, v in rates]
     meta = {"vehicle": "car 3", "start": "2025-11-24T14:05:12.125Z"}
     path.write_text(json.dumps({"meta": meta, "channels": channels}), encoding="utf-8")
-
-
-def _mat_values(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a struct for each channel with its times, values and units."""
-    from scipy.io import savemat
-
-    channels: dict[str, Any] = {}
-    for topic in topics:
-        for title, values in topic.fields.items():
-            name, unit = _split(title)
-            seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
-            channels[name] = {"Time": seconds, "Value": values, "Units": unit}
-    savemat(path, channels)
 
 
 def _json_columns(path: Path, topics: Sequence[Topic]) -> None:
