@@ -39,10 +39,8 @@ if TYPE_CHECKING:
 
 #: Steps of a column's own clock are at most this multiple of its usual step. A second clock is used if it has times in
 #: fewer rows than this share of another one. Lengths of two clocks of a table differ by less than this share. Share of
-#: steps that are not negative, of a column that may contain times.
-_REGULAR, _ENOUGH_ROWS, _ALIKE, _ASCENDING_SHARE = 1.5, 0.9, 0.01, 0.99
-#: Rows of a device in a table of several, and devices.
-_FEW_ROWS, _MOST_KINDS = 10, 50
+#: steps that are not negative, of a column that may contain times. Rows of a device in a table of several, and devices.
+_REGULAR, _ENOUGH_ROWS, _ALIKE, _ASCENDING_SHARE, _FEW_ROWS, _MOST_KINDS = 1.5, 0.9, 0.01, 0.99, 10, 50
 
 #: Evidence of motion on the unit of a clock.
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]

@@ -47,7 +47,6 @@ codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode(
 VBO_TYPE = "vbox/msg/Vbo"
 #: Share of the path that is along the heading if the signs of the positions are right.
 _ALONG_HEADING = 0.95
-_CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
 
 _MOST_ELEMENTS, _LARGEST, _DEEPEST = (CONSTANTS["json"][name] for name in ("elements", "largest", "deepest"))
 #: Values of a column and their rows.
@@ -61,12 +60,8 @@ def open_csv(file: TableFile) -> Tables:
     losses: list[Loss] = []
     with _text(file) as text:
         lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
-        if lines and lines[0].startswith("{"):
-            file.stream.seek(0)
-            return open_json_lines(file)
-        if lines and all(map(_record_of_pairs, lines[-_PAIRED:])):
-            text.seek(0)
-            return _tables_of_records(map(_record_of_pairs, text), file, "csv", "csv")
+        if (records := _records_of_lines(lines, text, file)) is not None:
+            return records
         given_separator = re.match(r"(?i)\ufeff?\"?sep=(.)", lines[0]) if lines else None
         separator = given_separator[1] if given_separator else _separator(lines)
         file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
@@ -82,14 +77,24 @@ def open_csv(file: TableFile) -> Tables:
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         tables: list[Table] = []
-        rows = chain(head[first:], rows)
+        rows, rate_hz = chain(head[first:], rows), file.settings.rate_hz or stated_hz
         while titles:
             following: list[str] = []
             columns = _columns(_until_titles(rows, titles, following), fields, file, losses, decimal, given)
             for sheet in by_times(f"csv_{len(tables) + 1}" if tables else "csv", columns, given):
-                tables += tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz or stated_hz)
+                tables += tables_of(sheet, file.name, losses, rate_hz=rate_hz)
             titles, (fields, given) = following, read_head(following)
     return Tables("csv", tables, losses)
+
+
+def _records_of_lines(lines: Sequence[str], text: io.TextIOWrapper, file: TableFile) -> Tables | None:
+    """Return the tables of a text whose first lines are objects, or numbers with names; None for another one."""
+    file.stream.seek(0)
+    if lines and lines[0].startswith("{"):
+        return open_json_lines(file)
+    text.seek(0)
+    is_log = bool(lines) and all(map(_record_of_pairs, lines[-_PAIRED:]))
+    return _tables_of_records(map(_record_of_pairs, text), file, "csv", "csv") if is_log else None
 
 
 def _until_titles(
@@ -105,8 +110,7 @@ def _until_titles(
 
 def _stated_rate(head: Iterable[Sequence[str]]) -> float | None:
     """Return the rows per second that a line above the columns states; None without one."""
-    labelled = (row if len(row) > 1 else re.split("[:=]", row[0], maxsplit=1) for row in head if row)
-    for label, *values in labelled:
+    for label, *values in (row if len(row) > 1 else re.split("[:=]", row[0], maxsplit=1) for row in head if row):
         number = next((cell for cell in values if cell.strip()), "")
         value = re.match(r"\s*(\d+(?:[.,]\d*)?(?:e[-+]?\d+)?)\s*(\w*)", number, re.IGNORECASE)
         text = label.strip(" \t:#").lower()
@@ -173,7 +177,7 @@ def open_vbo(file: TableFile) -> Tables:
     sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
     if not isinstance(columns.get("time"), np.ndarray):
         raise LogError(expected="a channel time in hhmmss.sss", got=", ".join(fields[:8]), where=file.name)
-    stamps = _vbo_stamps(columns, _CREATED.findall(head.partition("\n")[0]))
+    stamps = _vbo_stamps(columns, PATTERNS["created"].findall(head.partition("\n")[0]))
     return Tables("vbo", list(tables_of(sheet, file.name, losses, stamps)), losses)
 
 
@@ -248,20 +252,24 @@ def _head(
     of_units = next((i for i in above if i != names and _share(rows[i], is_unit) >= 0.5), -1)
     has_groups = names - 1 in above and not is_labelled and of_units != names - 1
     under = [rows[i] for i in above if names < i < first]
-    others = [rows[i] for i in reversed(above) if i != names and abs(i - names) <= len(last)]
-    named = [cell or _beside(others, i) for i, cell in enumerate(rows[names][:width])]
+    named = _filled(rows[names][:width], [rows[i] for i in reversed(last) if i != names])
     titles = _joined(named, rows[names - 1] if has_groups else [], under)
     if len(titles) < width and rows[full][-1].strip():  # names of the rows without a title, as R writes them
         titles = ["row", *titles]
-    given = rows[of_units] if of_units >= 0 else []
-    units = ["" if re.search("(?i)unit|einheit", c) and not is_unit(c) else c for c in given]
-    return titles, [PATTERNS["unit_label"].sub("", c).strip("[](){} ") for c in units], first
+    return titles, _units(rows[of_units]) if of_units >= 0 else [], first
 
 
-def _beside(rows: Sequence[Sequence[str]], column: int) -> str:
-    """Return the text of the first row that has one in a column without a title, ``TIME`` above ``STAMP``."""
-    cells = (row[column].strip() for row in rows if column < len(row))
-    return next((cell for cell in cells if cell and not is_unit(cell)), "")
+def _units(row: Sequence[str]) -> list[str]:
+    """Return the units of a row, without its label."""
+    units = ["" if re.search("(?i)unit|einheit", c) and not is_unit(c) else c for c in row]
+    return [PATTERNS["unit_label"].sub("", c).strip("[](){} ") for c in units]
+
+
+def _filled(titles: Sequence[str], others: Sequence[Sequence[str]]) -> list[str]:
+    """Return titles, an empty one by the other rows: ``TIME`` above ``STAMP``."""
+    columns = ((row[i].strip() for row in others if i < len(row)) for i in range(len(titles)))
+    texts = (next((cell for cell in column if cell and not is_unit(cell)), "") for column in columns)
+    return [title or text for title, text in zip(titles, texts, strict=True)]
 
 
 def _data_rows(rows: Sequence[Sequence[str]], width: int) -> list[int]:
@@ -351,18 +359,17 @@ def _columns(
 
 
 def _with_hemispheres(columns: dict[str, Any]) -> dict[str, Any]:
-    """Return columns with positions in degrees, south and west negative, of which others name the hemispheres.
+    """Return columns with positions in degrees, negative in the south and west if letters beside them name these.
 
     Receivers write degrees and minutes as ``4807.038``.
     """
     texts = [(c, {*c.drop_nulls().unique()} - {""}) for c in columns.values() if not isinstance(c, np.ndarray)]
     for letters, place in (("NS", "(?i)(^|_)lat"), ("EW", "(?i)(^|_)(lon|lng)")):
         sides = [c for c, values in texts if values and values <= {*letters}]
-        names = [n for n, c in columns.items() if re.search(place, n) and isinstance(c, np.ndarray)]
+        named = ((n, c) for n, c in columns.items() if re.search(place, n) and isinstance(c, np.ndarray))
+        names = [n for n, c in named if not (c < 0.0).any()]  # others are signed
         for name in names[:1] if sides else ():
             size = columns[name]
-            if np.nanmin(size, initial=0.0) < 0.0:  # they are signed
-                continue
             if np.nanmax(size, initial=0.0) > 180.0:
                 size = size // 100.0 + size % 100.0 / 60.0
             columns[name] = np.where((sides[0] == letters[1]).fill_null(value=False).to_numpy(), -size, size)

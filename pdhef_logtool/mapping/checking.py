@@ -150,8 +150,6 @@ def _kind_of(path: str, kinds: dict[str, str]) -> str | None:
 
 
 def _near(name: str, names: set[str]) -> str:
-    if close := near(name, sorted(names), 0.5):
-        return close
     tail = name.rsplit(".", 1)[-1].rsplit("/", 1)[-1]
     same_tail = sorted(k for k in names if k.rsplit(".", 1)[-1].rsplit("/", 1)[-1] == tail)
-    return f" (did you mean {same_tail[0]}?)" if same_tail else ""
+    return near(name, sorted(names), 0.5) or (f" (did you mean {same_tail[0]}?)" if same_tail else "")

@@ -187,14 +187,7 @@ class Weighing:
             if axes in ("", "body") and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
                 continue
             self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
-            left = length * self.fields.pieces.turning(x.si + 1j * y.si)
-            for part, velocity, of_body in (("x", x, self.fields.pieces.rate_of(length)), ("y", y, left)):
-                changes = self.fields.pieces.rate_of(velocity.si), of_body
-                for item in [f for f in self.fields.open("acceleration", part) if f.is_axis and not f.fixed]:
-                    over, body = (correlation(self.fields.pieces.smooth(item.si), change) for change in changes)
-                    if over > max(CLEAR, abs(body)):
-                        self.fields.candidates.remove(item)
-                        self.notes.append(f"{item.topic.name}.{item.path} is not used: it is over ground")
+            self._drop_changes_of(x, y)
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
             # Axes by the yaw rate alone cannot show its sign: beside a speed, the vector is left out.
             is_sure = steps is not None or not speeds
@@ -203,6 +196,18 @@ class Weighing:
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
+
+    def _drop_changes_of(self, x: Field, y: Field) -> None:
+        """Leave out accelerations that are derivatives of a velocity over ground, not of the speed and its course."""
+        pieces, length = self.fields.pieces, np.hypot(x.si, y.si)
+        ahead, left = pieces.rate_of(length), length * pieces.turning(x.si + 1j * y.si)
+        for item in [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and f.is_axis]:
+            if (of := {"x": (x, ahead), "y": (y, left)}.get(item.meaning.part)) is not None and not item.fixed:
+                changes = (pieces.rate_of(of[0].si), of[1])
+                over, body = (correlation(pieces.smooth(item.si), change) for change in changes)
+                if over > max(CLEAR, abs(body)):
+                    self.fields.candidates.remove(item)
+                    self.notes.append(f"{item.topic.name}.{item.path} is not used: it is over ground")
 
     def _vectors(self) -> Iterator[tuple[Field, Field]]:
         """Yield the x and y of velocities that change."""
