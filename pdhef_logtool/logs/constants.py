@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 CONSTANTS: Mapping[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+#: Patterns of texts in tables.
+PATTERNS: Mapping[str, re.Pattern[str]] = {name: re.compile(text) for name, text in CONSTANTS["patterns"].items()}
 
 
 def numbered(table: Mapping[str, Any]) -> dict[int, Any]:

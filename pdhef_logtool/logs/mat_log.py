@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.constants import CONSTANTS, numbered
+from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
 from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
@@ -36,16 +36,12 @@ _TAG_BYTES = struct.calcsize("II")
 _ELEMENTS, _NUMBERS = numbered(_MAT["elements"]), numbered(_MAT["numbers"])
 _CELL, _STRUCT, _OBJECT, _CHARACTERS = range(1, 5)
 _UNUSABLE, _ENCODINGS = numbered(_MAT["unusable"]), numbered(_MAT["encodings"])
-#: Structs inside one another.
-_DEEPEST = 8
+#: Structs inside one another; columns of a matrix that become fields.
+_DEEPEST, _MOST_COLUMNS = 8, 16
 #: Filters of HDF5 that are a part of it: deflate, shuffle, checksum.
 _FILTERS = frozenset({1, 2, 3})
-#: Columns of a matrix that become fields.
-_MOST_COLUMNS = 16
-#: Names of the values of a struct that has the name of the signal.
-_DATA = frozenset({"data", "value", "values"})
-#: Separates the parts of a path.
-_SLASH = "/"
+#: Names of the values of a struct that has the name of the signal. What separates the parts of a path.
+_DATA, _SLASH = frozenset({"data", "value", "values"}), "/"
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +72,12 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
     units: dict[str, dict[str, str]] = {}
     unusable = []
     leaves = (leaf for name, value in variables for leaf in _leaves(name, value, 0))
+    rate_hz = file.settings.rate_hz
     for path, value, unit in leaves:
         struct_, _, title = path.rpartition(_SLASH)
+        if isinstance(value, float | int):
+            rate_hz = rate_hz or float(value)
+            continue
         name, given = split_unit(title)
         unit = unit or given
         if isinstance(value, np.ndarray) and _has_times(value):
@@ -94,15 +94,11 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
     if unusable:
         what = f"variables that are no vectors of numbers are left out: {', '.join(unusable)}"
         losses.append(Loss("no-numbers", what, file.name, count=len(unusable), severity="note"))
-    tables = list(_mat_tables(arrays, units, file, losses))
+    tables = list(_mat_tables(arrays, units, file, losses, rate_hz))
     if not tables:
-        raise LogError(
-            expected="a vector of times (t, time, ...) as long as the signals beside it",
-            got=", ".join(name for columns in arrays.values() for name in columns) or "no numeric variables",
-            where=file.name,
-            remedy="name the vector of times so; without one, state the samples per second: --set rate_hz=100, "
-            "or rate_hz in the mapping file",
-        )
+        expected = "a vector of times (t, time, ...) as long as the signals beside it"
+        got = ", ".join(name for columns in arrays.values() for name in columns) or "no numeric variables"
+        raise LogError(expected=expected, got=got, where=file.name, remedy=CONSTANTS["clocks"]["remedy"])
     return tables
 
 
@@ -278,6 +274,7 @@ def _mat_tables(
     units: Mapping[str, Mapping[str, str]],
     file: TableFile,
     losses: list[Loss],
+    rate_hz: float | None,
 ) -> Iterator[Table]:
     """Yield the tables of the structs; vectors without a clock of their length are noted."""
     where = file.name
@@ -288,7 +285,7 @@ def _mat_tables(
             columns = {n: v for n, v in variables.items() if len(v) == length}
             name = field_name(struct_) if struct_ else "mat"
             sheets.append((struct_, length, Sheet(name, columns, units[struct_])))
-    clocks = _clocks(sheets, where, file.settings.rate_hz)
+    clocks = _clocks(sheets, where, rate_hz)
     rows: list[tuple[Sheet, IntArray]] = []
     for struct_, length, sheet in sheets:
         clock = _clock_of(struct_, length, clocks)
@@ -361,7 +358,8 @@ def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 
 def _leaves(path: str, value: Any, depth: int, unit: str = "") -> Iterator[tuple[str, Any, str]]:
-    if isinstance(value, np.ndarray | _Unusable):
+    is_rate = PATTERNS["rate"].fullmatch(path.rpartition(_SLASH)[2].lower())
+    if (is_rate and isinstance(value, float | int) and value > 0) or isinstance(value, np.ndarray | _Unusable):
         yield path, value, unit
     elif isinstance(value, dict | list) and depth >= _DEEPEST:
         yield path, _Unusable("too deep inside of structs"), unit
@@ -375,6 +373,7 @@ def _leaves(path: str, value: Any, depth: int, unit: str = "") -> Iterator[tuple
             label, unit = split_unit(_text_of(inner, "label", "name") or str(number))
             named = data[0] if len(data) == 1 else inner
             place = f"{path}{_SLASH}{field_name(label)}"
+            yield from _leaves(place, {n: v for n, v in inner.items() if isinstance(v, float | int)}, depth + 1)
             yield from _leaves(place, named, depth + 1, _text_of(inner, "unit", "units") or unit)
 
 

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_cells import read_cells
-from pdhef_logtool.logs.table_clocks import unwrapped
+from pdhef_logtool.logs.table_clocks import NO_TIME, unwrapped
 from pdhef_logtool.logs.table_columns import Sheet, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
-_NULL = np.iinfo(np.int64).min
 #: Units of NumPy's dates, by those types of Arrow that have no unit.
 _DATE_UNITS = {"date32[day]": "D", "date64[ms]": "ms"}
 
@@ -142,7 +141,7 @@ def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Los
     unit = _DATE_UNITS.get(str(column.type)) or getattr(column.type, "unit", "")
     if kind == "date":
         column = column.cast(pa.int32()) if unit == "D" else column
-        return column.cast(pa.int64()).fill_null(_NULL).to_numpy().view(f"M8[{unit}]")
+        return column.cast(pa.int64()).fill_null(NO_TIME).to_numpy().view(f"M8[{unit}]")
     if kind == "duration":
         is_of_day = pa.types.is_time(column.type)
         column = column.cast(pa.int32()) if pa.types.is_time32(column.type) else column

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.constants import CONSTANTS, numbered
+from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
 from pdhef_logtool.logs.recording_span import (
     BREAK_NS,
     NOTED_SHARE,
@@ -50,13 +50,6 @@ _DAYS_TO_1970: dict[int, str] = numbered(_CLOCKS["days_to_1970"])
 #: Names of other epochs by the ns of a unit, and the units from the epoch to 1970.
 _EPOCHS = {(ns, units): name for name, (ns, units) in _CLOCKS["epochs"].items()}
 _GPS_EPOCH_NS, _WEEK_S = _GPS["epoch_s"] * _SECONDS, _GPS["week_s"]
-
-#: A date, a time of day (of 12 hours with AM or PM) or ``minutes:seconds``, and an offset from UTC.
-_TIME_TEXT = (
-    r"^(?:(?P<a>\d{1,4})(?P<mark>[-./])(?P<b>\d{1,2})[-./](?P<c>\d{1,4}),?[T ]*)?"
-    r"(?:(?:(?P<hour>\d{1,3}):)?(?P<minute>\d{1,3}):(?P<second>\d{1,2})(?:[.,:](?P<fraction>\d{1,9})\d*)?)?"
-    r"\s*(?:(?P<half>[AaPp])\.?[Mm]\.?)?\s*(?:[Zz]|UTC|(?P<sign>[-+])(?P<zone_hour>\d\d):?(?P<zone_minute>\d\d)?)?$"
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,13 +134,19 @@ def seconds_of_day(values: FloatArray) -> FloatArray | None:
 
     They step by 40 more at a full minute.
     """
-    hours, rest = np.divmod(values, 1e4)
-    minutes, seconds = np.divmod(rest, 1e2)
-    if not ((values >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)).all():
+    of_day, is_time = of_digits(values)
+    if not is_time.all():
         return None
-    of_day = unwrapped(3600.0 * hours + 60.0 * minutes + seconds)
     jumps = np.diff(values) - np.diff(of_day)
     return of_day if (jumps > 39.0).any() and np.diff(of_day).max() < _MINUTE_NS / _SECONDS else None
+
+
+def of_digits(values: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the seconds since midnight of ``hhmmss.sss`` [N], going on behind midnight, and where they are a time."""
+    hours, rest = np.divmod(values, 1e4)
+    minutes, seconds = np.divmod(rest, 1e2)
+    is_time = (values >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
+    return unwrapped(3600.0 * hours + 60.0 * minutes + seconds), is_time
 
 
 def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz: float | None) -> tuple[int, int, str]:
@@ -254,9 +253,8 @@ def _steps(values: NDArray[Any]) -> tuple[float, int]:
 def _scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:
     """Return values [N] since an epoch in ns; those that do not fit into int64 have no time."""
     stamps = np.full(values.shape, NO_TIME, np.int64)
-    has_time = has_time & (
-        np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch) < _CLOCKS["last_ns"] / factor
-    )
+    size = np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch)
+    has_time = has_time & (size < _CLOCKS["last_ns"] / factor)
     given = values[has_time]
     # The fraction apart: a product would lose the last digits of a date.
     whole = given if given.dtype.kind in "iu" else np.floor(given)
@@ -310,9 +308,8 @@ def week_clock(week: FloatArray, seconds: FloatArray) -> Clock:
         given = given + added
     within = within / per_second if within.max(initial=0.0) > _WEEK_S else within
     stamps = np.full(week.shape, NO_TIME, np.int64)
-    stamps[has_time] = (
-        _GPS_EPOCH_NS + given * (_WEEK_S * _SECONDS) + np.round(within * float(_SECONDS)).astype(np.int64)
-    )
+    of_week = np.round(within * float(_SECONDS)).astype(np.int64)
+    stamps[has_time] = _GPS_EPOCH_NS + given * (_WEEK_S * _SECONDS) + of_week
     return Clock(_to_utc(stamps, has_time), notes)
 
 
@@ -333,7 +330,7 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
     the month is first, with a note.
     """
     texts = _numbered_months(texts.str.strip_chars())
-    parts = texts.str.extract_groups(_TIME_TEXT).struct.unnest()
+    parts = texts.str.extract_groups(PATTERNS["time_text"].pattern).struct.unnest()
     if dates is not None and parts["a"].null_count() == len(parts):
         return text_clock(dates.str.strip_chars() + " " + texts)
     number = {n: parts[n].cast(int, strict=False).fill_null(-1).to_numpy() for n in parts.columns if n not in _WORDS}
@@ -363,24 +360,18 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
 
 _WORDS = frozenset({"mark", "half", "sign", "fraction"})
 _MONTHS = [names.replace(" ", "|") for names in CONSTANTS["asc"]["months"]]
-_NAMED_MONTH = r"(?i)^(\d{{1,2}})[-./ ](?:{})[a-z]*[-./, ]+(\d{{2,4}})"
-#: ``Mon, Nov 24, 2025 2:05:12 PM``, or with the year at the end.
-_MONTH_FIRST = (
-    r"(?i)^(?:[a-z]{{3,9}},? )?(?:{})[a-z]*\.? +(\d{{1,2}}),? (?:(\d{{4}}),? )?"
-    r"(\d+:\d+(?::\d+(?:[.,]\d+)?)?(?: ?[ap]m)?)(?: (?:[a-z]{{3,4}})?(?:[-+]\d\d:?\d\d)?)?(?: (\d{{4}}))?$"
-)
-_COMPACT = r"^(\d{4})(\d\d)(\d\d)[T _-]?(\d\d)(\d\d)(\d\d)"
 
 
 def _numbered_months(texts: Series) -> Series:
     """Return texts [N] in which a named month is a number between day and year, and dates of digits have marks."""
-    if texts.drop_nulls().head(1).str.contains(_COMPACT).any():
-        return texts.str.replace(_COMPACT, "${1}-${2}-${3} ${4}:${5}:${6}")
+    compact, *named = (PATTERNS[name].pattern for name in ("compact_date", "named_month", "month_first"))
+    if texts.drop_nulls().head(1).str.contains(compact).any():
+        return texts.str.replace(compact, "${1}-${2}-${3} ${4}:${5}:${6}")
     every = "|".join(_MONTHS)
-    for form, result in ((_NAMED_MONTH, "${{1}}.{}.${{2}}"), (_MONTH_FIRST, "${{1}}.{}.${{2}}${{4}} ${{3}}")):
-        if texts.drop_nulls().head(1).str.contains(form.format(every)).any():
+    for form, result in zip(named, ("${{1}}.{}.${{2}}", "${{1}}.{}.${{2}}${{4}} ${{3}}"), strict=True):
+        if texts.drop_nulls().head(1).str.contains(form.replace("MONTH", every)).any():
             for number, names in enumerate(_MONTHS, 1):
-                texts = texts.str.replace(form.format(names), result.format(number))
+                texts = texts.str.replace(form.replace("MONTH", names), result.format(number))
     return texts
 
 
@@ -391,15 +382,12 @@ def _days(a: IntArray, b: IntArray, c: IntArray, mark: NDArray[Any]) -> tuple[In
     year = np.where(year_first, a, np.where(is_short, c + 2000, c))
     days, is_day = _civil(year, b, np.where(year_first, c, a))
     other, is_other = _civil(year, np.where(year_first, b, a), np.where(year_first, c, b))
-    day_first, month_first = ((-int(is_.sum()), _spread(of[is_])) for of, is_ in ((days, is_day), (other, is_other)))
+    orders = ((days, is_day), (other, is_other))
+    day_first, month_first = ((-int(is_.sum()), int(np.ptp(of[is_])) if is_.any() else 0) for of, is_ in orders)
     if (mark == ".").any() or year_first.any() or day_first < month_first:
         return days, is_day, ""
     is_open = day_first == month_first and bool((days != other)[is_day].any())
     return other, is_other, "no date shows whether day or month is first: read as month/day" if is_open else ""
-
-
-def _spread(values: IntArray) -> int:
-    return int(np.ptp(values)) if len(values) else 0
 
 
 def _civil(year: IntArray, month: IntArray, day: IntArray) -> tuple[IntArray, BoolArray]:

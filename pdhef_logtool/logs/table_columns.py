@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.table_clocks import (
     NAMED_UNITS,
     NO_TIME,
@@ -37,14 +37,10 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 if TYPE_CHECKING:
     from polars import Series
 
-#: Steps of a column's own clock are at most this multiple of its usual step.
-_REGULAR = 1.5
-#: A second clock is used if it has times in fewer rows than this share of another one.
-_ENOUGH_ROWS = 0.9
-#: Lengths of two clocks of a table differ by less than this share.
-_ALIKE = 0.01
-#: Share of steps that are not negative, of a column that may contain times.
-_ASCENDING_SHARE = 0.99
+#: Steps of a column's own clock are at most this multiple of its usual step. A second clock is used if it has times in
+#: fewer rows than this share of another one. Lengths of two clocks of a table differ by less than this share. Share of
+#: steps that are not negative, of a column that may contain times. Rows of a device in a table of several, and devices.
+_REGULAR, _ENOUGH_ROWS, _ALIKE, _ASCENDING_SHARE, _FEW_ROWS, _MOST_KINDS = 1.5, 0.9, 0.01, 0.99, 10, 50
 
 #: Evidence of motion on the unit of a clock.
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
@@ -53,11 +49,10 @@ _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS
 #: Products and quotients of units, with exponents.
 _SYMBOL = rf"(?:{'|'.join(map(re.escape, CONSTANTS['table_units']['symbols'].split()))})(?:\^?\**[-+]?\d|[⁻¹²³]+)?"
 _COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/·.]|\bper\b|\s)\s*{_SYMBOL})+")
-_BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 #: Letters in ASCII.
 LATIN = str.maketrans(CONSTANTS["latin"])
 _ALPHABETS = {name: dict(pair.split("=") for pair in pairs.split()) for name, pairs in CONSTANTS["alphabets"].items()}
-_LETTERS = str.maketrans(
+LETTERS = str.maketrans(
     {u: latin for a in _ALPHABETS.values() for letter, latin in a.items() for u in (letter, letter.upper())}
 )
 #: Words, and single letters as symbols, of the Greek alphabet; a dot above the symbol of a quantity.
@@ -69,28 +64,15 @@ _OTHER_ALPHABET = re.compile("|".join(_TRANSLATIONS))
 
 _TIME = re.compile(CONSTANTS["clocks"]["names"].format("|".join(TIME_UNITS_NS)))
 _TIME_LIKE = re.compile(CONSTANTS["clocks"]["like"])
-_WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
-_WEEK_TIME = re.compile(
-    r"(?:(?:gps|gnss)_)?(?:i?tow|sow|time_of_week|seconds_of_week|week_seconds|seconds|time)(?:_m?s)?"
-)
 _SECOND_NS = TIME_UNITS_NS["seconds"]
-#: Columns of a table in long form, with a row for each value.
-_SIGNAL = re.compile(
-    r"_?(?:signal|channel|variable|field|parameter|sensor|tag|key|telemetry|metric|measure|measurement|quantity|series|pid|name)"
-    r"(?:_?(?:name|id))?"
-)
-_VALUE = re.compile(
-    r"_?(?:physical_|signal_|phys_|telemetry_|metric_|measure_|measurement_)?(?:value|val|wert)(?:_double)?"
-)
-_DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 
 
 def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
     text = _OTHER_ALPHABET.sub(lambda match: f" {_TRANSLATIONS[match[0]]} ", text)
-    text = _GREEK_WORD.sub(lambda match: match[0].translate(_LETTERS), text.partition("\\")[0].translate(LATIN))
+    text = _GREEK_WORD.sub(lambda match: match[0].translate(LETTERS), text.partition("\\")[0].translate(LATIN))
     text = _DOT.sub("_dot", unicodedata.normalize("NFKD", text))
-    text = _GREEK.sub(lambda match: f"_{unicodedata.name(match[0]).split()[3].lower()}_", text).translate(_LETTERS)
+    text = _GREEK.sub(lambda match: f"_{unicodedata.name(match[0]).split()[3].lower()}_", text).translate(LETTERS)
     text = text.encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
     return f"n_{name}" if name[0].isdigit() else name
@@ -108,7 +90,7 @@ def unique(names: Iterable[str]) -> list[str]:
 
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit, with or without brackets."""
-    text = re.sub(r"^\s*units?\s*:|[\[\](){}]", "", text, flags=re.IGNORECASE).strip().lower()
+    text = re.sub(r"^\s*units?\s*:|[\[\](){}]", "", text, flags=re.IGNORECASE).strip().lower().translate(LETTERS)
     return text.replace(" ", "") in _UNITS or bool(_COMPOUND.fullmatch(text))
 
 
@@ -117,9 +99,11 @@ def split_unit(text: str) -> tuple[str, str]:
     if "|" in text:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
-    match = _BRACKETED.match(text.strip())
-    is_given = match and match[1] and is_unit(match[2]) and not match[2].isdigit()  # [1] is an index
-    return (match[1], match[2].strip()) if match and is_given else (text.strip(), "")
+    for name in ("unit_behind", "unit_in_brackets"):
+        match = PATTERNS[name].match(text.strip())
+        if match and match[1] and is_unit(match[2]) and not match[2].isdigit():  # [1] is an index
+            return match[1].rstrip(" /"), match[2].strip(" ()")
+    return text.strip(), ""
 
 
 def snake(name: str) -> str:
@@ -160,13 +144,9 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     if not chosen:
         if rate_hz:
             return rate_clock(max(map(len, sheet.columns.values()), default=0), rate_hz)
-        raise LogError(
-            expected="a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)",
-            got=", ".join([*sheet.columns][:8]) or "no columns",
-            where=f"{where}, {sheet.name}",
-            remedy="name the column of times so; without one, state the rows per second: --set rate_hz=100, or "
-            "rate_hz in the mapping file",
-        )
+        expected = "a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)"
+        got = ", ".join([*sheet.columns][:8]) or "no columns"
+        raise LogError(expected=expected, got=got, where=f"{where}, {sheet.name}", remedy=CONSTANTS["clocks"]["remedy"])
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
     clock = _read_clock(sheet, chosen, (*others, *certain), rate_hz) if certain else clocks[chosen]
     clock = _in_two_columns(clock, sheet, chosen, names)
@@ -181,7 +161,8 @@ def _in_parts(sheet: Sheet, names: Mapping[str, str]) -> Clock | None:
     """Return the clock of GPS weeks and seconds, or of years, months and so on until the second; None without them."""
     import polars as pl
 
-    week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
+    of_gps = (PATTERNS[name] for name in ("week", "week_time"))
+    week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in of_gps)
     if week is not None and seconds is not None:
         clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
         return replace(clock, columns=frozenset({week, seconds}))
@@ -256,7 +237,7 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
         given = column.drop_nulls().head(20)
-        named = _TIME_LIKE.search(text) or _DATE.fullmatch(text)
+        named = _TIME_LIKE.search(text) or PATTERNS["date"].fullmatch(text)
         grade, others = (0, 0) if is_time else (1, 1) if named else (2, max(1, len(given) - 1))
         return grade if len({*text_clock(given).stamps_ns.tolist()} - {NO_TIME}) > others else None
     if column.dtype.kind not in "iufM":
@@ -281,11 +262,8 @@ def _grade_of_numbers(sheet: Sheet, name: str, given: NDArray[Any]) -> int | Non
     steps = np.diff(given)
     is_count = bool((steps == steps[0]).all()) and steps[0] == 1
     is_regular = np.quantile(np.abs(steps - np.median(steps)), _ENOUGH_ROWS) <= _ALIKE * np.median(steps)
-    is_alone = (
-        len(sheet.columns) < CONSTANTS["clocks"]["fewest_columns"]
-        or name != next(iter(sheet.columns))
-        or name in sheet.units
-    )
+    are_few = len(sheet.columns) < CONSTANTS["clocks"]["fewest_columns"]
+    is_alone = are_few or name != next(iter(sheet.columns)) or name in sheet.units
     return 4 if is_regular and not (is_count or is_alone) else None
 
 
@@ -296,7 +274,7 @@ def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float
         unit = sheet.units.get(name, "") or NAMED_UNITS.get(text, text.rpartition("_")[2])
         clock = number_clock(column, unit, name, others, rate_hz)
     else:
-        date = next((n for n in sheet.columns if n != name and _DATE.fullmatch(snake(n))), name)
+        date = next((n for n in sheet.columns if n != name and PATTERNS["date"].fullmatch(snake(n))), name)
         dates = sheet.columns[date]
         clock = text_clock(column, None if date == name or isinstance(dates, np.ndarray) else dates)
         columns = {name, date}
@@ -322,9 +300,10 @@ def tables_of(
         clock = find_clock(sheet, where, rate_hz=None if named_values else rate_hz)
         stamps, used = clock.stamps_ns, clock.columns
         losses.extend(clock_notes(clock.notes, where))
-        if named_values and (long := list(_of_long_form(sheet, stamps, *named_values))):
-            for name, (part, its) in zip(unique(part.name for part, _ in long), long, strict=True):
-                yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
+        parts = list(_of_long_form(sheet, stamps, *named_values) if named_values else _of_kinds(sheet, stamps, used))
+        for name, (part, its) in zip(unique(part.name for part, _ in parts), parts, strict=True):
+            yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
+        if parts:
             return
     rows, lost = ascending_rows(stamps, f"{where}, {sheet.name}")
     losses.extend(lost)
@@ -394,24 +373,42 @@ def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:
 def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
     """Return names, values and units of a table in long form, None for another table."""
     named = {snake(name): column for name, column in sheet.columns.items()}
-    signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in (_SIGNAL, _VALUE))
+    of_long = (PATTERNS[name] for name in ("signal", "long_value"))
+    signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in of_long)
     is_long = signal is not None and not isinstance(signal, np.ndarray) and isinstance(value, np.ndarray)
     return (signal, value, named.get("unit", named.get("units"))) if is_long else None
+
+
+def _rows_by(texts: Series) -> dict[str, IntArray]:
+    """Return the rows of each text of a column."""
+    import polars as pl
+
+    rows = (
+        pl.DataFrame({"text": texts}).with_row_index().drop_nulls().group_by("text", maintain_order=True).agg("index")
+    )
+    return {text: numbers.to_numpy() for text, numbers in zip(rows["text"], rows["index"], strict=True)}
+
+
+def _of_kinds(sheet: Sheet, stamps: IntArray, used: frozenset[str]) -> Iterator[tuple[Sheet, IntArray]]:
+    """Yield the parts of a table whose rows are samples of several devices, which a column names."""
+    for name in (n for n, c in sheet.columns.items() if PATTERNS["kind"].fullmatch(snake(n))):
+        texts, columns = sheet.columns[name], {n: c for n, c in sheet.columns.items() if n not in {name, *used}}
+        rows_of = {} if isinstance(texts, np.ndarray) else _rows_by(texts)
+        if len(rows_of) <= _MOST_KINDS and sum(len(rows) >= _FEW_ROWS for rows in rows_of.values()) > 1:
+            for kind, rows in rows_of.items():
+                yield Sheet(field_name(kind), {n: c[rows] for n, c in columns.items()}, sheet.units), stamps[rows]
+            return
 
 
 def _of_long_form(
     sheet: Sheet, stamps: IntArray, signal: Series, value: NDArray[Any], units: Any
 ) -> Iterator[tuple[Sheet, IntArray]]:
     """Yield the signals of a table with a row for each value; signals with equal times are one sheet."""
-    import polars as pl
-
-    rows_of = pl.DataFrame({"signal": signal}).with_row_index().drop_nulls().group_by("signal", maintain_order=True)
-    grouped = rows_of.agg("index")
-    if grouped.height**2 > 100 * len(signal):  # texts of another kind
+    rows_of = _rows_by(signal)
+    if len(rows_of) ** 2 > 100 * len(signal):  # texts of another kind
         return
     clocks: dict[bytes, tuple[Sheet, IntArray]] = {}
-    for title, numbers in zip(grouped["signal"], grouped["index"], strict=True):
-        rows = numbers.to_numpy()
+    for title, rows in rows_of.items():
         part, _ = clocks.setdefault(stamps[rows].tobytes(), (Sheet(sheet.name, {}, {}), stamps[rows]))
         (field,), given = read_head([title])
         cell = None if units is None or isinstance(units, np.ndarray) else units[int(rows[0])]

@@ -52,8 +52,7 @@ class Table:
         type_name: str = "",
     ) -> Table:
         """Return a table of numbers [N] that are in memory, with the unit of each column where one is known."""
-        units = units or {}
-        fields = tuple(FieldInfo(path, "number", unit=units.get(path, "")) for path in columns)
+        fields = tuple(FieldInfo(path, "number", unit=(units or {}).get(path, "")) for path in columns)
         return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows], type_name)
 
 
@@ -71,13 +70,7 @@ class TableLog(DriveLog):
     LogError : stamps of a table step back, or two tables have one name.
     """
 
-    def __init__(
-        self,
-        file: LogFile,
-        kind: str,
-        tables: Sequence[Table],
-        lost: Sequence[Loss] = (),
-    ) -> None:
+    def __init__(self, file: LogFile, kind: str, tables: Sequence[Table], lost: Sequence[Loss] = ()) -> None:
         self.path, self.kind = file.place, kind
         self._file = file
         self._tables = {table.name: table for table in sorted(tables, key=lambda table: table.name)}

@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.mat_log import tables_of_variables
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
-from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, placed, unwrapped, whole_days
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, of_digits, placed, whole_days
 from pdhef_logtool.logs.table_columns import Sheet, by_times, field_name, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
@@ -38,48 +38,15 @@ if TYPE_CHECKING:
 
     from pdhef_logtool.logs.table_log import Table
 
-#: Lines at the start of a CSV file in which its header must be.
-_HEAD_LINES = 200
-#: Cells below the header that show the decimal mark of the file.
-_CELLS_OF_HEAD = 10_000
-#: Cells that are in memory as texts at the same time.
-_CELLS_AT_ONCE = 1 << 23
+#: Lines at the start of a CSV file in which its header must be; cells below it that show the decimal mark; lines that
+#: show numbers with names; cells that are in memory as texts at the same time.
+_HEAD_LINES, _CELLS_OF_HEAD, _PAIRED, _CELLS_AT_ONCE = 200, 10_000, 20, 1 << 23
 _CELL_END, _SPACES = "\x1f", r"\s{2,}"
-#: Numbers, in any spelling, and times.
-_VALUE = re.compile(
-    r"\s*([-+−]?(0x[\da-f]+|[\d.,'’\s]*\d[.,]?(e[-+]?\d+)?)|true|false|"
-    r"\d{1,4}[./-]\d\d?[./-]\d{2,4}([T ].*)?|(\d\d?:)?\d\d?:\d\d([.,]\d+)?Z?(\s?[AP]M)?)\s*",
-    re.IGNORECASE,
-)
-#: A number and its unit in one cell.
-_QUANTITY = re.compile(r"\s*[-+−]?\d[\d.,]*(?:e[-+]?\d+)?\s*([^\d\s.,][^\d]*)", re.IGNORECASE)
-#: The last line of the header of a file or of its channels.
-_END_OF_HEADER = re.compile(r"(?i)\W*(end[_ ]of[_ ]header|header[_ ]end)\W*")
-#: Marks of comments, and labels of the row of names where the first column contains no values.
-#: Labels of a rate, and of the time between rows.
-_RATES = {
-    "rate": r"(?:(?:sampl\w*|data|log\w*)[ _]?(?:rate|freq\w*)|freq\w*|abtast(?:rate|frequenz)|fs)(?: ?[[(]k?hz[])])?",
-    "step": r"(?:sampl\w*[ _]?(?:interval|period|time|step)|h_?resolution|delta_?[xt]|dt|abtastzeit)(?: ?[[(]\w+[])])?",
-}
-_UNIT_LABEL = re.compile(r"(?i)^\s*units?\s*:")
-#: A channel in a list above the rows.
-_LISTED = re.compile(r"(?i)(?:channel|signal|name)(?: ?name)?\s*[:=]\s*(.+)")
-_COMMENT = re.compile(r"(?:[#%!;]|//)\s*")
-_LABELS = frozenset(
-    {"name", "names", "signal", "signals", "channel", "channels", "variable", "variables", "title", "label"}
-)
 codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
 
 VBO_TYPE = "vbox/msg/Vbo"
-#: Channels of the receiver itself, which ``[channel units]`` leaves out.
-_RECEIVER = re.compile(
-    r"(satellites|time|latitude|longitude|velocity.*|heading|height|vertical velocity.*|(trigger )?event.*|.*_raw|"
-    r"glonass.*|gps.*|beidou.*|solution type.*|long accel.*|lat accel.*|.*distance m|date|avi.*)",
-    re.IGNORECASE,
-)
 #: Share of the path that is along the heading if the signs of the positions are right.
 _ALONG_HEADING = 0.95
-_CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
 
 _MOST_ELEMENTS, _LARGEST, _DEEPEST = (CONSTANTS["json"][name] for name in ("elements", "largest", "deepest"))
 #: Values of a column and their rows.
@@ -93,6 +60,8 @@ def open_csv(file: TableFile) -> Tables:
     losses: list[Loss] = []
     with _text(file) as text:
         lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
+        if (records := _records_of_lines(lines, text, file)) is not None:
+            return records
         given_separator = re.match(r"(?i)\ufeff?\"?sep=(.)", lines[0]) if lines else None
         separator = given_separator[1] if given_separator else _separator(lines)
         file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
@@ -104,25 +73,48 @@ def open_csv(file: TableFile) -> Tables:
         titles, units, first = _layout([row for _, row in head], file.name)
         stated_hz = _stated_rate(row for _, row in head[:first])
         fields, given = read_head(titles)
-        given |= {
-            name: _UNIT_LABEL.sub("", unit).strip("[](){} ")
-            for name, unit in zip(fields, units, strict=False)
-            if unit.strip()
-        }
+        given |= {name: unit for name, unit in zip(fields, units, strict=False) if unit}
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
-        columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
-    sheets, rate_hz = by_times("csv", columns, given), file.settings.rate_hz or stated_hz
-    tables = [table for sheet in sheets for table in tables_of(sheet, file.name, losses, rate_hz=rate_hz)]
+        tables: list[Table] = []
+        rows, rate_hz = chain(head[first:], rows), file.settings.rate_hz or stated_hz
+        while titles:
+            following: list[str] = []
+            columns = _columns(_until_titles(rows, titles, following), fields, file, losses, decimal, given)
+            for sheet in by_times(f"csv_{len(tables) + 1}" if tables else "csv", columns, given):
+                tables += tables_of(sheet, file.name, losses, rate_hz=rate_hz)
+            titles, (fields, given) = following, read_head(following)
     return Tables("csv", tables, losses)
+
+
+def _records_of_lines(lines: Sequence[str], text: io.TextIOWrapper, file: TableFile) -> Tables | None:
+    """Return the tables of a text whose first lines are objects, or numbers with names; None for another one."""
+    file.stream.seek(0)
+    if lines and lines[0].startswith("{"):
+        return open_json_lines(file)
+    text.seek(0)
+    is_log = bool(lines) and all(map(_record_of_pairs, lines[-_PAIRED:]))
+    return _tables_of_records(map(_record_of_pairs, text), file, "csv", "csv") if is_log else None
+
+
+def _until_titles(
+    rows: Iterable[tuple[int, list[str]]], titles: Sequence[str], following: list[str]
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a block of columns; ``following`` gets the titles of the next block, which begins alike."""
+    for number, row in rows:
+        if row and row[0] == titles[0].strip() and row[1:] != [*titles[1:]] and not any(map(_is_value, row)):
+            following += row
+            return
+        yield number, row
 
 
 def _stated_rate(head: Iterable[Sequence[str]]) -> float | None:
     """Return the rows per second that a line above the columns states; None without one."""
-    for label, *values in (row for row in head if len(row) > 1):
+    for label, *values in (row if len(row) > 1 else re.split("[:=]", row[0], maxsplit=1) for row in head if row):
         number = next((cell for cell in values if cell.strip()), "")
         value = re.match(r"\s*(\d+(?:[.,]\d*)?(?:e[-+]?\d+)?)\s*(\w*)", number, re.IGNORECASE)
-        of = next((kind for kind, pattern in _RATES.items() if re.fullmatch(pattern, label.strip(" \t:#").lower())), "")
+        text = label.strip(" \t:#").lower()
+        of = next((kind for kind in ("rate", "step") if PATTERNS[kind].fullmatch(text)), "")
         if value and of and (amount := float(value[1].replace(",", "."))) > 0.0:
             unit = (value[2] or re.sub(r".*\W(\w+)\W*", r"\1", label)).lower()
             seconds = TIME_UNITS_NS.get(unit, TIME_UNITS_NS["s"]) / TIME_UNITS_NS["s"]
@@ -139,7 +131,8 @@ def _titles_of_kinds(head: Sequence[Sequence[str]]) -> dict[str, list[str]]:
         row[0].lstrip("#% "): [c.strip() for c in row[1:]] for row in head if row and row[0].startswith(("#", "%"))
     }
     titles_of |= {row[3].strip(): [c.strip() for c in row[5:]] for row in head if len(row) > 5 and row[0] == "FMT"}
-    kinds = {row[0].strip() for row in head if len(row) > 1 and row[0][:1].isalpha() and row[0] != "FMT"}
+    kinds = {row[0].strip() for row in head if len(row) > 1 and re.match("[$#A-Za-z]", row[0]) and row[0] != "FMT"}
+    titles_of |= {kind: t.split() for kind in kinds for end, t in CONSTANTS["sentences"].items() if kind.endswith(end)}
     return {k: titles for k, titles in titles_of.items() if k in kinds and len(titles) > 1}
 
 
@@ -149,7 +142,8 @@ def _tables_of_kinds(
     """Return a table for each kind of row with times."""
     lines: dict[str, list[tuple[int, list[str]]]] = {}
     for number, (kind, *cells) in ((n, row) for n, row in rows if row and row[0].strip() in titles_of):
-        lines.setdefault(kind.strip(), []).append((number, [cell.strip() for cell in cells]))
+        cells = [re.sub(r"\*[\dA-Fa-f]+\s*$", "", c).strip() for cell in cells for c in cell.split(";")]
+        lines.setdefault(kind.strip(), []).append((number, cells[: len(titles_of[kind.strip()])]))
     losses: list[Loss] = []
     tables: list[Table] = []
     for kind, its in lines.items():
@@ -177,13 +171,13 @@ def open_vbo(file: TableFile) -> Tables:
         what = "longitude is positive to the east, against the format, as the heading shows: its sign is changed"
         losses.append(Loss("mirrored", what, file.name, severity="note"))
         columns["longitude"] = -columns["longitude"]
-    modules = [f for f, title in zip(fields, titles, strict=True) if not _RECEIVER.fullmatch(title)]
+    modules = [f for f, title in zip(fields, titles, strict=True) if not PATTERNS["receiver"].fullmatch(title)]
     units = {f: "min" for f in fields if f.startswith(("latitude", "longitude"))}
     units |= _channel_units(sections.get("channel units", []), modules, fields, file.name, losses) | given
     sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
     if not isinstance(columns.get("time"), np.ndarray):
         raise LogError(expected="a channel time in hhmmss.sss", got=", ".join(fields[:8]), where=file.name)
-    stamps = _vbo_stamps(columns, _CREATED.findall(head.partition("\n")[0]))
+    stamps = _vbo_stamps(columns, PATTERNS["created"].findall(head.partition("\n")[0]))
     return Tables("vbo", list(tables_of(sheet, file.name, losses, stamps)), losses)
 
 
@@ -216,9 +210,11 @@ def _separator(lines: Sequence[str]) -> str:
     """
     every = [re.sub(r'"[^"]*"', "", line) for line in lines]
     lines = every[-20:]
-    counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",")}
-    regular = next((s for s, n in counts.items() if n and min(n) > 0 and max(n) == min(n)), "")
-    frequent = max(counts, key=lambda s: sum(counts[s]))
+    if all(re.match(r"[$#%][A-Z\d]{3,},", line) for line in lines):  # sentences of a receiver
+        return ","
+    counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",", ":")}
+    regular = next((s for s, n in counts.items() if n and min(n) > 2 * (s == ":") and max(n) == min(n)), "")
+    frequent = max([*counts][:-1], key=lambda s: sum(counts[s]))
     widths = [len(re.split(_SPACES, line.strip())) for line in every]
     titles = (line for line, n in zip(every, widths, strict=True) if n == widths[-1] > 1)
     is_aligned = len({*widths[-20:]}) == 1 and any(re.search(r"[a-z.] [a-z(]", t, re.IGNORECASE) for t in titles)
@@ -230,12 +226,12 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     lengths = Counter(len(row) for row in rows[-20:])
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
-    header = max((i for i, row in enumerate(rows) if row and _END_OF_HEADER.fullmatch(row[0])), default=-1)
+    header = max((i for i, row in enumerate(rows) if row and PATTERNS["end_of_header"].fullmatch(row[0])), default=-1)
     data = _data_rows(rows, width)
     numbers = [i for i in data if i > header and len(rows[i]) == width > 1 and _share(rows[i], _is_value) >= 0.5]
     # Above the titles there may be a row with the numbers of the channels.
     full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width, header))), (0, []))
-    listed = [m[1] for row in rows if (m := _LISTED.fullmatch(", ".join(row))) is not None]
+    listed = [m[1] for row in rows if (m := PATTERNS["listed"].fullmatch(", ".join(row))) is not None]
     if not above and numbers and width - len(listed) in (0, 1):
         return ["Time", *listed][-width:], [], numbers[0]
     if not above:
@@ -252,19 +248,28 @@ def _head(
     is_labelled = not any(row[0].strip() for row in rows[full : full + 3])
     names = _names_row(rows, last, above if is_labelled or len(above) > len(last) else [])
     below = (i for i in range(names + 1, full) if i in data)
-    first = next((i for i in below if any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i])), full)
+    first = next((i for i in below if any(PATTERNS["value"].fullmatch(c) and not is_unit(c) for c in rows[i])), full)
     of_units = next((i for i in above if i != names and _share(rows[i], is_unit) >= 0.5), -1)
     has_groups = names - 1 in above and not is_labelled and of_units != names - 1
     under = [rows[i] for i in above if names < i < first]
-    titles = _joined(rows[names][:width], rows[names - 1] if has_groups else [], under)
+    named = _filled(rows[names][:width], [rows[i] for i in reversed(last) if i != names])
+    titles = _joined(named, rows[names - 1] if has_groups else [], under)
     if len(titles) < width and rows[full][-1].strip():  # names of the rows without a title, as R writes them
         titles = ["row", *titles]
-    units = (
-        []
-        if of_units < 0
-        else ["" if re.search("unit|einheit", c, re.IGNORECASE) and not is_unit(c) else c for c in rows[of_units]]
-    )
-    return titles, units, first
+    return titles, _units(rows[of_units]) if of_units >= 0 else [], first
+
+
+def _units(row: Sequence[str]) -> list[str]:
+    """Return the units of a row, without its label."""
+    units = ["" if re.search("(?i)unit|einheit", c) and not is_unit(c) else c for c in row]
+    return [PATTERNS["unit_label"].sub("", c).strip("[](){} ") for c in units]
+
+
+def _filled(titles: Sequence[str], others: Sequence[Sequence[str]]) -> list[str]:
+    """Return titles, an empty one by the other rows: ``TIME`` above ``STAMP``."""
+    columns = ((row[i].strip() for row in others if i < len(row)) for i in range(len(titles)))
+    texts = (next((cell for cell in column if cell and not is_unit(cell)), "") for column in columns)
+    return [title or text for title, text in zip(titles, texts, strict=True)]
 
 
 def _data_rows(rows: Sequence[Sequence[str]], width: int) -> list[int]:
@@ -277,7 +282,7 @@ def _data_rows(rows: Sequence[Sequence[str]], width: int) -> list[int]:
 def _names_row(rows: Sequence[Sequence[str]], last: Sequence[int], labelled: Sequence[int]) -> int:
     """Return the row of titles: labelled so, or with most texts that are no units."""
     names = max(reversed(last), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
-    return next((i for i in labelled if rows[i][0].strip().lower() in _LABELS), names)
+    return next((i for i in labelled if PATTERNS["label"].fullmatch(rows[i][0].strip())), names)
 
 
 def _titles(rows: Sequence[Sequence[str]], width: int, header: int) -> list[int]:
@@ -293,20 +298,20 @@ def _titles(rows: Sequence[Sequence[str]], width: int, header: int) -> list[int]
 
 def _is_value(cell: str) -> bool:
     """Return whether a cell is a number, a time, or a number with its unit."""
-    with_unit = _QUANTITY.fullmatch(cell)
-    return bool(_VALUE.fullmatch(cell) or (with_unit and is_unit(with_unit[1])))
+    with_unit = PATTERNS["quantity"].fullmatch(cell)
+    return bool(PATTERNS["value"].fullmatch(cell) or (with_unit and is_unit(with_unit[1])))
 
 
 def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
     """Return titles with the repeated titles of their groups in front, and the title of an index column below them."""
-    if groups and len({c.strip() for c in groups}) < len(titles) and all(groups):
+    if groups and len({c.strip() for c in groups}) < len(titles) and all(groups) and not any(map(_is_value, groups)):
         titles = [*titles[:1], *(f"{group}_{n}" for group, n in zip(groups[1:], titles[1:], strict=False))]
     return [next((row[0] for row in below if row[0] and not any(row[1:])), titles[0]), *titles[1:]]
 
 
 def _uncommented(row: Sequence[str], width: int) -> Sequence[str]:
     """Return a row of ``width`` cells, without the mark of a comment and an empty cell at its end."""
-    if row and (mark := _COMMENT.match(row[0])):
+    if row and (mark := PATTERNS["comment"].match(row[0])):
         title = row[0][mark.end() :].lstrip("# ")
         row = [title, *row[1:]] if title or len(row) <= width else row[1:]
     return row[:-1] if len(row) == width + 1 and not row[-1].strip() else row
@@ -350,6 +355,24 @@ def _columns(
                 cells, units[name] = read_cells(column.str.strip_suffix(unit), decimal), unit
             columns[name] = column.str.strip_chars() if cells.is_text else cells.values
             losses += cells.losses(name, file.name, lines)
+    return _with_hemispheres(columns)
+
+
+def _with_hemispheres(columns: dict[str, Any]) -> dict[str, Any]:
+    """Return columns with positions in degrees, negative in the south and west if letters beside them name these.
+
+    Receivers write degrees and minutes as ``4807.038``.
+    """
+    texts = [(c, {*c.drop_nulls().unique()} - {""}) for c in columns.values() if not isinstance(c, np.ndarray)]
+    for letters, place in (("NS", "(?i)(^|_)lat"), ("EW", "(?i)(^|_)(lon|lng)")):
+        sides = [c for c, values in texts if values and values <= {*letters}]
+        named = ((n, c) for n, c in columns.items() if re.search(place, n) and isinstance(c, np.ndarray))
+        names = [n for n, c in named if not (c < 0.0).any()]  # others are signed
+        for name in names[:1] if sides else ():
+            size = columns[name]
+            if np.nanmax(size, initial=0.0) > 180.0:
+                size = size // 100.0 + size % 100.0 / 60.0
+            columns[name] = np.where((sides[0] == letters[1]).fill_null(value=False).to_numpy(), -size, size)
     return columns
 
 
@@ -375,12 +398,12 @@ def _fitting(
             lines.append(line)
             data.write((text.replace("\n", " ") + "\n").encode())
         elif text.replace(_CELL_END, " ").strip():
-            (comments if text.startswith("#") else wrong).append(line)
+            (comments if text.startswith(("#", "{", "[")) else wrong).append(line)
     cut = [wrong.pop()] if wrong[-1:] == array("q", [line]) and len(row) < width else []
     for kind, what, numbers in (
         ("truncated", "the last row is incomplete", cut),
         ("bad-row", f"row without {width} cells", wrong),
-        ("comment", "row that begins with #", comments),
+        ("comment", "row that begins with #, { or [", comments),
     ):
         if numbers:
             place = f"{file.name}, from line {numbers[0]} on"
@@ -435,11 +458,8 @@ def _vbo_stamps(columns: Mapping[str, Any], created: Iterable[tuple[str, str, st
     """Return the times [N] of ``hhmmss.sss`` on the day that the file was created."""
     clock: FloatArray = columns["time"]
     finite = np.isfinite(clock) & (clock >= 0.0) & (clock < 240_000.0)
-    hours, rest = np.divmod(np.where(finite, clock, 0.0), 1e4)
-    minutes, seconds = np.divmod(rest, 1e2)
     stamps = np.full(len(clock), NO_TIME, np.int64)
-    of_day = unwrapped((3600.0 * hours + 60.0 * minutes + seconds)[finite])
-    stamps[finite] = np.round(of_day * 1e6).astype(np.int64) * 1000
+    stamps[finite] = np.round(of_digits(clock[finite])[0] * 1e6).astype(np.int64) * 1000
     with suppress(ValueError):
         for day, month, year in created:
             return np.where(finite, stamps + whole_days(dt.date(int(year), int(month), int(day))), NO_TIME)
@@ -455,8 +475,13 @@ def open_json_lines(file: TableFile) -> Tables:
         with suppress(ValueError, RecursionError):
             document = json.load(file.stream)
         file.stream.seek(0)
-    if records := max(_lists_of_records(document, _DEEPEST), key=len, default=[]):
-        return _tables_of_records(records, file, "json")
+    if records := sorted(_lists_of_records(document, _DEEPEST), key=lambda named: -len(named[1])):
+        tables = _tables_of_records(records[0][1], file, "json", records[0][0] if records[1:] else "json")
+        for name, its in records[1:]:
+            with suppress(LogError):  # a list without times
+                others = _tables_of_records(its, file, "json", name)
+                tables = Tables("json", [*tables.tables, *others.tables], [*tables.losses, *others.losses])
+        return tables
     if not isinstance(document, dict) or not any(isinstance(value, dict | list) for value in document.values()):
         return _tables_of_records(map(_record_of_json, file.stream), file, "json-lines")
     losses: list[Loss] = []
@@ -466,7 +491,17 @@ def open_json_lines(file: TableFile) -> Tables:
 
 def open_line_protocol(file: TableFile) -> Tables:
     """Read lines of a measurement, its tags, its fields and a time in ns, as databases of time series take them."""
-    return _tables_of_records(map(_record_of_line, file.stream), file, "lines")
+    return _tables_of_records(map(_record_of_line, file.stream), file, "lines", "lines")
+
+
+def _record_of_pairs(line: str) -> dict[str, Any] | None:
+    """Return the numbers of a line of a program's log, ``2025-11-24 14:05:12 [imu] ax=0.1``, by device and name."""
+    time, pairs = PATTERNS["log_time"].match(line), PATTERNS["pair"].findall(line)
+    if time is None or not pairs:
+        return None if line.strip() else {}
+    device = re.search(r"\[([A-Za-z]\w*)\]", line)
+    values: dict[str, Any] = {name: float(value) for name, value in pairs}
+    return {"time": time[1].replace(",", "."), **({device[1]: values} if device else values)}
 
 
 def _record_of_json(line: bytes) -> dict[str, Any] | None:
@@ -488,22 +523,22 @@ def _record_of_line(line: bytes) -> dict[str, Any] | None:
     return {"time": int(parts[3]), parts[1]: {n: float(v) for n, v in fields.items()}} if parts and fields else None
 
 
-def _lists_of_records(value: Any, depth: int) -> Iterator[list[dict[str, Any]]]:
-    """Yield the lists of objects in a document, and tables of their columns' names and rows."""
+def _lists_of_records(value: Any, depth: int, name: str = "json") -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Yield the names and lists of objects in a document, and tables of their columns' names and rows."""
     if isinstance(value, dict) and depth:
         if table := _named_rows(value):
-            yield table
+            yield name, table
             return
         if value and all(key.isdigit() and isinstance(inner, dict) for key, inner in value.items()):
-            value = [[*value.values()]]
-        for inner in value.values() if isinstance(value, dict) else value:
-            yield from _lists_of_records(inner, depth - 1)
+            value = {name: [*value.values()]}
+        for key, inner in value.items():
+            yield from _lists_of_records(inner, depth - 1, key)
     elif isinstance(value, list) and depth:
-        if len(value) > _MOST_ELEMENTS and all(isinstance(inner, dict) for inner in value):
-            yield value
+        if len(value) > _MOST_ELEMENTS and all(isinstance(inner, dict | None) for inner in value):
+            yield name, [inner for inner in value if inner is not None]
         else:
             for inner in value[:_MOST_ELEMENTS]:
-                yield from _lists_of_records(inner, depth - 1)
+                yield from _lists_of_records(inner, depth - 1, name)
 
 
 def _named_rows(value: dict[str, Any]) -> list[dict[str, Any]]:
@@ -524,16 +559,18 @@ def _array_of(value: Any, depth: int) -> Any:
         if len(value) > 1 and all(key.isdigit() for key in value):
             return _array_of([*value.values()], depth)
         return {name: _array_of(inner, depth - 1) for name, inner in value.items()}
+    if isinstance(value, list) and value and isinstance(value[0], dict) and depth:
+        return [_array_of(inner, depth - 1) for inner in value]
     if isinstance(value, list):
         with suppress(ValueError, TypeError):
             is_text = any(isinstance(v, str) for v in value[:2])
             return (
                 np.array([v.rstrip("Z") for v in value], "datetime64[ns]") if is_text else np.array(value, np.float64)
             )
-    return value if isinstance(value, str) else None
+    return value if isinstance(value, str | float | int) else None
 
 
-def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str) -> Tables:
+def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str, name: str = "json") -> Tables:
     """Return the tables of objects in the order of time; None counts as a damaged line."""
     losses: list[Loss] = []
     lines, wrong = array("q"), array("q")
@@ -556,10 +593,8 @@ def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str) -> Ta
         losses.append(Loss("bad-row", "line without an object", place, count=len(wrong)))
     file.limits.check_table(8 * len(lines) * len(cells), file.size, file.name)
     fields, units = read_head([*cells])
-    columns = {
-        name: _json_column(name, cells[path], lines, file, losses) for name, path in zip(fields, cells, strict=True)
-    }
-    sheet = Sheet("json" if kind != "lines" else "lines", columns, units)
+    columns = {f: _json_column(f, cells[path], lines, file, losses) for f, path in zip(fields, cells, strict=True)}
+    sheet = Sheet(field_name(name), columns, units)
     return Tables(kind, list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,7 +33,7 @@ from pdhef_logtool.logs.can_decoding import (
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.naming import VOCABULARY
-from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
+from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource, near
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
@@ -223,13 +222,11 @@ class CanSignalLog(DriveLog):
 
     def unreadable(self, topic: str) -> str:
         """Return why no field of a topic is known."""
-        view = self._views.get(topic)
-        return self._log.unreadable(topic if view is None else view.topic)
+        return self._log.unreadable(self._views[topic].topic if topic in self._views else topic)
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic whole."""
-        view = self._views.get(topic)
-        return self._log.first_messages(topic if view is None else view.topic, most)
+        return self._log.first_messages(self._views[topic].topic if topic in self._views else topic, most)
 
     def _read(
         self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
@@ -328,15 +325,15 @@ def _make_view(
     message_name, signal_name = names
     holders = [(path, m) for path, database in databases for m in database.messages if m.name == message_name]
     if not holders:
-        near = _near(message_name, [m.name for _, d in databases for m in d.messages])
-        return f"the DBC has no message {message_name}{near}"
+        names_of_messages = [m.name for _, d in databases for m in d.messages]
+        return f"the DBC has no message {message_name}{near(message_name, names_of_messages)}"
     holders = [h for h in holders if _is_named_like(h[0], source.topic)] or holders
     if len(holders) > 1:
         return f"message {message_name} is in {' and in '.join(p.name for p, _ in holders)}"
     message = holders[0][1]
     by_name = {s.name: s for s in message.signals}
     if signal_name not in by_name:
-        return f"message {message_name} has no signal {signal_name}{_near(signal_name, list(by_name))}"
+        return f"message {message_name} has no signal {signal_name}{near(signal_name, list(by_name))}"
     signal = by_name[signal_name]
     if signal.length > MOST_BITS:
         return f"{message_name}.{signal_name} has {signal.length} bits, at most {MOST_BITS} make a number"
@@ -392,8 +389,3 @@ def _best(kinds: Mapping[str, str], part: str) -> list[str]:
             depth = min(p.count(".") for p in matches)
             return [p for p in matches if p.count(".") == depth]
     return []
-
-
-def _near(name: str, valid_ids: Sequence[str]) -> str:
-    close = get_close_matches(name, valid_ids, n=1, cutoff=0.3)
-    return f" (did you mean {close[0]}?)" if close else ""

@@ -320,8 +320,7 @@ def si_of(source: SignalSource, parts: Sequence[FloatArray]) -> FloatArray:
         if source.combine == "root":
             total = np.sqrt(np.maximum(total, 0.0))
         return np.asarray(total + source.offset, dtype=np.float64)
-    if width > 1 and raw.ndim == 2 and raw.shape[1] != width:
-        raw = np.full((n, width), np.nan)  # Wrong number of columns: every sample is counted as lost.
-    elif (width > 1 and raw.ndim == 1) or (width == 1 and raw.ndim == 2):
-        raw = np.full((n, width) if width > 1 else n, np.nan)
+    shape = (n, width) if width > 1 else (n,)
+    if raw.shape != shape:
+        raw = np.full(shape, np.nan)  # Wrong number of columns: every sample is counted as lost.
     return np.asarray(raw * np.asarray(source.scale) + np.asarray(source.offset), dtype=np.float64)

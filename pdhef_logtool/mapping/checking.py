@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from difflib import get_close_matches
 from itertools import product
 from typing import TypeVar
 
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, QualityGate, SignalSource
+from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, QualityGate, SignalSource, near
 from pdhef_logtool.records.errors import MappingError
 
 #: Paths of the measurement time in messages, best first.
@@ -151,9 +150,6 @@ def _kind_of(path: str, kinds: dict[str, str]) -> str | None:
 
 
 def _near(name: str, names: set[str]) -> str:
-    close = get_close_matches(name, sorted(names), n=1, cutoff=0.5)
-    if close:
-        return f" (did you mean {close[0]}?)"
     tail = name.rsplit(".", 1)[-1].rsplit("/", 1)[-1]
     same_tail = sorted(k for k in names if k.rsplit(".", 1)[-1].rsplit("/", 1)[-1] == tail)
-    return f" (did you mean {same_tail[0]}?)" if same_tail else ""
+    return near(name, sorted(names), 0.5) or (f" (did you mean {same_tail[0]}?)" if same_tail else "")

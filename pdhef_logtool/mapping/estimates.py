@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES
 from pdhef_logtool.mapping.recognition import TWIST_COVARIANCES, TWIST_FIELDS
-from pdhef_logtool.mapping.records import CanSettings, SignalSource
+from pdhef_logtool.mapping.records import CanSettings, SignalSource, near
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS
@@ -142,13 +141,8 @@ def _split_signal(text: str, units: Mapping[str, str], option: str) -> tuple[str
         return None, text.strip()
     signal = head.strip()
     if signal not in units:
-        close = get_close_matches(signal, list(units), n=1, cutoff=0.5)
-        raise UsageError(
-            expected=f"SIGNAL out of {', '.join(units)}",
-            got=repr(signal),
-            where=f"{option} {text}",
-            remedy=f"did you mean {close[0]}?" if close else "",
-        )
+        got = repr(signal) + near(signal, list(units), 0.5)
+        raise UsageError(expected=f"SIGNAL out of {', '.join(units)}", got=got, where=f"{option} {text}")
     return signal, rest.strip()
 
 
@@ -159,12 +153,11 @@ def _split_topic(log: DriveLog, text: str, option: str) -> tuple[TopicInfo, str]
         topic = max(fitting, key=lambda t: len(t.name))
         return topic, text[len(topic.name) + 1 :]
     names = [t.name for t in log.topics]
-    close = get_close_matches(text, names, n=1, cutoff=0.5) or get_close_matches(text.split(".")[0], names, n=1)
     raise MappingError(
         expected="TOPIC.FIELD with a topic of this log",
-        got=text,
+        got=text + (near(text, names, 0.5) or near(text.split(".")[0], names, 0.6)),
         where=f"{log.path} {option}",
-        remedy=f"did you mean {close[0]}?" if close else "pdhef inspect lists the topics",
+        remedy="pdhef inspect lists the topics",
     )
 
 

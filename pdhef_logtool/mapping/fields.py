@@ -29,12 +29,15 @@ EXCITED_CURVATURE_1_M, SLOW_M_S = 0.0001, 1.0
 _HALF = 5
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
-#: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
-SAME, BY_DRIVING = 0.03, 0.15
+#: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
+#: grade and slip, and of the usual lengths among cars.
+SAME, BY_DRIVING, USUAL_LENGTHS = 0.03, 0.15, 0.4
 #: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
 CERTAIN = 0.9
+#: Usual lengths that convert curvature to an angle: a wheelbase, times a steering ratio for the steering wheel.
+USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
 #: Energies of rare units.
 RARE = {"mph": 1.5, "mg": 1.5, "ft/s²": 3.0}
 
@@ -205,6 +208,7 @@ def decide_units(fields: Fields) -> None:
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
+    _by_steering(fields)
     _by_siblings(fields)
 
 
@@ -283,13 +287,31 @@ def _by_turning(fields: Fields) -> None:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
 
 
+def _by_steering(fields: Fields) -> None:
+    """Determine the unit of the speed by the length that converts the path's curvature to a steering angle."""
+    speed, rate, steering = fields.best("speed"), fields.best("rate"), fields.best("steering")
+    if speed is None or rate is None or steering is None or speed.unit_known or speed.fixed:
+        return
+    curve = fields.curvature(speed.seen.cells, rate.seen.cells)
+    relation = None if curve is None else fit(fields.pieces.smooth(steering.seen.cells), curve)
+    if relation is None or abs(relation.correlation) < CLEAR:
+        return
+    ways = [Unit(u, f / m, k, USUAL_LENGTHS) for k, m in USUAL_LENGTH_M.items() for u, f in steering.units]
+    others = [[Unit(*u, energy=RARE.get(u[0], 0.0)) for u in f.units] for f in (rate, speed)]
+    share = posterior([ways, *others], [Gain((1, -1, 1), relation.slope, BY_DRIVING)]).sum(axis=(0, 1))
+    if share.max() > CERTAIN * share.sum():
+        speed.use(speed.units[int(share.argmax())][0])
+        speed.doubts.append(f"unit not given; taken as {speed.factors[0][0]}, with a usual ratio of the steering")
+
+
 def _by_siblings(fields: Fields) -> None:
     """Use the unit of other accelerations, or velocities, of the same message."""
     for kinds in ({"acceleration"}, {"speed", "velocity"}):
-        settled = {leaf_group(f): f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known}
+        certain = [f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known]
+        settled = {leaf_group(f): f for f in certain} | {triad_of(f): f for f in certain}
         mine = (f for f in fields.candidates if f.meaning.quantity in kinds and f.meaning.strength > 0.6)
         for item in [f for f in mine if not f.unit_known and leaf_group(f) in settled]:
-            other = settled[leaf_group(item)]
+            other = settled.get(triad_of(item), settled[leaf_group(item)])
             same = [u for u, s in item.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
             if same:
                 item.use(same[0])

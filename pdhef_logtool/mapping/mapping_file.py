@@ -14,14 +14,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from pdhef_logtool.mapping.naming import UNITS, plain_unit, unit_of
-from pdhef_logtool.mapping.records import (
-    CAN_PREFIX,
-    RECORDER_STAMPS,
-    CanSettings,
-    Mapping,
-    QualityGate,
-    SignalSource,
-)
+from pdhef_logtool.mapping.records import CAN_PREFIX, RECORDER_STAMPS, CanSettings, Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.errors import MappingError, MappingFileError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 from pdhef_logtool.storage.documents import checked, read_toml, unknown
@@ -254,10 +247,8 @@ def _problem_of_frames(source: SignalSource) -> str:
 
 def contradictions(mapping: Mapping) -> list[str]:
     """Return contradictions in a mapping: two names of one signal, or one field for two signals of a section."""
-    problems = []
-    pairs = [("steer_rad", "steering_wheel_rad")]
-    pairs += [(f"wheel_speed_{w}_m_s", f"wheel_speed_{w}_rad_s") for w in WHEELS]
-    problems += [
+    pairs = [_STEERING, *((f"wheel_speed_{w}_m_s", f"wheel_speed_{w}_rad_s") for w in WHEELS)]
+    problems = [
         f"signals.{a} and signals.{b}: give one of them, not both"
         for a, b in pairs
         if a in mapping.signals and b in mapping.signals

@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
 
-from pdhef_logtool.logs.table_columns import LATIN
+from pdhef_logtool.logs.table_columns import LATIN, LETTERS
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import WHEELS
 
@@ -54,10 +54,11 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
+    name = _PATTERNS["no_words"].sub("", name)
     name = _PATTERNS["sides"].sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
     name = _PATTERNS["corner_at_end"].sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
-        for piece in [part] if part.lower() in _WHOLE else _CAMEL.findall(part):
+        for piece in [part] if part.lower() in _WHOLE else _PATTERNS["camel"].findall(part):
             words += [english for word in _unglued(piece.lower()) for english in _SYNONYMS.get(word, word).split()]
     return tuple(words)
 
@@ -116,7 +117,7 @@ def is_command(*names: str) -> bool:
 
 def plain_unit(text: str) -> str:
     """Normalize a unit of a file to the form used in field names: ``Unit_DegrePerSecon`` becomes ``deg_per_s``."""
-    text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text.strip("[](){} ")).lower()
+    text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text.strip("[](){} ").translate(LETTERS)).lower()
     for pattern, sign in _SPELLED_UNITS:
         text = pattern.sub(sign, text)
     return re.sub(r"_+", "_", text).strip("_")
@@ -310,6 +311,7 @@ def _quantity(
         "@around": strength < 1.0,
         "@delta": "delta" in leaf <= _WORDS["of_delta"],
         "@letters": leaf <= set("xyz"),
+        "@only_axis": {w for w in leaf if not w.isdigit()} - {"axis", axis} == set(),
         "@v_axis": any(first == "v" and second in _AXES for first, second in pairwise(leaf_words)),
         "@bare_v": "v" in leaf <= _WORDS["of_v"],
         **{f"@unit_{kind.replace(' ', '_')}": bool(unit_of(named, kind)[0]) for kind in UNITS},

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -27,6 +28,12 @@ CAN_PREFIX = "can:"
 RECORDER_STAMPS = ("log_time", "publish_time")
 #: Default of ``stamp``: the message's header.stamp or stamp if its schema has one, else log time.
 AUTO_STAMP = "auto"
+
+
+def near(name: str, names: Sequence[str], cutoff: float = 0.3) -> str:
+    """Return the nearest of these names as a question for a message; empty if none is near."""
+    close = get_close_matches(name, names, n=1, cutoff=cutoff)
+    return f" (did you mean {close[0]}?)" if close else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
     SLOW_M_S,
+    USUAL_LENGTH_M,
     Fields,
     Gain,
     Unit,
@@ -64,8 +65,7 @@ _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
 #: the signal could also be a share of the largest angle.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
 USUAL = 0.6
-#: Usual lengths. Units of wheel speeds, which are mostly named as speeds; their energies where the rest is in SI units.
-USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
+#: Units of wheel speeds, which are mostly named as speeds; their energies where the rest is in SI units.
 #: Usual radius of a wheel, and 1-sigma of the logarithm of a radius that a car assumes for its wheel speeds.
 USUAL_RADIUS_M, WHEEL_RADIUS = 0.3, 0.015
 WHEEL_UNITS = (
@@ -193,8 +193,11 @@ class Weighing:
             beside = [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and not f.has_gravity]
             beside = [f for f in beside if axes not in ("", "body") and f.is_axis and leaf_group(f) == leaf_group(x)]
             self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y, *beside)]
+            self._drop_changes_of(x, y)
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
-            if axes in ("east, north", "north, east") and x.role in ("sensor", "navigation") and (is_named or steps):
+            # Axes by the yaw rate alone cannot show its sign: beside a speed, the vector is left out.
+            is_sure = steps is not None or (is_named and not any(f is not x for f in self.fields.open("speed")))
+            if axes in ("east, north", "north, east") and is_sure and x.role in ("sensor", "navigation"):
                 for name, item in zip(axes.split(", "), (x, y), strict=True):
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
@@ -211,6 +214,18 @@ class Weighing:
         if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
             y.sign = -1.0
             y.doubts.append("its device has axes forward, right, down, as gravity shows")
+
+    def _drop_changes_of(self, x: Field, y: Field) -> None:
+        """Leave out accelerations that are derivatives of a velocity over ground, not of the speed and its course."""
+        pieces, length = self.fields.pieces, np.hypot(x.si, y.si)
+        ahead, left = pieces.rate_of(length), length * pieces.turning(x.si + 1j * y.si)
+        for item in [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and f.is_axis]:
+            if (of := {"x": (x, ahead), "y": (y, left)}.get(item.meaning.part)) is not None and not item.fixed:
+                changes = (pieces.rate_of(of[0].si), of[1])
+                over, body = (correlation(pieces.smooth(item.si), change) for change in changes)
+                if over > max(CLEAR, abs(body)):
+                    self.fields.candidates.remove(item)
+                    self.notes.append(f"{item.topic.name}.{item.path} is not used: it is over ground")
 
     def _vectors(self) -> Iterator[tuple[Field, Field]]:
         """Yield the x and y of velocities that change."""

@@ -32,7 +32,7 @@ def rotation(axis: tuple[float, float, float], angle_rad: float) -> FloatArray:
     return np.asarray(np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * cross @ cross)
 
 
-_NUMPY = ("clip", "cumsum", "diag", "gradient", "maximum", "pi", "rint", "sqrt", "stack", "tan")
+_NUMPY = ("clip", "cos", "cumsum", "diag", "floor", "gradient", "maximum", "pi", "rint", "sin", "sqrt", "stack", "tan")
 #: Names of expressions beside the columns of the car. ``shift`` is a command ahead of its measurement.
 _NAMES = {
     "DEG": DEG, "DOWN": DOWN, "FORWARD": np.diag([1.0, 0.0]), "G": G_M_S2, "KMH": KMH, "RPM": 2.0 * np.pi / 60.0,

@@ -67,8 +67,11 @@ def _text(dialect: str, path: Path, topics: Sequence[Topic]) -> None:
     cells = {f"{key}s": [p[key] for p in parts] for key in ("title", "source", "group")}
     cells |= {f"{key}s": [form[key].format(**p) for p in parts] for key in ("name", "unit")}
     cells["numbers"] = [str(i) for i in range(12, 12 + len(titles))]
+    cells["channels"] = [form["channel"].format(number=i, **p) for i, p in enumerate(parts, 1)]
     start = min(int(t.arrival_ns[0]) for t in topics)
-    above = {name: form["separator"].join(row) for name, row in cells.items()} | _times(start, start, 0)
+    above = {
+        name: ("\n" if name == "channels" else form["separator"]).join(row) for name, row in cells.items()
+    } | _times(start, start, 0)
     rows = {"table": _table_rows, "samples": _sample_rows}.get(form["rows"], _value_rows)(form, topics, start)
     rows = (row.replace(".", form["decimal"]) for row in rows)
     lines = [*(line.format(**above) for line in form["head"]), *rows, *form["tail"], ""]
@@ -120,6 +123,32 @@ def _own_times(path: Path, topics: Sequence[Topic]) -> None:
     length = max(map(len, columns))
     rows = zip(*([*column, *[""] * (length - len(column))] for column in columns), strict=True)
     path.write_text("\n".join([*map(";".join, rows), ""]), encoding="utf-8")
+
+
+def _blocks(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a race data program's export: a block of times and values for each signal, one below the other."""
+    lines = ["PiToolboxVersionedASCIIDataSet", "Version\t2", "", "{OutingInformation}", "CarName\tcar 3"]
+    for seconds, name, unit, values in _signals(topics):
+        lines += ["", "{ChannelBlock}", f"Time\t{name}[{unit}]"]
+        lines += [f"{at:.3f}\t{v:.6g}" for at, v in zip(seconds.tolist(), values.tolist(), strict=True)]
+    path.write_bytes("\r\n".join([*lines, ""]).encode("cp1252"))
+
+
+def _stamps(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a workshop tester's log: groups side by side, each with a column of its own times."""
+    start = min(int(t.arrival_ns[0]) for t in topics)
+    columns = [["", "", "", "Marker"]]
+    for number, topic in enumerate(topics):
+        times = [f"{(s - start) / 1e9:.2f}" for s in topic.arrival_ns.tolist()]
+        columns.append([f"Group {'ABC'[number]}:", "", "TIME", "STAMP", *times])
+        for i, (title, values) in enumerate(topic.fields.items(), 1):
+            name, unit = _split(title)
+            above = [f"'{number + 4:03d}" if i == 1 else "", name, "", f" {unit}"]
+            columns.append([*above, *(f"{v:.2f}" for v in values.tolist())])
+    length = max(map(len, columns))
+    rows = zip(*([*column, *[""] * (length - len(column))] for column in columns), strict=True)
+    head = ["Monday,24,November,2025,14:05:12:00125", "1K0 907 379 AC,ESP MK60EC1  H31 0121"]
+    path.write_text("\n".join([*head, *map(",".join, rows), ""]), encoding="latin-1")
 
 
 def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
@@ -213,20 +242,18 @@ def _mat_runs(path: Path, topics: Sequence[Topic]) -> None:
     savemat(path, runs)
 
 
+def _signals(topics: Sequence[Topic]) -> Iterator[tuple[NDArray[np.float64], str, str, NDArray[np.float64]]]:
+    """Yield times in s since the first one, name, unit and values of each signal."""
+    start = topics[0].arrival_ns[0]
+    for topic in topics:
+        yield from (((topic.arrival_ns - start) * 1e-9, *_split(title), v) for title, v in topic.fields.items())
+
+
 def _mat_series(path: Path, topics: Sequence[Topic]) -> None:
     """Write a struct for each signal, as MATLAB's timeseries become."""
     from scipy.io import savemat
 
-    signals = ((t, *_split(title), values) for t in topics for title, values in t.fields.items())
-    series = {
-        name: {
-            "Name": name,
-            "Time": (t.arrival_ns - topics[0].arrival_ns[0]) * 1e-9,
-            "Data": v,
-            "DataInfo": {"Units": u},
-        }
-        for t, name, u, v in signals
-    }
+    series = {n: {"Name": n, "Time": s, "Data": v, "DataInfo": {"Units": u}} for s, n, u, v in _signals(topics)}
     savemat(path, {"data": series})
 
 
@@ -235,11 +262,32 @@ def _mat_pairs(path: Path, topics: Sequence[Topic]) -> None:
     from scipy.io import savemat
 
     vectors: dict[str, Any] = {"Sample_rate": 100.0, "Start_time": "2025/11/24 14:05:12.125"}
-    for topic in topics:
-        for name, values in topic.fields.items():
-            vectors[f"Data1_time_{name}"] = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
-            vectors[f"Data1_{name}"] = values
+    for seconds, name, _, values in _signals(topics):
+        vectors |= {f"Data1_time_{name}": seconds, f"Data1_{name}": values}
     savemat(path, vectors)
+
+
+def _mat_quantities(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a struct of quantities, each with data, unit and number of states, as a simulator's reader returns them."""
+    from scipy.io import savemat
+
+    quantities = {n: {"data": v, "unit": u, "nstates": 0.0} for _, n, u, v in _signals(topics)}
+    seconds = next(_signals(topics))[0]
+    savemat(path, {"data": {"Time": {"data": seconds, "unit": "s", "nstates": 0.0}, **quantities}})
+
+
+def _mat_columns(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a matrix of times and values for each signal."""
+    from scipy.io import savemat
+
+    savemat(path, {name: np.stack([seconds, values], 1) for seconds, name, _, values in _signals(topics)})
+
+
+def _mat_values(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a struct for each channel with its times, values and units."""
+    from scipy.io import savemat
+
+    savemat(path, {n: {"Time": s, "Value": v, "Units": u} for s, n, u, v in _signals(topics)})
 
 
 def _mat_recorder(path: Path, topics: Sequence[Topic]) -> None:
@@ -273,13 +321,16 @@ def _mat_scope(path: Path, topics: Sequence[Topic]) -> None:
     savemat(path, scopes)
 
 
-def _mat_columns(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a matrix of times and values for each signal."""
-    from scipy.io import savemat
-
-    start = topics[0].arrival_ns[0]
-    signals = ((name, (t.arrival_ns - start) * 1e-9, values) for t in topics for name, values in t.fields.items())
-    savemat(path, {name: np.stack([seconds, values], 1) for name, seconds, values in signals})
+def _json_lists(path: Path, topics: Sequence[Topic]) -> None:
+    """Write one document: a list of objects for each topic, with times in ms."""
+    document: dict[str, Any] = {"rideID": "7f", "startTime": int(topics[0].arrival_ns[0] // 10**6)}
+    for topic in topics:
+        columns = zip(*(values.tolist() for values in topic.fields.values()), strict=True)
+        document[topic.name.strip("/")] = [
+            {**dict(zip(topic.fields, row, strict=True)), "timestamp": stamp // 10**6}
+            for stamp, row in zip(topic.arrival_ns.tolist(), columns, strict=True)
+        ]
+    path.write_text(json.dumps(document), encoding="utf-8")
 
 
 def _mat_groups(path: Path, topics: Sequence[Topic]) -> None:
@@ -301,6 +352,14 @@ def _json_signals(path: Path, topics: Sequence[Topic]) -> None:
         for title, v in t.fields.items()
     }
     path.write_text(json.dumps(signals), encoding="utf-8")
+
+
+def _json_channels(path: Path, topics: Sequence[Topic]) -> None:
+    """Write one document: a list of channels with name, unit, rate and data."""
+    rates = ((round(1.0 / float(np.median(np.diff(s))), 3), n, u, v) for s, n, u, v in _signals(topics))
+    channels = [{"name": n, "unit": u, "samplerate": rate, "data": v.tolist()} for rate, n, u, v in rates]
+    meta = {"vehicle": "car 3", "start": "2025-11-24T14:05:12.125Z"}
+    path.write_text(json.dumps({"meta": meta, "channels": channels}), encoding="utf-8")
 
 
 def _json_columns(path: Path, topics: Sequence[Topic]) -> None:
@@ -379,6 +438,10 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
 _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     **{n: (d.get("suffix", ".csv"), partial(_text, n)) for n, d in _DIALECTS.items()},
     "csv-times": (".csv", _own_times),
+    "txt-blocks": (".txt", _blocks),
+    "csv-stamps": (".csv", _stamps),
+    "mat-quantities": (".mat", _mat_quantities),
+    "json-lists": (".json", _json_lists),
     "parquet-long": (".parquet", _long_parquet),
     "mat": (".mat", _mat),
     "mat-runs": (".mat", _mat_runs),
@@ -391,6 +454,8 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "mat-groups": (".mat", _mat_groups),
     "json-signals": (".json", _json_signals),
     "json-columns": (".json", _json_columns),
+    "json-channels": (".json", _json_channels),
+    "mat-values": (".mat", _mat_values),
     "hdf5": (".h5", _hdf5),
     "parquet-measures": (".parquet", _measures_parquet),
     "mdf": (".mf4", _mdf),
