@@ -58,7 +58,7 @@ def words_of(name: str) -> tuple[str, ...]:
     name = _PATTERNS["sides"].sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
     name = _PATTERNS["corner_at_end"].sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
-        for piece in [part] if part.lower() in _WHOLE else _PATTERNS["camel"].findall(part):
+        for piece in [part] if part.lower() in _WHOLE else _CAMEL.findall(part):
             words += [english for word in _unglued(piece.lower()) for english in _SYNONYMS.get(word, word).split()]
     return tuple(words)
 

@@ -20,7 +20,6 @@ from pdhef_logtool.mapping.candidates import (
     Field,
     Role,
     anchor_of,
-    leaf_group,
     look,
     named_fields,
     place_of,
@@ -190,9 +189,7 @@ class Weighing:
             if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
                 self._turn_down(y)
                 continue
-            beside = [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and not f.has_gravity]
-            beside = [f for f in beside if axes not in ("", "body") and f.is_axis and leaf_group(f) == leaf_group(x)]
-            self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y, *beside)]
+            self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y)]
             self._drop_changes_of(x, y)
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
             # Axes by the yaw rate alone cannot show its sign: beside a speed, the vector is left out.
