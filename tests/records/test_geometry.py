@@ -137,6 +137,12 @@ def test_dead_reckoning_of_a_circle_converges_with_the_square_of_the_step():
         assert math.log2(coarse / fine) == pytest.approx(2.0, abs=0.1)
 
 
+def test_dead_reckoning_stands_still_where_an_end_of_a_step_is_unknown() -> None:
+    vx = np.array([2.0, 2.0, np.nan, 2.0, 2.0])
+    x, _, _ = dead_reckon(np.arange(5) * 10**9, vx, np.zeros(5), np.zeros(5), (1.0, 0.0, 0.0))
+    assert x.tolist() == [1.0, 3.0, 3.0, 3.0, 5.0]
+
+
 def test_angles_beyond_a_turn_change_none_beside_them() -> None:
     within = np.array([-np.pi, -1e-300, -0.0, 0.0, 3.0, np.nextafter(np.pi, 0.0), np.nan])
     alone, beside = wrap_angle(within), wrap_angle(np.append(within, [7.0, -9.0]))
