@@ -22,6 +22,7 @@ from pdhef_logtool.records.geometry import (
     shift_velocity_to_cg,
     wrap_angle,
 )
+from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.student import student_quantile
 
 exact = settings(derandomize=True, deadline=None, max_examples=100)
@@ -154,3 +155,8 @@ def test_angles_beyond_a_turn_change_none_beside_them() -> None:
 def test_quantiles_are_those_of_scipy(share: float, freedom: int) -> None:
     assert student_quantile(share, freedom) == pytest.approx(stdtrit(freedom, share), rel=1e-9)
     assert student_quantile(share, math.inf) == pytest.approx(ndtri(share), rel=1e-12)
+
+
+def test_a_running_mean_is_of_the_finite_rows_around_by_their_weights() -> None:
+    mean = running_mean(np.array([1.0, 2.0, np.nan, 6.0]), 1, np.array([1.0, 3.0, 1.0, 1.0]))
+    np.testing.assert_allclose(mean, [1.75, 1.75, 3.0, 6.0])
