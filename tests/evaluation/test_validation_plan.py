@@ -9,13 +9,8 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.evaluation.validation_plan import (
-    ExposureNeed,
-    default_plan,
-    example_plan,
-    load_plan,
-    plan_from_dict,
-)
+from pdhef_logtool.evaluation import validation_plan
+from pdhef_logtool.evaluation.validation_plan import default_plan, example_plan, load_plan, plan_from_dict
 from pdhef_logtool.records.errors import UsageError
 from tests.run_report import follows
 
@@ -38,7 +33,7 @@ def test_the_example_is_valid_and_is_read(tmp_path: Path) -> None:
 
 
 def test_a_condition_contains_its_lower_edge_and_one_car() -> None:
-    need = ExposureNeed(speed_m_s=[10.0, 20.0], car="a", minutes=1.0)
+    need = validation_plan.ExposureNeed(speed_m_s=[10.0, 20.0], car="a", minutes=1.0)
     space = {(5.0, 0.0): 1.0, (10.0, 0.0): 3.0, (20.0, 0.0): 5.0}
     assert (need.seconds_of(space, 0.9, "a"), need.seconds_of(space, 0.9, "b")) == (3.0, 0.0)
 
