@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from reference_car import make_signals
@@ -26,6 +28,8 @@ def test_a_steady_drive_is_in_one_cell_for_as_long_as_it_lasts(speed: float, ay:
     (found,) = operating_space(made, None, None, VEHICLE)["cells"]
     assert (found["speed"], found["ay"]) == cell
     assert found["seconds"] == pytest.approx(20.0)
+    friction = np.repeat([0.3, 0.4, 0.9], [900, 200, 900])
+    assert operating_space(replace(made, friction=friction), None, None, VEHICLE)["friction_median"] == 0.4
     assert found["scored"] == 0 and np.isnan(found["sideslip_mse_rad2"])
 
 

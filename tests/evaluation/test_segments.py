@@ -7,7 +7,7 @@ import pytest
 from reference_car import signals_at
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
+from pdhef_logtool.evaluation.segments import driven_speed, find_intervals, moving_mask, segment_masks
 from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.records.tracks import make_track
 
@@ -113,3 +113,21 @@ def test_a_gap_in_the_stamps_ends_an_interval_and_is_not_smoothed_across():
     np.testing.assert_allclose(found, [(25, 27), (28, 30)], atol=0.1)
     step = np.where(t[keep] < 27.5, 0.0, 5.0)
     np.testing.assert_allclose(smooth(s.stamps_ns, step, 1.0), step, atol=1e-12)
+
+
+def test_a_car_moves_in_reverse_too_and_may_move_where_its_speed_is_unknown():
+    t, speed, ax, ay = staged()
+    s = signals(t, speed, ax, ay)
+    truth = make_track("truth", s.stamps_ns, vx_m_s=-speed)
+    np.testing.assert_array_equal(driven_speed(s, truth), speed)
+    assert moving_mask(s, truth, VEHICLE)[speed > 5.0].all()
+    assert moving_mask(signals(t, np.nan * speed, ax, ay), None, VEHICLE).all()
+
+
+def test_an_interval_ends_behind_its_last_stamp_and_a_car_at_rest_does_not_brake():
+    t, speed, ax, ay = staged()
+    s = signals(t, speed, np.where(t < 8, -4.0, ax), ay)
+    masks = segment_masks(s, None, VEHICLE)
+    (whole,) = find_intervals(s, {"all": masks["all"]})
+    assert whole.end_ns == s.stamps_ns[-1] + 1
+    assert not masks["braking"][t < 8].any()

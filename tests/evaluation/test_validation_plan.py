@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from pdhef_logtool.evaluation import validation_plan
 from pdhef_logtool.evaluation.validation_plan import default_plan, example_plan, load_plan, plan_from_dict
 from pdhef_logtool.records.errors import UsageError
 from tests.run_report import follows
@@ -29,6 +30,12 @@ def test_the_example_is_valid_and_is_read(tmp_path: Path) -> None:
     assert plan.requirements[2].label == "sideslip RMSE ≤ 0.5 × zero"
     assert plan.requirements[4].label == "sideslip in 95 % CI ≥ 90 %"
     assert not default_plan().file
+
+
+def test_a_condition_contains_its_lower_edge_and_one_car() -> None:
+    need = validation_plan.ExposureNeed(speed_m_s=[10.0, 20.0], car="a", minutes=1.0)
+    space = {(5.0, 0.0): 1.0, (10.0, 0.0): 3.0, (20.0, 0.0): 5.0}
+    assert (need.seconds_of(space, 0.9, "a"), need.seconds_of(space, 0.9, "b")) == (3.0, 0.0)
 
 
 def test_degrees_manoeuvres_and_quantiles() -> None:

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from mcap.records import Message, Statistics
+from mcap.stream_reader import StreamReader
 from recorded import write_vectors
 
 from pdhef_logtool import inspect_log
@@ -185,3 +187,14 @@ def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: py
     assert len(opened) > 3
     # One more time for the example message of a topic without a schema.
     assert sorted(opened.values())[-2:] in ([1, 1], [1, 2])
+
+
+def test_sums_times_and_numbers_of_messages_are_those_of_the_file(tmp_path: Path) -> None:
+    with McapLogWriter(tmp_path / "a.mcap") as writer:
+        writer.add_topic("/v", "std_msgs/msg/Float64")
+        for times in np.arange(10).reshape(2, 5):
+            writer.write([TopicBatch("/v", times, times, {"data": np.zeros(5)})])
+    with (tmp_path / "a.mcap").open("rb") as file:
+        records = [*StreamReader(file, validate_crcs=True).records]
+    assert [r.sequence for r in records if isinstance(r, Message)] == [*range(10)]
+    assert [(r.message_start_time, r.message_end_time) for r in records if isinstance(r, Statistics)] == [(0, 9)]

@@ -22,6 +22,7 @@ from pdhef_logtool.records.geometry import (
     shift_velocity_to_cg,
     wrap_angle,
 )
+from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.student import student_quantile
 
 exact = settings(derandomize=True, deadline=None, max_examples=100)
@@ -137,6 +138,12 @@ def test_dead_reckoning_of_a_circle_converges_with_the_square_of_the_step():
         assert math.log2(coarse / fine) == pytest.approx(2.0, abs=0.1)
 
 
+def test_dead_reckoning_stands_still_where_an_end_of_a_step_is_unknown() -> None:
+    vx = np.array([2.0, 2.0, np.nan, 2.0, 2.0])
+    x, _, _ = dead_reckon(np.arange(5) * 10**9, vx, np.zeros(5), np.zeros(5), (1.0, 0.0, 0.0))
+    assert x.tolist() == [1.0, 3.0, 3.0, 3.0, 5.0]
+
+
 def test_angles_beyond_a_turn_change_none_beside_them() -> None:
     within = np.array([-np.pi, -1e-300, -0.0, 0.0, 3.0, np.nextafter(np.pi, 0.0), np.nan])
     alone, beside = wrap_angle(within), wrap_angle(np.append(within, [7.0, -9.0]))
@@ -148,3 +155,8 @@ def test_angles_beyond_a_turn_change_none_beside_them() -> None:
 def test_quantiles_are_those_of_scipy(share: float, freedom: int) -> None:
     assert student_quantile(share, freedom) == pytest.approx(stdtrit(freedom, share), rel=1e-9)
     assert student_quantile(share, math.inf) == pytest.approx(ndtri(share), rel=1e-12)
+
+
+def test_a_running_mean_is_of_the_finite_rows_around_by_their_weights() -> None:
+    mean = running_mean(np.array([1.0, 2.0, np.nan, 6.0]), 1, np.array([1.0, 3.0, 1.0, 1.0]))
+    np.testing.assert_allclose(mean, [1.75, 1.75, 3.0, 6.0])

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 
 from pdhef_logtool.cli import console
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.printable import all_printable, printable, utf8
+from pdhef_logtool.records.printable import all_printable, listed, printable, utf8
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log, render_inspection
 from pdhef_logtool.storage.documents import jsonable
@@ -31,6 +31,12 @@ def test_what_is_shown_is_one_printable_line_of_limited_length(text: str, most: 
     line.encode()
     if text.isprintable() and len(text) <= most:
         assert line == text
+
+
+def test_a_text_of_the_largest_length_is_whole_and_names_beyond_the_most_are_counted() -> None:
+    assert printable("abcde", 5) == "abcde"
+    assert listed("abcdefgh") == "a, b, c, d, e and 3 more"
+    assert listed("abc", 2, count=7) == "a, b and 5 more"
 
 
 @given(_ANY)

@@ -48,7 +48,7 @@ def run(tmp_path: Path) -> Path:
     speed = np.full(N, 20.0)
     speed[:50] = 2.0
     still = {"vx_m_s": speed, "vy_m_s": np.zeros(N), "sideslip_rad": np.zeros(N)}
-    wild = {**still, "sideslip_rad": np.where(np.arange(N) < 50, np.pi, 0.0)}
+    wild = {**still, "sideslip_rad": np.where(np.arange(N) < 50, 1.02 * np.pi, 0.0)}
     valid = np.ones(N, dtype=np.bool_)
     valid[105:] = False
     write_estimates(folder, "a", truth=still, pd_hef={**still, "sideslip_rad": slip}, physics=still)
@@ -60,6 +60,7 @@ def run(tmp_path: Path) -> Path:
 def test_rows_have_drive_start_end_and_peak(run: Path) -> None:
     found = _find(run, "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10")
     first, second = found.events
+    assert len(_find(run, "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10", pad_s=0.15).events) == 1
     assert (first.drive, second.drive, found.searched) == ("a", "a", 2)
     assert (first.start_ns, first.end_ns) == (START_NS + 1_030_000_000, START_NS + 1_100_000_001)
     assert first.start_s == pytest.approx(2.03)
@@ -71,6 +72,7 @@ def test_rows_have_drive_start_end_and_peak(run: Path) -> None:
 
 def test_an_error_is_known_only_where_it_is_scored(run: Path) -> None:
     assert [e.drive for e in _find(run, "abs(sideslip_error_deg) > 170").events] == ["b"]
+    assert not _find(run, "abs(sideslip_error_deg) > 181").events
     slow = {**report(), "vehicle": {**report()["vehicle"], "low_speed_blend_m_s": 3.0}}
     entries = [entry("a"), entry("b"), entry("no_truth")]
     write_run(run, {}, entries=entries, reports={e["log"]: slow for e in entries})

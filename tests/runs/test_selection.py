@@ -82,6 +82,12 @@ def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:
     assert "the log's signals" in main(names).why
 
 
+def test_what_integrates_the_residual_is_no_better_one_and_zero_counts_only_where_it_ran() -> None:
+    rows = d2(pd_hef=0.11, kinematic=0.01, open_loop=0.1)
+    without = main("kinematic open-loop pd-hef", rows)
+    assert (without.name, without.distrusted, without.naive) == ("pd-hef", False, None)
+
+
 def test_zero_sideslip_is_a_baseline_and_never_chosen_by_its_agreement() -> None:
     """At the rear axle of a car the lateral velocity is small: an accelerometer there agrees with ``zero``."""
     names = "zero open-loop physics pd-hef"
