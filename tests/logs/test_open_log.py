@@ -192,9 +192,9 @@ def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: py
 def test_sums_times_and_numbers_of_messages_are_those_of_the_file(tmp_path: Path) -> None:
     with McapLogWriter(tmp_path / "a.mcap") as writer:
         writer.add_topic("/v", "std_msgs/msg/Float64")
-        for times in np.arange(10).reshape(2, 5):
-            writer.write([TopicBatch("/v", times, times, {"data": np.zeros(5)})])
+        for times in np.arange(12).reshape(3, 4):
+            writer.write([TopicBatch("/v", times, times, {"data": np.zeros(4)})])
     with (tmp_path / "a.mcap").open("rb") as file:
         records = [*StreamReader(file, validate_crcs=True).records]
-    assert [r.sequence for r in records if isinstance(r, Message)] == [*range(10)]
-    assert [(r.message_start_time, r.message_end_time) for r in records if isinstance(r, Statistics)] == [(0, 9)]
+    assert [r.sequence for r in records if isinstance(r, Message)] == [*range(12)]
+    assert [(r.message_start_time, r.message_end_time) for r in records if isinstance(r, Statistics)] == [(0, 11)]
