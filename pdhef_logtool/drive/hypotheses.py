@@ -30,8 +30,8 @@ UNRELATED_CORRELATION = 0.25
 TABLE: dict[str, Any] = tomllib.loads(Path(__file__).with_name("relations.toml").read_text(encoding="utf-8"))
 #: Correction factors with their texts by unit, and units in which mappings confuse a signal. A typical steering ratio
 #: or wheel radius recognises one quantity recorded as another.
-FACTORS: dict[str, list[tuple[float, str]]] = TABLE.pop("factors")
-UNITS: dict[str, list[str]] = TABLE.pop("units")
+FACTORS: dict[str, list[tuple[float, str]]] = TABLE["factors"]
+UNITS: dict[str, list[str]] = TABLE["units"]
 _TYPICAL = {factor for unit, factors in FACTORS.items() if unit.startswith("typical") for factor, _ in factors}
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
 FOREIGN = (180.0 / math.pi, G_M_S2, 3.6)

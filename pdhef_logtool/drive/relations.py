@@ -24,8 +24,8 @@ from pdhef_logtool.drive.hypotheses import (
 from pdhef_logtool.mapping.naming import CACHED_NAMES
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
-LENGTHS: dict[str, Any] = TABLE.pop("lengths")
-MOST: dict[str, float] = TABLE.pop("most")
+LENGTHS: dict[str, Any] = TABLE["lengths"]
+MOST: dict[str, float] = TABLE["most"]
 #: Least correlation of two residuals of a regression: they are small, and sliding changes their relation.
 MIN_PARTIAL_CORRELATION = 0.8
 #: Column of the ground-truth v_y at the CG if v_y is mapped. The mapped v_y has its own column, because the lever-arm
@@ -256,9 +256,8 @@ def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relati
     if yaw is None:
         return
     driven = yaw[gentle & np.isfinite(yaw)]
-    is_turning = driven.size > 0 and bool(
-        driven.std() > max(DRIVEN["yaw_rate_rad_s"], abs(driven.mean()))
-    )  # both sides
+    # To both sides, so that a steering angle that does not change is dead.
+    is_turning = driven.size > 0 and bool(driven.std() > max(DRIVEN["yaw_rate_rad_s"], abs(driven.mean())))
     curvature = np.where(pace.moving, yaw / speed, np.nan)
     for name, lengths in _lengths(pace, vehicle).items():
         steer, typical = columns.get(name), float(np.sqrt(lengths[0] * lengths[1]))
@@ -353,16 +352,13 @@ def _courses(columns: Mapping[str, FloatArray], pace: _Pace) -> Iterator[Relatio
     """Relate the yaw rates to the course rates of the ground truth, and of a GNSS receiver's velocity and positions."""
     for path, key in ((COURSE_RATE, "course"), (GNSS_COURSE_RATE, "course"), (GNSS_PATH[0], "gnss_path")):
         turnings = [columns[path]] if path in columns else []
-        if (
-            turnings and "truth.vx_m_s" in columns and "truth.vy_m_s" in columns
-        ):  # in a spin, the sideslip changes as well
+        # In a spin, the sideslip changes as well.
+        if turnings and "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:
             turnings.append(columns[path] - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
         line, mapped = ("course", "") if path == GNSS_COURSE_RATE else ("path", COURSE_RATE)
         for name in (n for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns):
-            its, gentle = (
-                law(key, name=name, line=line, mapped=mapped),
-                gentle_at(columns[name] * pace.speed, pace.moving),
-            )
+            its = law(key, name=name, line=line, mapped=mapped)
+            gentle = gentle_at(columns[name] * pace.speed, pace.moving)
             yield from _best([r for t in turnings for r in compare(its, t, columns[name], pace.moving, gentle)])
 
 

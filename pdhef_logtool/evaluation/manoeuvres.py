@@ -3,8 +3,8 @@
 The rules use sensors only, never ground truth. The steering angle is converted to a *demand*: the lateral acceleration
 of a linear car in steady state, ``δ v² / (L (1 + v²/v_ch²))``. One threshold then suits all speeds and sizes of cars,
 and does not depend on friction. A *swing* is the time in which the demand stays to one side; its duration is measured
-at half its peak. All rules are mirror symmetric. ``manoeuvres.toml`` contains the thresholds, docs/metrics.md the
-RULES.
+at half its peak. All rules are mirror symmetric. The thresholds are in ``manoeuvres.toml``, the rules in
+docs/metrics.md too.
 """
 
 from __future__ import annotations
