@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -151,7 +152,9 @@ class DriveOutputs:
         drive = self._run.drive
         # Recordings of a run have the same application, by which a viewer shows them as one dataset.
         identity = json.dumps([self._run.config.to_dict(), tool_versions()], sort_keys=True)
-        run = f"pdhef-{self._run_folder.resolve().name}-{sha256(identity.encode()).hexdigest()[:SHOWN_DIGITS]}"
+        # Rerun warns of other characters and of long names.
+        folder = re.sub(r"[^A-Za-z0-9_]+", "-", self._run_folder.resolve().name)[:64]
+        run = f"pdhef-{folder}-{sha256(identity.encode()).hexdigest()[:SHOWN_DIGITS]}"
         write_recording(
             self._change.file(opened_run.RECORDING_FILE),
             self._signals,

@@ -36,13 +36,15 @@ def test_the_first_command_of_the_readme_answers_with_an_error_and_no_verdict(tm
 
 
 def test_only_the_named_estimator_runs_and_is_judged(sample_logs_dir: Path, tmp_path: Path) -> None:
-    done = called("run", sample_logs_dir / "dlc.mcap", "-e", "linear-kf", *_LIGHT, "-o", tmp_path)
+    out = tmp_path / "of 1.0 (ä)"  # characters that Rerun would warn of
+    done = called("run", sample_logs_dir / "dlc.mcap", "-e", "linear-kf", *_LIGHT, "-o", out)
     assert done.stdout.startswith("Result   Sideslip RMSE of linear-kf: ")
+    assert "WARN" not in done.stderr
     assert "pd-hef" not in done.stdout
     assert "not causal" not in done.stdout
-    report = json.loads((tmp_path / "logs/dlc/report.json").read_text())
+    report = json.loads((out / "logs/dlc/report.json").read_text())
     assert [e["name"] for e in report["estimators"]] == ["linear-kf"]
-    assert "pd-hef" not in (tmp_path / "logs/dlc/report.html").read_text()
+    assert "pd-hef" not in (out / "logs/dlc/report.html").read_text()
 
 
 def test_a_table_without_a_date_is_of_no_year(tmp_path: Path) -> None:
