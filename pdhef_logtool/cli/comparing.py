@@ -110,6 +110,10 @@ def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
     def text(value: object) -> str:
         return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else printable(str(value))
 
-    heads = (f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items())
-    texts = (map(text, row) for row in rows.iter_rows())
-    console.stdout().print(console.table(*heads, rows=texts, fold=len(rows.columns)))
+    heads = [f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items()]
+    texts, out = (map(text, row) for row in rows.iter_rows()), console.stdout()
+    if sum(len(name) + 2 for name in rows.columns) <= out.width:
+        out.print(console.table(*heads, rows=texts, fold=len(heads)))
+        return
+    for row in texts:  # too many columns: a line each
+        out.print(console.named_lines(dict(zip(rows.columns, row, strict=True))), "")

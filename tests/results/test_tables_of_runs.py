@@ -20,6 +20,7 @@ from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal
 from studies.documentation_tables import with_tables
+from tests.command_line import called
 from tests.results.made_run import entry
 from tests.run_report import report
 
@@ -157,6 +158,12 @@ def test_a_wrong_statement_is_one_line_with_the_nearest_name(tmp_path: Path, sql
     with pytest.raises(UsageError) as error:
         query(write(tmp_path, "a"), sql)
     assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_rows_with_more_columns_than_the_terminal_are_printed_line_by_line(tmp_path: Path) -> None:
+    printed = called("query", write(tmp_path, "one", "two"), "SELECT * FROM drives").stdout
+    assert re.findall(r"(?m)^log +(\w+) *\nfile ", printed) == ["one", "two", "bad"]
+    assert max(map(len, printed.splitlines())) <= 100
 
 
 def test_a_damaged_table_is_named_and_only_if_it_is_asked_about(tmp_path: Path) -> None:
