@@ -12,13 +12,7 @@ from typing import Any
 import pytest
 
 from pdhef_logtool.car import store
-from pdhef_logtool.car.car import (
-    FIT_FILE,
-    NETWORK_FOLDER,
-    SHIPPED_CARS,
-    VEHICLE_FILE,
-    Car,
-)
+from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, SHIPPED_CARS, VEHICLE_FILE, Car
 from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import (
     FilterNoise,
