@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from studies.mcap_logs import Message, messages, write_log
+from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
 from studies.pages import ROOT
 
 _IMU = "/imu/data"
 _TOPICS = (_IMU, "/vehicle/status/steering_status", "/vehicle/wheel_speeds", "/truth/perfect/odometry")
-
-
-def later(message: Message, shift_ns: int) -> Message:
-    """Return a message in CDR that begins with its stamp, a while later."""
-    head, seconds, nanoseconds = struct.unpack_from("<4sII", message.data)
-    stamp = divmod(seconds * 10**9 + nanoseconds + shift_ns, 10**9)
-    data = struct.pack("<4sII", head, *stamp) + message.data[12:]
-    at_ns, published_ns = message.log_time_ns + shift_ns, message.publish_time_ns + shift_ns
-    return message._replace(log_time_ns=at_ns, publish_time_ns=published_ns, data=data)
 
 
 def write_hours(path: Path, hours: float) -> None:
@@ -30,6 +20,8 @@ def write_hours(path: Path, hours: float) -> None:
 
     def repeated() -> Iterator[Message]:
         for shift_ns in range(0, round(hours * 3600e9 / lasts_ns) * lasts_ns, lasts_ns):
-            yield from (later(m, shift_ns) for m in once)
+            for m in once:
+                at_ns, published_ns = m.log_time_ns + shift_ns, m.publish_time_ns + shift_ns
+                yield stamped(m, stamp_ns(m) + shift_ns)._replace(log_time_ns=at_ns, publish_time_ns=published_ns)
 
     write_log(path, repeated(), "ros2")

@@ -19,7 +19,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import why_silent
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
-from studies.mcap_logs import messages, write_log
+from studies.mcap_logs import messages, stamp_ns, stamped, write_log
 from tests.command_line import called
 
 SAID = "has no valid row although the car moves: its signals are there, but the estimator marks none as valid"
@@ -105,8 +105,7 @@ def test_the_share_of_dropped_samples_decides(share: float, code: int, tmp_path:
     drive = [*messages(sample_logs_dir / "step.mcap")]
     imu = [i for i, m in enumerate(drive) if m.topic == "/imu/data"]
     for k in np.linspace(10, len(imu) - 10, round(share * len(imu))).astype(int):
-        repeated, before = drive[imu[k]], drive[imu[k - 1]]
-        drive[imu[k]] = repeated._replace(data=before.data[:12] + repeated.data[12:])
+        drive[imu[k]] = stamped(drive[imu[k]], stamp_ns(drive[imu[k - 1]]))
     result = _run(write_log(tmp_path / "odd.mcap", drive, "ros2"), tmp_path / "out", "zero")
     assert result.exit_code == code
     (log,) = result.results
