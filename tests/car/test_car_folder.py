@@ -152,7 +152,7 @@ def add_physics(folder: Path) -> Fit:
     return fit
 
 
-def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path) -> None:
+def test_what_was_found_through_physics_is_its_own(folder: Path) -> None:
     """Other filters do not see it."""
     add_physics(folder)
     car = load(folder)

@@ -199,9 +199,7 @@ def test_view_takes_all_recordings_of_a_run_or_the_named_ones(tmp_path: Path, mo
     assert called[0][1:] == ["-m", "rerun", "--bind", "127.0.0.1", "--new", "--web-viewer", str(of["b"]), str(of["a"])]
 
 
-def test_view_serves_a_catalog_of_the_recordings(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_view_serves_a_catalog_of_the_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from pdhef_logtool.cli import running
 
     recording = tmp_path / "recording.rrd"
