@@ -20,7 +20,7 @@ from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.results.opened_run import TABLES
 from pdhef_logtool.results.parquet_sink import load_schema
 from pdhef_logtool.runs.config import RunConfig
-from studies.pages import DOCS, write
+from studies.pages import DOCS, table, write
 from truthsim.manoeuvres import MANOEUVRES
 from truthsim.sensors import SensorNoise
 
@@ -28,16 +28,12 @@ from truthsim.sensors import SensorNoise
 def with_tables(markdown: str) -> str:
     """Return a page with its tables; raises KeyError for one of an unknown name."""
 
-    def table(match: re.Match[str]) -> str:
-        return "\n".join([match[1], "", *_lines(*_TABLES[match[2]]), "", match[3]])
+    def made(match: re.Match[str]) -> str:
+        head, rows = _TABLES[match[2]]
+        body = ([cell.replace("|", "&#124;") for cell in row] for row in rows())
+        return f"{match[1]}\n\n{table(head, body)}\n\n{match[3]}"
 
-    return re.sub(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", table, markdown, flags=re.DOTALL)
-
-
-def _lines(columns: str, rows: Callable[[], Iterable[tuple[str, ...]]]) -> Iterator[str]:
-    head = tuple(columns.split(", "))
-    for row in (head, ("---",) * len(head), *rows()):
-        yield f"| {' | '.join(cell.replace('|', '&#124;') for cell in row)} |"
+    return re.sub(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", made, markdown, flags=re.DOTALL)
 
 
 def _metrics() -> Iterator[tuple[str, ...]]:
@@ -74,8 +70,8 @@ def _tables() -> Iterator[tuple[str, ...]]:
         yield f"`{name}`", schema["title"].partition(": ")[2], ", ".join(f"`{c['name']}`" for c in schema["columns"])
 
 
-def _columns(table: str) -> Iterator[tuple[str, ...]]:
-    for column in load_schema(f"{table}.parquet.json")["columns"]:
+def _columns(name: str) -> Iterator[tuple[str, ...]]:
+    for column in load_schema(f"{name}.parquet.json")["columns"]:
         yield f"`{column['name']}`", column["unit"], column["description"]
 
 

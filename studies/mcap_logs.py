@@ -1,7 +1,8 @@
-"""MCAP logs message by message: copied with other chunks, or with further topics."""
+"""MCAP logs message by message: copied with other chunks, other times or further topics."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,17 @@ class Message(NamedTuple):
     data: bytes
     encoding: str
     schema: tuple[str, str, bytes]
+
+
+def stamp_ns(message: Message) -> int:
+    """Return the stamp with which a message in CDR begins, bare or of a header."""
+    seconds, nanoseconds = struct.unpack_from("<II", message.data, 4)
+    return int(seconds * 10**9 + nanoseconds)
+
+
+def stamped(message: Message, at_ns: int) -> Message:
+    """Return a message in CDR with another stamp."""
+    return message._replace(data=message.data[:4] + struct.pack("<II", *divmod(at_ns, 10**9)) + message.data[12:])
 
 
 def messages(log: Path) -> Iterator[Message]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -14,6 +13,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.toml_text import toml_text
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -69,19 +69,10 @@ def write(path: Path, text: str) -> None:
     print(path)
 
 
-def toml_text(document: Mapping[str, Any], path: str = "") -> str:
-    """Return a document of tables, texts, numbers and lists of these as TOML."""
-    tables = {name: value for name, value in document.items() if isinstance(value, dict)}
-    lines = [f"{name} = {json.dumps(value)}" for name, value in document.items() if name not in tables]
-    for name, value in tables.items():
-        lines += ["", f"[{path}{name}]", toml_text(value, f"{path}{name}.")]
-    return "\n".join(lines)
-
-
 def write_toml(path: Path, document: Mapping[str, Any]) -> Path:
     """Write a document as TOML and return its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(toml_text(document) + "\n", encoding="utf-8")
+    path.write_text(toml_text(document), encoding="utf-8")
     return path
 
 

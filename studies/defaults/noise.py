@@ -20,10 +20,10 @@ from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
+from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.drives import DriveRecord, DriveSet, no_true_sideslip, record_of
+from pdhef_logtool.learning.drives import DriveRecord, DriveSet, record_of
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -34,8 +34,6 @@ SEED = 0
 TUNED = "phy-ukf:tuned"
 #: Added to each drive's RMSE as squares.
 FLOOR_RAD = math.radians(0.05)
-#: Drives with fewer scored stamps are left out.
-MIN_SCORED_STAMPS = 100
 #: If an estimate is missing at more of the scored stamps, its error is at least the error of sideslip 0.
 MIN_AVAILABILITY = 0.9
 #: Share of the trials that explore the whole space.
@@ -61,17 +59,9 @@ class Trial:
 
 
 def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
-    """Return the noise of the tuned filter: the best of ``trials``.
-
-    Raises
-    ------
-    SystemExit
-        No drive can be scored.
-    """
+    """Return the noise of the tuned filter: the best of ``trials``."""
     options, slow = task.settings.config.read_options, task.car.vehicle.low_speed_blend_m_s
     _, drives = task.read(partial(load_drive, task))
-    if not drives:
-        raise SystemExit("noise: at least one drive with a true sideslip and the signals of the filters is needed")
 
     def objective(values: Point) -> float:
         car = task.car.with_noise(TUNED, filter_noise(values))
@@ -105,18 +95,10 @@ def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
     return finite
 
 
-def load_drive(task: DriveSet, log: LogInput) -> tuple[DriveRecord, WholeDrive | None]:
-    """Read a drive with a true sideslip into memory; None with the reason in the record if it cannot be used."""
+def load_drive(task: DriveSet, log: LogInput) -> tuple[DriveRecord, WholeDrive]:
+    """Read a drive into memory, with its record."""
     with read_drive(log, task.car, task.mapping, task.settings.config.read_options) as drive:
-        missing = ", ".join(sorted(FEATURES - drive.available))
-        if left_out := no_true_sideslip(drive.plan) or (f"the log has no {missing}" if missing else ""):
-            return record_of(drive, left_out=left_out), None
         whole = drive.whole()
-        slow = task.car.vehicle.low_speed_blend_m_s
-        assert whole.truth is not None
-        scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))
-        if scored < MIN_SCORED_STAMPS:
-            return record_of(drive, left_out=f"{scored} stamps with a true sideslip above {slow:g} m/s"), None
         return record_of(drive, whole=whole), whole
 
 

@@ -24,14 +24,7 @@ from typing import Any
 
 import torch
 
-from pdhef_logtool.car.car import (
-    FIT_FILE,
-    NETWORK_FOLDER,
-    SHIPPED_CARS,
-    VEHICLE_FILE,
-    Car,
-    read_fit,
-)
+from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, SHIPPED_CARS, VEHICLE_FILE, Car, read_fit
 from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
 from pdhef_logtool.learning.drives import DriveSet, LearnSettings
 from pdhef_logtool.learning.network.train_command import PAPER_RECIPE, Recipe, dataset_for, train_on

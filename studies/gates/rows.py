@@ -18,13 +18,7 @@ import numpy as np
 
 from studies.calibration import DRIVEN, errors_over_sd, true_values, wrong_file
 from studies.conditions import row_inputs, row_logs
-from studies.gates.tool import (
-    Tool,
-    commands_and_options,
-    coverage_percent,
-    reports,
-    sideslip_rmse_deg,
-)
+from studies.gates.tool import Tool, commands_and_options, coverage_percent, reports, sideslip_rmse_deg
 from studies.mapping_mistakes import VERDICTS, outcomes
 from studies.pages import DRIVES, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table

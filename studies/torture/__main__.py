@@ -70,8 +70,9 @@ def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdi
 
 def long_log(hours: float, words: Sequence[str], folder: Path) -> Verdict:
     """Measure the memory of a command over many hours."""
-    log, output = folder / "hours.mcap", ("-o", str(folder / "out")) if "run" in words else ()
-    write_hours(log, hours)
+    log, output = folder.parent / f"hours-{hours:g}.mcap", ("-o", str(folder / "out")) if "run" in words else ()
+    if not log.is_file():
+        write_hours(log, hours)
     process = measured(words[0], str(log), *words[1:], *output, limit_s=3600.0)
     return Verdict(
         f"exit {process.code}", judge(process, (0, 3)).problem, {"s": process.wall_s, "bytes": process.peak_bytes}

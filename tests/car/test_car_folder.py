@@ -12,13 +12,7 @@ from typing import Any
 import pytest
 
 from pdhef_logtool.car import store
-from pdhef_logtool.car.car import (
-    FIT_FILE,
-    NETWORK_FOLDER,
-    SHIPPED_CARS,
-    VEHICLE_FILE,
-    Car,
-)
+from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, SHIPPED_CARS, VEHICLE_FILE, Car
 from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import (
     FilterNoise,
@@ -158,7 +152,7 @@ def add_physics(folder: Path) -> Fit:
     return fit
 
 
-def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path) -> None:
+def test_what_was_found_through_physics_is_its_own(folder: Path) -> None:
     """Other filters do not see it."""
     add_physics(folder)
     car = load(folder)

@@ -149,7 +149,7 @@ def test_a_wrong_entry_is_named(tmp_path, old, new, named):
         ("low_speed_blend_m_s", 6.0, "low-speed limit over sqrt(g wheelbase)"),
     ],
 )
-def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor, named):
+def test_relations_find_a_slip_that_the_ranges_let_pass(entry, factor, named):
     raw = tomllib.loads(EXAMPLE)
     raw["relaxation_length_m"] = 0.5
     place = next(t for t in (raw, raw["tyres"]["front"], raw["tyres"]["rear"]) if entry in t)

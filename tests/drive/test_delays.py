@@ -11,13 +11,7 @@ import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.checks import delay_checks
-from pdhef_logtool.drive.correlation import (
-    CommonGrid,
-    Shift,
-    find_shift,
-    on_common_grid,
-    shift_error,
-)
+from pdhef_logtool.drive.correlation import CommonGrid, Shift, find_shift, on_common_grid, shift_error
 from pdhef_logtool.drive.delays import LatencyEstimate, late_sensors
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.measured import measure

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.cli.app import app
@@ -20,6 +20,7 @@ from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
 from pdhef_logtool.records.ledger import DAMAGE, DAMAGED_SHARE, SampleCount, damage
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.inspection import inspect_log
+from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
 
 S = 1_000_000_000
 
@@ -31,33 +32,20 @@ def rewrite(
     source: Path, target: Path, log_shift: Shift, stamp_shift: Shift | None = None, chunk: int = 1 << 20
 ) -> None:
     """Copy an MCAP in order of log time, with log times moved, and header stamps (None: as the log times are)."""
-    with source.open("rb") as old, target.open("wb") as new:
-        reader, writer = make_reader(old), Writer(new, chunk_size=chunk, compression=CompressionType.LZ4)
-        writer.start(profile="ros2")
-        schemas: dict[int, int] = {}
-        channels: dict[int, int] = {}
-        numbers: dict[str, int] = {}
-        start = None
-        for schema, channel, message in reader.iter_messages(log_time_order=True):
-            assert schema is not None
-            if channel.id not in channels:
-                if schema.id not in schemas:
-                    schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
-                )
-            start = message.log_time if start is None else start
-            number = numbers[channel.topic] = numbers.get(channel.topic, -1) + 1
-            at = (number, (message.log_time - start) * 1e-9, channel.topic)
+
+    def moved() -> Iterator[Message]:
+        numbers: Counter[str] = Counter()
+        start_ns = next(messages(source)).log_time_ns
+        for m in messages(source):
+            at = (numbers[m.topic], (m.log_time_ns - start_ns) * 1e-9, m.topic)
+            numbers[m.topic] += 1
             by = log_shift(*at)
-            data = bytearray(message.data)
-            stamp = int.from_bytes(data[4:8], "little") * S + int.from_bytes(data[8:12], "little")
-            if abs(stamp - message.log_time) < 10 * S:  # behind the encapsulation: a stamp, bare or of a header
-                stamp += by if stamp_shift is None else stamp_shift(*at)
-                data[4:12] = (stamp // S).to_bytes(4, "little") + (stamp % S).to_bytes(4, "little")
-            log_time = min(max(message.log_time + by, 0), 2**64 - 1)
-            writer.add_message(channels[channel.id], log_time, bytes(data), log_time, message.sequence)
-        writer.finish()
+            log_time = min(max(m.log_time_ns + by, 0), 2**64 - 1)
+            if abs(stamp_ns(m) - m.log_time_ns) < 10 * S:
+                m = stamped(m, stamp_ns(m) + (by if stamp_shift is None else stamp_shift(*at)))
+            yield m._replace(log_time_ns=log_time, publish_time_ns=log_time)
+
+    write_log(target, moved(), "ros2", chunk_size=chunk, compression=CompressionType.LZ4)
 
 
 YEARS = 10 * 365 * 86_400 * S

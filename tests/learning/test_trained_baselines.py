@@ -13,11 +13,7 @@ import pytest
 from made_models import full_network
 
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.residual_model.bundle import (
-    LINEAR_REGRESSION_FILE,
-    PURE_LSTM_FOLDER,
-    load_bundle,
-)
+from pdhef_logtool.residual_model.bundle import LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER, load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from studies.defaults.train_baselines import SideslipSequence, fit_linear

@@ -11,13 +11,11 @@ import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import Tell, read_drive
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning import learn as learning
 from pdhef_logtool.learning.drives import LearnSettings
 from pdhef_logtool.learning.learn import LearnResult, learn
-from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.runs.config import RunConfig
 
@@ -36,11 +34,10 @@ def config(bare_vehicle: str, tmp_path_factory: pytest.TempPathFactory) -> RunCo
 def pool(sample_logs_dir: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> LearnResult:
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step", "fishhook")]
 
-    def without(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
-        return replace(mapping, truth={})
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning, "read_drive", partial(read_drive, adjust=without))
+        patch.setattr(
+            learning, "read_drive", partial(read_drive, adjust=lambda _log, mapping, _tell: replace(mapping, truth={}))
+        )
         return learn(logs, tmp_path_factory.mktemp("out") / "car", LearnSettings(config=config))
 
 

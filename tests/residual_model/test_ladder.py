@@ -13,11 +13,7 @@ from pydantic import ValidationError
 
 from pdhef_logtool.residual_model.features import FEATURES, ODD_COUNT, SlowFeatures, slow_features
 from pdhef_logtool.residual_model.ladder import LadderModel
-from pdhef_logtool.residual_model.ladder_fit import (
-    LadderFit,
-    TaughtDrive,
-    fit_ladder,
-)
+from pdhef_logtool.residual_model.ladder_fit import LadderFit, TaughtDrive, fit_ladder
 
 RATE_HZ = 50.0
 

@@ -130,7 +130,7 @@ def test_a_clip_has_the_topics_of_the_source_and_ours_around_the_event(clipped: 
     assert list((folder / "clips").iterdir()) == []  # only clips of the last search
 
 
-def test_a_source_that_is_not_found_or_is_another_file_is_told(clipped: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_source_that_is_not_found_or_is_another_file_is_told(clipped: tuple[Path, Path]) -> None:
     folder, logs = clipped
     found = _find(folder, "sideslip_rad > 0.5")
     told: list[str] = []

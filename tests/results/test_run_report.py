@@ -14,14 +14,7 @@ from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_
 from pdhef_logtool.evaluation.reasons import Interval, sensor_fault
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.plotted import colour_rgb
-from pdhef_logtool.results.run_report import (
-    LogOutcome,
-    build_run,
-    lines_of,
-    report_markdown,
-    tool_versions,
-    write_json,
-)
+from pdhef_logtool.results.run_report import LogOutcome, build_run, lines_of, report_markdown, tool_versions, write_json
 from pdhef_logtool.results.sink import Event
 from tests.run_report import SHA, VELOCITY, follows, ran, report, truth
 

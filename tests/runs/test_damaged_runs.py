@@ -65,9 +65,7 @@ def test_a_drive_whose_outputs_are_damaged_or_gone_is_run_again_and_that_is_said
 
 
 @pytest.mark.slow
-def test_every_file_of_a_drive_is_regenerated_and_a_page_alone(
-    out: Path, sample_logs_dir: Path, tmp_path: Path
-) -> None:
+def test_every_file_of_a_drive_is_regenerated_and_a_page_alone(out: Path, sample_logs_dir: Path) -> None:
     logs, keep = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")], ("--keep", "full")
     options = [o for o in OPTIONS if o not in ("--keep", "estimates", "--no-report")]
     assert command("run", *logs, "-o", str(out), *options, *keep).code == 0

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import why_silent
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
-from studies.torture.hours import Drive, read_samples, write_samples
+from studies.mcap_logs import messages, stamp_ns, stamped, write_log
 from tests.command_line import called
 
 SAID = "has no valid row although the car moves: its signals are there, but the estimator marks none as valid"
@@ -52,20 +51,17 @@ def silenced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimating, "runnable", runnable)
 
 
-def _run(change: Callable[[Drive], Drive], folder: Path, sample_logs_dir: Path, *estimators: str) -> RunResult:
-    log = folder / "odd.mcap"
-    write_samples(log, [change(read_samples(sample_logs_dir / "step.mcap"))])
+def _run(log: Path, out: Path, *estimators: str) -> RunResult:
     config = RunConfig(estimators=estimators, car=Path("saloon"), keep="estimates", network=Path("none"))
-    return run_logs([str(log)], folder / "out", config, report=False)
+    return run_logs([str(log)], out, config, report=False)
 
 
-def test_standstill_alone_is_no_failure_and_is_said(tmp_path: Path, sample_logs_dir: Path) -> None:
-    def standing(drive: Drive) -> Drive:
-        level = {"w": 1.0}
-        still = {t: {k: np.full_like(v, level.get(k[-1], 0.0)) for k, v in s.values.items()} for t, s in drive.items()}
-        return {t: replace(s, values=still[t]) for t, s in drive.items()}
-
-    result = _run(standing, tmp_path, sample_logs_dir, "zero", "phy-ukf")
+def test_standstill_alone_is_no_failure_and_is_said(tmp_path: Path) -> None:
+    names = "time [s],speed [m/s],steering_angle [rad],accel_x [m/s^2],accel_y [m/s^2],yaw_rate [rad/s]"
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (1000, 5))
+    log = tmp_path / "odd.csv"
+    np.savetxt(log, np.c_[np.arange(1000) / 100.0, noise], "%.4f", ",", header=names, comments="")
+    result = _run(log, tmp_path / "out", "zero", "phy-ukf")
     assert result.exit_code == 0
     (log,) = result.results
     assert log.report is not None
@@ -74,7 +70,7 @@ def test_standstill_alone_is_no_failure_and_is_said(tmp_path: Path, sample_logs_
 
 @pytest.mark.usefixtures("silenced")
 def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sample_logs_dir: Path) -> None:
-    result = _run(dict, tmp_path, sample_logs_dir, "zero", "phy-ukf")
+    result = _run(sample_logs_dir / "step.mcap", tmp_path, "zero", "phy-ukf")
     (log,) = result.results
     assert result.exit_code == 3
     assert log.report is not None
@@ -87,14 +83,13 @@ def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
     tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(estimating, "default_names", lambda _car, _available: ())  # physics has valid rows
-    write_samples(tmp_path / "odd.mcap", [read_samples(sample_logs_dir / "step.mcap")])
-    words = ("run", tmp_path / "odd.mcap", "-o", tmp_path / "out", "-e", "phy-ukf", "--car", "saloon")
+    words = ("run", sample_logs_dir / "step.mcap", "-o", tmp_path, "-e", "phy-ukf", "--car", "saloon")
     done = called(*words, "--network", "none", "--keep", "estimates", "--no-report", "--json")
     assert done.returncode == 1
-    report = json.loads((tmp_path / "out" / "logs" / "odd" / "report.json").read_text())
+    report = json.loads((tmp_path / "logs" / "step" / "report.json").read_text())
     assert [x["kind"] for x in report["losses"]] == ["no-valid-row"]
     said = f"no estimator {SAID.replace('no', 'a', 1)}"
-    assert done.stderr.splitlines()[-1] == f"pdhef: odd: {said}"
+    assert done.stderr.splitlines()[-1] == f"pdhef: step: {said}"
 
 
 def test_a_signal_that_ends_before_the_car_moves_is_named_as_the_cause() -> None:
@@ -106,15 +101,12 @@ def test_a_signal_that_ends_before_the_car_moves_is_named_as_the_cause() -> None
 
 @pytest.mark.parametrize(("share", "code"), [(0.005, 0), (0.03, 3)])
 def test_the_share_of_dropped_samples_decides(share: float, code: int, tmp_path: Path, sample_logs_dir: Path) -> None:
-    def jumbled(drive: Drive) -> Drive:
-        """Repeat the stamps of some samples."""
-        imu = drive["/imu/data"]
-        stamps = imu.stamp_ns.copy()
-        again = np.linspace(10, stamps.size - 10, round(share * stamps.size)).astype(int)
-        stamps[again] = stamps[again - 1]
-        return drive | {"/imu/data": replace(imu, stamp_ns=stamps)}
-
-    result = _run(jumbled, tmp_path, sample_logs_dir, "zero")
+    """Some samples of the IMU have the stamp of the one before."""
+    drive = [*messages(sample_logs_dir / "step.mcap")]
+    imu = [i for i, m in enumerate(drive) if m.topic == "/imu/data"]
+    for k in np.linspace(10, len(imu) - 10, round(share * len(imu))).astype(int):
+        drive[imu[k]] = stamped(drive[imu[k]], stamp_ns(drive[imu[k - 1]]))
+    result = _run(write_log(tmp_path / "odd.mcap", drive, "ros2"), tmp_path / "out", "zero")
     assert result.exit_code == code
     (log,) = result.results
     assert log.report is not None

@@ -14,9 +14,7 @@ import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import Tell, read_drive
-from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.model import fit
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
@@ -109,15 +107,11 @@ def test_a_model_of_an_earlier_drive_is_causal_and_mends_the_file(
 
 def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
     """The same log with its truth made unreadable gives the same bits."""
-    car = Car.load(wrong_car)
-    with read_drive(sample_logs_dir / "road.mcap", car, options=ReadOptions(end=END)) as drive:
+    log, car, options = sample_logs_dir / "road.mcap", Car.load(wrong_car), ReadOptions(end=END)
+    with read_drive(log, car, options=options) as drive:
         found = read_driving(drive)
         with_truth = DriveModel.fit(drive).posterior
-
-    def without(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
-        return replace(mapping, truth={})
-
-    with read_drive(sample_logs_dir / "road.mcap", car, options=ReadOptions(end=END), adjust=without) as drive:
+    with read_drive(log, car, options=options, adjust=lambda _log, mapping, _tell: replace(mapping, truth={})) as drive:
         assert drive.plan.truth is None
         np.testing.assert_array_equal(read_driving(drive).columns, found.columns)
         alone = DriveModel.fit(drive).posterior

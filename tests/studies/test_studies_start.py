@@ -25,13 +25,20 @@ RECORDED = {
 NO_RESULTS = ("studies.calibration", "studies.comparing")
 
 
-def start(folder: Path, page: str, words: str) -> None:
-    module, *options = words.split()
-    command = [sys.executable, "-m", module, *(word.replace(".", " ") for word in options), "--out", str(folder)]
-    command += [] if module == "studies.comparing" else ["--work", str(folder / "work")]
-    command += [] if module in NO_RESULTS else ["--results", str(folder / "results")]
+def ran(words: str, *options: object) -> str:
+    """Run a module with the options, and return what it prints."""
+    command = [sys.executable, "-m", *words.split(), *map(str, options)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def start(folder: Path, page: str, words: str) -> None:
+    module, *words_of_options = words.split()
+    options = [word.replace(".", " ") for word in words_of_options]
+    options += [] if module == "studies.comparing" else ["--work", str(folder / "work")]
+    options += [] if module in NO_RESULTS else ["--results", str(folder / "results")]
+    ran(module, *options, "--out", folder)
     assert "<!-- begin" in (folder / page).read_text(encoding="utf-8")
 
 
@@ -49,37 +56,11 @@ def test_a_study_of_recorded_drives_starts(name: str, tmp_path: Path) -> None:
 @pytest.mark.skipif(not DRIVES.is_dir(), reason="needs the recorded drives")
 def test_the_benchmark_of_own_logs_prints_a_table_without_a_vehicle_file(tmp_path: Path) -> None:
     (tmp_path / "v40_slalom.mcap").symlink_to(DRIVES / "v40_slalom.mcap")
-    command = [sys.executable, "-m", "studies.peers", "--folder", str(tmp_path), "--work", str(tmp_path / "work")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "| `pd-hef` | 1 |" in done.stdout
+    said = ran("studies.peers", "--folder", tmp_path, "--work", tmp_path / "work")
+    assert "| `pd-hef` | 1 |" in said
 
 
 def test_the_torture_judges_mutants_of_every_container(tmp_path: Path) -> None:
-    words = [
-        "mutations",
-        "formats",
-        "--logs",
-        "11",
-        "--count",
-        "1",
-        "--format",
-        "csv",
-        "--format",
-        "bag",
-        "--jobs",
-        "1",
-    ]
-    command = [
-        sys.executable,
-        "-m",
-        "studies.torture",
-        *words,
-        "--work",
-        str(tmp_path),
-        "--out",
-        str(tmp_path / "none"),
-    ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
+    words = "studies.torture mutations formats --logs 11 --count 1 --format csv --format bag --jobs 1"
+    ran(words, "--work", tmp_path, "--out", tmp_path / "none")
     assert (tmp_path / "formats.json").is_file()
