@@ -78,8 +78,8 @@ class Cost:
     peak_bytes: int
 
 
-def command_cost(*arguments: str | Path, module: str = "pdhef_logtool") -> Cost:
-    """Return the cost of ``pdhef ARGUMENTS``, or of another module, on one thread; its exit code must be 0 or 3.
+def command_cost(*arguments: str | Path, tree: Path = ROOT, module: str = "pdhef_logtool") -> Cost:
+    """Return the cost of ``pdhef ARGUMENTS`` of a source tree on one thread; its exit code must be 0 or 3.
 
     Linux counts the peak of a process from the size of its parent on, so a small one in between starts it.
     """
@@ -91,8 +91,8 @@ def command_cost(*arguments: str | Path, module: str = "pdhef_logtool") -> Cost:
     command = [sys.executable, "-c", code, sys.executable, "-m", module, *map(str, arguments)]
     # Byte code is kept, as in an installation.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    environment |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True, env=environment)
+    environment |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(tree)}
+    done = subprocess.run(command, cwd=tree, check=True, capture_output=True, text=True, env=environment)
     code_of, seconds, peak = json.loads(done.stdout)
     if code_of not in (0, 3):
         raise SystemExit(f"{module} {' '.join(map(str, arguments))} ended with {code_of}")
