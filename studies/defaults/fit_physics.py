@@ -1,4 +1,4 @@
-"""Fit ``physics`` of the shipped car: values and noise of all parts of the model, on five minutes of simulated driving.
+"""Fit ``physics`` of the shipped car: its parts, values and noise, on five minutes of simulated driving.
 
     python -m studies.defaults.fit_physics [-o FOLDER] [--work out/fit-physics] [--jobs 2]
 
@@ -15,9 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from pdhef_logtool.car.car import FIT_FILE, SHIPPED_CARS, Car
-from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, LearntOn, physics_sha256
+from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell
@@ -26,7 +25,7 @@ from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from studies.defaults.axle_forces import FitDrive
-from studies.defaults.physics_fit import fit_physics
+from studies.defaults.physics_fit import find_physics
 from studies.pages import options
 
 SEED, DRIVES = 5000, 24
@@ -68,11 +67,15 @@ def main(arguments: list[str] | None = None) -> int:
         drives.append(FitDrive(read.name, read.signals, read.truth))
         learnt_on.append(LearntOn(name=read.name, sha256=entry["sha256"], end_s=entry["duration_s"]))
 
-    parts = PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))
-    result = fit_physics(drives, car.datasheet, parts)
+    def say(text: str, share: float) -> None:
+        print(f"{100 * share:3.0f} % {text}", flush=True)
+
+    result, physics = find_physics(drives, car.datasheet, progress=say)
     # The smoother uses the filter's noise: the network predicts most of the model residual.
-    physics = FittedPhysics(values=FittedValues.of(result.vehicle), noise=result.noise, smoothing=(1.0, 1.0))
+    physics = physics.model_copy(update={"smoothing": (1.0, 1.0)})
     print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
+    for tried in physics.tried:
+        print(f"{', '.join(tried.parts) or 'static'}: {tried.held_out_deg} {'taken' if tried.taken else ''}")
     part = Fit(
         physics_sha256=physics_sha256(car.datasheet), values=FittedValues(), physics=physics, drives=tuple(learnt_on)
     )

@@ -1,4 +1,4 @@
-"""Identification of a car for ``physics``: the parameters of the model and its noise, through the filter itself.
+"""Identification of a car for ``physics``: the model, its parts' parameters and its noise, through the filter itself.
 
 In normalised parameters θ (distance from the prior in its standard deviations) the cost is
 
@@ -17,13 +17,13 @@ The single filter here has force scale and bank as states; in operation they are
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.car.descent import descend
-from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, PosteriorSteps, physics_filter
 from pdhef_logtool.records.signals import FloatArray
@@ -50,9 +50,8 @@ FLOOR_RAD = math.radians(0.05)
 NIS_LOG_STD = 1.0
 #: Errors beyond this many s count linearly: a moment in which the filter is lost must not decide the tyres.
 ROBUST = 3.0
-MAX_ITERATIONS, MIN_GAIN = 40, 2e-4
-#: Of the descent, in normalised parameters.
-DESCENT = {"derivative_step": 0.05, "max_step": 1.5}
+DERIVATIVE_STEP = 0.05
+MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
 #: Width of the tyres' priors about the axle-force fit, as a share of the widths about a vehicle file.
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
@@ -256,7 +255,16 @@ def fit_physics(
 
     firsts = [np.array([first.get(p.name, 0.0) for p in priors]) for first in starts]
     ends = [
-        descend(errors, fit_cost, scaled_errors, first, iterations=iterations, least_gain=least_gain, **DESCENT)
+        descend(
+            errors,
+            fit_cost,
+            scaled_errors,
+            first,
+            iterations=iterations,
+            least_gain=least_gain,
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        )
         for first in firsts
     ]
     (theta, normal, value), errors_of_drives = min(ends, key=lambda end: end[0].cost)
@@ -301,3 +309,81 @@ def scaled_errors(there: Sequence[DriveError], here: Sequence[DriveError]) -> Fl
         weight = math.sqrt(now.seconds / CORRELATION_S / max(now.counted, 1))
         parts.append(weight * np.clip(d.error, -ROBUST * s, ROBUST * s) / s)
     return np.concatenate([*parts, [_nis_residual(there)]])
+
+
+#: Parts in the order of the removal trials, starting with the least certain.
+ORDER = ("braking", "force_scale", "bank", "biases", "load_transfer", "roll", "lag")
+#: A part stays if driving that its fits have not seen is worse by this share without it, on average over the folds.
+LEAST_GAIN = 0.01
+#: Steps of a fit that only states whether a part is worth having; it starts where the one with the part ended.
+TRIAL_ITERATIONS = 8
+#: Driving to fit, and driving to score.
+Fold = tuple[Sequence[FitDrive], Sequence[FitDrive]]
+
+
+def choose_parts(
+    folds: Sequence[Fold],
+    start: VehicleParameters,
+    *,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> tuple[PhysicsParts, tuple[TriedParts, ...]]:
+    """Choose the parts by driving that their fits have not seen: each stays only with evidence.
+
+    Parts are removed one after the other, starting from all parts: some are useful only together, such as the roll
+    and the load transfer that it delays. The remaining parts must score better than the model without parts.
+    """
+    theta: list[Sequence[Theta]] = [STARTS for _ in folds]
+    tried: list[TriedParts] = []
+
+    def scored(parts: PhysicsParts, iterations: int) -> tuple[FloatArray, list[Sequence[Theta]]]:
+        """Return the logarithm of the RMS on the held-out half of each fold, and θ there."""
+        scores: list[float] = []
+        ends: list[Sequence[Theta]] = []
+        for (fit, held_out), starts in zip(folds, theta, strict=True):
+            result = fit_physics(fit, start, parts, starts=starts, iterations=iterations)
+            errors = drive_errors(held_out, start, result.vehicle, result.noise)
+            logs = sum(e.seconds * math.log(e.rms**2 + FLOOR_RAD**2) for e in errors)
+            scores.append(0.5 * logs / sum(e.seconds for e in errors))
+            ends.append(({p.name: float(t) for p, t in zip(result.priors, result.theta, strict=True)},))
+        return np.array(scores), ends
+
+    def tell(parts: PhysicsParts, scores: FloatArray, taken: bool) -> None:
+        held_out = tuple(round(float(x), 4) for x in np.degrees(np.exp(scores)))
+        tried.append(TriedParts(parts=parts.names, held_out_deg=held_out, taken=taken))
+
+    none = PhysicsParts()
+    static, _ = scored(none, MAX_ITERATIONS)
+    tell(none, static, True)
+    parts = PhysicsParts(**dict.fromkeys(ORDER, True))
+    best, theta = scored(parts, MAX_ITERATIONS)
+    tell(parts, best, True)
+    for number, name in enumerate(ORDER):
+        progress(f"is {name.replace('_', ' ')} worth having", (number + 2) / (len(ORDER) + 2))
+        fewer = parts.model_copy(update={name: False})
+        scores, ends = scored(fewer, TRIAL_ITERATIONS)
+        taken = bool((scores - best).mean() <= LEAST_GAIN)
+        tell(fewer, scores, taken)
+        if taken:
+            parts, best, theta = fewer, scores, ends
+    if (static - best).mean() <= LEAST_GAIN:
+        parts = none
+    return parts, tuple(tried)
+
+
+def find_physics(
+    drives: Sequence[FitDrive],
+    start: VehicleParameters,
+    *,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> tuple[PhysicsFit, FittedPhysics]:
+    """Identify ``physics`` of a car on drives with ground truth; also return it in the format of a car.
+
+    The parts of the model are chosen by cross-validation between two halves of the drives.
+    """
+    usable = [d for d in drives if usable_seconds(d, start) > 0.0]
+    halves = usable[::2], usable[1::2]
+    parts, tried = choose_parts([halves, halves[::-1]], start, progress=lambda text, x: progress(text, 0.7 * x))
+    progress("fitting the physics filter's sideslip to the ground truth", 0.7)
+    result = fit_physics(drives, start, parts)
+    values = FittedValues.of(result.vehicle)
+    return result, FittedPhysics(values=values, noise=result.noise, tried=tried)
