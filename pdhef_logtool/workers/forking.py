@@ -2,7 +2,8 @@
 
 The server does no other work: it has one thread and no open query, so that each fork is a complete process. Unlike
 the fork server of multiprocessing, it does not import ``__main__``, so that scripts can start it at module level, and
-creates no file. It works in threads and daemonic processes, and a process can have several servers.
+creates no file. It works in threads, in daemonic processes and in forks of a process that has a server; a process can
+have several. Its children end with it, and their processor time counts as the command's.
 """
 
 from __future__ import annotations

@@ -1,7 +1,11 @@
 """A pool of worker processes: a worker that dies, hangs or exceeds its memory costs only its own item.
 
 That item is repeated once alone in a new worker, and then reported as failed. Workers live as long as the run and are
-forked from a server (``forking.py``). A server that dies is restarted a bounded number of times and costs no item.
+forked from a server (``forking.py``). A server that dies is restarted a bounded number of times and costs no item:
+those that were under way are repeated alone, since a server mostly dies for lack of memory.
+
+Each worker has its own connection. In a pool with one pipe and lock for all (pebble, concurrent.futures), a worker that
+dies in the middle of a message, or with the lock, costs all others.
 """
 
 from __future__ import annotations
@@ -184,8 +188,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
     _server: ForkServer | None = None
     _deaths: int = 0
     _workers: list[_Worker[T]] = field(default_factory=list)
-    #: Items that are tried next because their server died, and those that are tried again alone.
-    _returned: list[_Attempt[T]] = field(default_factory=list)
+    #: Items that are tried again alone.
     _lost: list[_Attempt[T]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -200,7 +203,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
 
     def each(self, items: Iterable[T], progress: Progress = _silent) -> Generator[Ended[T, R], None, None]:
         """Do the work on every item, as :func:`supervise` does."""
-        self._progress, self._deaths, self._lost, self._returned = progress, 0, [], []
+        self._progress, self._deaths, self._lost = progress, 0, []
         try:
             yield from self._run((_Attempt(n, item) for n, item in enumerate(items)), self.jobs)
             while self._lost:
@@ -234,8 +237,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
     def _hand_out(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[Ended[T, R]]:
         """Hand items to workers; yield those that cannot be sent."""
         while sum(w.attempt is not None for w in self._workers) < jobs:
-            attempt = self._returned.pop() if self._returned else next(attempts, None)
-            if attempt is None:
+            if (attempt := next(attempts, None)) is None:
                 return
             attempt.tries, attempt.last = attempt.tries + 1, ""
             try:
@@ -324,7 +326,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
     def _lose(self, worker: _Worker[T], reason: str = "") -> Ended[T, R] | None:
         """End a worker. Its item is repeated once; then return its failure, by ``reason`` or the process's end.
 
-        If the fork server died with the worker, the item is not the cause: it is tried next.
+        If the fork server died with the worker, the item is not the cause, and this was no try of it.
         """
         attempt = worker.attempt
         assert attempt is not None
@@ -332,14 +334,11 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
         code = worker.child.end()
         if code is None:
             self._note_death(worker.child.server)
-        if code is None and not reason:
-            attempt.tries -= 1
-            self._returned.append(attempt)
-        elif attempt.tries < _TRIES:
+            attempt.tries -= not reason
+        if attempt.tries < _TRIES:
             self._lost.append(attempt)
-        else:
-            return attempt.failed(reason or _how_it_ended(code or 0))
-        return None
+            return None
+        return attempt.failed(reason or _how_it_ended(code or 0))
 
 
 def _how_it_ended(code: int) -> str:

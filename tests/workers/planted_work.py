@@ -133,6 +133,12 @@ def _wait(value: str, tell: Tell) -> str:
     return value
 
 
+def _burn(value: str, _tell: Tell) -> None:
+    until_s = time.process_time() + float(value)
+    while time.process_time() < until_s:
+        pass
+
+
 def _alone(value: str, tell: Tell) -> int:
     """Be lost the first time; the second time return how many workers there are."""
     _kill_once(value, tell)
@@ -156,5 +162,6 @@ _FAULTS = {
     "odd": lambda _value, _tell: Odd(),
     "unreadable": lambda _value, _tell: Unreadable(),
     "alone": _alone,
+    "burn": _burn,
     "wait": _wait,
 }

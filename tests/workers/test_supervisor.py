@@ -91,6 +91,13 @@ def test_workers_have_one_thread_and_live_as_long_as_the_run() -> None:
     assert not called
 
 
+def test_the_processor_time_of_workers_counts_as_that_of_the_command() -> None:
+    before = os.times()
+    outcomes([("burn", "0.3")] * 2, 2, Limits())
+    after = os.times()
+    assert after.children_user + after.children_system - before.children_user - before.children_system > 0.6
+
+
 def test_one_job_without_limits_runs_here() -> None:
     told: list[tuple[int, str, float]] = []
     items = [("where", ""), ("raise", ""), ("well", "x")]
@@ -170,6 +177,29 @@ def heard(number, text, share):
 for ended in supervise(planted, [("hang", "")] * 2, jobs=2, limits=Limits(silence_s=600.0), progress=heard):
     pass
 """
+
+
+AT_MODULE_LEVEL = """
+from multiprocessing import get_context
+from pdhef_logtool.workers.supervisor import supervise
+from tests.workers.planted_work import planted
+
+def result(item):
+    (ended,) = supervise(planted, [item], jobs=2)
+    return ended.result
+
+print(result(("well", "here")))
+with get_context("fork").Pool(1) as pool:
+    print(*pool.map(result, [("well", "in a pool")]))
+"""
+
+
+def test_workers_start_at_module_level_and_in_daemonic_processes(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(AT_MODULE_LEVEL)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    ended = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, check=False)
+    assert (ended.stdout, ended.stderr) == ("here\nin a pool\n", "")
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
