@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.names import MODEL_FILE as MODEL_FILE
 from pdhef_logtool.logs.discovery import RUN_FILE
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.storage.documents import file_sha256, read_json, read_sealed
+from pdhef_logtool.storage.documents import checked_sha256, read_json, read_sealed
 from pdhef_logtool.storage.object_store import Mirror, is_url
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class OpenedLog:
         if path is None or not os.path.isfile(path):  # noqa: PTH113 (False for a name that no file can have)
             return None
         if name not in self._sound:
-            _check(path, self.entry.get("files", {}).get(name), _AGAIN)
+            checked_sha256(path, self.entry.get("files", {}).get(name), RUN_FILE, _AGAIN)
             self._sound.add(name)
         return path
 
@@ -121,7 +121,7 @@ class OpenedRun:
         if name not in self._sound:
             if self.mirror is not None:
                 self.mirror.fetch(file)
-            _check(path, self.document.get("files", {}).get(file), "run the logs again")
+            checked_sha256(path, self.document.get("files", {}).get(file), RUN_FILE, "run the logs again")
             self._sound.add(name)
         return pl.scan_parquet(path)
 
@@ -129,17 +129,6 @@ class OpenedRun:
 def table_file(name: str) -> str:
     """Return the file of a table below the folder of a run."""
     return f"{TABLES_FOLDER}/{name}.parquet"
-
-
-def _check(path: Path, sha256: str | None, remedy: str) -> None:
-    """Raise OutputError for a file that is not as run.json names it."""
-    try:
-        if sha256 is not None and file_sha256(path) != sha256:
-            got = "another content: it is damaged, or of another run"
-            raise OutputError(expected=f"the {path.name} that run.json names", got=got, where=str(path), remedy=remedy)
-    except OSError as error:
-        got = error.strerror or str(error)
-        raise OutputError(expected=f"a readable {path.name}", got=got, where=str(path), remedy=remedy) from error
 
 
 def open_run(output: Path | str) -> OpenedRun:

@@ -79,21 +79,8 @@ _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
 
 @contextmanager
-def parquet_writer(
-    path: Path,
-    schema: pa.Schema,
-    dictionaries: Sequence[str] | None = None,
-    *,
-    encodings: Mapping[str, str] | None = None,
-    level: int | None = None,
-    checksums: bool = True,
-) -> Iterator[pq.ParquetWriter]:
-    """Yield the writer of a Parquet file with zstd, which gets its name when it is complete.
-
-    Parameters
-    ----------
-    path : the finished file. dictionaries : columns of few values; None: Parquet's choice.
-    encodings : Parquet's, by column. level : of zstd; None: Parquet's default. checksums : of pages.
+def parquet_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator[pq.ParquetWriter]:
+    """Yield the writer of a Parquet file with zstd, which gets its name when it is complete; ``options`` of Arrow's.
 
     Raises
     ------
@@ -104,15 +91,7 @@ def parquet_writer(
         PendingFile(path) as pending,
         writing(path),
         open_new(pending.path) as file,
-        pq.ParquetWriter(
-            file,
-            schema,
-            compression="zstd",
-            compression_level=level,
-            use_dictionary=True if dictionaries is None else list(dictionaries),
-            column_encoding=encodings,
-            write_page_checksum=checksums,
-        ) as writer,
+        pq.ParquetWriter(file, schema, compression="zstd", **options) as writer,
     ):
         yield writer
 
@@ -123,7 +102,6 @@ def write_estimates(
     *,
     selected: str | None = None,
     causal_from_ns: Mapping[str, int] | None = None,
-    rows_a_group: int = ROWS_A_GROUP,
 ) -> None:
     """Write estimates.parquet; a row group contains one estimator, so that one can be read without the others.
 
@@ -135,7 +113,6 @@ def write_estimates(
     selected : estimator; its track is also written as :data:`SELECTED`.
     causal_from_ns : first stamp from which the rows of an estimator depend on no later sample; an estimator without one
         is causal nowhere. None: unknown, and ``causal`` is null.
-    rows_a_group : rows of one row group.
 
     Raises
     ------
@@ -143,10 +120,10 @@ def write_estimates(
     """
     schema = arrow_schema("estimates.parquet.json")
     split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
-    encodings = {**split, "stamp_ns": "DELTA_BINARY_PACKED"}
-    with parquet_writer(path, schema, ["estimator"], encodings=encodings, level=_LEVEL) as writer:
-        for first in range(0, max(map(len, tracks), default=0), rows_a_group):
-            group = [track.rows(first, first + rows_a_group) for track in tracks]
+    options = {"column_encoding": {**split, "stamp_ns": "DELTA_BINARY_PACKED"}, "compression_level": _LEVEL}
+    with parquet_writer(path, schema, use_dictionary=["estimator"], write_page_checksum=True, **options) as writer:
+        for first in range(0, max(map(len, tracks), default=0), ROWS_A_GROUP):
+            group = [track.rows(first, first + ROWS_A_GROUP) for track in tracks]
             for track in group:
                 if not len(track):
                     continue

@@ -141,7 +141,7 @@ def _verdicts(plan: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def write_part(path: Path, part: pa.Table) -> None:
     """Write a part, or another table; raises OutputError."""
-    with parquet_writer(path, part.schema, checksums=False) as writer:
+    with parquet_writer(path, part.schema) as writer:
         writer.write_table(part)
 
 
@@ -173,7 +173,7 @@ def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str]
     schemas = {name: arrow_schema(f"{name}.parquet.json") for name in TABLES}
     with ExitStack() as stack:
         writers = {
-            name: stack.enter_context(parquet_writer(folder / f"{name}.parquet", schema, checksums=False))
+            name: stack.enter_context(parquet_writer(folder / f"{name}.parquet", schema))
             for name, schema in schemas.items()
         }
         while some := [*islice(left, _PARTS_AT_ONCE)]:
@@ -192,6 +192,4 @@ def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str]
 def add_verdicts(folder: Path, plan: Mapping[str, Any]) -> None:
     """Add the verdicts on the whole run to those on its drives; raises OutputError."""
     path = folder / "verdicts.parquet"
-    with reading(path), pq.ParquetFile(path) as file:
-        of_drives = file.read()
-    write_part(path, pa.concat_tables([of_drives, _table("verdicts", _verdicts(plan))]))
+    write_part(path, pa.concat_tables([read_part(path), _table("verdicts", _verdicts(plan))]))

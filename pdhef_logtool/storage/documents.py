@@ -15,7 +15,7 @@ from difflib import get_close_matches
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
-from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.printable import utf8
 
 if TYPE_CHECKING:
@@ -82,6 +82,19 @@ def file_sha256(path: Path) -> str:
     """Return the sha256 of a file's content; raises OSError."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def checked_sha256(path: Path, named: str | None, document: str, remedy: str) -> str:
+    """Return the sha256 of a file; raises OutputError if it cannot be read, or is not as ``document`` names it."""
+    try:
+        sha256 = file_sha256(path)
+    except OSError as error:
+        got = error.strerror or str(error)
+        raise OutputError(expected=f"a readable {path.name}", got=got, where=str(path), remedy=remedy) from error
+    if named not in (None, sha256):
+        expected, got = f"the {path.name} that {document} names", "another content: it is damaged, or of another run"
+        raise OutputError(expected=expected, got=got, where=str(path), remedy=remedy)
+    return sha256
 
 
 def _read(
