@@ -173,7 +173,8 @@ class Rosbag1Container(FileContainer):
                         self.meter.limits.check("chunk_messages", len(stamps), "a chunk")
                         self.meter.check()
                     channels.append(_U32.unpack(fields["conn"])[0])
-                    stamps.append(_time_ns(fields["time"]))
+                    seconds, nanoseconds = _TIME.unpack(fields["time"])
+                    stamps.append(seconds * 1_000_000_000 + nanoseconds)
                     offsets.append(begin)
                     lengths.append(offset - begin)
                 elif op != _OP_CONNECTION:
@@ -235,8 +236,3 @@ def _header_fields(text: bytes) -> dict[str, bytes]:
         fields[name.decode("ascii", errors="replace")] = value
         offset += 4 + length
     return fields
-
-
-def _time_ns(value: bytes) -> int:
-    seconds, nanoseconds = _TIME.unpack(value)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -241,18 +241,12 @@ class _Blocks:
         if isinstance(value, np.ndarray):
             return self.add(value, resolution)
         if isinstance(value, str):
-            return _label(value)
+            return printable(value, _LABEL_SIGNS)
         if isinstance(value, float):
             return float(f"{value:.9g}") if np.isfinite(value) else None
         if isinstance(value, list | tuple):
             return [self._plain(entry, resolution) for entry in value]
         return self.entries(value, resolution) if is_dataclass(value) else value
-
-
-def _label(text: str) -> str:
-    half = _LABEL_SIGNS // 2
-    cut = text if len(text) <= _LABEL_SIGNS else f"{text[: half - 1]}…{text[-half:]}"
-    return printable(cut)
 
 
 def joined(spans: Sequence[Span]) -> list[Span]:

@@ -105,7 +105,11 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"),
         "RMSE in °",
         [
-            Interval(d.estimator, d.median.low * degree, d.median.value * degree, d.median.high * degree, _colour(d))
+            Interval(
+                d.estimator,
+                *(degree * x for x in (d.median.low, d.median.value, d.median.high)),
+                INK if d.estimator == ANSWER else colour(d.estimator),
+            )
             for d in near
         ],
     )
@@ -140,10 +144,6 @@ def _told(fleet: Fleet) -> list[Distribution]:
         return list(fleet.distributions)
     shown = [d for d in fleet.distributions if d.estimator != ANSWER]
     return sorted(shown, key=lambda d: d.estimator not in mains)
-
-
-def _colour(distribution: Distribution) -> str:
-    return INK if distribution.estimator == ANSWER else colour(distribution.estimator)
 
 
 def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:

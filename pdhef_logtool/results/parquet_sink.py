@@ -33,17 +33,12 @@ def arrow_schema(name: str) -> pa.Schema:
     Each field carries its unit; the schema's own metadata carry format, version and all units once more, because
     only Arrow readers see metadata of fields.
     """
-
-    def type_of(name: str) -> pa.DataType:
-        is_dictionary = name == "dictionary<int32, string>"
-        return pa.dictionary(pa.int32(), pa.string()) if is_dictionary else pa.type_for_alias(name)
-
-    document = load_schema(name)
-    columns = document["columns"]
-    units = {column["name"]: column["unit"] for column in columns}
-    fields = [
-        pa.field(c["name"], type_of(c["type"]), nullable=c["nullable"], metadata={"unit": c["unit"]}) for c in columns
-    ]
+    document, fields = load_schema(name), []
+    for c in document["columns"]:
+        is_dictionary = c["type"] == "dictionary<int32, string>"
+        kind = pa.dictionary(pa.int32(), pa.string()) if is_dictionary else pa.type_for_alias(c["type"])
+        fields.append(pa.field(c["name"], kind, nullable=c["nullable"], metadata={"unit": c["unit"]}))
+    units = {c["name"]: c["unit"] for c in document["columns"]}
     stated = document | {"version": str(document["version"]), "units": json.dumps(units)}
     return pa.schema(fields, metadata={key: stated[key] for key in ("format", "version", "units", "missing")})
 

@@ -198,7 +198,9 @@ def train(
         began = time.perf_counter()
         train_loss, rate = run.epoch(train_pieces, epoch)
         loss = run.validate(validation_pieces)
-        run.end_epoch(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
+        run.history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
+        if run.best_epoch == epoch:
+            run.best = _weights(run.network)
         run.save(work / CHECKPOINT, identity)
         progress(f"epoch {epoch + 1}: train {train_loss:.4f}, validation {loss:.4f}", (epoch + 1) / recipe.epochs)
     provenance = {
@@ -363,12 +365,6 @@ class _Training:
                 total += float((square * p.weight).sum())
                 weight += float(p.weight.sum())
         return total / weight if weight else math.inf
-
-    def end_epoch(self, epoch: Epoch) -> None:
-        """Add an epoch to the history, and keep its weights if it is the best one."""
-        self.history.append(epoch)
-        if self.best_epoch == len(self.history) - 1:
-            self.best = _weights(self.network)
 
     def save(self, path: Path, identity: dict[str, Any]) -> None:
         """Write a checkpoint: tensors and document in one file, so that no write can leave an inconsistent pair.
