@@ -58,8 +58,8 @@ _FORMULAS: dict[str, Callable[[Mapping[str, float]], float]] = {
     "tyres.front.cornering_stiffness_n_per_rad": lambda v: 0.97 * stiffness_per_load(v["mass_kg"]) * v["front_load_n"],
     "tyres.rear.cornering_stiffness_n_per_rad": lambda v: 1.03 * stiffness_per_load(v["mass_kg"]) * v["rear_load_n"],
 }
-#: Their spreads and words.
-_TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+#: Their spreads and words, by entry.
+RULES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValue, ...]]:
@@ -91,7 +91,7 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
             continue
         value = float(f"{formula(values):.4g}")
         table[name] = values[name] = value
-        assumed.append(AssumedValue(entry, value, _TABLE[entry]["spread"], _TABLE[entry]["text"]))
+        assumed.append(AssumedValue(entry, value, RULES[entry]["spread"], RULES[entry]["text"]))
     return entries, tuple(assumed)
 
 

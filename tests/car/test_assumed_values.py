@@ -93,4 +93,4 @@ def test_wrong_entries_are_named(tmp_path: Path, entries: dict[str, float], name
 
 def test_the_documentation_has_every_rule() -> None:
     page = with_tables((Path(__file__).parents[2] / "docs" / "formats.md").read_text())
-    assert all(f"| `{rule.entry}` | {rule.text} |" in page for rule in RULES)
+    assert all(f"| `{entry}` | {rule['text']} |" in page for entry, rule in RULES.items())
