@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from pdhef_logtool.cli.console import print_indented, table, three_lines
-from pdhef_logtool.cli.plan_tables import plan_line, render_plan
+from pdhef_logtool.cli.run_tables import plan_line, render_plan
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.records.printable import listed

@@ -1,4 +1,4 @@
-"""Output of ``pdhef run`` and ``pdhef metrics``: the selected estimate as text, a table, output files, verdicts."""
+"""Output of ``pdhef run`` and ``pdhef metrics``: the selected estimate as text, a table, output files, the plan."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, three_lines
-from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.metric import registered
-from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
+from pdhef_logtool.evaluation.validation_plan import shown as value_text
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
 from pdhef_logtool.results import selected_estimate as selected
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_report import lines_of
 from pdhef_logtool.results.selected_estimate import Figures, assumptions_of, degrees, figures_of
 from pdhef_logtool.runs.run_result import RunResult
@@ -287,3 +288,40 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
         notes = lines_of("look_at", report, inside, main if len(mains) > 1 else "", selected.is_worse(*compared))
         joint.add_row(report["log"]["name"], seconds, *errors, cell(inside), *(notes or [""]))
     return joint
+
+
+#: Styles of the outcomes of requirements.
+STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
+
+
+def plan_line(plan_result: PlanVerdicts) -> Text:
+    """Return the numbers of passed, failed and inconclusive requirements."""
+    return outcomes_text(Counter[str](v.outcome for v in plan_result.verdicts), plan_result.plan.file)
+
+
+def outcomes_text(counts: Mapping[str, int], file: str) -> Text:
+    """Return the number of requirements by outcome, and the name of the plan."""
+    parts = [Text(f"{counts[outcome]} {outcome}", style) for outcome, style in STYLES.items() if counts.get(outcome)]
+    name = f"plan {file}" if file else "default plan, no gate"
+    return Text.assemble(Text(", ").join(parts), f" ({name})")
+
+
+def render_plan(plan_result: PlanVerdicts, console: Console) -> None:
+    """Print the requirements in a table, and the next steps for inconclusive ones."""
+    made = table("", "id", "requirement", ">value", ">margin", fold=3)
+    for v in plan_result.verdicts:
+        unit = v.requirement.unit
+        value, margin = ("-" if x is None else value_text(x, unit) for x in (v.value, v.margin))
+        made.add_row(Text(v.outcome, STYLES[v.outcome]), v.requirement.id, v.requirement.label, value, margin)
+    console.print(made)
+    to_do: dict[str, list[str]] = {}
+    for v in plan_result.verdicts:
+        if v.outcome != "PASS":
+            value = "" if v.value is None else f"{value_text(v.value, v.requirement.unit)}; "
+            what = v.reason.removeprefix(value)
+            to_do.setdefault(f"{what}. Next: {v.next}" if v.next else what, []).append(v.requirement.id)
+    for what, ids in to_do.items():
+        print_indented(f"{', '.join(ids)}: {what}", console)
+    for note in joint_notes({v.requirement.id: v.notes for v in plan_result.verdicts}):
+        print_indented(f"note: {note}", console)
+    console.print()
