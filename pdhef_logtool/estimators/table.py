@@ -45,7 +45,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from importlib import import_module
 from itertools import chain
 from operator import attrgetter
@@ -144,20 +144,15 @@ class Spec:
         if isinstance(build, str):
             module, _, function = build.partition(":")
             build = attrgetter(function)(import_module(f"{__package__}.{module}"))
-        if options.gnss and self.name in AIDED:
-            build = partial(_aided, build)
         calibration = calibration_of(self.name, car)
-        if calibration is None:
-            estimator: Estimator = build(self.name, car, options)
-            return estimator
-        calibrated: Any = build(self.name, car.calibrated_car, options)
-        return cast("Estimator", replace(calibrated, causal=self.causal and calibration.causal))
+        estimator: Any = build(self.name, car if calibration is None else car.calibrated_car, options)
+        if options.gnss and self.name in AIDED:
+            from pdhef_logtool.estimators.gnss_aided import GnssAided
 
-
-def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car, options: Options) -> Estimator:
-    from pdhef_logtool.estimators.gnss_aided import GnssAided  # compiled code is imported on demand
-
-    return GnssAided(build(name, car, options))  # type: ignore[arg-type]
+            estimator = GnssAided(estimator)
+        if calibration is not None:
+            estimator = replace(estimator, causal=self.causal and calibration.causal)
+        return cast("Estimator", estimator)
 
 
 #: Estimators of other packages: each entry point names a :class:`Spec`.

@@ -26,7 +26,6 @@ _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 _ZERO_BLOCK_BYTES = 1 << 20
 _LEAST_MESSAGE_BYTES = 8 + 3 * 4 + len(b"op=") + 1 + len(b"conn=") + 4 + len(b"time=") + 8
-_MESSAGES_A_CHECK = 1 << 16
 
 
 @dataclass(slots=True)
@@ -169,9 +168,7 @@ class Rosbag1Container(FileContainer):
             op = _op(fields)
             try:
                 if op == _OP_MESSAGE:
-                    if len(stamps) % _MESSAGES_A_CHECK == 0:
-                        self.meter.limits.check("chunk_messages", len(stamps), "a chunk")
-                        self.meter.check()
+                    self.meter.check_scan(len(stamps))
                     channels.append(_U32.unpack(fields["conn"])[0])
                     seconds, nanoseconds = _TIME.unpack(fields["time"])
                     stamps.append(seconds * 1_000_000_000 + nanoseconds)

@@ -128,10 +128,7 @@ def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
 
 
 def _report(log: OpenedLog) -> dict[str, Any] | None:
-    try:
-        report = log.report()
-    except OutputError:
-        return None
+    report = log.readable_report()
     return report if report is not None and isinstance(report.get("log"), dict) else None
 
 

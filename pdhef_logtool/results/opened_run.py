@@ -6,6 +6,7 @@ run.json contains its own digest and the sha256 of the files that are read back.
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,6 +82,12 @@ class OpenedLog:
             got = f"format {report.get('format')!r}"
             raise OutputError(expected="a report.json", got=got, where=str(path), remedy=_AGAIN)
         return report
+
+    def readable_report(self) -> dict[str, Any] | None:
+        """Return report.json, None also where it is damaged."""
+        with suppress(OutputError):
+            return self.report()
+        return None
 
     def main(self) -> str:
         """Return the selected estimator of the drive, or an empty string."""
