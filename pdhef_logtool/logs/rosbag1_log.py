@@ -19,7 +19,7 @@ from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import Block, ChannelRecord, FileContainer, Span, SpanDamageError, block_from_lists
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
-from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
 _U32 = struct.Struct("<I")
@@ -171,7 +171,7 @@ class Rosbag1Container(FileContainer):
                     self.meter.check_scan(len(stamps))
                     channels.append(_U32.unpack(fields["conn"])[0])
                     seconds, nanoseconds = _TIME.unpack(fields["time"])
-                    stamps.append(seconds * 1_000_000_000 + nanoseconds)
+                    stamps.append(seconds * NS_PER_S + nanoseconds)
                     offsets.append(begin)
                     lengths.append(offset - begin)
                 elif op != _OP_CONNECTION:
@@ -188,7 +188,7 @@ def _index(fields: Mapping[str, bytes], payload: bytes) -> tuple[int, IntArray]:
     """Return the connection and the log times [N] of an index record."""
     (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
     words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
-    return connection, words[:, 0] * 1_000_000_000 + words[:, 1]
+    return connection, words[:, 0] * NS_PER_S + words[:, 1]
 
 
 def _op(fields: Mapping[str, bytes]) -> int:

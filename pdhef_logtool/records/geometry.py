@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray
 
 #: Degrees of a radian, and standard gravity.
 DEGREES, GRAVITY_M_S2 = 180.0 / np.pi, 9.80665
@@ -104,7 +104,7 @@ def dead_reckon(
     -------
     x_m, y_m, yaw_rad : [N]; yaw is not wrapped.
     """
-    dt = np.diff(stamps_ns) * 1e-9
+    dt = np.diff(stamps_ns) * S_PER_NS
     ok = np.isfinite(vx_m_s + vy_m_s + yaw_rate_rad_s)
     dt = np.where(ok[1:] & ok[:-1], dt, 0.0)
 

@@ -13,6 +13,8 @@ FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
+S_PER_NS, NS_PER_S = 1e-9, 1_000_000_000
+
 WHEELS = ("fl", "fr", "rl", "rr")
 
 #: SI units by the ending of a name; a name without any is a plain number.
@@ -213,7 +215,7 @@ SIGNAL_COLUMNS = tuple(f.name for f in fields(Signals) if f.name not in ("availa
 
 def step_durations_s(stamps_ns: IntArray) -> FloatArray:
     """Return the duration before each step, [K]; NaN at the first one."""
-    return np.append(np.full(min(len(stamps_ns), 1), np.nan), np.diff(stamps_ns) * 1e-9)
+    return np.append(np.full(min(len(stamps_ns), 1), np.nan), np.diff(stamps_ns) * S_PER_NS)
 
 
 def has_gnss(names: Collection[str]) -> bool:

@@ -26,7 +26,7 @@ from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.printable import printable
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, FloatArray
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.results.selected_estimate import assumptions_of, failed_checks, result_of
@@ -193,7 +193,7 @@ def duration(seconds: float) -> str:
 
 def stamp(stamp_ns: int) -> str:
     """Return a stamp in nanoseconds as RFC 3339 in UTC, exact; without a date or out of their range as a number."""
-    whole, rest = divmod(int(stamp_ns), 1_000_000_000)
+    whole, rest = divmod(int(stamp_ns), NS_PER_S)
     if not is_dated(stamp_ns):
         return f"{whole}.{rest:09d} s"
     try:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.records.running_mean import running_mean
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
 from pdhef_logtool.residual_model.ladder import (
     LINEAR,
@@ -220,7 +220,7 @@ def _responses(basis: Basis, sample: _Sample) -> FloatArray:
 
 def _thinned(drive: TaughtDrive) -> _Sample:
     """Return the data of a drive for a fit, at most :data:`FIT_RATE_HZ` rows per second."""
-    step_s = float(np.median(np.diff(drive.stamps_ns))) * 1e-9 if len(drive.stamps_ns) > 1 else 1.0
+    step_s = float(np.median(np.diff(drive.stamps_ns))) * S_PER_NS if len(drive.stamps_ns) > 1 else 1.0
     every = max(1, round(1.0 / (FIT_RATE_HZ * step_s)))
     rows = np.flatnonzero(drive.usable)[::every]
     weight_s = step_s * every * np.broadcast_to(drive.weight, drive.lacking_rad.shape)[rows]

@@ -11,6 +11,7 @@ from pathlib import Path
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError, PdhefError
+from pdhef_logtool.records.signals import NS_PER_S
 from pdhef_logtool.results.events import FoundEvents
 from pdhef_logtool.results.mcap_sink import NAMESPACE, AnnotatedMcap
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
@@ -47,7 +48,7 @@ def write_clips(
     """
     logs = {log.label: log for log in run.logs}
     names: list[str] = []
-    failed, pad_ns = found_events.failed, round(pad_s * 1e9)
+    failed, pad_ns = found_events.failed, round(pad_s * NS_PER_S)
     with OutputFolder(run.folder), FolderTransaction(run.folder / CLIPS, keep=False) as change:
         for label, events in groupby(found_events.events, key=lambda event: event.drive):
             log = logs[label]

@@ -24,7 +24,7 @@ from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, sour
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.plotted import LogLine, log_lines, log_message, plotted_fields
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots, rounded
@@ -53,9 +53,9 @@ _PLANAR = np.array([0, 1, 5])
 #: Of zstd: of rounded numbers level 3 makes 1 % more bytes, level 6 3 % fewer in three times the time.
 _LEVEL = 1
 #: Between two poses of a track that is not shown first and between two plotted values; between two points of the map.
-_POSE_STEP_NS, _PATH_STEP_NS = 50_000_000, 1_000_000_000
+_POSE_STEP_NS, _PATH_STEP_NS = 50_000_000, NS_PER_S
 #: Steps of the tracks that --estimators does not name; the shortest one for which the file is small enough.
-_STEPS_NS = tuple(round(s * 1e9) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
+_STEPS_NS = tuple(round(s * NS_PER_S) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
 #: The shortest one of a long drive.
 _LONG_STEP_NS = 200_000_000
 #: Messages are encoded in pieces of this duration.
@@ -304,7 +304,7 @@ def _covariance(track: StateTrack, use: IntArray) -> FloatArray:
 
 def _path_message(stamp_ns: int, poses: FloatArray) -> bytes:
     """Return ``nav_msgs/msg/Path`` in little-endian CDR; ``poses`` [N, 3]: x, y (m), yaw (rad)."""
-    header = struct.pack("<iII4s", *divmod(stamp_ns, 1_000_000_000), len(MAP_FRAME) + 1, MAP_FRAME.encode())
+    header = struct.pack("<iII4s", *divmod(stamp_ns, NS_PER_S), len(MAP_FRAME) + 1, MAP_FRAME.encode())
     data = bytearray(header + struct.pack("<I", len(poses)))
     for (x_m, y_m, _), (w, x, y, z) in zip(poses, quat_from_yaw(poses[:, 2]), strict=True):
         data += header

@@ -16,7 +16,7 @@ from pdhef_logtool.evaluation.reasons import reason_intervals
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.plotted import ERRORS, LEVEL_NAMES, STATES, Plot, colour_rgb, drawn, errors, log_lines
 from pdhef_logtool.results.run_report import report_markdown
@@ -28,7 +28,7 @@ from pdhef_logtool.storage.files import open_new, writing
 MOST_OTHERS = 12
 
 #: A line is broken at gaps longer than this.
-LONGEST_BRIDGE_NS = 1_000_000_000
+LONGEST_BRIDGE_NS = NS_PER_S
 
 #: Points of one trajectory in the plan view; it is thinned when it would grow beyond.
 MOST_TRAJECTORY_POINTS = 20_000

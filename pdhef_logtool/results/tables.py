@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.signals import S_PER_NS
 from pdhef_logtool.results.opened_run import TABLES
 from pdhef_logtool.results.parquet_sink import arrow_array, arrow_schema, parquet_writer, reading
 from pdhef_logtool.results.run_report import LogOutcome
@@ -132,7 +133,7 @@ def _faults(report: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 def _times(of: Mapping[str, Any]) -> dict[str, float]:
     if of["start_ns"] is None or of["end_ns"] is None:
         return {}
-    return {"seconds": (of["end_ns"] - of["start_ns"]) * 1e-9}
+    return {"seconds": (of["end_ns"] - of["start_ns"]) * S_PER_NS}
 
 
 def _verdicts(plan: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ from pdhef_logtool.estimators.reference.gnss import (
 )
 from pdhef_logtool.estimators.reference.inputs import ANTENNA_Y_STD_M, LINEAR_FRICTION, RATE_HZ, knots, sensor_noise
 from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import INDEPENDENT_SHARE, REFERENCE, StateTrack, make_track
 
 #: Wheelbase for the priors of lengths; for smaller cars they are scaled by the wheelbase.
@@ -311,8 +311,8 @@ class ReferenceEstimator:
 def _interpolated(span: SideslipReference, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Return v_x, v_y, r [K, 3], covariance of v_x, v_y and shares [K, 3] each, and validity at stamps of a span."""
     left = np.clip(np.searchsorted(span.stamps_ns, stamps_ns, side="right") - 1, 0, len(span.stamps_ns) - 2)
-    step_s = np.asarray((span.stamps_ns[left + 1] - span.stamps_ns[left]) * 1e-9, dtype=np.float64)
-    share = (stamps_ns - span.stamps_ns[left]) * 1e-9 / step_s
+    step_s = np.asarray((span.stamps_ns[left + 1] - span.stamps_ns[left]) * S_PER_NS, dtype=np.float64)
+    share = (stamps_ns - span.stamps_ns[left]) * S_PER_NS / step_s
 
     def between(column: FloatArray) -> FloatArray:
         weight = share.reshape(-1, *[1] * (column.ndim - 1))

@@ -26,7 +26,7 @@ from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import BoolArray
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.results.parquet_sink import arrow_array, arrow_schema, parquet_writer
@@ -197,7 +197,7 @@ class DatasetDrive:
         column = {name: table[name].to_numpy() for name in table.column_names if name != "split"}
         stamps = column["stamp_ns"].astype(np.int64)
         step_s = np.full(stamps.shape[0], float(self.entry["period_s"]))
-        step_s[:-1] = np.diff(stamps) * 1e-9
+        step_s[:-1] = np.diff(stamps) * S_PER_NS
         rows = np.isfinite([column[name] for name in FEATURES]).all(axis=0)  # with a state of the filter
         column = {name: values[rows] for name, values in column.items()}
         weight = column["weight"].astype(np.float32)

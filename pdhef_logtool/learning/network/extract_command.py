@@ -37,7 +37,7 @@ from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import S_PER_NS, Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
@@ -512,9 +512,9 @@ def _counts(rows: residuals.ResidualRows, log_start_ns: int) -> dict[str, Any]:
     squares = np.square(rows.targets[use] / rows.step_s[use, None])
     mean = np.cumsum(squares, axis=0)[-1] / len(squares) if len(squares) else np.full(2, math.nan)
     return {
-        "start_s": (first - log_start_ns) * 1e-9,
-        "end_s": (last - log_start_ns) * 1e-9,
-        "duration_s": (last - first) * 1e-9,
+        "start_s": (first - log_start_ns) * S_PER_NS,
+        "end_s": (last - log_start_ns) * S_PER_NS,
+        "duration_s": (last - first) * S_PER_NS,
         "rows": len(rows),
         "usable_rows": len(squares),
         "segments": len(np.unique(rows.segment[use])),
