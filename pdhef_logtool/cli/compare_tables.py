@@ -25,7 +25,7 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
     """Print a comparison: verdict, assumptions and next step, then their basis."""
     requirements = comparison.requirements
     verdict = "; gate closed: ".join((comparing.sentence("verdict", comparison), *comparison.failures))
-    result = verdict if requirements is None else Text.assemble(verdict, "; ", plan_line(requirements))
+    result = verdict if requirements is None else Text.assemble(verdict, "; ", plan_line(requirements.to_dict()))
     console.print(
         three_lines(result, comparing.sentence("assumed", comparison), comparing.sentence("next", comparison))
     )

@@ -81,15 +81,16 @@ def render_run(result: RunResult, console: Console) -> None:
 
 def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
     """Return the first three lines: result, assumptions, next step."""
-    given, texts = result.requirements, [_texts(report) for report in reports]
+    plan = None if result.requirements is None else result.requirements.to_dict()
+    texts = [_texts(report) for report in reports]
     failed = [r.outcome.log for r in result.results if r.report is None]
     alone = len(result.results) == 1
     said = _range(reports) if not alone else selected.result_of(reports[0]) if reports else "the log failed"
     steps = [f"{', '.join(failed[:_MOST_FAILED])} failed: read the cause below"] if failed else []
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
-    steps = next_steps(None if given is None else given.to_dict(), steps)
+    steps = next_steps(plan, steps)
     return three_lines(
-        said if given is None else Text.assemble(said, "; ", plan_line(given)),
+        said if plan is None else Text.assemble(said, "; ", plan_line(plan)),
         "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none"),
         steps[0] if steps else "no action needed",
     )
@@ -107,13 +108,12 @@ def _range(reports: Sequence[_Report]) -> str:
 def _fleet_head(summary: Mapping[str, Any]) -> Table:
     """Return the three lines of a run of many logs."""
     plan = summary["plan"] or {}
-    counts = Counter(str(r["outcome"]) for r in plan.get("requirements") or ())
     errors = summary["errors"]
     rmse = f"median sideslip RMSE {degrees(errors[0]['median_rad'])}" if errors else "no drive is scored"
     said = f"{rmse} of {summary['scored']} drives"
     steps = next_steps(plan, ["read the failures below"] if summary["failed"] else ())
     return three_lines(
-        Text.assemble(said, "; ", outcomes_text(counts, plan.get("file") or "")) if counts else said,
+        Text.assemble(said, "; ", plan_line(plan)) if plan.get("requirements") else said,
         "differs by drive, see report.json",
         steps[0] if steps else f"open {Path(summary['output']) / PAGE_FILE}",
     )
@@ -294,15 +294,11 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
 STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
 
 
-def plan_line(plan_result: PlanVerdicts) -> Text:
-    """Return the numbers of passed, failed and inconclusive requirements."""
-    return outcomes_text(Counter[str](v.outcome for v in plan_result.verdicts), plan_result.plan.file)
-
-
-def outcomes_text(counts: Mapping[str, int], file: str) -> Text:
-    """Return the number of requirements by outcome, and the name of the plan."""
-    parts = [Text(f"{counts[outcome]} {outcome}", style) for outcome, style in STYLES.items() if counts.get(outcome)]
-    name = f"plan {file}" if file else "default plan, no gate"
+def plan_line(plan: Mapping[str, Any]) -> Text:
+    """Return the number of requirements by outcome of a plan with its verdicts, and the name of the plan."""
+    counts = Counter(str(r["outcome"]) for r in plan["requirements"])
+    parts = [Text(f"{counts[outcome]} {outcome}", style) for outcome, style in STYLES.items() if counts[outcome]]
+    name = f"plan {plan['file']}" if plan["file"] else "default plan, no gate"
     return Text.assemble(Text(", ").join(parts), f" ({name})")
 
 

@@ -201,10 +201,8 @@ class McapContainer(FileContainer):
         return Span.of((id_, times[end - n : end]) for (id_, n), end in zip(parts, ends, strict=True))
 
     def _lose_indexes(self, extent: Extent) -> None:
-        what = (
-            f"the message indexes of the chunk at byte {extent.start} are damaged: its messages are found without them"
-        )
-        self.lose("bad-record", what)
+        what = f"the message indexes of the chunk at byte {extent.start} are damaged"
+        self.lose("bad-record", f"{what}: its messages are found without them")
 
     def _read_header(self) -> int:
         """Read the header record, which is the first one; return its end."""

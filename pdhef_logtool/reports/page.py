@@ -55,22 +55,19 @@ def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
     document, blocks = charts.document()
     scripts = [_asset(name) for name in _SCRIPTS]
     style = "\n".join(_asset(name) for name in _STYLES)
-    page = (
-        _environment()
-        .get_template(template)
-        .render(
-            **texts,
-            figure=partial(_place, charts),
-            policy=_policy(scripts, style),
-            scripts=[Markup(s) for s in scripts],  # noqa: S704 (files of this package)
-            style=Markup(style),  # noqa: S704
-            licence=Markup(_asset("UPLOT-LICENSE")),  # noqa: S704
-            document=_embedded(document),
-            blocks={name: Markup(text) for name, text in blocks.items()},  # noqa: S704 (base64)
-            tool=f"pdhef-logtool {__version__}",
-        )
+    page = _environment().get_template(template)
+    html = page.render(
+        **texts,
+        figure=partial(_place, charts),
+        policy=_policy(scripts, style),
+        scripts=[Markup(s) for s in scripts],  # noqa: S704 (files of this package)
+        style=Markup(style),  # noqa: S704
+        licence=Markup(_asset("UPLOT-LICENSE")),  # noqa: S704
+        document=_embedded(document),
+        blocks={name: Markup(text) for name, text in blocks.items()},  # noqa: S704 (base64)
+        tool=f"pdhef-logtool {__version__}",
     )
-    return page.encode("utf-8", "backslashreplace")
+    return html.encode("utf-8", "backslashreplace")
 
 
 @cache

@@ -132,16 +132,9 @@ def find_events(
     if not searched and estimators:
         _check_tracks(estimators, condition, estimator, selected=any(log.main() for log in run.logs))
     unreadable = sum(log.label in damaged or log.outcome.startswith("failed") for log in run.logs)
-    return FoundEvents(
-        condition.text + (f" for {least_s:g} s" if least_s else ""),
-        searched,
-        tuple(events),
-        left_out,
-        estimator or "the selected estimates",
-        unreadable > 0,
-        unreadable,
-        tuple(damaged.values()),
-    )
+    where = condition.text + (f" for {least_s:g} s" if least_s else "")
+    of, lines = estimator or "the selected estimates", tuple(damaged.values())
+    return FoundEvents(where, searched, tuple(events), left_out, of, unreadable > 0, unreadable, lines)
 
 
 @dataclass(frozen=True, slots=True)

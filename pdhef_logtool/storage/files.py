@@ -32,12 +32,11 @@ _REMEDIES = {
     errno.EDQUOT: "free some space within the quota or choose another place",
     errno.EFBIG: "raise the limit on the size of a file (ulimit -f)",
     errno.EROFS: "choose a place that can be written",
-    errno.EACCES: "choose a place that you may write to",
-    errno.EPERM: "choose a place that you may write to",
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "choose a place that you may write to"),
     errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ENOTDIR: "something else has that name: move it or choose another place",
-    errno.EISDIR: "something else has that name: move it or choose another place",
-    errno.EEXIST: "something else has that name: move it or choose another place",
+    **dict.fromkeys(
+        (errno.ENOTDIR, errno.EISDIR, errno.EEXIST), "something else has that name: move it or choose another place"
+    ),
     errno.EIO: "the disk fails: check it or choose another place",
 }
 
