@@ -62,7 +62,6 @@ class FeatureSequence:
     The target is residual rates in m/s² and rad/s² (m = 2), or v_y in m/s (m = 1).
     """
 
-    drive: str
     features: FloatArray
     target: FloatArray
     weight: FloatArray
@@ -656,4 +655,4 @@ class SplitSequences:
                     weight = weight * np.isfinite(values[:, 0])
                 values[weight == 0.0] = 0.0
                 if weight.sum() > 0.0:
-                    yield FeatureSequence(drive.entry["name"], features, values, weight)
+                    yield FeatureSequence(features, values, weight)
