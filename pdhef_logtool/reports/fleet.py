@@ -98,20 +98,13 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
     if not judged or len(fleet.drives) == 1:
         return
     first = judged[0]
-    near = [d for d in judged if d.median.value <= _DRAWN * first.median.value]
-    charts.figures["medians"] = IntervalsFigure(
-        f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
-        + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"),
-        "RMSE in °",
-        [
-            Interval(
-                d.estimator,
-                *(DEGREES * x for x in (d.median.low, d.median.value, d.median.high)),
-                INK if d.estimator == ANSWER else colour(d.estimator),
-            )
-            for d in near
-        ],
-    )
+    bars = []
+    for d in (d for d in judged if d.median.value <= _DRAWN * first.median.value):
+        low, middle, high = (DEGREES * x for x in (d.median.low, d.median.value, d.median.high))
+        bars.append(Interval(d.estimator, low, middle, high, INK if d.estimator == ANSWER else colour(d.estimator)))
+    title = f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
+    title += "" if len(bars) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"
+    charts.figures["medians"] = IntervalsFigure(title, "RMSE in °", bars)
     if first.drives > 2:
         values = first.values * DEGREES
         edges, counts = _histogram(values)
