@@ -145,16 +145,6 @@ class _Job:
     resume: bool
 
     @property
-    def name(self) -> str:
-        """Name of the drive in the dataset."""
-        return self.settings.name_of(self.log_input.stem)
-
-    def identity(self, split: str) -> dict[str, str]:
-        """Return the entries of the drive that determine its path in the dataset."""
-        sha, vehicle = self.physics
-        return {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha}
-
-    @property
     def physics(self) -> tuple[str, VehicleParameters]:
         """Digest and parameters of the vehicle behind the residuals."""
         car = self.car
@@ -355,7 +345,9 @@ def _failure(job: _Job, reason: str) -> DriveResult:
 def _extract(job: _Job, progress: Progress) -> DriveResult:
     settings, source = job.settings, identity_of(job.log_input)
     split, split_from = choose_split(source, chosen=settings.split, listed=job.listed_split)
-    fingerprint, identity = _fingerprint(job, split), job.identity(split)
+    fingerprint, (sha, vehicle) = _fingerprint(job, split), job.physics
+    name = settings.name_of(job.log_input.stem)
+    identity = {"name": name, "split": split, "car": vehicle.name, "vehicle_sha256": sha}
     target = dataset.drive_file(job.output, identity)
     if job.resume and (kept := _kept(job, target, source, split, fingerprint)) is not None:
         return kept
