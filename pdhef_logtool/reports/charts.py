@@ -241,7 +241,8 @@ class _Blocks:
         if isinstance(value, np.ndarray):
             return self.add(value, resolution)
         if isinstance(value, str):
-            return printable(value, _LABEL_SIGNS)
+            half = _LABEL_SIGNS // 2
+            return printable(value if len(value) <= _LABEL_SIGNS else f"{value[: half - 1]}…{value[-half:]}")
         if isinstance(value, float):
             return float(f"{value:.9g}") if np.isfinite(value) else None
         if isinstance(value, list | tuple):
