@@ -87,12 +87,12 @@ def _source_of(log: OpenedLog, folder: Path | None) -> Path:
             if sha256 is not None and hash_log(path) == sha256:
                 return path
         got = f"{len(candidates)} of that name with other content" if candidates else "none of that name"
-        raise OutputError(expected=f"the log {name}", got=got, where=str(folder), remedy="name its folder by --source")
+        raise OutputError(expected=f"the log {name}", got=got, where=folder, remedy="name its folder by --source")
     if (copy := log.file(_ANNOTATED)) is not None:
         return copy
     raise OutputError(
         expected=f"a full copy of {name}, {_ANNOTATED}",
         got="a run without one",
-        where=str(log.folder),
+        where=log.folder,
         remedy="name the folder of the logs: --source DIR",
     )

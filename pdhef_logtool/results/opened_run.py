@@ -80,7 +80,7 @@ class OpenedLog:
         report = read_json(path, "a report.json", OutputError, _AGAIN, MAX_DOCUMENT_BYTES)
         if report.get("format") != "pdhef.report":
             got = f"format {report.get('format')!r}"
-            raise OutputError(expected="a report.json", got=got, where=str(path), remedy=_AGAIN)
+            raise OutputError(expected="a report.json", got=got, where=path, remedy=_AGAIN)
         return report
 
     def readable_report(self) -> dict[str, Any] | None:
@@ -158,13 +158,13 @@ def open_run(output: Path | str) -> OpenedRun:
         mirror.fetch(RUN_FILE)
     if not path.is_file():
         got = f"a folder without {RUN_FILE}" if folder.is_dir() else "no such folder"
-        where = str(folder) if mirror is None else mirror.objects.shown
+        where = folder if mirror is None else mirror.objects.shown
         missing = mirror is None and not folder.exists()
         raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=missing)
     document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
     if document.get("format") != "pdhef.run":
         got = f"format {document.get('format')!r}"
-        raise OutputError(expected=what, got=got, where=str(path), remedy=_REMEDY)
+        raise OutputError(expected=what, got=got, where=path, remedy=_REMEDY)
     place = folder / LOGS
     logs = tuple(_opened(entry, place, mirror) for entry in document["logs"])
     return OpenedRun(folder, document, logs, mirror)
@@ -174,6 +174,6 @@ def _opened(entry: dict[str, Any], folder: Path, mirror: Mirror | None) -> Opene
     label = entry.get("log")
     if not isinstance(label, str) or label in {"", ".", ".."} or {"/", "\\"} & set(label):
         # A label names a folder that reports are written to: it may not lead out of the run's.
-        where = str(folder.parent / RUN_FILE)
-        raise OutputError(expected="the name of a log's folder", got=repr(label)[:80], where=where, remedy=_REMEDY)
+        got, where = repr(label)[:80], folder.parent / RUN_FILE
+        raise OutputError(expected="the name of a log's folder", got=got, where=where, remedy=_REMEDY)
     return OpenedLog(label, str(entry.get("outcome", "")), folder / label, entry, mirror)

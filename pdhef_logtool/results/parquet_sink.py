@@ -183,7 +183,7 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
         tables = [file.read_row_group(i, columns=wanted) for i, name in enumerate(names) if name == estimator]
     if not tables:
         names = [*dict.fromkeys(name for name in names if name != SELECTED)]
-        raise OutputError(expected=f"one of {', '.join(names)}", got=estimator, where=str(path))
+        raise OutputError(expected=f"one of {', '.join(names)}", got=estimator, where=path)
     return _track_from_table(estimator, pa.concat_tables(tables))
 
 
@@ -212,4 +212,4 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError, LookupError, pa.ArrowException) as error:
         got = f"one that cannot be read: {' '.join(str(error).split())[:200]}"
-        raise OutputError(expected="a readable Parquet file", got=got, where=str(path), remedy=_AGAIN) from error
+        raise OutputError(expected="a readable Parquet file", got=got, where=path, remedy=_AGAIN) from error

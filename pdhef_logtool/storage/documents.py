@@ -63,7 +63,7 @@ def read_sealed(
     """
     document = read_json(path, what, error, remedy, max_bytes)
     if not is_sealed(document):
-        raise error(expected=what, got="one that is not as it was written", where=str(path), remedy=remedy)
+        raise error(expected=what, got="one that is not as it was written", where=path, remedy=remedy)
     return {key: value for key, value in document.items() if key != DIGEST}
 
 
@@ -90,10 +90,10 @@ def checked_sha256(path: Path, named: str | None, document: str, remedy: str) ->
         sha256 = file_sha256(path)
     except OSError as error:
         got = error.strerror or str(error)
-        raise OutputError(expected=f"a readable {path.name}", got=got, where=str(path), remedy=remedy) from error
+        raise OutputError(expected=f"a readable {path.name}", got=got, where=path, remedy=remedy) from error
     if named not in (None, sha256):
         expected, got = f"the {path.name} that {document} names", "another content: it is damaged, or of another run"
-        raise OutputError(expected=expected, got=got, where=str(path), remedy=remedy)
+        raise OutputError(expected=expected, got=got, where=path, remedy=remedy)
     return sha256
 
 
@@ -104,7 +104,7 @@ def _read(
         document = parse(read_text(path, max_bytes))
         got = _oddity(document)
     except FileNotFoundError:
-        raise error(expected=what, got="no such file", where=str(path), remedy=remedy, missing=True) from None
+        raise error(expected=what, got="no such file", where=path, remedy=remedy, missing=True) from None
     except OSError as problem:
         got = problem.strerror or str(problem)
     except RecursionError:
@@ -112,7 +112,7 @@ def _read(
     except ValueError as problem:  # of the decoder, either parser, or a number of thousands of digits
         got = str(problem)
     if got:
-        raise error(expected=what, got=got, where=str(path), remedy=remedy)
+        raise error(expected=what, got=got, where=path, remedy=remedy)
     return dict(document)
 
 
@@ -141,7 +141,7 @@ def _oddity(document: object) -> str:
 
 
 def validated(
-    model: type[ModelT], raw: object, where: str, error: type[PdhefError], *, expected: str, remedy: str = ""
+    model: type[ModelT], raw: object, where: object, error: type[PdhefError], *, expected: str, remedy: str = ""
 ) -> ModelT:
     """Return the record of a parsed document.
 

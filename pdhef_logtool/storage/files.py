@@ -115,7 +115,7 @@ def cannot_write(target: Path, error: OSError) -> OutputError:
     made = OutputError(
         expected="a place to write to",
         got=error.strerror or str(error) or type(error).__name__,
-        where=str(target),
+        where=target,
         remedy=_REMEDIES.get(error.errno or 0, "choose another place"),
     )
     made.ends_run = error.errno in _OF_THE_DISK

@@ -143,7 +143,7 @@ class FolderLock:
                 raise OutputError(
                     expected="an output folder that no other command is writing to",
                     got="one that another command is writing to",
-                    where=str(self.path),
+                    where=self.path,
                     remedy=f"{self._who()}wait for it or choose another folder",
                 )
             time.sleep(_POLL_S)

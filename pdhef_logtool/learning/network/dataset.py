@@ -244,7 +244,7 @@ class Dataset:
         """Return the vehicle behind the residuals of a drive."""
         wanted = drive.entry["vehicle_sha256"]
         parameters = next((v["parameters"] for v in self.manifest["vehicles"] if v["sha256"] == wanted), None)
-        where, expected = str(self.folder / MANIFEST), "the parameters of a vehicle"
+        where, expected = self.folder / MANIFEST, "the parameters of a vehicle"
         return validated(VehicleParameters, parameters, where, OutputError, expected=expected)
 
 
@@ -263,7 +263,7 @@ def read_dataset(folder: Path) -> Dataset:
         raise OutputError(
             expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
             got=f"{kind} {version} with {', '.join(names or ['none'])}",
-            where=str(path),
+            where=path,
             remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
         )
     drives = tuple(DatasetDrive(folder / d["file"], d) for d in document["drives"])

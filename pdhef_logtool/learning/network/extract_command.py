@@ -275,9 +275,9 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
     try:
         data = dataset.read_dataset(output)
     except OutputError as error:
-        raise UsageError(expected=expected, got=error.got, where=str(output), remedy=remedy) from None
+        raise UsageError(expected=expected, got=error.got, where=output, remedy=remedy) from None
     if data.model != settings.model:
-        raise UsageError(expected=expected, got=f"one for {data.model}", where=str(output), remedy=remedy)
+        raise UsageError(expected=expected, got=f"one for {data.model}", where=output, remedy=remedy)
     return data.manifest
 
 
@@ -469,7 +469,7 @@ def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool = False) -> None:
         remedy = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
     else:
         return
-    raise EstimatorError(expected=expected, got=got, where=str(job.log_input.path), remedy=remedy)
+    raise EstimatorError(expected=expected, got=got, where=job.log_input.path, remedy=remedy)
 
 
 def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:

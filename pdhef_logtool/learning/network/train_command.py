@@ -393,13 +393,11 @@ class _Training:
                 raise ValueError("content that is not as it was written")
         except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
             expected = "a checkpoint of a training"
-            raise ModelError(
-                expected=expected, got=str(error), where=str(path), remedy="remove it to train again"
-            ) from None
+            raise ModelError(expected=expected, got=str(error), where=path, remedy="remove it to train again") from None
         if document["identity"] != json.loads(json.dumps(identity)):
             expected, got = "a checkpoint of this recipe and data", "one of another"
             remedy = "train into another folder, or remove the checkpoint"
-            raise ModelError(expected=expected, got=got, where=str(path), remedy=remedy)
+            raise ModelError(expected=expected, got=got, where=path, remedy=remedy)
         groups: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
         for name, value in tensors.items():
             group, _, key = name.partition(".")
@@ -497,7 +495,7 @@ def run_training(
     start = network_folder(NO_MODEL if init is None else init)
     bundle = None if start is None else load_bundle(start)
     if bundle is not None and bundle.model != data.model:
-        raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=str(init))
+        raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=init)
     check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
     with OutputFolder(output):
         return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
@@ -516,7 +514,7 @@ def dataset_for(folder: Path, model: str) -> Dataset:
         raise OutputError(
             expected=f"residuals of {model}",
             got=f"residuals of {data.model}",
-            where=str(folder),
+            where=folder,
             remedy=f"pdhef extract LOG... -o DATASET --filter {model} writes them, into another folder",
         )
     return data
