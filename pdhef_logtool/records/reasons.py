@@ -28,7 +28,7 @@ _SENSORS = (("ay", "a_y"), ("yaw_rate", "gyro"))
 _FAULTS = {BURST_AY: "noise burst", SPIKE_AY: "spike", STUCK_AY: "stuck", DEAD_AY: "dead", MISSING_AY: "missing"}
 #: All reasons in order of their bits.
 REASONS = tuple(
-    Reason(bit << i, f"{text.split()[-1]}_{name}", f"{sensor} {text}")
+    Reason(bit << i, f"{text.removeprefix('noise ')}_{name}", f"{sensor} {text}")
     for bit, text in _FAULTS.items()
     for i, (name, sensor) in enumerate(_SENSORS)
 )
