@@ -84,7 +84,8 @@ _TABLES: dict[str, tuple[str, Callable[[], Iterable[tuple[str, ...]]]]] = {
     "sensor_errors": ("name, default, meaning", lambda: _entries(SensorNoise, SensorNoise()._asdict())),
     "limits": ("limit, default, meaning", lambda: _entries(ResourceLimits, asdict(ResourceLimits()))),
     "assumed_values": (
-        "entry left out, rule, spread", lambda: ((f"`{r.entry}`", r.text, f"{r.spread:.0%}") for r in RULES),
+        "entry left out, rule, spread",
+        lambda: ((f"`{entry}`", rule["text"], f"{rule['spread']:.0%}") for entry, rule in RULES.items()),
     ),
     "manoeuvres": (
         "name, manoeuvre, km/h, μ",

@@ -36,16 +36,6 @@ class AssumedValue:
     rule: str
 
 
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """Rule for an entry. ``value`` computes it from the entries before it, including axle loads in N."""
-
-    entry: str
-    value: Callable[[Mapping[str, float]], float]
-    spread: float
-    text: str
-
-
 def stiffness_per_load(mass_kg: float) -> float:
     """Return cornering stiffness over axle load in 1/rad by the class of vehicle.
 
@@ -54,7 +44,8 @@ def stiffness_per_load(mass_kg: float) -> float:
     return float(np.interp(math.log(mass_kg), np.log([50.0, 400.0, 4000.0, 12_000.0]), [6.0, 14.5, 14.5, 6.0]))
 
 
-#: In the order of their dependence.
+#: Rules by entry, in the order of their dependence: each computes it from the entries before it, including axle loads
+#: in N.
 _FORMULAS: dict[str, Callable[[Mapping[str, float]], float]] = {
     "yaw_inertia_kg_m2": lambda v: v["mass_kg"] * v["cg_to_front_axle_m"] * v["cg_to_rear_axle_m"],
     "track_m": lambda v: min(0.547 * v["wheelbase_m"], 2.1),
@@ -67,9 +58,8 @@ _FORMULAS: dict[str, Callable[[Mapping[str, float]], float]] = {
     "tyres.front.cornering_stiffness_n_per_rad": lambda v: 0.97 * stiffness_per_load(v["mass_kg"]) * v["front_load_n"],
     "tyres.rear.cornering_stiffness_n_per_rad": lambda v: 1.03 * stiffness_per_load(v["mass_kg"]) * v["rear_load_n"],
 }
-#: The same with the spreads and words of ``assumed_values.toml``.
-_TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-RULES = tuple(Rule(entry, value, **_TABLE[entry]) for entry, value in _FORMULAS.items())
+#: Their spreads and words, by entry.
+RULES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValue, ...]]:
@@ -89,8 +79,8 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
     weight_n = values["mass_kg"] * GRAVITY_M_S2
     values |= {"wheelbase_m": front + rear}
     values |= {"front_load_n": weight_n * rear / (front + rear), "rear_load_n": weight_n * front / (front + rear)}
-    for rule in RULES:
-        *tables, name = rule.entry.split(".")
+    for entry, formula in _FORMULAS.items():
+        *tables, name = entry.split(".")
         if tables and "tyres" in raw:
             continue
         table = entries
@@ -99,9 +89,9 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
         if name in table:
             values[name] = float(table[name]) if _is_positive(table[name]) else math.nan
             continue
-        value = float(f"{rule.value(values):.4g}")
+        value = float(f"{formula(values):.4g}")
         table[name] = values[name] = value
-        assumed.append(AssumedValue(rule.entry, value, rule.spread, rule.text))
+        assumed.append(AssumedValue(entry, value, RULES[entry]["spread"], RULES[entry]["text"]))
     return entries, tuple(assumed)
 
 

@@ -60,7 +60,7 @@ def read_vehicle_file(path: Path) -> VehicleFile:
     VehicleError
         The file is missing or is not TOML, or has wrong, unknown or missing entries; the message lists all of them.
     """
-    return vehicle_of_entries(read_toml(path, "a vehicle TOML, car folder or 'saloon'", VehicleError), where=str(path))
+    return vehicle_of_entries(read_toml(path, "a vehicle TOML, car folder or 'saloon'", VehicleError), where=path)
 
 
 def with_sensors(vehicle: VehicleParameters, profile: Path | str) -> VehicleParameters:
@@ -76,12 +76,12 @@ def with_sensors(vehicle: VehicleParameters, profile: Path | str) -> VehiclePara
         entries = read_toml(Path(profile), "a TOML file with [sensors]", VehicleError).get("sensors")
         expected, remedy = "a table [sensors] as in vehicle.toml", f"profiles by name: {', '.join(SENSOR_PROFILES)}"
         if not isinstance(entries, dict):
-            raise VehicleError(expected=expected, got="none", where=str(profile), remedy=remedy)
+            raise VehicleError(expected=expected, got="none", where=profile, remedy=remedy)
         sensors = validated(Sensors, entries, f"{profile}: sensors", VehicleError, expected=expected, remedy=REMEDY)
     return vehicle.model_copy(update={"sensors": sensors})
 
 
-def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
+def vehicle_of_entries(raw: Mapping[str, Any], *, where: object) -> VehicleFile:
     """Return the vehicle of the entries of a vehicle.toml; raises VehicleError as :func:`read_vehicle_file`."""
     problems: list[str] = []
     checked(_Wheelbase, {name: raw[name] for name in _Wheelbase.model_fields if name in raw}, "", problems)

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from pdhef_logtool.cli.console import print_indented, table, three_lines
-from pdhef_logtool.cli.plan_tables import plan_line, render_plan
+from pdhef_logtool.cli.run_tables import plan_line, render_plan
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.records.printable import listed
@@ -25,7 +25,7 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
     """Print a comparison: verdict, assumptions and next step, then their basis."""
     requirements = comparison.requirements
     verdict = "; gate closed: ".join((comparing.sentence("verdict", comparison), *comparison.failures))
-    result = verdict if requirements is None else Text.assemble(verdict, "; ", plan_line(requirements))
+    result = verdict if requirements is None else Text.assemble(verdict, "; ", plan_line(requirements.to_dict()))
     console.print(
         three_lines(result, comparing.sentence("assumed", comparison), comparing.sentence("next", comparison))
     )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.cli.console import cell, table, three_lines
@@ -85,18 +84,13 @@ def render_learning(result: LearnResult, console: Console) -> None:
     console.print(head)
     if "rungs" in result.figures:
         console.print()
-        _teaching(result.figures, console)
-
-
-def _teaching(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the tested residual models."""
-    rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
-    for t in figures["rungs"]:
-        outcome = "" if not t["against"] else "better" if t["taken"] else "not better"
-        outcome = "used" if t["rung"] == figures["rung"] else outcome
-        against = [cell(t[k] if t["against"] else None, digits=4) for k in ("difference_deg2", "standard_error_deg2")]
-        rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, outcome)
-    console.print(rungs)
+        rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
+        for t in result.figures["rungs"]:
+            outcome = "" if not t["against"] else "better" if t["taken"] else "not better"
+            outcome = "used" if t["rung"] == result.figures["rung"] else outcome
+            of_rung = (t[k] if t["against"] else None for k in ("difference_deg2", "standard_error_deg2"))
+            rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *(cell(x, digits=4) for x in of_rung), outcome)
+        console.print(rungs)
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:

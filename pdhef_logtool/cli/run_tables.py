@@ -1,4 +1,4 @@
-"""Output of ``pdhef run`` and ``pdhef metrics``: the selected estimate as text, a table, output files, verdicts."""
+"""Output of ``pdhef run`` and ``pdhef metrics``: the selected estimate as text, a table, output files, the plan."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, three_lines
-from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.metric import registered
-from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
+from pdhef_logtool.evaluation.validation_plan import shown as value_text
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
 from pdhef_logtool.results import selected_estimate as selected
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_report import lines_of
 from pdhef_logtool.results.selected_estimate import Figures, assumptions_of, degrees, figures_of
 from pdhef_logtool.runs.run_result import RunResult
@@ -80,15 +81,16 @@ def render_run(result: RunResult, console: Console) -> None:
 
 def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
     """Return the first three lines: result, assumptions, next step."""
-    given, texts = result.requirements, [_texts(report) for report in reports]
+    plan = None if result.requirements is None else result.requirements.to_dict()
+    texts = [_texts(report) for report in reports]
     failed = [r.outcome.log for r in result.results if r.report is None]
     alone = len(result.results) == 1
     said = _range(reports) if not alone else selected.result_of(reports[0]) if reports else "the log failed"
     steps = [f"{', '.join(failed[:_MOST_FAILED])} failed: read the cause below"] if failed else []
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
-    steps = next_steps(None if given is None else given.to_dict(), steps)
+    steps = next_steps(plan, steps)
     return three_lines(
-        said if given is None else Text.assemble(said, "; ", plan_line(given)),
+        said if plan is None else Text.assemble(said, "; ", plan_line(plan)),
         "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none"),
         steps[0] if steps else "no action needed",
     )
@@ -106,13 +108,12 @@ def _range(reports: Sequence[_Report]) -> str:
 def _fleet_head(summary: Mapping[str, Any]) -> Table:
     """Return the three lines of a run of many logs."""
     plan = summary["plan"] or {}
-    counts = Counter(str(r["outcome"]) for r in plan.get("requirements") or ())
     errors = summary["errors"]
     rmse = f"median sideslip RMSE {degrees(errors[0]['median_rad'])}" if errors else "no drive is scored"
     said = f"{rmse} of {summary['scored']} drives"
     steps = next_steps(plan, ["read the failures below"] if summary["failed"] else ())
     return three_lines(
-        Text.assemble(said, "; ", outcomes_text(counts, plan.get("file") or "")) if counts else said,
+        Text.assemble(said, "; ", plan_line(plan)) if plan.get("requirements") else said,
         "differs by drive, see report.json",
         steps[0] if steps else f"open {Path(summary['output']) / PAGE_FILE}",
     )
@@ -287,3 +288,36 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
         notes = lines_of("look_at", report, inside, main if len(mains) > 1 else "", selected.is_worse(*compared))
         joint.add_row(report["log"]["name"], seconds, *errors, cell(inside), *(notes or [""]))
     return joint
+
+
+#: Styles of the outcomes of requirements.
+STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
+
+
+def plan_line(plan: Mapping[str, Any]) -> Text:
+    """Return the number of requirements by outcome of a plan with its verdicts, and the name of the plan."""
+    counts = Counter(str(r["outcome"]) for r in plan["requirements"])
+    parts = [Text(f"{counts[outcome]} {outcome}", style) for outcome, style in STYLES.items() if counts[outcome]]
+    name = f"plan {plan['file']}" if plan["file"] else "default plan, no gate"
+    return Text.assemble(Text(", ").join(parts), f" ({name})")
+
+
+def render_plan(plan_result: PlanVerdicts, console: Console) -> None:
+    """Print the requirements in a table, and the next steps for inconclusive ones."""
+    made = table("", "id", "requirement", ">value", ">margin", fold=3)
+    for v in plan_result.verdicts:
+        unit = v.requirement.unit
+        value, margin = ("-" if x is None else value_text(x, unit) for x in (v.value, v.margin))
+        made.add_row(Text(v.outcome, STYLES[v.outcome]), v.requirement.id, v.requirement.label, value, margin)
+    console.print(made)
+    to_do: dict[str, list[str]] = {}
+    for v in plan_result.verdicts:
+        if v.outcome != "PASS":
+            value = "" if v.value is None else f"{value_text(v.value, v.requirement.unit)}; "
+            what = v.reason.removeprefix(value)
+            to_do.setdefault(f"{what}. Next: {v.next}" if v.next else what, []).append(v.requirement.id)
+    for what, ids in to_do.items():
+        print_indented(f"{', '.join(ids)}: {what}", console)
+    for note in joint_notes({v.requirement.id: v.notes for v in plan_result.verdicts}):
+        print_indented(f"note: {note}", console)
+    console.print()

@@ -157,7 +157,7 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
         raise OutputError(
             expected=f"a log named {missing[0]}" if missing else RECORDING_FILE,
             got=", ".join(recordings) or "none",
-            where=str(output),
+            where=output,
             remedy="" if recordings else "pdhef run LOG -o OUT --keep full writes one",
         )
     return [recordings[name] for name in dict.fromkeys(logs)] if logs else list(recordings.values())
@@ -196,6 +196,6 @@ def plan(action: str, *, output: Path) -> None:
     if action != "init":
         raise UsageError(expected="init", got=action, where="pdhef plan", remedy="pdhef plan init -o plan.toml")
     if output.exists():
-        raise UsageError(expected="a new file", got="one that exists", where=str(output), remedy="choose another name")
+        raise UsageError(expected="a new file", got="one that exists", where=output, remedy="choose another name")
     write_bytes(output, example_plan().encode())
     console.say(f"{output} written; use it: pdhef run LOGS -o OUT --plan {output}")

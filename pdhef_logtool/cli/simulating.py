@@ -38,7 +38,9 @@ def simulate(
         _list_manoeuvres()
         return
     if manoeuvre is None or output is None:
-        raise _incomplete("manoeuvre" if manoeuvre is None else "-o FILE")
+        got, remedy = "manoeuvre" if manoeuvre is None else "-o FILE", "pdhef simulate --list shows the manoeuvres"
+        where = "pdhef simulate"
+        raise UsageError(expected="a manoeuvre and -o FILE", got=f"no {got}", where=where, remedy=remedy)
     from truthsim.batch import sensor_noise
     from truthsim.drive import DEFAULT_VEHICLE, simulate_drive, write_drive
     from truthsim.faults import parse_fault
@@ -61,11 +63,6 @@ def simulate(
     )
     write_drive(drive, output, without=without or ())
     console.print_facts({"output": str(output), **drive.facts()})
-
-
-def _incomplete(missing: str) -> UsageError:
-    remedy = "pdhef simulate --list shows the manoeuvres"
-    return UsageError(expected="a manoeuvre and -o FILE", got=f"no {missing}", where="pdhef simulate", remedy=remedy)
 
 
 @options.command("simulate suite")

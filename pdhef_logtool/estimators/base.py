@@ -49,22 +49,18 @@ class Estimator(Protocol):
     @property
     def algorithm(self) -> str:
         """Stable name of the algorithm, a class attribute, for example ``vehicle-ukf`` (:mod:`~.algorithm`)."""
-        ...
 
     @property
     def version(self) -> int:
         """Version of the algorithm, a class attribute: incremented when the same inputs give other estimates."""
-        ...
 
     @property
     def name(self) -> str:
         """Name in the tables, for example ``phy-ukf``."""
-        ...
 
     @property
     def causal(self) -> bool:
         """Whether each step uses only its own sample and earlier ones; checked in every run."""
-        ...
 
 
 class StepEstimator(Estimator, Protocol):
@@ -83,16 +79,14 @@ class StepEstimator(Estimator, Protocol):
             :class:`ModelPredictor`. Joined steps of consecutive windows equal one call over the whole log bit for bit.
         state : for the next window.
         """
-        ...
 
 
 @runtime_checkable
 class ModelPredictor(Protocol):
-    """An estimator that extrapolates its steps with its model; others are extrapolated by :func:`linear_track`."""
+    """An estimator that extrapolates its steps with its model; others are extrapolated by their rates."""
 
     def predict(self, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Return the track at the scored stamps [M]; rows that are not ``usable`` are not valid."""
-        ...
 
 
 @runtime_checkable
@@ -101,21 +95,16 @@ class Smoother(Estimator, Protocol):
 
     def smooth(self, signals: Signals) -> StateTrack:
         """Return the track of a drive at the stamps of its signals [N]."""
-        ...
 
 
 def predict_track(estimator: Estimator, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
-    """Extrapolate steps to the scored stamps [M], by the estimator's model if it has one."""
+    """Extrapolate steps to the scored stamps [M], by the estimator's model, otherwise to first order by their rates."""
     if isinstance(estimator, ModelPredictor):
         return estimator.predict(steps, ahead, stamps_ns)
-    return linear_track(estimator.name, steps, ahead, stamps_ns)
-
-
-def linear_track(name: str, steps: Steps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
-    """Extrapolate steps to first order with constant rates."""
     out = steps.values[ahead.step] + steps.rates[ahead.step] * ahead.horizon_s[:, None]
     out[~ahead.usable] = np.nan
-    return make_track(name, stamps_ns, **dict(zip(QUANTITIES, out.T.copy(), strict=True)), valid=ahead.usable)
+    columns = dict(zip(QUANTITIES, out.T.copy(), strict=True))
+    return make_track(estimator.name, stamps_ns, **columns, valid=ahead.usable)
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.reference.gnss import LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import RATE_HZ, ROLL_PER_AY_RAD_S2_M, SLOW_S
 from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, sideslip_std
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
@@ -291,7 +291,7 @@ class GnssAided:
         vehicle = self.estimator.physics.vehicle
         ay_m_s2 = signals.ay_m_s2 / (1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2)
         columns = (
-            np.nan_to_num(signals.steps_s), (signals.ready_ns - stamps_ns) * 1e-9, ay_m_s2,
+            np.nan_to_num(signals.steps_s), (signals.ready_ns - stamps_ns) * S_PER_NS, ay_m_s2,
             signals.yaw_rate_rad_s, track.vx_m_s, track.vy_m_s, track.valid & np.isfinite(track.vy_m_s),
             *signals.gnss_velocity_m_s.T, signals.gnss_velocity_std_m_s, np.nan_to_num(signals.gnss_late_s),
         )  # fmt: skip

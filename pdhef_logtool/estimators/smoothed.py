@@ -32,7 +32,7 @@ from pdhef_logtool.estimators.adaptive_physics import FORGET_S, AdaptivePhysics,
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs
 from pdhef_logtool.estimators.rts import smooth_covariances, smooth_states
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, LinkedSteps, VehicleUkf
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
@@ -161,6 +161,6 @@ def blocks(stamps_ns: IntArray, block_s: float) -> Iterator[slice]:
     if not len(stamps_ns):
         yield slice(0, 0)
         return
-    block = (stamps_ns - stamps_ns[0]) // round(block_s * 1e9)
+    block = (stamps_ns - stamps_ns[0]) // round(block_s * NS_PER_S)
     edges = [0, *(np.flatnonzero(np.diff(block)) + 1).tolist(), len(block)]
     yield from (slice(first, end) for first, end in pairwise(edges))

@@ -45,7 +45,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from importlib import import_module
 from itertools import chain
 from operator import attrgetter
@@ -144,20 +144,15 @@ class Spec:
         if isinstance(build, str):
             module, _, function = build.partition(":")
             build = attrgetter(function)(import_module(f"{__package__}.{module}"))
-        if options.gnss and self.name in AIDED:
-            build = partial(_aided, build)
         calibration = calibration_of(self.name, car)
-        if calibration is None:
-            estimator: Estimator = build(self.name, car, options)
-            return estimator
-        calibrated: Any = build(self.name, car.calibrated_car, options)
-        return cast("Estimator", replace(calibrated, causal=self.causal and calibration.causal))
+        estimator: Any = build(self.name, car if calibration is None else car.calibrated_car, options)
+        if options.gnss and self.name in AIDED:
+            from pdhef_logtool.estimators.gnss_aided import GnssAided
 
-
-def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car, options: Options) -> Estimator:
-    from pdhef_logtool.estimators.gnss_aided import GnssAided  # compiled code is imported on demand
-
-    return GnssAided(build(name, car, options))  # type: ignore[arg-type]
+            estimator = GnssAided(estimator)
+        if calibration is not None:
+            estimator = replace(estimator, causal=self.causal and calibration.causal)
+        return cast("Estimator", estimator)
 
 
 #: Estimators of other packages: each entry point names a :class:`Spec`.
@@ -178,14 +173,14 @@ OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
 #: Estimators of this package, in the order of the tables. A preset with an option has an entry if it differs.
 SPECS: tuple[Spec, ...] = (
     Spec("zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors",
-         "pass_through:build", _PLANAR, 0xF0E442),
+         "stepwise:build_pass_through", _PLANAR, 0xF0E442),
     Spec("zero:no-lateral", "the sensors passed through; claims no lateral velocity",
-         "pass_through:build", _PLANAR, 0xCC79A7),
-    Spec("kinematic", "leaky integral of a_y - v_x r", "kinematic:build", _PLANAR | {"ay_m_s2"}, 0x009E73),
+         "stepwise:build_pass_through", _PLANAR, 0xCC79A7),
+    Spec("kinematic", "leaky integral of a_y - v_x r", "stepwise:build_kinematic", _PLANAR | {"ay_m_s2"}, 0x009E73),
     Spec("open-loop", "nominal single-track model from steering and speed alone",
-         "open_loop:build", _INPUTS, 0xE69F00),
+         "stepwise:build_open_loop", _INPUTS, 0xE69F00),
     Spec(OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",
-         "open_loop:build", _INPUTS, 0x661100, causal=False),
+         "stepwise:build_open_loop", _INPUTS, 0x661100, causal=False),
     Spec("linear-regression", "sideslip linear in the network's features, low-passed at 2 Hz (needs such a model)",
          "direct_network:build", FEATURES, 0xDDCC77, network="linear_regression"),
     Spec("phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",

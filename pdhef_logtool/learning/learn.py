@@ -46,6 +46,7 @@ from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.model.priors import TYRES
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
+from pdhef_logtool.records.signals import S_PER_NS
 from pdhef_logtool.records.steps import release
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
@@ -253,7 +254,7 @@ def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDriv
             record = record if truth_at is None else replace(record, truth=(ESTIMATED,))
             return record, OpenedDrive(drive, taught, whole)
         lacks = "no driving with a true sideslip above the low-speed limit"
-    start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
+    start_s, end_s = ((t - drive.log.start_ns) * S_PER_NS for t in (drive.plan.start_ns, drive.plan.end_ns))
     record = replace(record_of(drive, left_out=lacks), seconds=end_s - start_s, span_s=(start_s, end_s))
     return record, OpenedDrive(drive, driving)
 

@@ -12,7 +12,7 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.learning.drives import no_true_sideslip
 from pdhef_logtool.model.drive_model import DriveModel, lacking
 from pdhef_logtool.model.driving import STEP_S, Driving
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.referencing import reference_of
@@ -32,7 +32,7 @@ def weight_of(std_rad: FloatArray) -> FloatArray:
 def with_truth(driving: Driving, truth: StateTrack) -> Driving:
     """Return driving with ground truth on its grid; NaN in gaps of the ground truth and outside of stretches."""
     start = int(driving.stamps_ns[0]) if len(driving.stamps_ns) else 0
-    middle_ns = driving.stamps_ns - round(0.5 * STEP_S * 1e9)  # a cell has the mean of its samples
+    middle_ns = driving.stamps_ns - round(0.5 * STEP_S * NS_PER_S)  # a cell has the mean of its samples
     seconds, grid = ((s - start).astype(np.float64) for s in (truth.stamps_ns, middle_ns))
     slopes = np.interp(grid, seconds, np.tan(np.where(truth.valid, truth.sideslip_rad, np.nan)), np.nan, np.nan)
     std = np.interp(grid, seconds, np.nan_to_num(truth.sideslip_std_rad))

@@ -157,6 +157,6 @@ def require_regular(path: Path, shown_path: LogPlace | None = None) -> None:
         raise LogError(
             expected="a regular file",
             got=_KINDS.get(stat.S_IFMT(mode), "a folder"),
-            where=str(shown_path or path),
+            where=shown_path or path,
             remedy="record to a file, and give that",
         )

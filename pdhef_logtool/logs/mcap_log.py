@@ -59,7 +59,6 @@ _CRC_BLOCK_BYTES = 4 << 20
 _CHUNK_HEAD_BYTES = RECORD.size + _CHUNK.size + _U64.size  # without the name of the compression
 _LONGEST_NAME = 4  # of a compression
 _ATTACHMENT_HEAD_BYTES = 64 << 10  # at most, in front of its data
-_MESSAGES_A_CHECK = 1 << 16
 #: Plain numbers: comparing with the members of an enumeration takes longer than reading a record.
 _OP_MESSAGE, _OP_CHUNK, _OP_MESSAGE_INDEX = int(Opcode.MESSAGE), int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX)
 _OP_SCHEMA, _OP_CHANNEL, _OP_HEADER = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.HEADER)
@@ -202,10 +201,8 @@ class McapContainer(FileContainer):
         return Span.of((id_, times[end - n : end]) for (id_, n), end in zip(parts, ends, strict=True))
 
     def _lose_indexes(self, extent: Extent) -> None:
-        what = (
-            f"the message indexes of the chunk at byte {extent.start} are damaged: its messages are found without them"
-        )
-        self.lose("bad-record", what)
+        what = f"the message indexes of the chunk at byte {extent.start} are damaged"
+        self.lose("bad-record", f"{what}: its messages are found without them")
 
     def _read_header(self) -> int:
         """Read the header record, which is the first one; return its end."""
@@ -460,9 +457,7 @@ class McapContainer(FileContainer):
         offsets = array("q")
         for opcode, start, _ in _records(content, 0, len(content)):
             if opcode == _OP_MESSAGE:
-                if len(offsets) % _MESSAGES_A_CHECK == 0:
-                    self.meter.limits.check("chunk_messages", len(offsets), "a chunk")
-                    self.meter.check()
+                self.meter.check_scan(len(offsets))
                 offsets.append(start - RECORD.size)
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
                 raise SpanDamageError(f"it contains a record of kind {opcode}, which no chunk may")

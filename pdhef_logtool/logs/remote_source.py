@@ -278,7 +278,7 @@ class RemoteSource(ByteSource):
             raise ChangedError(
                 expected="the object that was opened",
                 got="another one (its size, ETag or time of modification differs)",
-                where=str(self._place),
+                where=self._place,
                 remedy="run again when the object no longer changes",
             )
         return size, int(part[1]) if part else 0
@@ -317,7 +317,7 @@ async def _repeated(place: RemotePlace, request: Callable[..., Awaitable[Any]], 
 
 
 def _error(place: RemotePlace, got: str, remedy: str, expected: str = "an object that can be read") -> SourceError:
-    return SourceError(expected=expected, got=got, where=str(place), remedy=remedy)
+    return SourceError(expected=expected, got=got, where=place, remedy=remedy)
 
 
 def _words_of(error: Exception) -> tuple[str, str, bool]:

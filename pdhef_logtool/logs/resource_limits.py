@@ -16,6 +16,7 @@ from pdhef_logtool.records.errors import LogError
 #: Remedy of an exceeded limit.
 RAISE_LIMIT = "if the recording is sound, raise the limit with --set budget=FACTOR"
 _MIB = 1 << 20
+_MESSAGES_A_CHECK = 1 << 16
 _FEW_MESSAGES = 1 << 16
 
 
@@ -126,6 +127,12 @@ class Meter:
                 where=f"{self._bytes} bytes read",
                 remedy=RAISE_LIMIT,
             )
+
+    def check_scan(self, messages: int) -> None:
+        """Check the limits once in a while, in a scan that has found this number of messages in a chunk."""
+        if messages % _MESSAGES_A_CHECK == 0:
+            self.limits.check("chunk_messages", messages, "a chunk")
+            self.check()
 
     @contextmanager
     def running(self, size: int = 0) -> Iterator[None]:

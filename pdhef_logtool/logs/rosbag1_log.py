@@ -19,14 +19,13 @@ from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import Block, ChannelRecord, FileContainer, Span, SpanDamageError, block_from_lists
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
-from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 _ZERO_BLOCK_BYTES = 1 << 20
 _LEAST_MESSAGE_BYTES = 8 + 3 * 4 + len(b"op=") + 1 + len(b"conn=") + 4 + len(b"time=") + 8
-_MESSAGES_A_CHECK = 1 << 16
 
 
 @dataclass(slots=True)
@@ -169,11 +168,10 @@ class Rosbag1Container(FileContainer):
             op = _op(fields)
             try:
                 if op == _OP_MESSAGE:
-                    if len(stamps) % _MESSAGES_A_CHECK == 0:
-                        self.meter.limits.check("chunk_messages", len(stamps), "a chunk")
-                        self.meter.check()
+                    self.meter.check_scan(len(stamps))
                     channels.append(_U32.unpack(fields["conn"])[0])
-                    stamps.append(_time_ns(fields["time"]))
+                    seconds, nanoseconds = _TIME.unpack(fields["time"])
+                    stamps.append(seconds * NS_PER_S + nanoseconds)
                     offsets.append(begin)
                     lengths.append(offset - begin)
                 elif op != _OP_CONNECTION:
@@ -190,7 +188,7 @@ def _index(fields: Mapping[str, bytes], payload: bytes) -> tuple[int, IntArray]:
     """Return the connection and the log times [N] of an index record."""
     (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
     words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
-    return connection, words[:, 0] * 1_000_000_000 + words[:, 1]
+    return connection, words[:, 0] * NS_PER_S + words[:, 1]
 
 
 def _op(fields: Mapping[str, bytes]) -> int:
@@ -235,8 +233,3 @@ def _header_fields(text: bytes) -> dict[str, bytes]:
         fields[name.decode("ascii", errors="replace")] = value
         offset += 4 + length
     return fields
-
-
-def _time_ns(value: bytes) -> int:
-    seconds, nanoseconds = _TIME.unpack(value)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -56,7 +56,7 @@ class SqliteContainer(Container):
         self._db = self._connect(path)
         self.on_close(self._db.close)
         try:
-            self._db.text_factory = _text
+            self._db.text_factory = lambda stored: stored.decode("utf-8", errors="replace")  # also of a damaged one
             self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.limits.chunk_bytes, 2**31 - 1))
             self._db.set_progress_handler(self._out_of_time, _STEPS_A_CHECK)
             for pragma in ("trusted_schema = OFF", "mmap_size = 0", "cell_size_check = ON"):
@@ -190,8 +190,3 @@ class SqliteContainer(Container):
         sound = (row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes))
         timed = ((topic, min(timestamp, MAX_TIME_NS), data) for topic, timestamp, data in sound)
         return block_of(RawMessage(topic, time_ns, time_ns, 0, data) for topic, time_ns, data in timed)
-
-
-def _text(stored: bytes) -> str:
-    """Decode a text column even if it is damaged."""
-    return stored.decode("utf-8", errors="replace")

@@ -199,7 +199,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             return above
         free = next((i for i in range(1, _LARGEST_ID + 1) if i not in taken), None)
         if free is None:
-            raise OutputError(expected="at most 65535 channels", got="more", where=str(self._path))
+            raise OutputError(expected="at most 65535 channels", got="more", where=self._path)
         return free
 
     def write(self, batches: Sequence[TopicBatch], raws: Iterable[Block | RawChunk] = ()) -> None:

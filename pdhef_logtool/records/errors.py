@@ -27,10 +27,10 @@ class PdhefError(Exception):
 
     exit_code: int = EXIT_FAILURE
 
-    def __init__(self, *, expected: str, got: str, where: str, remedy: str = "", missing: bool = False) -> None:
+    def __init__(self, *, expected: str, got: str, where: object, remedy: str = "", missing: bool = False) -> None:
         self.expected = expected
         self.got = got
-        self.where = where
+        self.where = str(where)
         self.remedy = remedy
         self.missing = missing
         if missing:

@@ -22,6 +22,6 @@ def required(module: str, extra: str, use: str, where: object) -> Any:
         raise UsageError(
             expected=f"the package {module.partition('.')[0]}, which {use}",
             got="an installation without it",
-            where=str(where),
+            where=where,
             remedy=f"pip install 'pdhef-logtool[{extra}]'",
         ) from None

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray
 
 #: Degrees of a radian, and standard gravity.
 DEGREES, GRAVITY_M_S2 = 180.0 / np.pi, 9.80665
 
 #: Length of a degree of latitude on a sphere, m: for paths, whose shape counts.
 DEGREE_M = 111_200.0
-WGS84_A_M = 6378137.0
-WGS84_E2 = 6.69437999014e-3
+WGS84_A_M, WGS84_E2 = 6378137.0, 6.69437999014e-3
 
 
 def wrap_angle(angle_rad: FloatArray) -> FloatArray:
@@ -104,7 +103,7 @@ def dead_reckon(
     -------
     x_m, y_m, yaw_rad : [N]; yaw is not wrapped.
     """
-    dt = np.diff(stamps_ns) * 1e-9
+    dt = np.diff(stamps_ns) * S_PER_NS
     ok = np.isfinite(vx_m_s + vy_m_s + yaw_rate_rad_s)
     dt = np.where(ok[1:] & ok[:-1], dt, 0.0)
 

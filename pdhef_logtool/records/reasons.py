@@ -24,16 +24,11 @@ class Reason:
     text: str
 
 
+_SENSORS = (("ay", "a_y"), ("yaw_rate", "gyro"))
+_FAULTS = {BURST_AY: "noise burst", SPIKE_AY: "spike", STUCK_AY: "stuck", DEAD_AY: "dead", MISSING_AY: "missing"}
 #: All reasons in order of their bits.
-REASONS = (
-    Reason(BURST_AY, "burst_ay", "a_y noise burst"),
-    Reason(BURST_YAW_RATE, "burst_yaw_rate", "gyro noise burst"),
-    Reason(SPIKE_AY, "spike_ay", "a_y spike"),
-    Reason(SPIKE_YAW_RATE, "spike_yaw_rate", "gyro spike"),
-    Reason(STUCK_AY, "stuck_ay", "a_y stuck"),
-    Reason(STUCK_YAW_RATE, "stuck_yaw_rate", "gyro stuck"),
-    Reason(DEAD_AY, "dead_ay", "a_y dead"),
-    Reason(DEAD_YAW_RATE, "dead_yaw_rate", "gyro dead"),
-    Reason(MISSING_AY, "missing_ay", "a_y missing"),
-    Reason(MISSING_YAW_RATE, "missing_yaw_rate", "gyro missing"),
+REASONS = tuple(
+    Reason(bit << i, f"{text.removeprefix('noise ')}_{name}", f"{sensor} {text}")
+    for bit, text in _FAULTS.items()
+    for i, (name, sensor) in enumerate(_SENSORS)
 )

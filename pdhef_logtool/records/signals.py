@@ -13,70 +13,49 @@ FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
+S_PER_NS, NS_PER_S = 1e-9, 1_000_000_000
+
 WHEELS = ("fl", "fr", "rl", "rr")
 
+#: SI units by the ending of a name; a name without any is a plain number.
+_UNITS = {"_m_s2": "m/s^2", "_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_deg": "deg", "_m": "m"}
+
+
+def _with_units(*names: str) -> dict[str, str]:
+    """Return the units of names."""
+    return {name: next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "1") for name in names}
+
+
 #: All signals of mappings, with their SI units (ISO 8855: x forward, y left, z up, positive left).
-SIGNAL_UNITS: dict[str, str] = {
-    "steer_rad": "rad",  # mean road-wheel angle
-    "steering_wheel_rad": "rad",
-    "ax_m_s2": "m/s^2",
-    "ay_m_s2": "m/s^2",
-    "yaw_rate_rad_s": "rad/s",
-    "roll_rate_rad_s": "rad/s",
-    "pitch_rate_rad_s": "rad/s",
-    "speed_m_s": "m/s",
-    **{f"wheel_speed_{w}_m_s": "m/s" for w in WHEELS},
-    **{f"wheel_speed_{w}_rad_s": "rad/s" for w in WHEELS},
-    "gnss_velocity_east_m_s": "m/s",  # of the antenna, Doppler
-    "gnss_velocity_north_m_s": "m/s",
-    "gnss_speed_m_s": "m/s",
-    "gnss_course_rad": "rad",  # ENU: counter-clockwise from east
-    "gnss_velocity_accuracy_m_s": "m/s",  # from the receiver, 1-sigma
-    "gnss_fix_type": "1",  # below 1: no position
-    "gnss_latitude_deg": "deg",  # of the antenna
-    "gnss_longitude_deg": "deg",
-    "gnss_position_accuracy_m": "m",  # horizontal, from the receiver, 1-sigma
-    "gnss_heading_rad": "rad",  # of two antennas, ENU: only if mapped by hand
-    "friction": "1",
-}
+SIGNAL_UNITS = _with_units(
+    *("steer_rad", "steering_wheel_rad"),  # the mean road-wheel angle, and the driver's
+    *("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "speed_m_s"),
+    *(f"wheel_speed_{w}_{unit}" for unit in ("m_s", "rad_s") for w in WHEELS),
+    *("gnss_velocity_east_m_s", "gnss_velocity_north_m_s", "gnss_speed_m_s"),  # of the antenna, Doppler
+    "gnss_course_rad",  # ENU: counter-clockwise from east
+    "gnss_velocity_accuracy_m_s",  # from the receiver, 1-sigma
+    "gnss_fix_type",  # below 1: no position
+    *("gnss_latitude_deg", "gnss_longitude_deg"),  # of the antenna
+    "gnss_position_accuracy_m",  # horizontal, from the receiver, 1-sigma
+    "gnss_heading_rad",  # of two antennas, ENU: only if mapped by hand
+    "friction",
+)
 
 #: All truth channels of mappings, with their units. ``*_ecef*``, ``enu_*`` have 3 columns, ``quat_wxyz`` 4.
-TRUTH_UNITS: dict[str, str] = {
-    "vx_m_s": "m/s",
-    "vy_m_s": "m/s",
-    "sideslip_rad": "rad",
-    "yaw_rate_rad_s": "rad/s",
-    "ax_m_s2": "m/s^2",
-    "ay_m_s2": "m/s^2",
-    "x_m": "m",
-    "y_m": "m",
-    "lat_deg": "deg",
-    "lon_deg": "deg",
-    "alt_m": "m",
-    "ecef_position_m": "m",
-    "ecef_velocity_m_s": "m/s",
-    "enu_velocity_m_s": "m/s",
-    "quat_wxyz": "1",
-    "course_rad": "rad",  # ENU: counter-clockwise from east
-    "yaw_rad": "rad",  # ENU: counter-clockwise from east
-    "position_std_m": "m",
-    "friction": "1",
-}
+TRUTH_UNITS = _with_units(
+    *("vx_m_s", "vy_m_s", "sideslip_rad", "yaw_rate_rad_s", "ax_m_s2", "ay_m_s2"),
+    *("x_m", "y_m", "lat_deg", "lon_deg", "alt_m"),
+    *("ecef_position_m", "ecef_velocity_m_s", "enu_velocity_m_s", "quat_wxyz"),
+    *("course_rad", "yaw_rad"),  # ENU: counter-clockwise from east
+    *("position_std_m", "friction"),
+)
 
 #: All quantities of recorded estimates, with their units. ``valid`` is 0 where the estimate must not be used.
-ESTIMATE_UNITS: dict[str, str] = {
-    "vx_m_s": "m/s",
-    "vy_m_s": "m/s",
-    "yaw_rate_rad_s": "rad/s",
-    "sideslip_rad": "rad",
-    "ay_m_s2": "m/s^2",
-    "vx_std_m_s": "m/s",
-    "vy_std_m_s": "m/s",
-    "yaw_rate_std_rad_s": "rad/s",
-    "sideslip_std_rad": "rad",
-    "valid": "1",
-    "diverged": "1",
-}
+ESTIMATE_UNITS = _with_units(
+    *("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"),
+    *("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s", "sideslip_std_rad"),
+    *("valid", "diverged"),
+)
 
 #: Prefix of the names of all GNSS signals.
 GNSS = "gnss_"
@@ -236,7 +215,7 @@ SIGNAL_COLUMNS = tuple(f.name for f in fields(Signals) if f.name not in ("availa
 
 def step_durations_s(stamps_ns: IntArray) -> FloatArray:
     """Return the duration before each step, [K]; NaN at the first one."""
-    return np.append(np.full(min(len(stamps_ns), 1), np.nan), np.diff(stamps_ns) * 1e-9)
+    return np.append(np.full(min(len(stamps_ns), 1), np.nan), np.diff(stamps_ns) * S_PER_NS)
 
 
 def has_gnss(names: Collection[str]) -> bool:

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, FloatArray, IntArray
 
 #: Longest prediction of an output after the newest processed step; beyond it, the stamp is not valid.
 MAX_PREDICTION_S = 0.3
@@ -72,7 +72,7 @@ def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
     """Extend measurements [N], which are finite at single stamps, over up to :data:`RESTART_GAP_S`."""
     finite = np.isfinite(values)
     last = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0]), -1))
-    fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RESTART_GAP_S * 1e9)
+    fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RESTART_GAP_S * NS_PER_S)
     return np.where(fresh, values[np.maximum(last, 0)], np.nan)
 
 
@@ -98,6 +98,6 @@ class Extrapolation(Release):
 
 def extrapolation(steps_ns: IntArray, chosen: Release, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
     """Return the extrapolation to scored stamps [M] from the chosen ones of steps [K] with stamps and validity."""
-    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.step]) * 1e-9, np.nan)
+    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.step]) * S_PER_NS, np.nan)
     usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.step]
     return Extrapolation(chosen.step, chosen.arrived, horizon_s, usable)

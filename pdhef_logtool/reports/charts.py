@@ -10,7 +10,7 @@ import numpy as np
 
 from pdhef_logtool.estimators.table import all_specs
 from pdhef_logtool.records.printable import printable
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import S_PER_NS, FloatArray
 from pdhef_logtool.reports.encoding import Grid, encode
 from pdhef_logtool.results.plotted import colour_rgb
 from pdhef_logtool.results.sink import TRUTH
@@ -205,7 +205,7 @@ class Charts:
         grid = self.grid
         if grid is None:
             return None
-        return {"start": (grid.start_ns - self.origin_ns) * 1e-9, "cell": grid.cell_s, "cells": grid.cells}
+        return {"start": (grid.start_ns - self.origin_ns) * S_PER_NS, "cell": grid.cell_s, "cells": grid.cells}
 
     def document(self) -> tuple[dict[str, Any], dict[str, str]]:
         """Return the document for the page's script, and the text blocks that it refers to, by name."""
@@ -241,18 +241,13 @@ class _Blocks:
         if isinstance(value, np.ndarray):
             return self.add(value, resolution)
         if isinstance(value, str):
-            return _label(value)
+            half = _LABEL_SIGNS // 2
+            return printable(value if len(value) <= _LABEL_SIGNS else f"{value[: half - 1]}…{value[-half:]}")
         if isinstance(value, float):
             return float(f"{value:.9g}") if np.isfinite(value) else None
         if isinstance(value, list | tuple):
             return [self._plain(entry, resolution) for entry in value]
         return self.entries(value, resolution) if is_dataclass(value) else value
-
-
-def _label(text: str) -> str:
-    half = _LABEL_SIGNS // 2
-    cut = text if len(text) <= _LABEL_SIGNS else f"{text[: half - 1]}…{text[-half:]}"
-    return printable(cut)
 
 
 def joined(spans: Sequence[Span]) -> list[Span]:

@@ -15,7 +15,7 @@ from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.reports import charts as draw
 from pdhef_logtool.reports.encoding import Grid, envelope, first_known, grid_of
@@ -227,7 +227,7 @@ def _peaks(report: Mapping[str, Any]) -> list[_Peak]:
     for place in report.get("largest_errors") or ():
         stamp = int(place["stamp_ns"])
         names = [s["name"] for s in report["segments"] if s["start_ns"] <= stamp < s["end_ns"]]
-        at_s, during = (stamp - int(report["log"]["start_ns"])) * 1e-9, ", ".join(dict.fromkeys(names))
+        at_s, during = (stamp - int(report["log"]["start_ns"])) * S_PER_NS, ", ".join(dict.fromkeys(names))
         peaks.append({**place, "at_s": at_s, "during": during})
     return peaks
 
@@ -279,7 +279,7 @@ def _rows(
     """Return the rows of the strip: missing or faulty signals first, then the driving segments."""
 
     def span(start_ns: int, end_ns: int, text: str) -> draw.Span:
-        return draw.Span((int(start_ns) - origin_ns) * 1e-9, (int(end_ns) - origin_ns) * 1e-9, text)
+        return draw.Span((int(start_ns) - origin_ns) * S_PER_NS, (int(end_ns) - origin_ns) * S_PER_NS, text)
 
     def spans(mask: BoolArray, text: str) -> list[draw.Span]:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
@@ -287,7 +287,7 @@ def _rows(
         return [span(a, b, text) for a, b in zip(stamps[edges[::2]], stamps[ends], strict=True)]
 
     steps = np.diff(stamps)
-    longest = max(_GAP_S * 1e9, _GAP_STEPS * float(np.median(steps)) if steps.size else 0.0)
+    longest = max(_GAP_S * NS_PER_S, _GAP_STEPS * float(np.median(steps)) if steps.size else 0.0)
     losses = [x for x in report["losses"] if x.get("start_ns") is not None]
     rows = [
         draw.Row("no estimate", draw.FAULT, spans(series[roles.main]["invalid"], f"{roles.main} is not valid")),
@@ -374,4 +374,4 @@ def _by_error(
 
 
 def _seconds(at_ns: FloatArray | IntArray, charts: draw.Charts) -> FloatArray:
-    return np.asarray((at_ns - charts.origin_ns) * 1e-9, dtype=np.float64)
+    return np.asarray((at_ns - charts.origin_ns) * S_PER_NS, dtype=np.float64)

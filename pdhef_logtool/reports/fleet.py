@@ -10,6 +10,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
+from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import INK, BarsFigure, Charts, Interval, IntervalsFigure, against, colour
 from pdhef_logtool.reports.page import render
@@ -86,8 +87,7 @@ def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
     if not ranked:
         return (fleet.drives[0].label, None) if fleet.logs == 1 and fleet.drives else None
     if len(ranked) > 1:
-        degree = math.degrees(1.0)
-        bars = [Interval(d.label, math.nan, d.error() * degree, math.nan, colour(d.main)) for d in ranked[:_WORST]]
+        bars = [Interval(d.label, math.nan, d.error() * DEGREES, math.nan, colour(d.main)) for d in ranked[:_WORST]]
         title = f"The {len(bars)} drives with the largest sideslip RMSE"
         charts.figures["worst"] = IntervalsFigure(title, "RMSE in °", bars, zero=0.0)
     return ranked[0].label, ranked[0].error()
@@ -98,26 +98,22 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
     if not judged or len(fleet.drives) == 1:
         return
     first = judged[0]
-    near = [d for d in judged if d.median.value <= _DRAWN * first.median.value]
-    degree = math.degrees(1.0)
-    charts.figures["medians"] = IntervalsFigure(
-        f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
-        + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"),
-        "RMSE in °",
-        [
-            Interval(d.estimator, d.median.low * degree, d.median.value * degree, d.median.high * degree, _colour(d))
-            for d in near
-        ],
-    )
+    bars = []
+    for d in (d for d in judged if d.median.value <= _DRAWN * first.median.value):
+        low, middle, high = (DEGREES * x for x in (d.median.low, d.median.value, d.median.high))
+        bars.append(Interval(d.estimator, low, middle, high, INK if d.estimator == ANSWER else colour(d.estimator)))
+    title = f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
+    title += "" if len(bars) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"
+    charts.figures["medians"] = IntervalsFigure(title, "RMSE in °", bars)
     if first.drives > 2:
-        values = first.values * degree
+        values = first.values * DEGREES
         edges, counts = _histogram(values)
         beyond = " (last bar: and above)" if values[-1] > edges[-1] else ""
         title = f"Drives by RMSE of the selected estimate's sideslip{beyond}"
         charts.figures["spread"] = BarsFigure(title, "RMSE in °", edges.tolist(), counts.tolist())
     rival, drives = _rival(fleet), fleet.scored
     if rival is not None:
-        ours, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))
+        ours, other = (np.array([d.error(name) * DEGREES for d in drives]) for name in (ANSWER, rival))
         both = np.isfinite(ours) & np.isfinite(other) & (ours > 0.0) & (other > 0.0)
         if np.count_nonzero(both) > 2:
             title = f"One point per drive; below the line the selected estimate has the lower error, above it {rival}"
@@ -140,10 +136,6 @@ def _told(fleet: Fleet) -> list[Distribution]:
         return list(fleet.distributions)
     shown = [d for d in fleet.distributions if d.estimator != ANSWER]
     return sorted(shown, key=lambda d: d.estimator not in mains)
-
-
-def _colour(distribution: Distribution) -> str:
-    return INK if distribution.estimator == ANSWER else colour(distribution.estimator)
 
 
 def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:

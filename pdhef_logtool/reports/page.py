@@ -26,7 +26,7 @@ from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.printable import printable
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, FloatArray
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.results.selected_estimate import assumptions_of, failed_checks, result_of
@@ -55,22 +55,19 @@ def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
     document, blocks = charts.document()
     scripts = [_asset(name) for name in _SCRIPTS]
     style = "\n".join(_asset(name) for name in _STYLES)
-    page = (
-        _environment()
-        .get_template(template)
-        .render(
-            **texts,
-            figure=partial(_place, charts),
-            policy=_policy(scripts, style),
-            scripts=[Markup(s) for s in scripts],  # noqa: S704 (files of this package)
-            style=Markup(style),  # noqa: S704
-            licence=Markup(_asset("UPLOT-LICENSE")),  # noqa: S704
-            document=_embedded(document),
-            blocks={name: Markup(text) for name, text in blocks.items()},  # noqa: S704 (base64)
-            tool=f"pdhef-logtool {__version__}",
-        )
+    page = _environment().get_template(template)
+    html = page.render(
+        **texts,
+        figure=partial(_place, charts),
+        policy=_policy(scripts, style),
+        scripts=[Markup(s) for s in scripts],  # noqa: S704 (files of this package)
+        style=Markup(style),  # noqa: S704
+        licence=Markup(_asset("UPLOT-LICENSE")),  # noqa: S704
+        document=_embedded(document),
+        blocks={name: Markup(text) for name, text in blocks.items()},  # noqa: S704 (base64)
+        tool=f"pdhef-logtool {__version__}",
     )
-    return page.encode("utf-8", "backslashreplace")
+    return html.encode("utf-8", "backslashreplace")
 
 
 @cache
@@ -193,7 +190,7 @@ def duration(seconds: float) -> str:
 
 def stamp(stamp_ns: int) -> str:
     """Return a stamp in nanoseconds as RFC 3339 in UTC, exact; without a date or out of their range as a number."""
-    whole, rest = divmod(int(stamp_ns), 1_000_000_000)
+    whole, rest = divmod(int(stamp_ns), NS_PER_S)
     if not is_dated(stamp_ns):
         return f"{whole}.{rest:09d} s"
     try:

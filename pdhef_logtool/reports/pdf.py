@@ -48,7 +48,7 @@ def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
         raise OutputError(
             expected="Chromium, which prints the PDF",
             got="none on this machine",
-            where=str(target),
+            where=target,
             remedy="apt-get install chromium, or print report.html from any browser",
         )
     with tempfile.TemporaryDirectory(prefix="pdhef-pdf-") as scratch:
@@ -91,7 +91,7 @@ def _print(browser: str, page: Path, made: Path, target: Path) -> None:
     except (OSError, subprocess.TimeoutExpired) as error:
         got = [str(error)]
     if not made.is_file():
-        raise OutputError(expected="a PDF", got=(got or ["none"])[0], where=str(target), remedy="print report.html")
+        raise OutputError(expected="a PDF", got=(got or ["none"])[0], where=target, remedy="print report.html")
 
 
 def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
@@ -128,10 +128,7 @@ def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
 
 
 def _report(log: OpenedLog) -> dict[str, Any] | None:
-    try:
-        report = log.report()
-    except OutputError:
-        return None
+    report = log.readable_report()
     return report if report is not None and isinstance(report.get("log"), dict) else None
 
 

@@ -203,7 +203,7 @@ class ModelBundle(NetworkDesign):
         # Features that change their sign have a mean of 0, so that normalised values change it too.
         mirror = scaled * self.signs if self.odd else np.zeros_like(scaled)
         both = np.stack([scaled, mirror], axis=1).astype(np.float32)
-        said, after = self._network.run(both, self._network.initial_state() if carry is None else carry)
+        said, after = self._network.run(both, carry)
         straight, mirrored = said[:, 0].astype(np.float64), said[:, 1]
         return 0.5 * (straight - mirrored) if self.odd else straight, after
 

@@ -130,13 +130,10 @@ class ForwardPass:
             hidden=len(weights["lstm.weight_hh_l0"]) // 4,
         )
 
-    def initial_state(self) -> NetworkState:
-        """Return a state of zeros."""
-        return np.zeros((len(self.layers), 2, SIDES, self.hidden), dtype=np.float32)
-
-    def run(self, inputs: Float32Array, state: NetworkState) -> tuple[Float32Array, NetworkState]:
-        """Run [T, 2, k] from a state; returns [T, 2, outputs] and the state after."""
-        after = state.copy()
+    def run(self, inputs: Float32Array, state: NetworkState | None) -> tuple[Float32Array, NetworkState]:
+        """Run [T, 2, k] from a state, None: zeros; returns [T, 2, outputs] and the state after."""
+        shape = len(self.layers), 2, SIDES, self.hidden
+        after = np.zeros(shape, dtype=np.float32) if state is None else state.copy()
         said = np.empty((len(inputs), SIDES, len(self.head[-1][1])), dtype=np.float32)
         for first in range(0, len(inputs), _TILE_STEPS):
             x = np.ascontiguousarray(inputs[first : first + _TILE_STEPS], dtype=np.float32)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.records.running_mean import running_mean
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
 from pdhef_logtool.residual_model.ladder import (
     LINEAR,
@@ -90,10 +90,9 @@ class RungTrial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LadderFit:
-    """The chosen model, None for ``none``; λ; all tested models; driving in s; number of blocks."""
+    """The chosen model, None for ``none``; all tested models; driving in s; number of blocks."""
 
     model: LadderModel | None
-    ridge: float
     trials: tuple[RungTrial, ...]
     seconds: float
     blocks: int
@@ -155,17 +154,17 @@ def _solve(drives: Sequence[FloatArray], ridge: float) -> FloatArray:
     return np.asarray(np.linalg.solve(normal[:-1, :-1] + ridge * np.eye(len(normal) - 1), normal[:-1, -1]))
 
 
-def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR, RANDOM), seed: int = 0) -> LadderFit:
+def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR, RANDOM)) -> LadderFit:
     """Choose a model and fit it; a constant that is added to a drive's error does not change the result."""
     samples = [s for s in map(_thinned, drives) if s.seconds >= LEAST_BLOCK_S]
     seconds = math.fsum(s.seconds for s in samples)
     if not samples or seconds < 2.0 * LEAST_BLOCK_S:
-        return LadderFit(None, math.inf, (), seconds, 0)
+        return LadderFit(None, (), seconds, 0)
     odd, even = (np.concatenate([getattr(s.drive.features, n)[s.rows] for s in samples]) for n in ("odd", "even"))
     scale = np.maximum(np.sqrt(np.mean(odd**2, axis=0)), 1e-9)
     even_mean, even_scale = even.mean(axis=0), np.maximum(even.std(axis=0), 1e-3)
     count = RANDOM_FEATURES if RANDOM in rungs and seconds >= RANDOM_LEAST_S else 0
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     basis = Basis(
         scale, even_mean, even_scale, rng.normal(size=(count, ODD_COUNT)) * FREQUENCY,
         rng.normal(size=(count, EVEN_COUNT)) * FREQUENCY, rng.uniform(0.0, 2.0 * math.pi, count),
@@ -176,12 +175,11 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     linear = problem.only(ODD_COUNT)
     trials, chosen = _climb({LINEAR: linear} | ({RANDOM: problem} if count else {}))
     if chosen == NONE:
-        return LadderFit(None, math.inf, trials, seconds, len(problem.blocks))
+        return LadderFit(None, trials, seconds, len(problem.blocks))
     taken = linear if chosen == LINEAR else problem
-    ridge = _best_ridge(taken, ())
     random = 0 if chosen == LINEAR else count
     used = ODD_COUNT + random
-    weights = _solve(list(taken.whole), ridge) / unit
+    weights = _solve(list(taken.whole), _best_ridge(taken, ())) / unit
     phi = np.concatenate([_features(basis, s.drive.features, s.rows) for s in samples])[:, :used]
     speed = np.quantile(even[:, SPEED_COLUMN], [1.0 - QUANTILE, QUANTILE])
     model = LadderModel(
@@ -192,7 +190,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
         speed_m_s=plain(np.maximum(speed, 0.1)),
         largest_m_s2=plain(np.quantile(np.abs(phi @ weights), 0.999)),
     )
-    return LadderFit(model, ridge, trials, seconds, len(problem.blocks))
+    return LadderFit(model, trials, seconds, len(problem.blocks))
 
 
 def _features(basis: Basis, features: SlowFeatures, rows: IntArray | slice) -> FloatArray:
@@ -220,7 +218,7 @@ def _responses(basis: Basis, sample: _Sample) -> FloatArray:
 
 def _thinned(drive: TaughtDrive) -> _Sample:
     """Return the data of a drive for a fit, at most :data:`FIT_RATE_HZ` rows per second."""
-    step_s = float(np.median(np.diff(drive.stamps_ns))) * 1e-9 if len(drive.stamps_ns) > 1 else 1.0
+    step_s = float(np.median(np.diff(drive.stamps_ns))) * S_PER_NS if len(drive.stamps_ns) > 1 else 1.0
     every = max(1, round(1.0 / (FIT_RATE_HZ * step_s)))
     rows = np.flatnonzero(drive.usable)[::every]
     weight_s = step_s * every * np.broadcast_to(drive.weight, drive.lacking_rad.shape)[rows]

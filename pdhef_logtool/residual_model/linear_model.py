@@ -87,16 +87,15 @@ def load_linear_model(path: Path) -> LinearModel:
     ModelError
         The file is missing or wrong, or its coefficients do not belong to its hash.
     """
-    where = str(path)
     remedy = "remove the file, or take a complete network"
     document = read_json(path, "the coefficients of a linear regression", ModelError, remedy)
     kind = tuple(document.pop(key, None) for key in ("format", "version", "target"))
     if kind != (FORMAT, FORMAT_VERSION, TARGET):
         wanted = f"{FORMAT} {FORMAT_VERSION} of {TARGET}"
-        raise ModelError(expected=wanted, got=f"{kind[0]} {kind[1]} of {kind[2]}", where=where, remedy=remedy)
+        raise ModelError(expected=wanted, got=f"{kind[0]} {kind[1]} of {kind[2]}", where=path, remedy=remedy)
     sha256, names = document.pop("sha256", None), document.pop("features", None)
     entries, expected = {"feature_names": names, **document}, "the entries of a linear regression"
-    model = validated(LinearModel, entries, where, ModelError, expected=expected)
+    model = validated(LinearModel, entries, path, ModelError, expected=expected)
     if len(model.coefficients) != len(model.feature_names) or sha256 != model.sha256:
-        raise ModelError(expected="coefficients that belong to the file's hash", got="another hash", where=where)
+        raise ModelError(expected="coefficients that belong to the file's hash", got="another hash", where=path)
     return model

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
+from contextlib import closing
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
 from pdhef_logtool.logs.discovery import hash_log
-from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError, PdhefError
-from pdhef_logtool.results.events import FoundEvent, FoundEvents
+from pdhef_logtool.records.signals import NS_PER_S
+from pdhef_logtool.results.events import FoundEvents
 from pdhef_logtool.results.mcap_sink import NAMESPACE, AnnotatedMcap
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
@@ -47,50 +48,34 @@ def write_clips(
     """
     logs = {log.label: log for log in run.logs}
     names: list[str] = []
-    failed = found_events.failed
+    failed, pad_ns = found_events.failed, round(pad_s * NS_PER_S)
     with OutputFolder(run.folder), FolderTransaction(run.folder / CLIPS, keep=False) as change:
         for label, events in groupby(found_events.events, key=lambda event: event.drive):
+            log = logs[label]
             try:
-                opened = open_log(_source_of(logs[label], source))
+                opened = open_log(_source_of(log, source))
             except PdhefError as error:
                 failed = True
                 tell(f"{label}: no clip: {error}")
                 continue
-            if opened.messages is None or all(t.name.startswith(NAMESPACE) for t in opened.topics):
-                tell(f"{label}: clips contain the tool's tracks only: no messages to copy; --source DIR names the log")
-            try:
-                names += [
-                    str(run.folder / CLIPS / name)
-                    for name in _clips_of(logs[label], list(events), change, opened, pad_s, named)
-                ]
+            with closing(opened):
+                if opened.messages is None or all(t.name.startswith(NAMESPACE) for t in opened.topics):
+                    what = "no messages to copy; --source DIR names the log"
+                    tell(f"{label}: clips contain the tool's tracks only: {what}")
+                report, estimates = log.report() or {}, log.file(ESTIMATES_FILE)
+                assert estimates is not None
+                wanted = {TRUTH, log.main(), *((report.get("answer") or {}).get("shown") or ()), *named}
+                tracks = [read_track(estimates, name) for name in list_estimators(estimates) if name in wanted]
+                for event in events:
+                    span_ns = max(event.start_ns - pad_ns, opened.start_ns), min(event.end_ns + pad_ns, opened.end_ns)
+                    name = f"{label}_{event.start_s:.2f}s.mcap"
+                    cut = [track.between(*span_ns) for track in tracks]
+                    with AnnotatedMcap(change.file(name), opened, span_ns=span_ns) as clip:
+                        clip.write(cut)
+                        clip.finish(report, cut)
+                    names.append(str(run.folder / CLIPS / name))
                 failed |= any(loss.severity == "lost" for loss in opened.lost)
-            finally:
-                opened.close()
     return replace(found_events, clips=tuple(names), failed=failed)
-
-
-def _clips_of(
-    log: OpenedLog,
-    events: list[FoundEvent],
-    change: FolderTransaction,
-    source: DriveLog,
-    pad_s: float,
-    named: Collection[str],
-) -> Iterator[str]:
-    """Write the clips of one drive; yield their names."""
-    report, estimates = log.report() or {}, log.file(ESTIMATES_FILE)
-    assert estimates is not None
-    wanted = {TRUTH, log.main(), *((report.get("answer") or {}).get("shown") or ()), *named}
-    tracks = [read_track(estimates, name) for name in list_estimators(estimates) if name in wanted]
-    for event in events:
-        pad_ns = round(pad_s * 1e9)
-        span_ns = max(event.start_ns - pad_ns, source.start_ns), min(event.end_ns + pad_ns, source.end_ns)
-        name = f"{log.label}_{event.start_s:.2f}s.mcap"
-        cut = [track.between(*span_ns) for track in tracks]
-        with AnnotatedMcap(change.file(name), source, span_ns=span_ns) as clip:
-            clip.write(cut)
-            clip.finish(report, cut)
-        yield name
 
 
 def _source_of(log: OpenedLog, folder: Path | None) -> Path:
@@ -102,12 +87,12 @@ def _source_of(log: OpenedLog, folder: Path | None) -> Path:
             if sha256 is not None and hash_log(path) == sha256:
                 return path
         got = f"{len(candidates)} of that name with other content" if candidates else "none of that name"
-        raise OutputError(expected=f"the log {name}", got=got, where=str(folder), remedy="name its folder by --source")
+        raise OutputError(expected=f"the log {name}", got=got, where=folder, remedy="name its folder by --source")
     if (copy := log.file(_ANNOTATED)) is not None:
         return copy
     raise OutputError(
         expected=f"a full copy of {name}, {_ANNOTATED}",
         got="a run without one",
-        where=str(log.folder),
+        where=log.folder,
         remedy="name the folder of the logs: --source DIR",
     )

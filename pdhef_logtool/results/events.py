@@ -16,7 +16,7 @@ from pdhef_logtool.evaluation.smoothing import runs
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
-from pdhef_logtool.records.signals import BoolArray, IntArray
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, IntArray
 from pdhef_logtool.records.tracks import TRACK_COLUMNS
 from pdhef_logtool.results.condition import Condition, Reference, parse_condition
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
@@ -132,16 +132,9 @@ def find_events(
     if not searched and estimators:
         _check_tracks(estimators, condition, estimator, selected=any(log.main() for log in run.logs))
     unreadable = sum(log.label in damaged or log.outcome.startswith("failed") for log in run.logs)
-    return FoundEvents(
-        condition.text + (f" for {least_s:g} s" if least_s else ""),
-        searched,
-        tuple(events),
-        left_out,
-        estimator or "the selected estimates",
-        unreadable > 0,
-        unreadable,
-        tuple(damaged.values()),
-    )
+    where = condition.text + (f" for {least_s:g} s" if least_s else "")
+    of, lines = estimator or "the selected estimates", tuple(damaged.values())
+    return FoundEvents(where, searched, tuple(events), left_out, of, unreadable > 0, unreadable, lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +196,7 @@ def _events_of(
         if not np.isnan(inside).all():
             peak_at = first + int(np.nanargmin(inside) if condition.falls else np.nanargmax(inside))
         start_ns, end_ns = int(stamps[first]), int(stamps[last - 1]) + 1
-        start_s, end_s = ((ns - drive.start_ns) * 1e-9 for ns in (start_ns, end_ns))
+        start_s, end_s = ((ns - drive.start_ns) * S_PER_NS for ns in (start_ns, end_ns))
         of_peak = (None, None) if peak_at is None else (float(values[peak_at]), int(stamps[peak_at]))
         events.append(FoundEvent(log.label, start_ns, end_ns, start_s, end_s, *of_peak))
     return events
@@ -213,9 +206,9 @@ def _spans(stamps_ns: IntArray, mask: BoolArray, least_s: float, pad_s: float) -
     """Return the rows [first, last) of the runs in a mask [N] that last long enough, joined where their pads touch."""
     joined: list[tuple[int, int]] = []
     for first, last in runs(stamps_ns, mask):
-        if (stamps_ns[last - 1] - stamps_ns[first]) * 1e-9 < least_s - 1e-9:
+        if (stamps_ns[last - 1] - stamps_ns[first]) * S_PER_NS < least_s - 1e-9:
             continue
-        if joined and (stamps_ns[first] - stamps_ns[joined[-1][1] - 1]) * 1e-9 <= 2.0 * pad_s:
+        if joined and (stamps_ns[first] - stamps_ns[joined[-1][1] - 1]) * S_PER_NS <= 2.0 * pad_s:
             joined[-1] = (joined[-1][0], last)
         else:
             joined.append((first, last))

@@ -7,9 +7,10 @@ import math
 import re
 import struct
 from collections.abc import Container, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from mcap.records import Attachment
@@ -23,7 +24,7 @@ from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, sour
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.plotted import LogLine, log_lines, log_message, plotted_fields
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots, rounded
@@ -52,9 +53,9 @@ _PLANAR = np.array([0, 1, 5])
 #: Of zstd: of rounded numbers level 3 makes 1 % more bytes, level 6 3 % fewer in three times the time.
 _LEVEL = 1
 #: Between two poses of a track that is not shown first and between two plotted values; between two points of the map.
-_POSE_STEP_NS, _PATH_STEP_NS = 50_000_000, 1_000_000_000
+_POSE_STEP_NS, _PATH_STEP_NS = 50_000_000, NS_PER_S
 #: Steps of the tracks that --estimators does not name; the shortest one for which the file is small enough.
-_STEPS_NS = tuple(round(s * 1e9) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
+_STEPS_NS = tuple(round(s * NS_PER_S) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
 #: The shortest one of a long drive.
 _LONG_STEP_NS = 200_000_000
 #: Messages are encoded in pieces of this duration.
@@ -83,7 +84,8 @@ def thinned_step_ns(source_bytes: int, *, rows: int, others: int, span_ns: int) 
     return next(fit, _STEPS_NS[-1])
 
 
-class AnnotatedMcap:
+@dataclass(eq=False)
+class AnnotatedMcap(AbstractContextManager["AnnotatedMcap"]):
     """The annotated log; as a context it leaves no file on an exception.
 
     Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp), ``odometry`` (``nav_msgs/msg/Odometry``, the
@@ -109,27 +111,21 @@ class AnnotatedMcap:
     OutputError : When the file cannot be written.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        source: DriveLog | None,
-        *,
-        shown: Container[str] | None = None,
-        others_step_ns: int | None = None,
-        min_speed_m_s: float = 1.0,
-        span_ns: tuple[int, int] | None = None,
-        left_out: Container[str] | None = None,
-    ) -> None:
-        self._source = None if source is None else source.messages
-        self._shown, self._others_step_ns, self._min_speed_m_s = shown, others_step_ns, min_speed_m_s
-        self._span_ns, self._left_out = span_ns, left_out
-        profile = "ros2" if self._source is None else source_profile(self._source)
-        self._writer = McapLogWriter(path, profile=profile, level=_LEVEL)
-        self._states: set[str] = set()
+    path: Path
+    source: DriveLog | None
+    _: KW_ONLY
+    shown: Container[str] | None = None
+    others_step_ns: int | None = None
+    min_speed_m_s: float = 1.0
+    span_ns: tuple[int, int] | None = None
+    left_out: Container[str] | None = None
 
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
+    def __post_init__(self) -> None:
+        """Begin the file."""
+        self._source = None if self.source is None else self.source.messages
+        profile = "ros2" if self._source is None else source_profile(self._source)
+        self._writer = McapLogWriter(self.path, profile=profile, level=_LEVEL)
+        self._states: set[str] = set()
 
     def __exit__(self, *_: object) -> None:
         """Remove an unfinished file."""
@@ -144,14 +140,14 @@ class AnnotatedMcap:
         raws: Iterator[_Raw] = iter(())
         waiting: list[_Raw] = []
         if self._source is not None:
-            left_out = self._left_out or ()
+            left_out = self.left_out or ()
             channels = register_channels(
                 self._writer,
                 self._source,
                 leave_out=lambda topic: topic.startswith(NAMESPACE) or topic in left_out,
-                whole_metadata=self._left_out is None,
+                whole_metadata=self.left_out is None,
             )
-            raws = iterate_copy(self._source, channels, *(self._span_ns or (None, None)))
+            raws = iterate_copy(self._source, channels, *(self.span_ns or (None, None)))
         for track in tracks:
             self._add_topics(track.name)
         rows = [self._rows(track) for track in tracks]
@@ -166,14 +162,14 @@ class AnnotatedMcap:
         """Return the rows with a state, an odometry message and plotted values."""
         stated = posed = np.arange(len(track))
         plotted = first_of_slots(track.stamps_ns, _POSE_STEP_NS)
-        is_shown = self._shown is None or track.name in self._shown
-        if self._others_step_ns is None:
+        is_shown = self.shown is None or track.name in self.shown
+        if self.others_step_ns is None:
             posed = posed if is_shown else plotted
         elif is_shown:
             posed = first_of_slots(track.stamps_ns, 2 * _POSE_STEP_NS)
             stated = plotted if track.name == TRUTH else stated
         else:
-            stated = posed = plotted = first_of_slots(track.stamps_ns, self._others_step_ns)
+            stated = posed = plotted = first_of_slots(track.stamps_ns, self.others_step_ns)
         return stated, posed[pose_known(track)[posed]], plotted
 
     def _batches(
@@ -183,7 +179,7 @@ class AnnotatedMcap:
         first, last = np.searchsorted(track.stamps_ns, piece).tolist()
         part = track.rows(first, last)
         stated, posed, plotted = (r[slice(*np.searchsorted(r, (first, last)))] - first for r in rows)
-        drawn = {n: rounded(n, c[plotted]) for n, c in plotted_fields(part, truth, self._min_speed_m_s).items()}
+        drawn = {n: rounded(n, c[plotted]) for n, c in plotted_fields(part, truth, self.min_speed_m_s).items()}
         of_topics = (stated, _state_fields(part, stated)), (posed, _odometry_fields(part, posed)), (plotted, drawn)
         return [
             TopicBatch(topic_of(track.name, what), stamps_ns, stamps_ns, {"header.stamp": stamps_ns, **fields})
@@ -195,7 +191,7 @@ class AnnotatedMcap:
         """Write the maps of the tracks, the log, the metrics record and report.json, and give the file its name."""
         self._write_paths(tracks)
         self._write_log(log_lines(report, events, tracks))
-        if self._source is not None and self._left_out is None:
+        if self._source is not None and self.left_out is None:
             for attachment in self._source.attachments():
                 if not _is_our_report(attachment):
                     self._writer.attachment(attachment)
@@ -308,7 +304,7 @@ def _covariance(track: StateTrack, use: IntArray) -> FloatArray:
 
 def _path_message(stamp_ns: int, poses: FloatArray) -> bytes:
     """Return ``nav_msgs/msg/Path`` in little-endian CDR; ``poses`` [N, 3]: x, y (m), yaw (rad)."""
-    header = struct.pack("<iII4s", *divmod(stamp_ns, 1_000_000_000), len(MAP_FRAME) + 1, MAP_FRAME.encode())
+    header = struct.pack("<iII4s", *divmod(stamp_ns, NS_PER_S), len(MAP_FRAME) + 1, MAP_FRAME.encode())
     data = bytearray(header + struct.pack("<I", len(poses)))
     for (x_m, y_m, _), (w, x, y, z) in zip(poses, quat_from_yaw(poses[:, 2]), strict=True):
         data += header

@@ -6,6 +6,7 @@ run.json contains its own digest and the sha256 of the files that are read back.
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.names import MODEL_FILE as MODEL_FILE
 from pdhef_logtool.logs.discovery import RUN_FILE
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.storage.documents import file_sha256, read_json, read_sealed
+from pdhef_logtool.storage.documents import checked_sha256, read_json, read_sealed
 from pdhef_logtool.storage.object_store import Mirror, is_url
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ class OpenedLog:
         if path is None or not os.path.isfile(path):  # noqa: PTH113 (False for a name that no file can have)
             return None
         if name not in self._sound:
-            _check(path, self.entry.get("files", {}).get(name), _AGAIN)
+            checked_sha256(path, self.entry.get("files", {}).get(name), RUN_FILE, _AGAIN)
             self._sound.add(name)
         return path
 
@@ -79,8 +80,14 @@ class OpenedLog:
         report = read_json(path, "a report.json", OutputError, _AGAIN, MAX_DOCUMENT_BYTES)
         if report.get("format") != "pdhef.report":
             got = f"format {report.get('format')!r}"
-            raise OutputError(expected="a report.json", got=got, where=str(path), remedy=_AGAIN)
+            raise OutputError(expected="a report.json", got=got, where=path, remedy=_AGAIN)
         return report
+
+    def readable_report(self) -> dict[str, Any] | None:
+        """Return report.json, None also where it is damaged."""
+        with suppress(OutputError):
+            return self.report()
+        return None
 
     def main(self) -> str:
         """Return the selected estimator of the drive, or an empty string."""
@@ -121,7 +128,7 @@ class OpenedRun:
         if name not in self._sound:
             if self.mirror is not None:
                 self.mirror.fetch(file)
-            _check(path, self.document.get("files", {}).get(file), "run the logs again")
+            checked_sha256(path, self.document.get("files", {}).get(file), RUN_FILE, "run the logs again")
             self._sound.add(name)
         return pl.scan_parquet(path)
 
@@ -129,17 +136,6 @@ class OpenedRun:
 def table_file(name: str) -> str:
     """Return the file of a table below the folder of a run."""
     return f"{TABLES_FOLDER}/{name}.parquet"
-
-
-def _check(path: Path, sha256: str | None, remedy: str) -> None:
-    """Raise OutputError for a file that is not as run.json names it."""
-    try:
-        if sha256 is not None and file_sha256(path) != sha256:
-            got = "another content: it is damaged, or of another run"
-            raise OutputError(expected=f"the {path.name} that run.json names", got=got, where=str(path), remedy=remedy)
-    except OSError as error:
-        got = error.strerror or str(error)
-        raise OutputError(expected=f"a readable {path.name}", got=got, where=str(path), remedy=remedy) from error
 
 
 def open_run(output: Path | str) -> OpenedRun:
@@ -162,13 +158,13 @@ def open_run(output: Path | str) -> OpenedRun:
         mirror.fetch(RUN_FILE)
     if not path.is_file():
         got = f"a folder without {RUN_FILE}" if folder.is_dir() else "no such folder"
-        where = str(folder) if mirror is None else mirror.objects.shown
+        where = folder if mirror is None else mirror.objects.shown
         missing = mirror is None and not folder.exists()
         raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=missing)
     document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
     if document.get("format") != "pdhef.run":
         got = f"format {document.get('format')!r}"
-        raise OutputError(expected=what, got=got, where=str(path), remedy=_REMEDY)
+        raise OutputError(expected=what, got=got, where=path, remedy=_REMEDY)
     place = folder / LOGS
     logs = tuple(_opened(entry, place, mirror) for entry in document["logs"])
     return OpenedRun(folder, document, logs, mirror)
@@ -178,6 +174,6 @@ def _opened(entry: dict[str, Any], folder: Path, mirror: Mirror | None) -> Opene
     label = entry.get("log")
     if not isinstance(label, str) or label in {"", ".", ".."} or {"/", "\\"} & set(label):
         # A label names a folder that reports are written to: it may not lead out of the run's.
-        where = str(folder.parent / RUN_FILE)
-        raise OutputError(expected="the name of a log's folder", got=repr(label)[:80], where=where, remedy=_REMEDY)
+        got, where = repr(label)[:80], folder.parent / RUN_FILE
+        raise OutputError(expected="the name of a log's folder", got=got, where=where, remedy=_REMEDY)
     return OpenedLog(label, str(entry.get("outcome", "")), folder / label, entry, mirror)

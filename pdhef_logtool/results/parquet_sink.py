@@ -33,17 +33,12 @@ def arrow_schema(name: str) -> pa.Schema:
     Each field carries its unit; the schema's own metadata carry format, version and all units once more, because
     only Arrow readers see metadata of fields.
     """
-
-    def type_of(name: str) -> pa.DataType:
-        is_dictionary = name == "dictionary<int32, string>"
-        return pa.dictionary(pa.int32(), pa.string()) if is_dictionary else pa.type_for_alias(name)
-
-    document = load_schema(name)
-    columns = document["columns"]
-    units = {column["name"]: column["unit"] for column in columns}
-    fields = [
-        pa.field(c["name"], type_of(c["type"]), nullable=c["nullable"], metadata={"unit": c["unit"]}) for c in columns
-    ]
+    document, fields = load_schema(name), []
+    for c in document["columns"]:
+        is_dictionary = c["type"] == "dictionary<int32, string>"
+        kind = pa.dictionary(pa.int32(), pa.string()) if is_dictionary else pa.type_for_alias(c["type"])
+        fields.append(pa.field(c["name"], kind, nullable=c["nullable"], metadata={"unit": c["unit"]}))
+    units = {c["name"]: c["unit"] for c in document["columns"]}
     stated = document | {"version": str(document["version"]), "units": json.dumps(units)}
     return pa.schema(fields, metadata={key: stated[key] for key in ("format", "version", "units", "missing")})
 
@@ -79,21 +74,8 @@ _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
 
 @contextmanager
-def parquet_writer(
-    path: Path,
-    schema: pa.Schema,
-    dictionaries: Sequence[str] | None = None,
-    *,
-    encodings: Mapping[str, str] | None = None,
-    level: int | None = None,
-    checksums: bool = True,
-) -> Iterator[pq.ParquetWriter]:
-    """Yield the writer of a Parquet file with zstd, which gets its name when it is complete.
-
-    Parameters
-    ----------
-    path : the finished file. dictionaries : columns of few values; None: Parquet's choice.
-    encodings : Parquet's, by column. level : of zstd; None: Parquet's default. checksums : of pages.
+def parquet_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator[pq.ParquetWriter]:
+    """Yield the writer of a Parquet file with zstd, which gets its name when it is complete; ``options`` of Arrow's.
 
     Raises
     ------
@@ -104,15 +86,7 @@ def parquet_writer(
         PendingFile(path) as pending,
         writing(path),
         open_new(pending.path) as file,
-        pq.ParquetWriter(
-            file,
-            schema,
-            compression="zstd",
-            compression_level=level,
-            use_dictionary=True if dictionaries is None else list(dictionaries),
-            column_encoding=encodings,
-            write_page_checksum=checksums,
-        ) as writer,
+        pq.ParquetWriter(file, schema, compression="zstd", **options) as writer,
     ):
         yield writer
 
@@ -123,7 +97,6 @@ def write_estimates(
     *,
     selected: str | None = None,
     causal_from_ns: Mapping[str, int] | None = None,
-    rows_a_group: int = ROWS_A_GROUP,
 ) -> None:
     """Write estimates.parquet; a row group contains one estimator, so that one can be read without the others.
 
@@ -135,7 +108,6 @@ def write_estimates(
     selected : estimator; its track is also written as :data:`SELECTED`.
     causal_from_ns : first stamp from which the rows of an estimator depend on no later sample; an estimator without one
         is causal nowhere. None: unknown, and ``causal`` is null.
-    rows_a_group : rows of one row group.
 
     Raises
     ------
@@ -143,10 +115,10 @@ def write_estimates(
     """
     schema = arrow_schema("estimates.parquet.json")
     split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
-    encodings = {**split, "stamp_ns": "DELTA_BINARY_PACKED"}
-    with parquet_writer(path, schema, ["estimator"], encodings=encodings, level=_LEVEL) as writer:
-        for first in range(0, max(map(len, tracks), default=0), rows_a_group):
-            group = [track.rows(first, first + rows_a_group) for track in tracks]
+    options = {"column_encoding": {**split, "stamp_ns": "DELTA_BINARY_PACKED"}, "compression_level": _LEVEL}
+    with parquet_writer(path, schema, use_dictionary=["estimator"], write_page_checksum=True, **options) as writer:
+        for first in range(0, max(map(len, tracks), default=0), ROWS_A_GROUP):
+            group = [track.rows(first, first + ROWS_A_GROUP) for track in tracks]
             for track in group:
                 if not len(track):
                     continue
@@ -211,7 +183,7 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
         tables = [file.read_row_group(i, columns=wanted) for i, name in enumerate(names) if name == estimator]
     if not tables:
         names = [*dict.fromkeys(name for name in names if name != SELECTED)]
-        raise OutputError(expected=f"one of {', '.join(names)}", got=estimator, where=str(path))
+        raise OutputError(expected=f"one of {', '.join(names)}", got=estimator, where=path)
     return _track_from_table(estimator, pa.concat_tables(tables))
 
 
@@ -240,4 +212,4 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError, LookupError, pa.ArrowException) as error:
         got = f"one that cannot be read: {' '.join(str(error).split())[:200]}"
-        raise OutputError(expected="a readable Parquet file", got=got, where=str(path), remedy=_AGAIN) from error
+        raise OutputError(expected="a readable Parquet file", got=got, where=path, remedy=_AGAIN) from error

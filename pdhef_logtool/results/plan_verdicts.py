@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
@@ -19,7 +17,6 @@ from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, Requiremen
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
-from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun, open_run
 from pdhef_logtool.results.pairing import pair_logs
@@ -291,13 +288,7 @@ def judged_drive(log: OpenedLog, read_report: Callable[[], Mapping[str, Any] | N
     """Return a log of a run to judge; ``read_report`` None: from its file."""
     main = log.entry.get("main")
     factors = {"car": (log.entry.get("car") or {}).get("name"), **{k: log.entry.get(k) for k in ("day", "route")}}
-    return JudgedDrive(log.label, None if main is None else str(main), read_report or partial(_report, log), factors)
-
-
-def _report(log: OpenedLog) -> Mapping[str, Any] | None:
-    with suppress(OutputError):  # the comparison states it
-        return log.report()
-    return None
+    return JudgedDrive(log.label, None if main is None else str(main), read_report or log.readable_report, factors)
 
 
 def in_space(drive: JudgedDrive, report: Mapping[str, Any]) -> JudgedDrive:

@@ -14,7 +14,7 @@ from pdhef_logtool.evaluation.reasons import reason_intervals
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, truth_speed
 from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import lines_of
 from pdhef_logtool.results.sink import Event
@@ -145,7 +145,7 @@ def log_lines(report: Mapping[str, Any], events: Sequence[Event], tracks: Iterab
 
 def log_message(line: LogLine) -> bytes:
     """Return a line as ``rcl_interfaces/msg/Log`` in little-endian CDR."""
-    seconds, rest_ns = divmod(line.stamp_ns, 1_000_000_000)
+    seconds, rest_ns = divmod(line.stamp_ns, NS_PER_S)
     data = bytearray(struct.pack("<iIB", seconds, rest_ns, line.level))
     for text in (line.source, line.text, "", ""):
         raw = text.encode() + b"\0"

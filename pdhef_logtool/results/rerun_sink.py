@@ -16,7 +16,7 @@ from pdhef_logtool.evaluation.reasons import reason_intervals
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.plotted import ERRORS, LEVEL_NAMES, STATES, Plot, colour_rgb, drawn, errors, log_lines
 from pdhef_logtool.results.run_report import report_markdown
@@ -28,7 +28,7 @@ from pdhef_logtool.storage.files import open_new, writing
 MOST_OTHERS = 12
 
 #: A line is broken at gaps longer than this.
-LONGEST_BRIDGE_NS = 1_000_000_000
+LONGEST_BRIDGE_NS = NS_PER_S
 
 #: Points of one trajectory in the plan view; it is thinned when it would grow beyond.
 MOST_TRAJECTORY_POINTS = 20_000
@@ -120,7 +120,8 @@ def write_recording(
         recording.send_recording_start_time_nanos(start_ns)
         drawing = _Drawing(recording, start_ns, is_long, min_speed_m_s)
         if signals is not None:
-            drawing.draw_signals(signals)
+            inputs = {p.name: np.asarray(getattr(signals, p.column))[:, None] * p.factor for p in _INPUTS}
+            drawing.send_sparse("/inputs", _SIGNALS, signals.stamps_ns, inputs)
         for track in tracks:
             drawing.draw_track(track, truth, places[track.name], colour_rgb(track.name, colours or {}))
             drawing.draw_reasons(track)
@@ -184,11 +185,6 @@ class _Drawing:
         """Send something without a time."""
         self.recording.log(entity, what, static=True, strict=True)
 
-    def draw_signals(self, signals: Signals) -> None:
-        """Draw the inputs of the estimators."""
-        columns = {plot.name: np.asarray(getattr(signals, plot.column))[:, None] * plot.factor for plot in _INPUTS}
-        self._send_sparse("/inputs", _SIGNALS, signals.stamps_ns, columns)
-
     def draw_track(self, track: StateTrack, truth: StateTrack | None, place: str, rgb: tuple[int, int, int]) -> None:
         """Draw a track with its errors and its way."""
         band = [] if track.name == TRUTH else [f"{track.name} 95 %"] * 2
@@ -204,11 +200,11 @@ class _Drawing:
         else:
             by_name = errors(track, truth, self.min_speed_m_s)
             columns |= {f"error_{name}": values[:, None] for name, values in by_name.items()}
-        self._send_sparse(f"/{place}", _TRACK, track.stamps_ns, {n: columns.pop(n) for n in _SPARSE & columns.keys()})
+        self.send_sparse(f"/{place}", _TRACK, track.stamps_ns, {n: columns.pop(n) for n in _SPARSE & columns.keys()})
         self._send_rows(f"/{place}", _TRACK, track.stamps_ns, columns)
         self._draw_path(track, place, rgb)
 
-    def _send_sparse(self, entity: str, archetype: str, stamps_ns: IntArray, columns: Mapping[str, FloatArray]) -> None:
+    def send_sparse(self, entity: str, archetype: str, stamps_ns: IntArray, columns: Mapping[str, FloatArray]) -> None:
         """Send each component [N, k] where it is known, so that its line continues between; unknown at one stamp."""
         for name, values in columns.items():
             sent = ~np.isnan(values[:, 0])

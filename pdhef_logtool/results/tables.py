@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.signals import S_PER_NS
 from pdhef_logtool.results.opened_run import TABLES
 from pdhef_logtool.results.parquet_sink import arrow_array, arrow_schema, parquet_writer, reading
 from pdhef_logtool.results.run_report import LogOutcome
@@ -132,7 +133,7 @@ def _faults(report: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 def _times(of: Mapping[str, Any]) -> dict[str, float]:
     if of["start_ns"] is None or of["end_ns"] is None:
         return {}
-    return {"seconds": (of["end_ns"] - of["start_ns"]) * 1e-9}
+    return {"seconds": (of["end_ns"] - of["start_ns"]) * S_PER_NS}
 
 
 def _verdicts(plan: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -141,7 +142,7 @@ def _verdicts(plan: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def write_part(path: Path, part: pa.Table) -> None:
     """Write a part, or another table; raises OutputError."""
-    with parquet_writer(path, part.schema, checksums=False) as writer:
+    with parquet_writer(path, part.schema) as writer:
         writer.write_table(part)
 
 
@@ -173,7 +174,7 @@ def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str]
     schemas = {name: arrow_schema(f"{name}.parquet.json") for name in TABLES}
     with ExitStack() as stack:
         writers = {
-            name: stack.enter_context(parquet_writer(folder / f"{name}.parquet", schema, checksums=False))
+            name: stack.enter_context(parquet_writer(folder / f"{name}.parquet", schema))
             for name, schema in schemas.items()
         }
         while some := [*islice(left, _PARTS_AT_ONCE)]:
@@ -192,6 +193,4 @@ def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str]
 def add_verdicts(folder: Path, plan: Mapping[str, Any]) -> None:
     """Add the verdicts on the whole run to those on its drives; raises OutputError."""
     path = folder / "verdicts.parquet"
-    with reading(path), pq.ParquetFile(path) as file:
-        of_drives = file.read()
-    write_part(path, pa.concat_tables([of_drives, _table("verdicts", _verdicts(plan))]))
+    write_part(path, pa.concat_tables([read_part(path), _table("verdicts", _verdicts(plan))]))

@@ -18,8 +18,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
-    from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference
-    from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
+    from pdhef_logtool.estimators.reference.drive import ReferenceEstimator, ReferencePrior, SideslipReference
 
 #: A drive is smoothed in spans of this length, which overlap by twice the margin: memory does not grow with the drive.
 SPAN_S, MARGIN_S = 600.0, 30.0
@@ -45,7 +44,7 @@ def reference_of(drive: Drive, model: DriveModel, config: RunConfig) -> DriveRef
     scored = drive.plan.truth is not None and "sideslip_rad" in drive.plan.derivation
     if config.reference == "off" or (config.reference == "auto" and scored):
         return None
-    from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
+    from pdhef_logtool.estimators.reference.drive import ReferenceEstimator
 
     missing = [name for name in _NEEDS if name not in drive.available]
     if missing:

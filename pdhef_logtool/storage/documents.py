@@ -15,7 +15,7 @@ from difflib import get_close_matches
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
-from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.printable import utf8
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def read_sealed(
     """
     document = read_json(path, what, error, remedy, max_bytes)
     if not is_sealed(document):
-        raise error(expected=what, got="one that is not as it was written", where=str(path), remedy=remedy)
+        raise error(expected=what, got="one that is not as it was written", where=path, remedy=remedy)
     return {key: value for key, value in document.items() if key != DIGEST}
 
 
@@ -84,6 +84,19 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def checked_sha256(path: Path, named: str | None, document: str, remedy: str) -> str:
+    """Return the sha256 of a file; raises OutputError if it cannot be read, or is not as ``document`` names it."""
+    try:
+        sha256 = file_sha256(path)
+    except OSError as error:
+        got = error.strerror or str(error)
+        raise OutputError(expected=f"a readable {path.name}", got=got, where=path, remedy=remedy) from error
+    if named not in (None, sha256):
+        expected, got = f"the {path.name} that {document} names", "another content: it is damaged, or of another run"
+        raise OutputError(expected=expected, got=got, where=path, remedy=remedy)
+    return sha256
+
+
 def _read(
     path: Path, parse: Callable[[str], Any], what: str, error: type[PdhefError], remedy: str, max_bytes: int = MAX_BYTES
 ) -> dict[str, Any]:
@@ -91,7 +104,7 @@ def _read(
         document = parse(read_text(path, max_bytes))
         got = _oddity(document)
     except FileNotFoundError:
-        raise error(expected=what, got="no such file", where=str(path), remedy=remedy, missing=True) from None
+        raise error(expected=what, got="no such file", where=path, remedy=remedy, missing=True) from None
     except OSError as problem:
         got = problem.strerror or str(problem)
     except RecursionError:
@@ -99,7 +112,7 @@ def _read(
     except ValueError as problem:  # of the decoder, either parser, or a number of thousands of digits
         got = str(problem)
     if got:
-        raise error(expected=what, got=got, where=str(path), remedy=remedy)
+        raise error(expected=what, got=got, where=path, remedy=remedy)
     return dict(document)
 
 
@@ -128,7 +141,7 @@ def _oddity(document: object) -> str:
 
 
 def validated(
-    model: type[ModelT], raw: object, where: str, error: type[PdhefError], *, expected: str, remedy: str = ""
+    model: type[ModelT], raw: object, where: object, error: type[PdhefError], *, expected: str, remedy: str = ""
 ) -> ModelT:
     """Return the record of a parsed document.
 

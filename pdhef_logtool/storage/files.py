@@ -32,12 +32,11 @@ _REMEDIES = {
     errno.EDQUOT: "free some space within the quota or choose another place",
     errno.EFBIG: "raise the limit on the size of a file (ulimit -f)",
     errno.EROFS: "choose a place that can be written",
-    errno.EACCES: "choose a place that you may write to",
-    errno.EPERM: "choose a place that you may write to",
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "choose a place that you may write to"),
     errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ENOTDIR: "something else has that name: move it or choose another place",
-    errno.EISDIR: "something else has that name: move it or choose another place",
-    errno.EEXIST: "something else has that name: move it or choose another place",
+    **dict.fromkeys(
+        (errno.ENOTDIR, errno.EISDIR, errno.EEXIST), "something else has that name: move it or choose another place"
+    ),
     errno.EIO: "the disk fails: check it or choose another place",
 }
 
@@ -116,7 +115,7 @@ def cannot_write(target: Path, error: OSError) -> OutputError:
     made = OutputError(
         expected="a place to write to",
         got=error.strerror or str(error) or type(error).__name__,
-        where=str(target),
+        where=target,
         remedy=_REMEDIES.get(error.errno or 0, "choose another place"),
     )
     made.ends_run = error.errno in _OF_THE_DISK

@@ -119,54 +119,6 @@ class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
             self._work.parent.rmdir()
 
 
-class OutputFolder:
-    """A folder that this process locks, so that no other of ours writes to it; created if it is missing.
-
-    Parameters
-    ----------
-    path : the folder. parts : names of folders in it that are outputs themselves.
-
-    Raises
-    ------
-    OutputError
-        It cannot be created or is locked by another command.
-    """
-
-    def __init__(self, path: Path, parts: Iterable[str] = ()) -> None:
-        self.path = path
-        self._parts = tuple(parts)
-        self._lock = FolderLock(path)
-
-    def begin(self, name: str, stale: Container[str] = ()) -> FolderTransaction:
-        """Begin to replace a folder, such as ``logs/drive``, without its stale files; raises OutputError."""
-        return FolderTransaction(self.path / name, stale=stale)
-
-    def sweep(self) -> None:
-        """Remove remains of killed commands, and finish an interrupted exchange."""
-        sweep_files(self.path, held=True)
-        for part in (self.path / name for name in self._parts):
-            with contextlib.suppress(OSError):
-                for work in list((part / WORK).iterdir()):
-                    _repair(work, part / work.name)
-                (part / WORK).rmdir()
-            sweep_files(part, held=True)
-            with contextlib.suppress(OSError):
-                for folder in [p for p in part.iterdir() if p.is_dir() and not p.is_symlink()]:
-                    sweep_files(folder, held=True)
-
-    def __enter__(self) -> Self:
-        """Lock the folder and sweep it."""
-        self._lock.acquire()
-        self.sweep()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Release the lock; after an interruption, sweep first."""
-        if kind is not None:
-            self.sweep()
-        self._lock.release()
-
-
 class FolderLock:
     """Lock of a folder until it is released or this process ends; the folder is created if it is missing.
 
@@ -175,7 +127,7 @@ class FolderLock:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.path = folder
         self._descriptors: list[int] = []
         self._file: Path | None = None
 
@@ -183,15 +135,15 @@ class FolderLock:
         """Lock the folder, after at most ``wait_s``; raises OutputError if another command has locked it."""
         end = time.monotonic() + wait_s
         while True:
-            with writing(self._folder):
-                self._folder.mkdir(parents=True, exist_ok=True)
+            with writing(self.path):
+                self.path.mkdir(parents=True, exist_ok=True)
                 if self._try():
                     return
             if time.monotonic() >= end:
                 raise OutputError(
                     expected="an output folder that no other command is writing to",
                     got="one that another command is writing to",
-                    where=str(self._folder),
+                    where=self.path,
                     remedy=f"{self._who()}wait for it or choose another folder",
                 )
             time.sleep(_POLL_S)
@@ -221,12 +173,12 @@ class FolderLock:
     def _try(self) -> bool:
         if WINDOWS:  # which opens no folders
             return self._try_file()
-        descriptor = os.open(self._folder, os.O_RDONLY)
+        descriptor = os.open(self.path, os.O_RDONLY)
         try:
             if not _locked(descriptor):
                 os.close(descriptor)
                 return False
-            if not os.path.samestat(os.fstat(descriptor), self._folder.stat()):
+            if not os.path.samestat(os.fstat(descriptor), self.path.stat()):
                 os.close(descriptor)  # exchanged since it was opened: the lock is on the old one
                 return False
         except OSError as error:
@@ -239,9 +191,9 @@ class FolderLock:
 
     def _try_file(self) -> bool:
         """Create the complete lock file; remove a dead process's first."""
-        file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{process_name()}.partial"
+        file, prepared = self.path / LOCK_FILE, self.path / f"{LOCK_FILE}.{process_name()}.partial"
         if (holder := _holder(file)) is not None and is_alive(holder) is False:
-            stale = self._folder / f"{LOCK_FILE}.stale.{process_name()}.partial"
+            stale = self.path / f"{LOCK_FILE}.stale.{process_name()}.partial"
             with contextlib.suppress(FileNotFoundError):
                 file.rename(stale)
                 if _holder(stale) != holder:  # another took it in the meantime: it is theirs
@@ -260,12 +212,59 @@ class FolderLock:
         return True
 
     def _who(self) -> str:
-        holder = _holder(self._folder / LOCK_FILE)
+        holder = _holder(self.path / LOCK_FILE)
         if holder is None:
             return ""
         if is_alive(holder) is None:
             return f"if no command runs on any machine, remove {LOCK_FILE} in it, else "
         return f"it is process {holder.split('-')[1]}: "
+
+
+class OutputFolder(FolderLock):
+    """A folder that this process locks, so that no other of ours writes to it; created if it is missing.
+
+    Parameters
+    ----------
+    path : the folder. parts : names of folders in it that are outputs themselves.
+
+    Raises
+    ------
+    OutputError
+        It cannot be created or is locked by another command.
+    """
+
+    def __init__(self, path: Path, parts: Iterable[str] = ()) -> None:
+        super().__init__(path)
+        self._parts = tuple(parts)
+
+    def begin(self, name: str, stale: Container[str] = ()) -> FolderTransaction:
+        """Begin to replace a folder, such as ``logs/drive``, without its stale files; raises OutputError."""
+        return FolderTransaction(self.path / name, stale=stale)
+
+    def sweep(self) -> None:
+        """Remove remains of killed commands, and finish an interrupted exchange."""
+        sweep_files(self.path, held=True)
+        for part in (self.path / name for name in self._parts):
+            with contextlib.suppress(OSError):
+                for work in list((part / WORK).iterdir()):
+                    _repair(work, part / work.name)
+                (part / WORK).rmdir()
+            sweep_files(part, held=True)
+            with contextlib.suppress(OSError):
+                for folder in [p for p in part.iterdir() if p.is_dir() and not p.is_symlink()]:
+                    sweep_files(folder, held=True)
+
+    def __enter__(self) -> Self:
+        """Lock the folder and sweep it."""
+        self.acquire()
+        self.sweep()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Release the lock; after an interruption, sweep first."""
+        if kind is not None:
+            self.sweep()
+        self.release()
 
 
 def local_path(place: Path | str) -> Path:

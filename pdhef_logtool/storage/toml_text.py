@@ -8,27 +8,26 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 
-def toml_text(entries: Mapping[str, Any], head: str = "", comments: Mapping[str, str] | None = None) -> str:
-    """Return entries as TOML with the lines of ``head`` as comments above, and ``comments`` by dotted name.
+def toml_text(entries: Mapping[str, Any], head: str = "") -> str:
+    """Return entries as TOML with the lines of ``head`` as comments above.
 
     A table contains plain entries first, then lists with an item per line, then tables; otherwise the order is kept.
     """
     lines = [f"# {line}".rstrip() for line in head.splitlines()]
-    return "\n".join([*lines, *_table((), entries, comments or {})]).lstrip("\n") + "\n"
+    return "\n".join([*lines, *_table((), entries)]).lstrip("\n") + "\n"
 
 
-def _table(name: tuple[str, ...], entries: Mapping[str, Any], comments: Mapping[str, str]) -> Iterator[str]:
+def _table(name: tuple[str, ...], entries: Mapping[str, Any]) -> Iterator[str]:
     plain = {k: v for k, v in entries.items() if not isinstance(v, Mapping)}
     if name and (plain or not entries):
         yield ""
         yield f"[{'.'.join(map(_key, name))}]"
     for key, value in sorted(plain.items(), key=lambda item: _has_lines(item[1])):
-        comment = comments.get(".".join((*name, key)))
         text = "[\n" + "".join(f"    {_value(v)},\n" for v in value) + "]" if _has_lines(value) else _value(value)
-        yield f"{_key(key)} = {text}" + (f"  # {comment}" if comment else "")
+        yield f"{_key(key)} = {text}"
     for key, value in entries.items():
         if isinstance(value, Mapping):
-            yield from _table((*name, key), value, comments)
+            yield from _table((*name, key), value)
 
 
 def _has_lines(value: Any) -> bool:

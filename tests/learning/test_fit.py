@@ -32,13 +32,13 @@ def make_sequences(seed: int, count: int, steps: int = 400) -> list[FeatureSeque
     """Targets are a lagged, nonlinear function of two features: a network without memory cannot learn them."""
     rng = np.random.default_rng(seed)
     out = []
-    for i in range(count):
+    for _ in range(count):
         drive = np.cumsum(rng.normal(size=(steps, len(FEATURES))), axis=0) * 0.1
         lagged = np.zeros(steps)
         for k in range(1, steps):
             lagged[k] = 0.9 * lagged[k - 1] + 0.1 * np.tanh(drive[k, 1])
         target = np.stack([0.8 * lagged, -0.3 * lagged], axis=1)
-        out.append(FeatureSequence(f"drive{i}", drive, target, np.ones(steps)))
+        out.append(FeatureSequence(drive, target, np.ones(steps)))
     return out
 
 

@@ -39,11 +39,11 @@ def arrays(count: int = 200, **changes: Any) -> ResidualRows:
     return ResidualRows(**{**columns, **changes})
 
 
-def sequence(count: int, value: float = 1.0, drive: str = "a") -> FeatureSequence:
+def sequence(count: int, value: float = 1.0) -> FeatureSequence:
     features = np.zeros((count, len(FEATURES)))
     features[:, 0] = np.arange(count) % 5
     features[:, 1] = value
-    return FeatureSequence(drive, features, np.tile([value, -2.0 * value], (count, 1)), np.ones(count))
+    return FeatureSequence(features, np.tile([value, -2.0 * value], (count, 1)), np.ones(count))
 
 
 def test_normalisation_is_by_weight_and_keeps_the_targets_zero() -> None:

@@ -13,6 +13,7 @@ from written import as_written
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, SHARE_COLUMNS
+from pdhef_logtool.results import parquet_sink
 from pdhef_logtool.results.parquet_sink import list_estimators, load_schema, read_track, write_estimates
 from pdhef_logtool.results.tables import write_metrics
 
@@ -38,8 +39,9 @@ def tracks(circle):
 
 
 @pytest.fixture
-def path(tmp_path, tracks) -> Path:
-    write_estimates(tmp_path / "estimates.parquet", list(tracks.values()), rows_a_group=256)
+def path(tmp_path, tracks, monkeypatch) -> Path:
+    monkeypatch.setattr(parquet_sink, "ROWS_A_GROUP", 256)
+    write_estimates(tmp_path / "estimates.parquet", list(tracks.values()))
     return tmp_path / "estimates.parquet"
 
 
@@ -89,11 +91,12 @@ def test_one_track_comes_back(tracks, name, path):
         assert np.isnan(track.covariance[:, 0, 1]).all()
 
 
-def test_the_selected_estimate_is_written_twice_and_causal_rows_are_marked(tmp_path, circle):
+def test_the_selected_estimate_is_written_twice_and_causal_rows_are_marked(tmp_path, circle, monkeypatch):
+    monkeypatch.setattr(parquet_sink, "ROWS_A_GROUP", 250)
     path = tmp_path / "estimates.parquet"
     a, b = circle("phy-ukf", 0, 600, covariance=False), circle("zero", 0, 600, bias=0.1)
     causal_from_ns = {"phy-ukf": int(a.stamps_ns[100])}
-    write_estimates(path, [a, b], selected="phy-ukf", causal_from_ns=causal_from_ns, rows_a_group=250)
+    write_estimates(path, [a, b], selected="phy-ukf", causal_from_ns=causal_from_ns)
     frame = pl.read_parquet(path)
     groups = [g["estimator"][0] for g in frame.partition_by("estimator", maintain_order=True)]
     assert groups == ["phy-ukf", "selected", "zero"]

@@ -38,11 +38,11 @@ rows = [
 ]
 
 [t]
-n = [1, 2.0]  # both
+n = [1, 2.0]
 
 [t.u]
 x = true
 """
-    assert toml_text(entries, "Head", {"t.n": "both"}) == text
+    assert toml_text(entries, "Head") == text
     with pytest.raises(TypeError, match="NoneType"):
         toml_text({"a": None})

@@ -14,7 +14,7 @@ from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, step_durations_s
+from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray, Signals, step_durations_s
 from pdhef_logtool.records.steps import StepColumns, last_known
 
 #: Rate of the published filters, Hz. Their noise per sample is converted from it to the step between two samples.
@@ -99,7 +99,7 @@ class Peer:
         values, rates = np.full((2, len(stamps_ns), 4), np.nan)
         values[:, VX], values[:, VY], values[:, YAW_RATE] = samples.vx, *samples.states.T
         before = np.searchsorted(stamps_ns, stamps_ns - RATE_SPAN_NS)
-        span_s = np.maximum((stamps_ns - stamps_ns[before]) * 1e-9, 1e-3)
+        span_s = np.maximum((stamps_ns - stamps_ns[before]) * S_PER_NS, 1e-3)
         rates[:, VY] = (values[:, VY] - values[before, VY]) / span_s
         valid = np.isfinite(values[:, : YAW_RATE + 1]).all(axis=1)
         kept = int(np.searchsorted(stamps_ns, stamps_ns[-1] - HISTORY_NS)) if len(stamps_ns) else 0

@@ -23,7 +23,7 @@ from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.gaussian import update
 from pdhef_logtool.estimators.peers.peer import PUBLISHED_HZ, Peer, Samples
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S, SingleTrack, single_track
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray
 from pdhef_logtool.records.steps import RESTART_GAP_S
 
 #: Car of the published noise.
@@ -56,7 +56,7 @@ class SlipCar(NamedTuple):
 
 def _low_passed(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
     """Return a column [K] through the low pass."""
-    times_s, total = stamps_ns * 1e-9, np.zeros_like(values)
+    times_s, total = stamps_ns * S_PER_NS, np.zeros_like(values)
     for i, weight in enumerate(LOW_PASS):
         total += weight / sum(LOW_PASS) * np.interp(times_s - i / PUBLISHED_HZ, times_s, values)
     return total
@@ -164,7 +164,7 @@ class SlipUkf(Peer):
 
     def estimate(self, samples: Samples, first: int, steps_s: FloatArray, memory: FloatArray) -> None:
         """Run the filter (see :class:`~.peer.Peer`)."""
-        vehicle, times_s = self.vehicle, samples.stamps_ns * 1e-9
+        vehicle, times_s = self.vehicle, samples.stamps_ns * S_PER_NS
         ax = _low_passed(samples.stamps_ns, np.nan_to_num(samples.held("ax")))
         ay, yaw_rate = (_low_passed(samples.stamps_ns, samples.held(name)) for name in ("ay", "yaw_rate"))
         yaw_acceleration = (yaw_rate - np.interp(times_s - YAW_SPAN_S, times_s, yaw_rate)) / YAW_SPAN_S

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pdhef_logtool.estimators import kinematic_filter as s
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 
 #: Knots per second.
 RATE_HZ = 20.0
@@ -47,7 +47,7 @@ def sensor_noise(signals: Signals, rows: FloatArray) -> FloatArray:
         (signals.ay_m_s2, s.MEAN_AY, LEAST_NOISE_M_S2),
         (signals.yaw_rate_rad_s, s.MEAN_YAW_RATE, LEAST_NOISE_RAD_S),
     )
-    stamps_ns = np.rint(np.arange(len(rows)) * (1e9 / RATE_HZ)).astype(np.int64)
+    stamps_ns = np.rint(np.arange(len(rows)) * (NS_PER_S / RATE_HZ)).astype(np.int64)
     return np.array(
         [
             max(white_noise(signals.stamps_ns, values, least), white_noise(stamps_ns, rows[:, mean], least))
@@ -69,7 +69,7 @@ def white_noise(stamps_ns: IntArray, values: FloatArray, least: float) -> float:
         return least
     third = np.abs(np.diff(values, 3))
     sample_std = 1.4826 * float(np.median(third)) / math.sqrt(20.0)
-    return max(least, sample_std * math.sqrt(float(np.median(np.diff(stamps))) * 1e-9))
+    return max(least, sample_std * math.sqrt(float(np.median(np.diff(stamps))) * S_PER_NS))
 
 
 def knots(
@@ -79,7 +79,7 @@ def knots(
 
     ``speed_over_ground``: the speed is the length of a velocity; this is assumed if it equals the GNSS speed.
     """
-    t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+    t = (signals.stamps_ns - signals.stamps_ns[0]) * S_PER_NS
     h = 1.0 / RATE_HZ
     knot_s = np.arange(0.0, t[-1] + 0.5 * h, h)
     rows = np.full((len(knot_s), s.INPUTS), np.nan)
@@ -111,7 +111,7 @@ def knots(
     _add_tilt(rows, signals, t, knot_s)
     _add_gnss(rows, signals, knot_s)
     rows[:, s.STANDSTILL] = standstill(rows)
-    return signals.stamps_ns[0] + np.rint(knot_s * 1e9).astype(np.int64), rows
+    return signals.stamps_ns[0] + np.rint(knot_s * NS_PER_S).astype(np.int64), rows
 
 
 def law_std(rows: FloatArray, friction: float) -> FloatArray:
@@ -229,7 +229,7 @@ def _add_gnss(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
     new = np.ones(len(good), dtype=np.bool_)
     new[1:] = (velocity[good[1:]] != velocity[good[:-1]]).any(axis=1)
     good = good[new]
-    t = (signals.stamps_ns[good] - signals.stamps_ns[0]) * 1e-9
+    t = (signals.stamps_ns[good] - signals.stamps_ns[0]) * S_PER_NS
     k = np.minimum(np.rint(t * RATE_HZ).astype(np.int64), len(knot_s) - 1)
     rows[k, s.GNSS_EAST], rows[k, s.GNSS_NORTH] = velocity[good].T
     rows[k, s.GNSS_OFFSET] = t - knot_s[k]

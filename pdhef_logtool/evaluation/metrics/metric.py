@@ -5,7 +5,10 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,7 +17,6 @@ from numpy.typing import NDArray
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import SIGNALS, read_unit
-from pdhef_logtool.records.entries import load_entries
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -240,7 +242,18 @@ MODULES = (
 
 def registered() -> Mapping[str, Metric]:
     """Return the metrics by name; their files are imported at the first call."""
-    return load_entries("pdhef_logtool.evaluation.metrics", MODULES, "METRICS")
+    return _metrics_of(MODULES)
+
+
+@cache
+def _metrics_of(modules: Sequence[str]) -> Mapping[str, Metric]:
+    metrics: dict[str, Metric] = {}
+    for module in modules:
+        for metric in import_module(f"{__package__}.{module}").METRICS:
+            if metric.name in metrics:
+                raise ValueError(f"METRICS: {metric.name!r} of {module}.py is registered twice")
+            metrics[metric.name] = metric
+    return MappingProxyType(metrics)
 
 
 def evaluate_drive(drive: EvaluatedDrive, names: Collection[str] | None = None) -> list[MetricRow]:

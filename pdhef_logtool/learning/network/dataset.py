@@ -26,12 +26,12 @@ from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import BoolArray
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.results.parquet_sink import arrow_array, arrow_schema, parquet_writer
 from pdhef_logtool.results.run_report import tool_versions, write_json
-from pdhef_logtool.storage.documents import DIGEST, digest, file_sha256, is_sealed, read_sealed, seal, validated
+from pdhef_logtool.storage.documents import DIGEST, checked_sha256, digest, is_sealed, read_sealed, seal, validated
 
 FORMAT = "pdhef.residual-dataset"
 FORMAT_VERSION = 7
@@ -49,6 +49,7 @@ ROWS_A_GROUP = 32768
 _ENTRY = b"pdhef.drive"
 _EXPECTED = f"a residual dataset with its {MANIFEST}"
 _REMEDY = "write one with pdhef extract LOG... -o DATASET (--resume finishes an interrupted one)"
+_AGAIN = "extract it again"
 _SCHEMA = "residuals.parquet.json"
 
 
@@ -70,7 +71,7 @@ def write_drive(path: Path, rows: ResidualRows, entry: Mapping[str, Any], *, tru
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
     columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": chosen, "truth_source": np.full(len(rows), truth_source)}
     table = pa.Table.from_arrays([arrow_array(columns[f.name], f.type) for f in schema], schema=schema)
-    with parquet_writer(path, schema, ["segment"]) as writer:
+    with parquet_writer(path, schema, use_dictionary=["segment"], write_page_checksum=True) as writer:
         writer.write_table(table, row_group_size=ROWS_A_GROUP)
         writer.add_key_value_metadata({_ENTRY.decode(): json.dumps(seal(entry), sort_keys=True)})
 
@@ -136,7 +137,7 @@ def write_manifest(
     drives = []
     for entry in sorted(entries, key=lambda e: str(e["name"])):
         path = drive_file(folder, entry)
-        sha256 = _checked_sha256(path, entry.get("file_sha256"))
+        sha256 = checked_sha256(path, entry.get("file_sha256"), MANIFEST, _AGAIN)
         drives.append({**entry, "file": path.relative_to(folder).as_posix(), "file_sha256": sha256})
     splits = {}
     for name in dict.fromkeys((*SPLITS, *(d["split"] for d in drives))):
@@ -173,19 +174,6 @@ def remove_unnamed(folder: Path, manifest: Mapping[str, Any]) -> None:
                     parent.rmdir()
 
 
-def _checked_sha256(path: Path, named: str | None) -> str:
-    """Return the digest of a drive's file; raises OutputError if it differs from the one that the manifest names."""
-    sha256, got = "", "another content"
-    try:
-        sha256 = file_sha256(path)
-    except OSError as error:
-        got = error.strerror or str(error)
-    if not sha256 or named not in (None, sha256):
-        expected = "the drive's file that the manifest names"
-        raise OutputError(expected=expected, got=got, where=str(path), remedy="extract it again")
-    return sha256
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class DatasetDrive:
     """One drive of a dataset. Its arrays are read on every access, as a dataset may exceed the memory.
@@ -204,12 +192,12 @@ class DatasetDrive:
         OutputError
             The file is missing or differs from the manifest.
         """
-        _checked_sha256(self.path, self.entry["file_sha256"])
+        checked_sha256(self.path, self.entry["file_sha256"], MANIFEST, _AGAIN)
         table = pq.read_table(self.path, partitioning=None)
         column = {name: table[name].to_numpy() for name in table.column_names if name != "split"}
         stamps = column["stamp_ns"].astype(np.int64)
         step_s = np.full(stamps.shape[0], float(self.entry["period_s"]))
-        step_s[:-1] = np.diff(stamps) * 1e-9
+        step_s[:-1] = np.diff(stamps) * S_PER_NS
         rows = np.isfinite([column[name] for name in FEATURES]).all(axis=0)  # with a state of the filter
         column = {name: values[rows] for name, values in column.items()}
         weight = column["weight"].astype(np.float32)
@@ -256,7 +244,7 @@ class Dataset:
         """Return the vehicle behind the residuals of a drive."""
         wanted = drive.entry["vehicle_sha256"]
         parameters = next((v["parameters"] for v in self.manifest["vehicles"] if v["sha256"] == wanted), None)
-        where, expected = str(self.folder / MANIFEST), "the parameters of a vehicle"
+        where, expected = self.folder / MANIFEST, "the parameters of a vehicle"
         return validated(VehicleParameters, parameters, where, OutputError, expected=expected)
 
 
@@ -275,7 +263,7 @@ def read_dataset(folder: Path) -> Dataset:
         raise OutputError(
             expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
             got=f"{kind} {version} with {', '.join(names or ['none'])}",
-            where=str(path),
+            where=path,
             remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
         )
     drives = tuple(DatasetDrive(folder / d["file"], d) for d in document["drives"])

@@ -37,7 +37,7 @@ from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import S_PER_NS, Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
@@ -143,16 +143,6 @@ class _Job:
     mapping: SignalMapping | None
     listed_split: str | None
     resume: bool
-
-    @property
-    def name(self) -> str:
-        """Name of the drive in the dataset."""
-        return self.settings.name_of(self.log_input.stem)
-
-    def identity(self, split: str) -> dict[str, str]:
-        """Return the entries of the drive that determine its path in the dataset."""
-        sha, vehicle = self.physics
-        return {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha}
 
     @property
     def physics(self) -> tuple[str, VehicleParameters]:
@@ -285,9 +275,9 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
     try:
         data = dataset.read_dataset(output)
     except OutputError as error:
-        raise UsageError(expected=expected, got=error.got, where=str(output), remedy=remedy) from None
+        raise UsageError(expected=expected, got=error.got, where=output, remedy=remedy) from None
     if data.model != settings.model:
-        raise UsageError(expected=expected, got=f"one for {data.model}", where=str(output), remedy=remedy)
+        raise UsageError(expected=expected, got=f"one for {data.model}", where=output, remedy=remedy)
     return data.manifest
 
 
@@ -355,7 +345,9 @@ def _failure(job: _Job, reason: str) -> DriveResult:
 def _extract(job: _Job, progress: Progress) -> DriveResult:
     settings, source = job.settings, identity_of(job.log_input)
     split, split_from = choose_split(source, chosen=settings.split, listed=job.listed_split)
-    fingerprint, identity = _fingerprint(job, split), job.identity(split)
+    fingerprint, (sha, vehicle) = _fingerprint(job, split), job.physics
+    name = settings.name_of(job.log_input.stem)
+    identity = {"name": name, "split": split, "car": vehicle.name, "vehicle_sha256": sha}
     target = dataset.drive_file(job.output, identity)
     if job.resume and (kept := _kept(job, target, source, split, fingerprint)) is not None:
         return kept
@@ -477,7 +469,7 @@ def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool = False) -> None:
         remedy = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
     else:
         return
-    raise EstimatorError(expected=expected, got=got, where=str(job.log_input.path), remedy=remedy)
+    raise EstimatorError(expected=expected, got=got, where=job.log_input.path, remedy=remedy)
 
 
 def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:
@@ -512,9 +504,9 @@ def _counts(rows: residuals.ResidualRows, log_start_ns: int) -> dict[str, Any]:
     squares = np.square(rows.targets[use] / rows.step_s[use, None])
     mean = np.cumsum(squares, axis=0)[-1] / len(squares) if len(squares) else np.full(2, math.nan)
     return {
-        "start_s": (first - log_start_ns) * 1e-9,
-        "end_s": (last - log_start_ns) * 1e-9,
-        "duration_s": (last - first) * 1e-9,
+        "start_s": (first - log_start_ns) * S_PER_NS,
+        "end_s": (last - log_start_ns) * S_PER_NS,
+        "duration_s": (last - first) * S_PER_NS,
         "rows": len(rows),
         "usable_rows": len(squares),
         "segments": len(np.unique(rows.segment[use])),

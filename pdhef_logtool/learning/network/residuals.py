@@ -35,7 +35,7 @@ from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.vehicle_ukf import U_AX, U_FRICTION, U_STEER, HeldInputs, VehicleUkf
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Steps longer than this many periods are gaps without an increment.
@@ -120,7 +120,7 @@ def residual_increments(
     rates = np.empty((len(stamps_ns), 2))
     usable = (np.where(good[:, None], state, 1.0), np.where(good, steer_rad, 0.0), np.where(good, friction, 1.0))
     _nominal_rates(*usable, parameters, rates)
-    step_s = np.diff(stamps_ns) * 1e-9
+    step_s = np.diff(stamps_ns) * S_PER_NS
     increments: FloatArray = np.diff(state[:, 1:3], axis=0) - 0.5 * step_s[:, None] * (rates[:-1] + rates[1:])
     increments[~(good[:-1] & good[1:] & (step_s <= max_step_s))] = np.nan
     return increments
@@ -138,7 +138,7 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
     for k in range(states.shape[0] - 1):
         out[k, 0] = math.nan
         out[k, 1] = math.nan
-        dt = (stamps_ns[k + 1] - stamps_ns[k]) * 1e-9
+        dt = (stamps_ns[k + 1] - stamps_ns[k]) * S_PER_NS
         if not (good[k] and good[k + 1] and dt <= max_step_s):
             run[0] = 0.0
             continue
@@ -215,7 +215,7 @@ def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: 
         centre = centres[start : start + _CHUNK]
         curve = np.cumsum(increments[centre[:, None] + steps], axis=1)
         curve = np.concatenate([np.zeros_like(curve[:, :1]), curve], axis=1)
-        time_s = (stamps_ns[centre[:, None] + points] - stamps_ns[centre][:, None]) * 1e-9
+        time_s = (stamps_ns[centre[:, None] + points] - stamps_ns[centre][:, None]) * S_PER_NS
         span = np.abs(time_s).max(axis=1)
         u = time_s / span[:, None]
         powers, normal = cubic_equations(u)
@@ -242,7 +242,7 @@ def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
     if third.size < 5:
         return math.nan
     sigma = float(np.quantile(np.abs(third), _NOISE_QUANTILE)) / (_NOISE_POINT * math.sqrt(_THIRD_DIFFERENCE_GAIN))
-    return math.sqrt(2.0) * sigma / (period_ns * 1e-9)
+    return math.sqrt(2.0) * sigma / (period_ns * S_PER_NS)
 
 
 def residual_rows(
@@ -281,7 +281,7 @@ def residual_rows(
         increments = residual_increments(stamps_ns, state, inputs, nominal, max_step_s=gap_s)
     targets, step_s = np.full((count, 2), np.nan), np.full(count, np.nan)
     targets[:-1] = smooth_increments(signals.stamps_ns, increments, half_window)
-    step_s[:-1] = np.diff(signals.stamps_ns) * 1e-9
+    step_s[:-1] = np.diff(signals.stamps_ns) * S_PER_NS
     usable = _complete(targets) & complete
     # If the filter restarts at the next row, the network starts without a state in operation, too.
     usable[:-1] &= complete[1:] & (segment[1:] == segment[:-1])

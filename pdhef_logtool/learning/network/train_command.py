@@ -62,7 +62,6 @@ class FeatureSequence:
     The target is residual rates in m/s² and rad/s² (m = 2), or v_y in m/s (m = 1).
     """
 
-    drive: str
     features: FloatArray
     target: FloatArray
     weight: FloatArray
@@ -198,7 +197,9 @@ def train(
         began = time.perf_counter()
         train_loss, rate = run.epoch(train_pieces, epoch)
         loss = run.validate(validation_pieces)
-        run.end_epoch(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
+        run.history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
+        if run.best_epoch == epoch:
+            run.best = _weights(run.network)
         run.save(work / CHECKPOINT, identity)
         progress(f"epoch {epoch + 1}: train {train_loss:.4f}, validation {loss:.4f}", (epoch + 1) / recipe.epochs)
     provenance = {
@@ -364,12 +365,6 @@ class _Training:
                 weight += float(p.weight.sum())
         return total / weight if weight else math.inf
 
-    def end_epoch(self, epoch: Epoch) -> None:
-        """Add an epoch to the history, and keep its weights if it is the best one."""
-        self.history.append(epoch)
-        if self.best_epoch == len(self.history) - 1:
-            self.best = _weights(self.network)
-
     def save(self, path: Path, identity: dict[str, Any]) -> None:
         """Write a checkpoint: tensors and document in one file, so that no write can leave an inconsistent pair.
 
@@ -398,13 +393,11 @@ class _Training:
                 raise ValueError("content that is not as it was written")
         except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
             expected = "a checkpoint of a training"
-            raise ModelError(
-                expected=expected, got=str(error), where=str(path), remedy="remove it to train again"
-            ) from None
+            raise ModelError(expected=expected, got=str(error), where=path, remedy="remove it to train again") from None
         if document["identity"] != json.loads(json.dumps(identity)):
             expected, got = "a checkpoint of this recipe and data", "one of another"
             remedy = "train into another folder, or remove the checkpoint"
-            raise ModelError(expected=expected, got=got, where=str(path), remedy=remedy)
+            raise ModelError(expected=expected, got=got, where=path, remedy=remedy)
         groups: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
         for name, value in tensors.items():
             group, _, key = name.partition(".")
@@ -502,7 +495,7 @@ def run_training(
     start = network_folder(NO_MODEL if init is None else init)
     bundle = None if start is None else load_bundle(start)
     if bundle is not None and bundle.model != data.model:
-        raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=str(init))
+        raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=init)
     check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
     with OutputFolder(output):
         return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
@@ -521,7 +514,7 @@ def dataset_for(folder: Path, model: str) -> Dataset:
         raise OutputError(
             expected=f"residuals of {model}",
             got=f"residuals of {data.model}",
-            where=str(folder),
+            where=folder,
             remedy=f"pdhef extract LOG... -o DATASET --filter {model} writes them, into another folder",
         )
     return data
@@ -660,4 +653,4 @@ class SplitSequences:
                     weight = weight * np.isfinite(values[:, 0])
                 values[weight == 0.0] = 0.0
                 if weight.sum() > 0.0:
-                    yield FeatureSequence(drive.entry["name"], features, values, weight)
+                    yield FeatureSequence(features, values, weight)
