@@ -13,8 +13,9 @@ from reference_car import drive, slalom, with_noise
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Sensors, VehicleParameters, default_vehicle
 from pdhef_logtool.drive.sensor_faults import without_faults
+from pdhef_logtool.estimators.kinematic import Kinematic
+from pdhef_logtool.estimators.pass_through import PassThrough
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.estimators.stepwise import Kinematic, PassThrough
 from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
 from pdhef_logtool.records import reasons
 from pdhef_logtool.records.errors import VehicleError

@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators.kinematic import LEAK_S
 from pdhef_logtool.estimators.peers.peer import Peer, Samples
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S, matrices, single_track, solve
-from pdhef_logtool.estimators.stepwise import LEAK_S
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.steps import RESTART_GAP_S
 
