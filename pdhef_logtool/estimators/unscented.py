@@ -99,10 +99,10 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
 @_compiled
 def draw(x, root, places, m, points):  # type: ignore[no-untyped-def]
     """Write the sigma points of the state x [n] with the root [n, n] of its covariance to a block."""
-    spread = math.sqrt(x.shape[0])
+    spread, columns = math.sqrt(x.shape[0]), columns_of(2 * m)
     for j in range(x.shape[0]):
         first, centre = places[j] * WIDTH, x[j]
-        for i in range(WIDTH):
+        for i in range(columns):
             points[first + i] = centre
         for i in range(min(j + 1, m)):
             away = spread * root[i, j]
@@ -153,12 +153,11 @@ def moments(points, places, m, q, x, P, away):  # type: ignore[no-untyped-def]
     for j in range(n):
         x[j] = _deviate(points, places[j] * WIDTH, columns, n, away, j)
     for a in range(m):
-        for b in range(0, P.shape[1], LANES):
+        for b in range(a // LANES * LANES, P.shape[1], LANES):
             P[a, b], P[a, b + 1], P[a, b + 2], P[a, b + 3] = _products(away, a, b, 0.5 / n)
-    for a in range(m, n):
-        for b in range(m):
-            P[a, b] = P[b, a]
     for a in range(n):
+        for b in range(min(a, m)):
+            P[a, b] = P[b, a]
         P[a, a] += q[a]
 
 

@@ -613,8 +613,8 @@ def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore
         keep(P, out_P, k)
 
 
-@njit(cache=True)
-def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-untyped-def]
+@_compiled
+def _predict_outputs(due, held, q_std, early, model, scratch, out):  # type: ignore[no-untyped-def]
     """Predict the steps ``due`` with their inputs held; rows without a step (−1) are unchanged.
 
     Over a latency the model is nearly linear: the covariance is J P Jᵀ + Q. J is of differences away from 0, which are
@@ -624,15 +624,18 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
     held_x, held_P, inputs, residual_rate, noise = held
     out_x, out_P, out_ay = out
     layout, places, p, f = model
+    (x, q, JP), J, points = scratch
     n, m, away = held_x.shape[1], changing(layout), 1e-4  # in the unit of each entry
-    points, x, q, J, JP = np.zeros(PLACES * WIDTH), np.zeros(n), np.zeros(n), np.zeros((MOTION, m)), np.zeros(m)
     for row in range(step.shape[0]):
         k, dt = step[row], horizon_s[row]
         if k < 0 or not is_finite(held_x[k], held_P[k]):
             continue
         P, over, rate = held_P[k], held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
-        x[:] = held_x[k]
-        out_P[row] = P[:MOTION, :MOTION]
+        for a in range(n):
+            x[a] = held_x[k, a]
+        for a in range(MOTION):
+            for b in range(MOTION):
+                out_P[row, a, b] = P[a, b]
         if dt > 0.0:
             process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
             for j in range(n):
@@ -653,7 +656,7 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
                     out_P[row, a, b] = out_P[row, b, a] = s
             for j in range(n):
                 x[j] = points[places[j] * WIDTH]
-        out_x[row] = x
+        keep_state(x, out_x, row)
         out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
 
 
@@ -783,7 +786,8 @@ def predicted_track(
     x, covariance, ay = np.full((count, n), np.nan), np.full((count, MOTION, MOTION), np.nan), np.full(count, np.nan)
     due = (np.where(ahead.usable, step, -1), ahead.horizon_s)
     held = (steps.x, steps.P, steps.inputs, rate, noise)
-    _predict_outputs(due, held, q_std, early, model, (x, covariance, ay))
+    scratch = tuple(np.zeros((3, n))), np.zeros((MOTION, n)), np.zeros(PLACES * WIDTH)
+    _predict_outputs(due, held, q_std, early, model, scratch, (x, covariance, ay))
     usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[step, U_SPEED])
     return make_track(
         name,
