@@ -117,7 +117,7 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
     n = x.shape[0]
     points, away, reading = np.zeros(PLACES * WIDTH), np.zeros((n, WIDTH)), np.zeros(WIDTH)
     root, q, S, Pxz = np.zeros((n, n)), np.zeros(n), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
-    z_hat, nu, use = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS, np.bool_)
+    nu, use = np.zeros(READINGS), np.zeros(READINGS, np.bool_)
     no_r = np.zeros(READINGS)  # R is added when it is adapted
     for k in range(window.dt_s.shape[0]):
         m, a, ok, dt = memory[0], adapted_memory[0], start_ok[k], window.dt_s[k]
@@ -147,8 +147,7 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
             alive = ukf.is_finite(x, P)
             out_prior[k] = x
             if alive:
-                ukf.expect(x, P, root, now, rate[0], no_r, layout, places, p, f, points, away, reading, z_hat, S, Pxz)
-                ukf.innovate(now, z_hat, nu)
+                ukf.expect(x, P, root, now, rate[0], no_r, layout, places, p, f, points, away, reading, nu, S, Pxz)
                 for i in range(READINGS):
                     use[i] = math.isfinite(nu[i])
                     r = r0[i]

@@ -22,10 +22,10 @@ in m/s². Without axle forces it is the nominal model (:mod:`~pdhef_logtool.car.
 
 States are the columns of a block: row i has entry i of all states. Each entry has a fixed row, 0 for missing parts.
 Loops over the columns, a multiple of ``LANES``, have neither branches nor calls, so that they become vector
-instructions. In a step of the model with axle forces the tyres are evaluated once, at the instant t* at which the exponential kernel of the
-lag has its centroid, with the initial state extrapolated by its derivative. Velocities use the mean of the forces at
-both ends. The method is of second order in the step except for slow quantities (speed in the lag, bank, force scale,
-and the load transfer without roll), and stable for any lag.
+instructions. In a step of the model with axle forces the tyres are evaluated once, at the instant t* at which the
+exponential kernel of the lag has its centroid, with the initial state extrapolated by its derivative. Velocities use
+the mean of the forces at both ends. The method is of second order in the step except for slow quantities (speed in the
+lag, bank, force scale, and the load transfer without roll), and stable for any lag.
 """
 
 from __future__ import annotations
@@ -172,16 +172,18 @@ def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
 
 
 class _Step(NamedTuple):
-    """Constants of a step of the model with axle forces, common to all points."""
+    """Constants of a step of the model with axle forces, common to all points.
+
+    Those of an axle are B, C, E and D of its tyres, B over friction where it needs that, and D over the mass with the
+    factor by braking; s_z if the formula contains the transfer of steady cornering, else 0; its share of the mass.
+    """
 
     nominal: Prepared
     ax: float
-    front_grip: float  # factor by braking
-    rear_grip: float
     kept: float  # share of an axle's initial force that remains at the end of the step
     tyre_s: float  # t*: time from the step's start to the evaluation of the tyres
-    front_held: float  # s_z if the front axle's formula already contains the transfer of steady cornering, else 0
-    rear_held: float
+    front: tuple[float, ...]
+    rear: tuple[float, ...]
 
 
 @_inline
@@ -217,16 +219,14 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
         x = h * max(vx, p.blend_low_m_s) / f.relaxation_length_m
         kept = math.exp(-x)
         tyre_s = h * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else h * (0.5 + x / 12.0)
+    c, held = prepare(steer, friction, p), f.load_sensitivity
+    front = grip_under_braking(ax, friction, f.front_load_per_ax)
+    rear = grip_under_braking(ax, friction, f.rear_load_per_ax)
     return _Step(
-        prepare(steer, friction, p),
-        ax,
-        grip_under_braking(ax, friction, f.front_load_per_ax),
-        grip_under_braking(ax, friction, f.rear_load_per_ax),
-        kept,
-        tyre_s,
-        f.load_sensitivity if f.front_holds_transfer else 0.0,
-        f.load_sensitivity if f.rear_holds_transfer else 0.0,
-    )
+        c, ax, kept, tyre_s,
+        (c.b_front, p.front_C, p.front_E, front * c.peak_front, f.front_holds_transfer * held, f.front_share),
+        (c.b_rear, p.rear_C, p.rear_E, rear * c.peak_rear, f.rear_holds_transfer * held, f.rear_share),
+    )  # fmt: skip
 
 
 @_inline
@@ -238,20 +238,15 @@ def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
 
 # positional: as advance.
 @_inline
-def _tyre_forces(points, columns, row, angle, c, p, f):  # type: ignore[no-untyped-def]
+def _tyre_forces(points, columns, row, angle, axle, f):  # type: ignore[no-untyped-def]
     """Replace the velocity across an axle, in its ``row``, by the tyres' steady force over the mass in m/s².
 
     ``angle`` is the front wheels' steering angle, which the rear ones do not have. Loops of a few operations each
     process several columns at the same time, which one long chain of operations does not.
     """
-    front = row == FRONT_TYRES
-    stiffness, shape, curvature, peak, held, share, grip = (
-        (c.nominal.b_front, p.front_C, p.front_E, c.nominal.peak_front, c.front_held, f.front_share, c.front_grip)
-        if front
-        else (c.nominal.b_rear, p.rear_C, p.rear_E, c.nominal.peak_rear, c.rear_held, f.rear_share, c.rear_grip)
-    )
+    stiffness, shape, curvature, peak, held, share = axle
     for j in range(columns):
-        steer = angle - points[STEER_BIAS * WIDTH + j] if front else 0.0
+        steer = angle - points[STEER_BIAS * WIDTH + j] if row == FRONT_TYRES else 0.0
         points[row * WIDTH + j] = stiffness * (steer - arctangent(points[row * WIDTH + j], points[SPEED * WIDTH + j]))
     for j in range(columns):
         slip = points[row * WIDTH + j]
@@ -259,8 +254,7 @@ def _tyre_forces(points, columns, row, angle, c, p, f):  # type: ignore[no-untyp
     for j in range(columns):
         points[row * WIDTH + j] = shape * arctangent(points[row * WIDTH + j], 1.0)
     for j in range(columns):
-        steady = grip * peak * sine(points[row * WIDTH + j])
-        scale = max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        steady, scale = peak * sine(points[row * WIDTH + j]), max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
         factor = _transfer_factor(points[LEAN * WIDTH + j], f.load_sensitivity, f)
         points[row * WIDTH + j] = steady * scale * factor / _transfer_factor(steady / share, held, f)
 
@@ -289,10 +283,9 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
     c = _prepare(vx, h, over.steer, over.ax, over.friction, p, f)
     nominal = c.nominal
     per_kinematic = 1.0 / KINEMATIC_TIME_CONSTANT_S
-    rolls = layout.roll >= 0
-    stiffness = f.roll_frequency_rad_s**2 if rolls else 0.0
-    damping = 2.0 * f.roll_damping * f.roll_frequency_rad_s if rolls else 0.0
-    leans = rolls and abs(f.roll_gradient) > LEAST_ROLL_GRADIENT
+    frequency = f.roll_frequency_rad_s if layout.roll >= 0 else 0.0
+    stiffness, damping = frequency**2, 2.0 * f.roll_damping * frequency
+    leans = layout.roll >= 0 and abs(f.roll_gradient) > LEAST_ROLL_GRADIENT
     per_gradient, follows = (1.0 / f.roll_gradient, 0.0) if leans else (0.0, 1.0)
     bank_kept = math.exp(-h / BANK_TIME_S) if layout.bank >= 0 else 1.0
     scale_kept = math.exp(-h / FORCE_SCALE_TIME_S) if layout.force_scale >= 0 else 1.0
@@ -321,8 +314,8 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
             points[MEAN_VY * WIDTH + j] = vy + half * vy_dot
             points[MEAN_RATE * WIDTH + j] = r + half * r_dot
             points[MEAN_ROLL_RATE * WIDTH + j] = phi_dot + half * roll_acc
-        _tyre_forces(points, columns, FRONT_TYRES, over.steer, c, p, f)
-        _tyre_forces(points, columns, REAR_TYRES, over.steer, c, p, f)
+        _tyre_forces(points, columns, FRONT_TYRES, over.steer, c.front, f)
+        _tyre_forces(points, columns, REAR_TYRES, over.steer, c.rear, f)
         # the step, with the mean of the forces at both ends
         for j in range(columns):
             vx, vy, r = points[VX * WIDTH + j], points[VY * WIDTH + j], points[YAW_RATE * WIDTH + j]
@@ -422,8 +415,7 @@ def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, Pxz):  # typ
     """
     turn, curve, n = p.mass_kg / p.yaw_inertia_kg_m2 * p.imu_x_m, -p.imu_y_m, x.shape[0]
     tilt = 1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient
-    for i in range(WIDTH):
-        slope[i] = 0.0
+    slope[:] = 0.0
     slope[FRONT], slope[REAR] = math.cos(steer) * (tilt + turn * p.front_m), tilt - turn * p.rear_m
     slope[ROLL], slope[FORCE_SCALE] = GRAVITY_M_S2, tilt * rate_vy
     rate, variance = x[YAW_RATE], P[YAW_RATE, YAW_RATE]
@@ -434,8 +426,7 @@ def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, Pxz):  # typ
     of_rate = variance - of_vx - of_vy
     s = curve * curve * (variance * variance + n * (of_vx * of_vx + of_vy * of_vy + of_rate * of_rate))
     mean = tilt * rate_vy + curve * (variance - rate * rate)
-    for a in range(Pxz.shape[1]):
-        Pxz[Z_AY, a] = 0.0
+    Pxz[Z_AY, :] = 0.0
     for i in range(n):
         along = slope[places[i]]
         mean += along * x[i]
@@ -456,9 +447,9 @@ def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-unty
     x[FRONT], x[REAR] = 0.0, 0.0
     for _ in range(3):  # converges fast
         points[LEAN * WIDTH] = x[FRONT] * c.nominal.cos + x[REAR]
-        for row, entry, arm in ((FRONT_TYRES, FRONT, p.front_m), (REAR_TYRES, REAR, -p.rear_m)):
+        for row, entry, arm, axle in ((FRONT_TYRES, FRONT, p.front_m, c.front), (REAR_TYRES, REAR, -p.rear_m, c.rear)):
             points[row * WIDTH] = x[VY] + arm * x[YAW_RATE]
-            _tyre_forces(points, LANES, row, steer, c, p, f)
+            _tyre_forces(points, LANES, row, steer, axle, f)
             x[entry] = points[row * WIDTH]
     if layout.roll >= 0:
         w = dynamic_share(x[VX], p)

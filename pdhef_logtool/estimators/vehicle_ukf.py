@@ -30,7 +30,15 @@ from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.estimators.unscented import cholesky, cross_covariance, draw, moments, padded, reading_moments, update
+from pdhef_logtool.estimators.unscented import (
+    cholesky,
+    cross_covariance,
+    draw,
+    moments,
+    padded,
+    reading_moments,
+    update,
+)
 from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
     BANK_TIME_S,
@@ -226,15 +234,6 @@ class HeldInputs(NamedTuple):
     friction: float
 
 
-class GateResult(NamedTuple):
-    """Result of the gate: whether it opens, whether a sample is outside, number of samples, sum of squares."""
-
-    opens: bool
-    outside: bool
-    seen: int
-    squares: float
-
-
 # ------------------------------------------------------------------------------------------------ one step
 
 
@@ -295,9 +294,7 @@ def starts(now, unknown_steer, tuning, model, x, P, memory):  # type: ignore[no-
     r = now.yaw_rate if math.isfinite(now.yaw_rate) else 0.0
     x[:] = 0.0
     x[VX], x[VY], x[YAW_RATE] = now.speed, p.rear_m * r, r
-    P[:, :] = 0.0
-    for i in range(x.shape[0]):
-        P[i, i] = tuning.initial_std[i] ** 2
+    P[:, : x.shape[0]] = np.diag(tuning.initial_std**2)
     if unknown_steer:
         x[layout.steer_bias] = -(p.front_m + p.rear_m) * r / max(now.speed, p.blend_low_m_s)
         P[layout.steer_bias, layout.steer_bias] = UNKNOWN_STEER_STD**2
@@ -360,46 +357,38 @@ def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_inline
-def expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, reading, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write the expected readings [3], the lower triangle of their covariance with R, and the cross covariance [3, n].
+def expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, reading, nu, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write the innovation [3], NaN for missing samples, the lower triangle of its covariance with R, and P_xz [3, n].
 
     ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
     the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
     """
-    m = changing(layout)
-    s, n = layout.force_scale, x.shape[0]
+    m, s, n, first = changing(layout), layout.force_scale, x.shape[0], layout.sensor_bias
     least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
     if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
-        z_hat[Z_AY], S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz)
+        ay, S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz)
     else:
         cholesky(P, root)
         draw(x, root, places, m, points)
         read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
-        z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, root, m, away, Pxz, Z_AY)
+        ay, S[Z_AY, Z_AY] = reading_moments(reading, root, m, away, Pxz, Z_AY)
+    nu[Z_AY], nu[Z_YAW_RATE], nu[Z_SPEED] = now.ay - ay, now.yaw_rate - x[YAW_RATE], now.speed - x[VX]
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
-        z_hat[i] = x[entry]
         for a in range(Pxz.shape[1]):
             Pxz[i, a] = P[entry, a]
         for j in range(i + 1):
             S[i, j] = Pxz[j, entry]
-    if layout.sensor_bias >= 0:
-        add_biases(x, P, layout.sensor_bias, z_hat, S, Pxz)
-    for i in range(READINGS):
-        S[i, i] += r[i]
-
-
-@_inline
-def add_biases(x, P, first, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Add the biases of a_y and yaw rate, the entries from ``first``, to expected readings and their covariances."""
-    for i in range(READINGS):
+    for i in range(READINGS if first >= 0 else 0):  # the biases of a_y and yaw rate
         for j in range(min(i, Z_YAW_RATE) + 1):
             S[i, j] += Pxz[i, first + j]
             if i <= Z_YAW_RATE:
                 S[i, j] += Pxz[j, first + i] + P[first + i, first + j]
-    for i in (Z_AY, Z_YAW_RATE):
-        z_hat[i] += x[first + i]
+    for i in range(Z_SPEED if first >= 0 else 0):
+        nu[i] -= x[first + i]
         for a in range(Pxz.shape[1]):
             Pxz[i, a] += P[first + i, a]
+    for i in range(READINGS):
+        S[i, i] += r[i]
 
 
 @_inline
@@ -409,18 +398,11 @@ def changing(layout):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def innovate(now, z_hat, nu):  # type: ignore[no-untyped-def]
-    """Write the innovation [3], NaN for missing samples."""
-    nu[Z_AY] = now.ay - z_hat[Z_AY]
-    nu[Z_YAW_RATE] = now.yaw_rate - z_hat[Z_YAW_RATE]
-    nu[Z_SPEED] = now.speed - z_hat[Z_SPEED]
-
-
-@_inline
 def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
-    """Decide which samples are used; those that are out of the gate for too long open it (docs/method.md#gate).
+    """Return whether the gate opens and a sample is outside, the number of samples, and the sum of their squares.
 
-    Writes which samples there are (``given``), which are used, and the innovation with those beyond it at the gate.
+    Samples that are out of the gate for too long open it (docs/method.md#gate). Writes which samples there are
+    (``given``), which are used, and the innovation with those beyond it at the gate.
     """
     opens, outside, seen, squares = False, False, 0, 0.0
     for i in range(READINGS):
@@ -441,7 +423,7 @@ def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
                 m.rejected[i] = max(m.rejected[i], _JUST_REJECTED_S)
                 use[i] = m.rejected[i] > GATE_OPENS_AFTER_S
                 opens = opens or use[i]
-    return GateResult(opens, outside, seen, squares)
+    return opens, outside, seen, squares
 
 
 @njit(cache=True, no_cpython_wrapper=True, _nrt=True)
@@ -451,10 +433,10 @@ def likelihood_of(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
+def settle(now, seen, squares, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
     """Average the normalised squared innovations, and contain the motion at rest; return whether the car is at rest."""
-    if gated.seen > 0:
-        m.nis += min(1.0, now.dt / DIVERGED_AVERAGE_S) * (gated.squares / gated.seen - m.nis)
+    if seen > 0:
+        m.nis += min(1.0, now.dt / DIVERGED_AVERAGE_S) * (squares / seen - m.nis)
     # Standstill: for a while the speed sensor reads zero and the car does not turn.
     turns = abs(now.yaw_rate) > rules.still_yaw_rate_rad_s
     if math.isfinite(now.speed):
@@ -537,7 +519,7 @@ def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore
     q_std, r_std, initial_std, standstill_std, rules = tuning
     layout, places, p, car = model
     x, P, memory = belief
-    root, q, points, away, reading, z_hat, nu, at_gate, S, Pxz, r, given, use = scratch
+    root, q, points, away, reading, nu, at_gate, r, S, Pxz, given, use = scratch
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_linked, out_predicted_P, out_cross = links
     linked, bias = out_linked.shape[0] > 0, layout.steer_bias
@@ -576,29 +558,27 @@ def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore
             if alive:
                 for i in range(READINGS):
                     r[i] = r_std[i] * r_std[i] + (window.extra_r[k, i] if i < Z_SPEED else 0.0)
-                expect(x, P, root, now, rate[0], r, layout, places, p, f, points, away, reading, z_hat, S, Pxz)
-                innovate(now, z_hat, nu)
-                gated = gate(now, m, nu, S, at_gate, given, use)
+                expect(x, P, root, now, rate[0], r, layout, places, p, f, points, away, reading, nu, S, Pxz)
+                opens, outside, seen, squares = gate(now, m, nu, S, at_gate, given, use)
                 for i in range(READINGS):
                     if given[i]:
                         out_nu[k, i] = nu[i]
-                if gated.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
+                if outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
                     out_likelihood[k] = likelihood_of(x, P, at_gate, S, Pxz, given)
-                if gated.opens:
+                if opens:
                     P *= GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         keep(P, out_predicted_P, k)
-                    expect(x, P, root, now, rate[0], r, layout, places, p, f, points, away, reading, z_hat, S, Pxz)
-                    innovate(now, z_hat, nu)
+                    expect(x, P, root, now, rate[0], r, layout, places, p, f, points, away, reading, nu, S, Pxz)
                     for i in range(READINGS):
                         if use[i]:
                             m.rejected[i] = 0.0
                 nis, dof, likelihood = update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k], out_dof[k] = nis, dof
-                    if not gated.outside:
+                    if not outside:
                         out_likelihood[k] = likelihood
-                stands = settle(now, gated, rules, standstill_std, x, P, m)
+                stands = settle(now, seen, squares, rules, standstill_std, x, P, m)
                 alive = is_finite(x, P)
             # Without steering, a_y and yaw rate the motion is unknown: the filter ends, and waits for them.
             determined = alive and not (unknown and P[bias, bias] > MAX_STEER_STD**2)
@@ -661,24 +641,6 @@ def _predict_outputs(due, held, q_std, early, model, scratch, out):  # type: ign
 
 
 # ------------------------------------------------------------------------------------------------ records
-
-
-class Scratch(NamedTuple):
-    """Arrays of a kernel that keep nothing between steps, see :mod:`~.unscented`; the last five of the readings."""
-
-    root: FloatArray
-    q: FloatArray
-    points: FloatArray
-    away: FloatArray
-    reading: FloatArray
-    z_hat: FloatArray
-    nu: FloatArray
-    at_gate: FloatArray
-    S: FloatArray
-    Pxz: FloatArray
-    r: FloatArray
-    given: BoolArray
-    use: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -930,7 +892,7 @@ class VehicleUkf:
         rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
         tuning = self.tuning._replace(q_std=self.tuning.q_std.copy())  # it changes with the steering
-        _filter(window, tuning, self.parameters, belief, scratch_of(n), steps.written, links)
+        _filter(window, tuning, self.parameters, belief, _scratch(n), steps.written, links)
         return LinkedSteps(steps, *links), FilterState(belief, slip)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
@@ -959,21 +921,18 @@ def _expected_ay(x, inputs, model, out):  # type: ignore[no-untyped-def]
             out[k] = reading[0] + (x[k, layout.sensor_bias] if layout.sensor_bias >= 0 else 0.0)
 
 
-def scratch_of(n: int) -> Scratch:
-    """Return the arrays of a kernel for ``n`` states."""
-    root, readings, here = padded(n, n), np.zeros((4, READINGS)), np.zeros((2, READINGS), dtype=np.bool_)
-    z_hat, nu, at_gate, r = readings
-    points, away, reading = np.zeros(PLACES * WIDTH), np.zeros((root.shape[1], WIDTH)), np.zeros(WIDTH)
-    S, Pxz = np.zeros((READINGS, READINGS)), padded(READINGS, n)
-    return Scratch(root, np.zeros(n), points, away, reading, z_hat, nu, at_gate, S, Pxz, r, *here)
+def _scratch(n: int) -> tuple[Any, ...]:
+    """Return the arrays of a kernel for ``n`` states that keep nothing between steps, of the readings those from ν."""
+    root, of_readings = padded(n, n), np.zeros((3, READINGS))
+    block = (np.zeros(PLACES * WIDTH), np.zeros((root.shape[1], WIDTH)), np.zeros(WIDTH))
+    covariances, chosen = (np.zeros((READINGS, READINGS)), padded(READINGS, n)), np.zeros((2, READINGS), dtype=np.bool_)
+    return root, np.zeros(n), *block, *of_readings, *covariances, *chosen
 
 
 def resume(state: FilterState | None, n: int) -> Belief:
     """Return a copy of the state before a window, which the kernel updates in place."""
     if state is None:
-        P = padded(n, n)
-        np.fill_diagonal(P, 1.0)
-        return Belief(np.zeros(n), P, np.zeros(1, MEMORY))
+        return Belief(np.zeros(n), np.eye(n, padded(n, n).shape[1]), np.zeros(1, MEMORY))
     return Belief(*(part.copy() for part in state.belief))
 
 
