@@ -54,10 +54,9 @@ from pdhef_logtool.records.signals import IntArray
 #: Rows of a block: one for each entry that a state may have. The first ``CORE`` are those of every model with axle
 #: forces, the first four those of every model.
 VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR, ROLL, ROLL_RATE, BANK, FORCE_SCALE, STEER_BIAS, AY_BIAS, RATE_BIAS = range(13)
-MOTION, CORE = 3, 6
+MOTION, CORE, PLACES = 3, 6, 21
 #: Rows behind them, with values of a step of the model that one loop leaves to the next.
-SPEED, FRONT_TYRES, REAR_TYRES, LEAN, MEAN_VX, MEAN_VY, MEAN_RATE, MEAN_ROLL_RATE = range(13, 21)
-PLACES = 21
+SPEED, FRONT_TYRES, REAR_TYRES, LEAN, MEAN_VX, MEAN_VY, MEAN_RATE, MEAN_ROLL_RATE = range(RATE_BIAS + 1, PLACES)
 #: Sensors.
 Z_AY, Z_YAW_RATE, Z_SPEED = range(3)
 READINGS = 3
