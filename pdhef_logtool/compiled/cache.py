@@ -26,6 +26,7 @@ from typing import Any
 import numba
 from numba.core import caching, config
 from numba.core.runtime import rtsys
+from numba.core.types.misc import unliteral
 from numba.extending import overload
 from numba.misc.appdirs import AppDirs
 from numba.np import arrayobj, linalg
@@ -84,6 +85,9 @@ def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
     options.setdefault("no_cpython_wrapper", bool(options.get("forceinline")))
     compiled = numba.njit(function, no_cfunc_wrapper=True, **options)
     if cache and not config.DISABLE_JIT:
+        # A call with a constant is one with a number: numba would compile the function for each value again.
+        resolve = compiled.get_call_template
+        compiled.get_call_template = lambda args, named: resolve([unliteral(a) for a in args], named)
         if (folder := kept_in()) is None:
             announce()
         else:

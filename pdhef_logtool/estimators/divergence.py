@@ -78,10 +78,8 @@ def wrong_branch(
     signals = without_impossible(signals)
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
     flags = np.empty(len(signals), dtype=np.bool_)
-    motion = (
-        signals.steps_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s,
-        track.yaw_rate_rad_s, track.valid,
-    )  # fmt: skip
+    of_track = map(np.ascontiguousarray, (track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s))
+    motion = (signals.steps_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, *of_track, track.valid)
     sensors, tilt = vehicle.sensors, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
     car = (
         vehicle.assumed_friction, tilt, *noise.measurement_std(sensors)[:2], *vehicle.imu_position_m[:2],

@@ -48,7 +48,7 @@ FILTER_DEG = (0.3, 0.15, 5.0, 30.0)
 #: (lag), and with roll rate (height of the antenna).
 SPEED_STD_M_S, SPEED_SHARE, GNSS_STD_M_S, LAG_S, HEIGHT_STD_M = 0.1, 0.3, 0.1, 0.02, 0.5
 #: White noise of v_x and of a_y, m/s²/√Hz, of the gyro, rad/s/√Hz, and random walk of its bias, rad/s/√s.
-NOISE, RATE_WALK = np.array([1.0, 0.05, 0.001]), 1e-5
+NOISE, RATE_WALK = (1.0, 0.05, 0.001), 1e-5
 #: Time constants of the innovation statistic of a receiver that gets worse or better, s, for samples at 10 Hz; its
 #: limit for one sample; its value at which the heading is reinitialized.
 WORSE_S, BETTER_S, SAMPLE_S, LARGEST_NIS, LOST_NIS = 1.0, 10.0, 0.1, 100.0, 60.0

@@ -115,9 +115,9 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
     out_x, out_P, _, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_trust, out_r_scale = adapted
     n = x.shape[0]
-    points, reading = np.zeros(PLACES * WIDTH), np.zeros(WIDTH)
-    L, q, S, Pxz = np.zeros((n, n)), np.zeros(n), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
-    z_hat, nu, use = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS, np.bool_)
+    points, away, reading = np.zeros(PLACES * WIDTH), np.zeros((n, WIDTH)), np.zeros(WIDTH)
+    root, q, S, Pxz = np.zeros((n, n)), np.zeros(n), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
+    nu, use = np.zeros(READINGS), np.zeros(READINGS, np.bool_)
     no_r = np.zeros(READINGS)  # R is added when it is adapted
     for k in range(window.dt_s.shape[0]):
         m, a, ok, dt = memory[0], adapted_memory[0], start_ok[k], window.dt_s[k]
@@ -143,12 +143,11 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
             over, rate = ukf.held_over_step(now, m), (a.trust * m.rate_vy, a.trust * m.rate_r)
             noise_dt = (1.0 + process_noise_gain * a.trust) * dt  # Eq 26
             ukf.process_noise(tuning.q_std, over.ax_known, noise_dt, layout, q)
-            ukf.predict(x, P, L, over, rate, dt, 0.0, q, layout, places, p, f, points)  # Eq 19
+            ukf.predict(x, P, root, over, rate, dt, 0.0, q, layout, places, p, f, points, away)  # Eq 19
             alive = ukf.is_finite(x, P)
             out_prior[k] = x
             if alive:
-                ukf.expect(x, P, L, now, rate[0], no_r, layout, places, p, f, points, reading, z_hat, S, Pxz)
-                ukf.innovate(now, z_hat, nu)
+                ukf.expect(x, P, root, now, rate[0], no_r, layout, places, p, f, points, away, reading, nu, S, Pxz)
                 for i in range(READINGS):
                     use[i] = math.isfinite(nu[i])
                     r = r0[i]

@@ -1,16 +1,18 @@
 """The scaled unscented transform and the Kalman update, compiled (Wan and van der Merwe 2000), without a model.
 
 Sigma points are the columns of a block [rows · WIDTH], in which the entries of a state have the rows ``places``: the
-centre, x + columns of √n L, x − columns of √n L, and copies of the centre up to whole vectors. With n = x.size and
-α = 1, β = 2, κ = 0 a point has the weight w = 1/(2 n), and the centre 0 in the mean and 2 in the covariance. With the
+centre, x ± each row of √n R with P = Rᵀ R, and copies of the centre up to whole vectors. With n = x.size and α = 1,
+β = 2, κ = 0 a point has the weight w = 1/(2 n), and the centre 0 in the mean and 2 in the covariance. With the
 deviations e of the points from the centre and their weighted sum δ, which is the change of the mean, the covariance is
 
     2 δ δᵀ + w Σ (e − δ)(e − δ)ᵀ = w Σ e eᵀ + δ δᵀ,
 
 in which the centre's column has δ / √w.
 
-The last n − m entries of a state are constants on which the model does not depend: the points along the columns that
-they have alone are at the centre in all other entries, and a block has the first m columns of L only.
+The last n − m entries of a state are constants on which the model does not depend: the points along the rows that
+they have alone are at the centre in all other entries, and a block has the first m rows of R only.
+
+Covariances and roots may have further columns up to whole vectors (:func:`padded`), which are zero.
 """
 
 from __future__ import annotations
@@ -20,52 +22,57 @@ import math
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.vehicle_model import WIDTH
+from pdhef_logtool.estimators.vehicle_model import LANES, WIDTH, columns_of
+from pdhef_logtool.records.signals import FloatArray
 
 #: Smallest variance on the diagonal of a repaired covariance.
 COVARIANCE_FLOOR = 1e-12
 
-_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+# Without reference counts, which are slow: these functions create no arrays.
+_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
+_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
 # Sums in any order, so that the compiler can take several terms at a time.
-_sum = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"})
+_sum = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"}, _nrt=False)
+
+
+def padded(rows: int, n: int) -> FloatArray:
+    """Return zeros [rows, n] with columns up to whole vectors, which the compiler processes without a remainder."""
+    return np.zeros((rows, (n + LANES - 1) // LANES * LANES))
 
 
 @_inline
-def _factor(P, L):  # type: ignore[no-untyped-def]
-    # First C with P = Σ_k c_k c_kᵀ / c_kk, and above its diagonal C over c_kk: to take all roots at the end is faster.
-    n = P.shape[0]
-    for j in range(n):
-        for i in range(j, n):
-            s = P[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[k, j]
-            L[i, j] = s
-        if not L[j, j] > 0.0 and P[j, j] != 0.0:
-            return False
-        per = 1.0 / L[j, j] if L[j, j] > 0.0 else 0.0  # 0: the entry is known
-        for i in range(j + 1, n):
-            L[j, i] = L[i, j] * per
-    for j in range(n):
-        per_root = 1.0 / math.sqrt(L[j, j]) if L[j, j] > 0.0 else 0.0
-        L[:j, j] = 0.0
-        for i in range(j, n):
-            L[i, j] *= per_root
-    return True
+def _factor(P, root):  # type: ignore[no-untyped-def]
+    # Gaussian elimination leaves R times the roots of the pivots; whole rows are faster than those from the diagonal.
+    n, positive = P.shape[0], True
+    for i in range(n):
+        for j in range(root.shape[1]):
+            root[i, j] = P[i, j]
+    for k in range(n):
+        pivot = root[k, k]
+        positive = positive and (pivot > 0.0 or P[k, k] == 0.0)
+        per_pivot = 1.0 / pivot if pivot > 0.0 else 0.0  # 0: the entry is known
+        for i in range(k + 1, n):
+            factor = root[k, i] * per_pivot
+            for j in range(root.shape[1]):
+                root[i, j] -= factor * root[k, j]
+        per_root = math.sqrt(per_pivot)
+        for j in range(root.shape[1]):
+            root[k, j] *= per_root
+    return positive
 
 
 @_compiled
-def cholesky(P, L):  # type: ignore[no-untyped-def]
-    """Write the lower Cholesky factor of P [n, n] to L, which is zero above its diagonal; P is repaired if needed.
+def cholesky(P, root):  # type: ignore[no-untyped-def]
+    """Write the upper Cholesky factor R of P = Rᵀ R [n, n] to ``root``; P is repaired if needed.
 
-    An entry without variance has a column of zeros.
+    An entry without variance has a row of zeros. Below the diagonal are remainders without meaning.
     """
-    if not _factor(P, L):
+    if not _factor(P, root):
         repair_covariance(P)
-        _factor(P, L)
+        _factor(P, root)
 
 
-@njit(cache=True)
+@njit(cache=True, _nrt=True)
 def repair_covariance(P):  # type: ignore[no-untyped-def]
     """Make P [n, n] symmetric positive definite in place by raising eigenvalues to the floor.
 
@@ -79,7 +86,7 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
             P[j, i] = m
     if not math.isfinite(np.sum(P)):
         return
-    w, v = np.linalg.eigh(P)
+    w, v = np.linalg.eigh(P[:, :n].copy())
     floor = max(COVARIANCE_FLOOR, 1e-13 * max(w[n - 1], 0.0))
     for i in range(n):
         for j in range(n):
@@ -89,102 +96,95 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
             P[i, j] = s
 
 
-@_inline
-def _row(block, places, j):  # type: ignore[no-untyped-def]
-    return block[places[j] * WIDTH :]
-
-
 @_compiled
-def draw(x, L, places, m, points):  # type: ignore[no-untyped-def]
-    """Write the sigma points of the state x [n] with the root L [n, n] of its covariance to a block."""
-    root = math.sqrt(x.shape[0])
+def draw(x, root, places, m, points):  # type: ignore[no-untyped-def]
+    """Write the sigma points of the state x [n] with the root [n, n] of its covariance to a block."""
+    spread, columns = math.sqrt(x.shape[0]), columns_of(2 * m)
     for j in range(x.shape[0]):
-        row = _row(points, places, j)
-        for i in range(WIDTH):
-            row[i] = x[j]
+        first, centre = places[j] * WIDTH, x[j]
+        for i in range(columns):
+            points[first + i] = centre
         for i in range(min(j + 1, m)):
-            away = root * L[j, i]
-            row[1 + i] = x[j] + away
-            row[1 + m + i] = x[j] - away
+            away = spread * root[i, j]
+            points[first + 1 + 2 * i] = centre + away
+            points[first + 2 + 2 * i] = centre - away
 
 
 @_sum
-def _products(block, places, a, b):  # type: ignore[no-untyped-def]
-    """Return the scalar products of row a with four rows from b on; beyond the last row, the last row again."""
-    last, of_a = places.shape[0] - 1, _row(block, places, a)
-    row_0, row_1 = _row(block, places, b), _row(block, places, min(b + 1, last))
-    row_2, row_3 = _row(block, places, min(b + 2, last)), _row(block, places, min(b + 3, last))
-    s_0 = s_1 = s_2 = s_3 = 0.0
-    for i in range(WIDTH):
-        s_0 += of_a[i] * row_0[i]
-        s_1 += of_a[i] * row_1[i]
-        s_2 += of_a[i] * row_2[i]
-        s_3 += of_a[i] * row_3[i]
-    return s_0, s_1, s_2, s_3
-
-
-@_sum
-def _deviate(row, m, n):  # type: ignore[no-untyped-def]
-    """Replace a row by its deviations from the centre, the centre by √(0.5 / n) times their sum; return the mean."""
-    centre, moved = row[0], 0.0
-    for i in range(WIDTH):
-        row[i] = row[i] - centre if i <= 2 * m else 0.0
-        moved += row[i]
-    row[0] = math.sqrt(0.5 / n) * moved
+def _deviate(points, first, columns, n, away, row):  # type: ignore[no-untyped-def]
+    """Write the deviations of points from their centre to a row, and there √w times their sum; return the mean."""
+    centre, moved = points[first], 0.0
+    for i in range(columns):
+        away[row, i] = points[first + i] - centre
+    for i in range(columns):
+        moved += away[row, i]
+    away[row, 0] = math.sqrt(0.5 / n) * moved
     return centre + 0.5 / n * moved
 
 
+@_sum
+def _products(away, a, b, weight):  # type: ignore[no-untyped-def]
+    """Return the weighted scalar products of row a with the four rows from b on."""
+    s_0 = s_1 = s_2 = s_3 = 0.0
+    for i in range(WIDTH):
+        s_0 += away[a, i] * away[b, i]
+        s_1 += away[a, i] * away[b + 1, i]
+        s_2 += away[a, i] * away[b + 2, i]
+        s_3 += away[a, i] * away[b + 3, i]
+    return weight * s_0, weight * s_1, weight * s_2, weight * s_3
+
+
 @_inline
-def _covariance(L, a, row, m):  # type: ignore[no-untyped-def]
-    """Return the covariance of state entry a before the model with a result after it, of deviations ``row``."""
+def _covariance(root, a, m, away, row):  # type: ignore[no-untyped-def]
+    """Return the covariance of state entry a before the model with a result after it, of deviations in a ``row``."""
     s = 0.0
     for i in range(min(a + 1, m)):
-        s += L[a, i] * (row[1 + i] - row[1 + m + i])
-    return 0.5 / math.sqrt(L.shape[0]) * s
+        s += root[i, a] * (away[row, 1 + 2 * i] - away[row, 2 + 2 * i])
+    return 0.5 / math.sqrt(root.shape[0]) * s
 
 
 @_compiled
-def moments(points, places, m, q, x, P):  # type: ignore[no-untyped-def]
+def moments(points, places, m, q, x, P, away):  # type: ignore[no-untyped-def]
     """Write mean [n] and covariance [n, n] of sigma points, with ``q`` [n] added to the variances.
 
-    The points are replaced by their deviations.
+    ``away`` [n, WIDTH] are the deviations of the points, with rows of zeros up to whole vectors.
     """
-    n = x.shape[0]
+    n, columns = x.shape[0], columns_of(2 * m)
     for j in range(n):
-        x[j] = _deviate(_row(points, places, j), m, n)
+        x[j] = _deviate(points, places[j] * WIDTH, columns, n, away, j)
+    for a in range(m):
+        for b in range(a // LANES * LANES, P.shape[1], LANES):
+            P[a, b], P[a, b + 1], P[a, b + 2], P[a, b + 3] = _products(away, a, b, 0.5 / n)
     for a in range(n):
-        end = min(a + 1, m)
-        for b in range(0, end, 4):
-            sums = _products(points, places, a, b)
-            for i in range(min(4, end - b)):
-                P[a, b + i] = P[b + i, a] = 0.5 / n * sums[i]
+        for b in range(min(a, m)):
+            P[a, b] = P[b, a]
         P[a, a] += q[a]
 
 
 @_compiled
-def reading_moments(reading, L, m, covariance):  # type: ignore[no-untyped-def]
-    """Write the covariance [n] of a reading [WIDTH] of sigma points with the state; return its mean and variance.
+def reading_moments(reading, root, m, away, Pxz, row):  # type: ignore[no-untyped-def]
+    """Write a row of P_xz, the covariance of a reading [WIDTH] of sigma points; return its mean and variance.
 
-    The reading is replaced by its deviations.
+    The first row of ``away`` is overwritten by the deviations.
     """
-    n, s = L.shape[0], 0.0
-    mean = _deviate(reading, m, n)
+    n, s = root.shape[0], 0.0
+    mean = _deviate(reading, 0, columns_of(2 * m), n, away, 0)
     for i in range(2 * m + 1):
-        s += reading[i] * reading[i]
+        s += away[0, i] * away[0, i]
     for a in range(n):
-        covariance[a] = _covariance(L, a, reading, m)
+        Pxz[row, a] = _covariance(root, a, m, away, 0)
     return mean, 0.5 / n * s
 
 
 @_compiled
-def cross_covariance(L, deviations, places, m, out):  # type: ignore[no-untyped-def]
-    """Write the covariance [n, n] of the state before a step, with the root L, and after it, with its deviations."""
-    n = L.shape[0]
+def cross_covariance(root, m, away, out, k):  # type: ignore[no-untyped-def]
+    """Write covariance k [n, n] of the state before a step, with the root, and after it, with its deviations."""
+    n = root.shape[0]
     for a in range(n):
         for b in range(n):
-            out[a, b] = _covariance(L, a, _row(deviations, places, b), m)
-            for i in range(m, n):
-                out[a, b] += L[a, i] * L[b, i]
+            out[k, a, b] = _covariance(root, a, m, away, b)
+            for i in range(m, min(a, b) + 1):
+                out[k, a, b] += root[i, a] * root[i, b]
 
 
 @_compiled
@@ -214,14 +214,15 @@ def update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
         nu[i] *= per_root
         nis += nu[i] * nu[i]
         det *= S[i, i]
+        for j in range(i):
+            for a in range(P.shape[1]):
+                Pxz[i, a] -= S[i, j] * Pxz[j, a]
+        for a in range(P.shape[1]):
+            Pxz[i, a] *= per_root
         for a in range(n):
-            s = Pxz[i, a]
-            for j in range(i):
-                s -= S[i, j] * Pxz[j, a]
-            Pxz[i, a] = s * per_root
             x[a] += nu[i] * Pxz[i, a]
         for a in range(n if use[i] else 0):
             gain = Pxz[i, a]
-            for b in range(n):
+            for b in range(P.shape[1]):
                 P[a, b] -= gain * Pxz[i, b]
     return nis, used, -0.5 * (nis + used * math.log(2.0 * math.pi)) - math.log(det)

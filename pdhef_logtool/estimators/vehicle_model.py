@@ -21,11 +21,11 @@ in m/s². Without axle forces it is the nominal model (:mod:`~pdhef_logtool.car.
 - **Force scale**: 1 + s on the tyres' forces, an Ornstein-Uhlenbeck process.
 
 States are the columns of a block: row i has entry i of all states. Each entry has a fixed row, 0 for missing parts.
-Inner loops process ``LANES`` columns without branches and calls, so that they become vector instructions. In a step of
-the model with axle forces the tyres are evaluated once, at the instant t* at which the exponential kernel of the
-lag has its centroid, with the initial state extrapolated by its derivative. Velocities use the mean of the forces at
-both ends. The method is of second order in the step except for slow quantities (speed in the lag, bank, force scale,
-and the load transfer without roll), and stable for any lag.
+Loops over the columns, a multiple of ``LANES``, have neither branches nor calls, so that they become vector
+instructions. In a step of the model with axle forces the tyres are evaluated once, at the instant t* at which the
+exponential kernel of the lag has its centroid, with the initial state extrapolated by its derivative. Velocities use
+the mean of the forces at both ends. The method is of second order in the step except for slow quantities (speed in the
+lag, bank, force scale, and the load transfer without roll), and stable for any lag.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pdhef_logtool.car.elementary_functions import arctangent, sine
 from pdhef_logtool.car.nominal_model import (
     KINEMATIC_TIME_CONSTANT_S,
     MAX_SUBSTEPS,
@@ -42,7 +43,6 @@ from pdhef_logtool.car.nominal_model import (
     accelerations,
     derivative,
     dynamic_share,
-    magic_formula,
     planar_lateral_acceleration,
     prepare,
     substeps,
@@ -54,12 +54,14 @@ from pdhef_logtool.records.signals import IntArray
 #: Rows of a block: one for each entry that a state may have. The first ``CORE`` are those of every model with axle
 #: forces, the first four those of every model.
 VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR, ROLL, ROLL_RATE, BANK, FORCE_SCALE, STEER_BIAS, AY_BIAS, RATE_BIAS = range(13)
-MOTION, CORE, PLACES = 3, 6, 13
+MOTION, CORE, PLACES = 3, 6, 21
+#: Rows behind them, with values of a step of the model that one loop leaves to the next.
+SPEED, FRONT_TYRES, REAR_TYRES, LEAN, MEAN_VX, MEAN_VY, MEAN_RATE, MEAN_ROLL_RATE = range(RATE_BIAS + 1, PLACES)
 #: Sensors.
 Z_AY, Z_YAW_RATE, Z_SPEED = range(3)
 READINGS = 3
-#: Columns of an inner loop, and columns of a block: a multiple of it, for two states an entry before the sensor
-#: biases and one at the centre.
+#: Numbers in a vector, and columns of a block: a multiple of it, for two states an entry before the sensor biases and
+#: one at the centre.
 LANES = 4
 WIDTH = 6 * LANES
 
@@ -74,9 +76,10 @@ _LEAST_GRIP = 0.2
 #: Below this roll gradient, rad/(m/s²), roll does not indicate load transfer, which then follows the acceleration.
 LEAST_ROLL_GRADIENT = 1e-3
 
-_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
-_compiled_inside = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"})
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+# Without reference counts, which are slow: these functions create no arrays.
+_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
+_compiled_inside = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
+_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
 
 
 class Layout(NamedTuple):
@@ -96,7 +99,7 @@ class Layout(NamedTuple):
         rows = [VX, VY, YAW_RATE, AX_BIAS]
         for index, part in zip(self[1:], _ROWS_OF_PARTS, strict=True):
             rows += part if index >= 0 else ()
-        return np.array(rows)
+        return np.array(rows, dtype=np.uint8)
 
     @property
     def named(self) -> dict[str, int]:
@@ -168,16 +171,24 @@ def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
 
 
 class _Step(NamedTuple):
-    """Constants of a step of the model with axle forces, common to all points."""
+    """Constants of a step of the model with axle forces, common to all points.
+
+    Those of an axle are B, C, E and D of its tyres, B over friction where it needs that, and D over the mass with the
+    factor by braking; s_z if the formula contains the transfer of steady cornering, else 0; its share of the mass.
+    """
 
     nominal: Prepared
     ax: float
-    front_grip: float  # factor by braking
-    rear_grip: float
     kept: float  # share of an axle's initial force that remains at the end of the step
     tyre_s: float  # t*: time from the step's start to the evaluation of the tyres
-    front_held: float  # s_z if the front axle's formula already contains the transfer of steady cornering, else 0
-    rear_held: float
+    front: tuple[float, ...]
+    rear: tuple[float, ...]
+
+
+@_inline
+def columns_of(points):  # type: ignore[no-untyped-def]
+    """Return the number of columns of a block for a centre and ``points`` others, rounded up to whole vectors."""
+    return (points + LANES) // LANES * LANES
 
 
 @njit(cache=True)
@@ -207,16 +218,14 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
         x = h * max(vx, p.blend_low_m_s) / f.relaxation_length_m
         kept = math.exp(-x)
         tyre_s = h * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else h * (0.5 + x / 12.0)
+    c, held = prepare(steer, friction, p), f.load_sensitivity
+    front = grip_under_braking(ax, friction, f.front_load_per_ax)
+    rear = grip_under_braking(ax, friction, f.rear_load_per_ax)
     return _Step(
-        prepare(steer, friction, p),
-        ax,
-        grip_under_braking(ax, friction, f.front_load_per_ax),
-        grip_under_braking(ax, friction, f.rear_load_per_ax),
-        kept,
-        tyre_s,
-        f.load_sensitivity if f.front_holds_transfer else 0.0,
-        f.load_sensitivity if f.rear_holds_transfer else 0.0,
-    )
+        c, ax, kept, tyre_s,
+        (c.b_front, p.front_C, p.front_E, front * c.peak_front, f.front_holds_transfer * held, f.front_share),
+        (c.b_rear, p.rear_C, p.rear_E, rear * c.peak_rear, f.rear_holds_transfer * held, f.rear_share),
+    )  # fmt: skip
 
 
 @_inline
@@ -226,17 +235,27 @@ def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
     return 1.0 - sensitivity * x * x
 
 
-# positional: numbers of one point in an inner loop for vectorization.
+# positional: as advance.
 @_inline
-def _tyre_forces(v, vy, r, angle, ay, force, c, p, f):  # type: ignore[no-untyped-def]
-    """Return the steady F_yf/m and F_yr/m in m/s²; the load transfer depends on ``ay``."""
-    ff, fr = magic_formula(v, vy, r, angle, c.nominal, p)
-    ff *= c.front_grip
-    fr *= c.rear_grip
-    factor = _transfer_factor(ay, f.load_sensitivity, f)
-    ff *= force * factor / _transfer_factor(ff / f.front_share, c.front_held, f)
-    fr *= force * factor / _transfer_factor(fr / f.rear_share, c.rear_held, f)
-    return ff, fr
+def _tyre_forces(points, columns, row, angle, axle, f):  # type: ignore[no-untyped-def]
+    """Replace the velocity across an axle, in its ``row``, by the tyres' steady force over the mass in m/s².
+
+    ``angle`` is the front wheels' steering angle, which the rear ones do not have. Loops of a few operations each
+    process several columns at the same time, which one long chain of operations does not.
+    """
+    stiffness, shape, curvature, peak, held, share = axle
+    for j in range(columns):
+        steer = angle - points[STEER_BIAS * WIDTH + j] if row == FRONT_TYRES else 0.0
+        points[row * WIDTH + j] = stiffness * (steer - arctangent(points[row * WIDTH + j], points[SPEED * WIDTH + j]))
+    for j in range(columns):
+        slip = points[row * WIDTH + j]
+        points[row * WIDTH + j] = slip - curvature * (slip - arctangent(slip, 1.0))
+    for j in range(columns):
+        points[row * WIDTH + j] = shape * arctangent(points[row * WIDTH + j], 1.0)
+    for j in range(columns):
+        steady, scale = peak * sine(points[row * WIDTH + j]), max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        factor = _transfer_factor(points[LEAN * WIDTH + j], f.load_sensitivity, f)
+        points[row * WIDTH + j] = steady * scale * factor / _transfer_factor(steady / share, held, f)
 
 
 # positional: numbers and records of numbers, which are free of cost in compiled calls.
@@ -263,66 +282,69 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
     c = _prepare(vx, h, over.steer, over.ax, over.friction, p, f)
     nominal = c.nominal
     per_kinematic = 1.0 / KINEMATIC_TIME_CONSTANT_S
-    rolls = layout.roll >= 0
-    stiffness = f.roll_frequency_rad_s**2 if rolls else 0.0
-    damping = 2.0 * f.roll_damping * f.roll_frequency_rad_s if rolls else 0.0
-    leans = rolls and abs(f.roll_gradient) > LEAST_ROLL_GRADIENT
+    frequency = f.roll_frequency_rad_s if layout.roll >= 0 else 0.0
+    stiffness, damping = frequency**2, 2.0 * f.roll_damping * frequency
+    leans = layout.roll >= 0 and abs(f.roll_gradient) > LEAST_ROLL_GRADIENT
     per_gradient, follows = (1.0 / f.roll_gradient, 0.0) if leans else (0.0, 1.0)
     bank_kept = math.exp(-h / BANK_TIME_S) if layout.bank >= 0 else 1.0
     scale_kept = math.exp(-h / FORCE_SCALE_TIME_S) if layout.force_scale >= 0 else 1.0
     t, half = c.tyre_s, 0.5 * h
     for _ in range(n):
-        for first in range(0, columns, LANES):
-            block = points[first:]
-            for j in range(LANES):
-                vx, vy, r = block[VX * WIDTH + j], block[VY * WIDTH + j], block[YAW_RATE * WIDTH + j]
-                ff, fr = block[FRONT * WIDTH + j], block[REAR * WIDTH + j]
-                phi, phi_dot = block[ROLL * WIDTH + j], block[ROLL_RATE * WIDTH + j]
-                angle = over.steer - block[STEER_BIAS * WIDTH + j]
-                slope = GRAVITY_M_S2 * block[BANK * WIDTH + j]
-                force = max(0.1, 1.0 + block[FORCE_SCALE * WIDTH + j])
-                ax = c.ax - block[AX_BIAS * WIDTH + j]
-                w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * nominal.per_blend))
-                follow = (1.0 - w) * per_kinematic
-                # at the start
-                ffc = ff * nominal.cos
-                r_kin = vx * nominal.r_kin_per_vx
-                vx_dot = ax + r * r * p.imu_x_m + vy * r
-                vy_dot = w * (ffc + fr - slope - vx * r) + follow * (p.rear_m * r_kin - vy)
-                r_dot = w * nominal.inertia * (p.front_m * ffc - p.rear_m * fr) + follow * (r_kin - r)
-                vx_dot += r_dot * p.imu_y_m
-                ay = w * (ffc + fr) + (1.0 - w) * vx * r
-                roll_acc = stiffness * (f.roll_gradient * ay - phi) - damping * phi_dot
-                # the tyres, at t*
-                sway = f.swing_m * (phi_dot + t * roll_acc)
-                lean = (phi + t * phi_dot) * per_gradient + follows * ay
-                v = max(vx + t * vx_dot, p.blend_low_m_s)
-                sf, sr = _tyre_forces(v, vy + t * vy_dot + sway, r + t * r_dot, angle, lean, force, c, p, f)
-                ff1 = sf + (ff - sf) * c.kept
-                fr1 = sr + (fr - sr) * c.kept
-                # the mean over the step
-                mf = 0.5 * (ff + ff1)
-                mr = 0.5 * (fr + fr1)
-                mfc = mf * nominal.cos
-                mx, my, mrate = vx + half * vx_dot, vy + half * vy_dot, r + half * r_dot
-                r_kin = mx * nominal.r_kin_per_vx
-                r_dot = w * nominal.inertia * (p.front_m * mfc - p.rear_m * mr) + follow * (r_kin - mrate)
-                mrate = r + half * r_dot
-                vy_dot = w * (mfc + mr - slope - mx * mrate) + follow * (p.rear_m * r_kin - my)
-                my = vy + half * vy_dot
-                ay = w * (mfc + mr) + (1.0 - w) * mx * mrate
-                middle, speed = phi + half * phi_dot, phi_dot + half * roll_acc
-                block[VX * WIDTH + j] = vx + h * (ax + r_dot * p.imu_y_m + mrate * mrate * p.imu_x_m + my * mrate)
-                block[VY * WIDTH + j] = vy + h * vy_dot
-                block[YAW_RATE * WIDTH + j] = r + h * r_dot
-                block[FRONT * WIDTH + j] = ff1
-                block[REAR * WIDTH + j] = fr1
-                block[ROLL * WIDTH + j] = phi + h * speed
-                block[ROLL_RATE * WIDTH + j] = phi_dot + h * (
-                    stiffness * (f.roll_gradient * ay - middle) - damping * speed
-                )
-                block[BANK * WIDTH + j] *= bank_kept
-                block[FORCE_SCALE * WIDTH + j] *= scale_kept
+        # from the start to t*: the velocities across the axles, and what the lean transfers
+        for j in range(columns):
+            vx, vy, r = points[VX * WIDTH + j], points[VY * WIDTH + j], points[YAW_RATE * WIDTH + j]
+            phi, phi_dot = points[ROLL * WIDTH + j], points[ROLL_RATE * WIDTH + j]
+            w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * nominal.per_blend))
+            follow = (1.0 - w) * per_kinematic
+            ffc, fr = points[FRONT * WIDTH + j] * nominal.cos, points[REAR * WIDTH + j]
+            r_kin = vx * nominal.r_kin_per_vx
+            slope = GRAVITY_M_S2 * points[BANK * WIDTH + j]
+            vy_dot = w * (ffc + fr - slope - vx * r) + follow * (p.rear_m * r_kin - vy)
+            r_dot = w * nominal.inertia * (p.front_m * ffc - p.rear_m * fr) + follow * (r_kin - r)
+            vx_dot = c.ax - points[AX_BIAS * WIDTH + j] + r * r * p.imu_x_m + vy * r + r_dot * p.imu_y_m
+            ay = w * (ffc + fr) + (1.0 - w) * vx * r
+            roll_acc = stiffness * (f.roll_gradient * ay - phi) - damping * phi_dot
+            across, turn = vy + t * vy_dot + f.swing_m * (phi_dot + t * roll_acc), r + t * r_dot
+            points[SPEED * WIDTH + j] = max(vx + t * vx_dot, p.blend_low_m_s)
+            points[FRONT_TYRES * WIDTH + j] = across + p.front_m * turn
+            points[REAR_TYRES * WIDTH + j] = across - p.rear_m * turn
+            points[LEAN * WIDTH + j] = (phi + t * phi_dot) * per_gradient + follows * ay
+            points[MEAN_VX * WIDTH + j] = vx + half * vx_dot
+            points[MEAN_VY * WIDTH + j] = vy + half * vy_dot
+            points[MEAN_RATE * WIDTH + j] = r + half * r_dot
+            points[MEAN_ROLL_RATE * WIDTH + j] = phi_dot + half * roll_acc
+        _tyre_forces(points, columns, FRONT_TYRES, over.steer, c.front, f)
+        _tyre_forces(points, columns, REAR_TYRES, over.steer, c.rear, f)
+        # the step, with the mean of the forces at both ends
+        for j in range(columns):
+            vx, vy, r = points[VX * WIDTH + j], points[VY * WIDTH + j], points[YAW_RATE * WIDTH + j]
+            phi, phi_dot = points[ROLL * WIDTH + j], points[ROLL_RATE * WIDTH + j]
+            mx, my, rate = points[MEAN_VX * WIDTH + j], points[MEAN_VY * WIDTH + j], points[MEAN_RATE * WIDTH + j]
+            w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * nominal.per_blend))
+            follow = (1.0 - w) * per_kinematic
+            ff, fr = points[FRONT * WIDTH + j], points[REAR * WIDTH + j]
+            sf, sr = points[FRONT_TYRES * WIDTH + j], points[REAR_TYRES * WIDTH + j]
+            ff1, fr1 = sf + (ff - sf) * c.kept, sr + (fr - sr) * c.kept
+            mfc, mr = 0.5 * (ff + ff1) * nominal.cos, 0.5 * (fr + fr1)
+            r_kin = mx * nominal.r_kin_per_vx
+            r_dot = w * nominal.inertia * (p.front_m * mfc - p.rear_m * mr) + follow * (r_kin - rate)
+            rate = r + half * r_dot
+            slope = GRAVITY_M_S2 * points[BANK * WIDTH + j]
+            vy_dot = w * (mfc + mr - slope - mx * rate) + follow * (p.rear_m * r_kin - my)
+            my = vy + half * vy_dot
+            ay = w * (mfc + mr) + (1.0 - w) * mx * rate
+            vx_dot = c.ax - points[AX_BIAS * WIDTH + j] + r_dot * p.imu_y_m + rate * rate * p.imu_x_m + my * rate
+            middle, speed = phi + half * phi_dot, points[MEAN_ROLL_RATE * WIDTH + j]
+            roll_acc = stiffness * (f.roll_gradient * ay - middle) - damping * speed
+            points[VX * WIDTH + j] = vx + h * vx_dot
+            points[VY * WIDTH + j] = vy + h * vy_dot
+            points[YAW_RATE * WIDTH + j] = r + h * r_dot
+            points[FRONT * WIDTH + j] = ff1
+            points[REAR * WIDTH + j] = fr1
+            points[ROLL * WIDTH + j] = phi + h * speed
+            points[ROLL_RATE * WIDTH + j] = phi_dot + h * roll_acc
+            points[BANK * WIDTH + j] *= bank_kept
+            points[FORCE_SCALE * WIDTH + j] *= scale_kept
 
 
 @_inline
@@ -332,18 +354,16 @@ def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untype
     h = dt / n
     g, sixth = 0.5 * h, h / 6.0
     for _ in range(n):
-        for first in range(0, columns, LANES):
-            block = points[first:]
-            for j in range(LANES):
-                x, y, r = block[VX * WIDTH + j], block[VY * WIDTH + j], block[YAW_RATE * WIDTH + j]
-                ax = over.ax - block[AX_BIAS * WIDTH + j]
-                x1, y1, r1 = derivative(x, y, r, ax, steer, c, p)
-                x2, y2, r2 = derivative(x + g * x1, y + g * y1, r + g * r1, ax, steer, c, p)
-                x3, y3, r3 = derivative(x + g * x2, y + g * y2, r + g * r2, ax, steer, c, p)
-                x4, y4, r4 = derivative(x + h * x3, y + h * y3, r + h * r3, ax, steer, c, p)
-                block[VX * WIDTH + j] = x + sixth * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
-                block[VY * WIDTH + j] = y + sixth * (y1 + 2.0 * y2 + 2.0 * y3 + y4)
-                block[YAW_RATE * WIDTH + j] = r + sixth * (r1 + 2.0 * r2 + 2.0 * r3 + r4)
+        for j in range(columns):
+            x, y, r = points[VX * WIDTH + j], points[VY * WIDTH + j], points[YAW_RATE * WIDTH + j]
+            ax = over.ax - points[AX_BIAS * WIDTH + j]
+            x1, y1, r1 = derivative(x, y, r, ax, steer, c, p)
+            x2, y2, r2 = derivative(x + g * x1, y + g * y1, r + g * r1, ax, steer, c, p)
+            x3, y3, r3 = derivative(x + g * x2, y + g * y2, r + g * r2, ax, steer, c, p)
+            x4, y4, r4 = derivative(x + h * x3, y + h * y3, r + h * r3, ax, steer, c, p)
+            points[VX * WIDTH + j] = x + sixth * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
+            points[VY * WIDTH + j] = y + sixth * (y1 + 2.0 * y2 + 2.0 * y3 + y4)
+            points[YAW_RATE * WIDTH + j] = r + sixth * (r1 + 2.0 * r2 + 2.0 * r3 + r4)
 
 
 # positional: as advance.
@@ -386,8 +406,8 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
 
 # positional: as advance.
 @_inline
-def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, covariance):  # type: ignore[no-untyped-def]
-    """Write the covariance [n] of the accelerometer's reading with the state; return its mean and variance.
+def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, Pxz):  # type: ignore[no-untyped-def]
+    """Write the covariance of the accelerometer's reading with the state to P_xz [3, n]; return its mean and variance.
 
     They are those of the sigma points of :func:`read_ay` where all are in the dynamic range of a model with axle
     forces: it is linear except for r². ``slope`` [WIDTH] is overwritten.
@@ -405,26 +425,31 @@ def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, covariance):
     of_rate = variance - of_vx - of_vy
     s = curve * curve * (variance * variance + n * (of_vx * of_vx + of_vy * of_vy + of_rate * of_rate))
     mean = tilt * rate_vy + curve * (variance - rate * rate)
-    for a in range(n):
-        covariance[a] = 0.0
-        for i in range(n):
-            covariance[a] += slope[places[i]] * P[i, a]
-        s += covariance[a] * slope[places[a]]
-        mean += slope[places[a]] * x[a]
+    Pxz[Z_AY, :] = 0.0
+    for i in range(n):
+        along = slope[places[i]]
+        mean += along * x[i]
+        for a in range(Pxz.shape[1]):
+            Pxz[Z_AY, a] += along * P[i, a]
+    for i in range(n):
+        s += Pxz[Z_AY, i] * slope[places[i]]
     return mean, s
 
 
-@njit(cache=True)
+@njit(cache=True, _nrt=True)
 def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-untyped-def]
     """Set the axle forces of a state [n] to the steady tyre forces at their lateral acceleration; without roll."""
     steer -= x[layout.steer_bias]
-    c = _prepare(x[VX], 0.01, steer, ax, friction, p, f)
-    v = max(x[VX], p.blend_low_m_s)
-    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    c, points = _prepare(x[VX], 0.01, steer, ax, friction, p, f), np.zeros(PLACES * WIDTH)
+    points[SPEED * WIDTH : (SPEED + 1) * WIDTH] = max(x[VX], p.blend_low_m_s)
+    points[FORCE_SCALE * WIDTH] = x[layout.force_scale] if layout.force_scale >= 0 else 0.0
     x[FRONT], x[REAR] = 0.0, 0.0
     for _ in range(3):  # converges fast
-        ay = x[FRONT] * c.nominal.cos + x[REAR]
-        x[FRONT], x[REAR] = _tyre_forces(v, x[VY], x[YAW_RATE], steer, ay, force, c, p, f)
+        points[LEAN * WIDTH] = x[FRONT] * c.nominal.cos + x[REAR]
+        for row, entry, arm, axle in ((FRONT_TYRES, FRONT, p.front_m, c.front), (REAR_TYRES, REAR, -p.rear_m, c.rear)):
+            points[row * WIDTH] = x[VY] + arm * x[YAW_RATE]
+            _tyre_forces(points, LANES, row, steer, axle, f)
+            x[entry] = points[row * WIDTH]
     if layout.roll >= 0:
         w = dynamic_share(x[VX], p)
         ay = w * (x[FRONT] * c.nominal.cos + x[REAR]) + (1.0 - w) * x[VX] * x[YAW_RATE]

@@ -3,8 +3,8 @@
 The models f (motion) and h (readings) are in :mod:`~.vehicle_model`; ``phy-ukf`` uses the nominal one, the others that
 with axle forces and the parts of the car. A step is
 
-    χ = x ± columns of √(n P);  χ⁻ = f(χ, u) + residual;  x⁻, P⁻ = mean and covariance of χ⁻, + Q
-    χ = x⁻ ± columns of √(n P⁻);  ζ = h(χ, u);  ẑ, S, P_xz = moments of ζ and χ, + R;  gate
+    χ = x ± rows of √(n P);  χ⁻ = f(χ, u) + residual;  x⁻, P⁻ = mean and covariance of χ⁻, + Q
+    χ = x⁻ ± rows of √(n P⁻);  ζ = h(χ, u);  ẑ, S, P_xz = moments of ζ and χ, + R;  gate
     x = x⁻ + P_xz S⁻¹ (z − ẑ);  P = P⁻ − P_xz S⁻¹ P_xzᵀ
 
 with the scaled unscented transform at α = 1, β = 2, κ = 0 (Wan and van der Merwe 2000): the centre has the weight 0 in
@@ -30,14 +30,21 @@ from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.estimators.unscented import cholesky, cross_covariance, draw, moments, reading_moments, update
+from pdhef_logtool.estimators.unscented import (
+    cholesky,
+    cross_covariance,
+    draw,
+    moments,
+    padded,
+    reading_moments,
+    update,
+)
 from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
     BANK_TIME_S,
     CORE,
     FORCE_SCALE_TIME_S,
     FRONT,
-    LANES,
     MOTION,
     NOMINAL,
     PLACES,
@@ -53,6 +60,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     Layout,
     PhysicsParameters,
     advance,
+    columns_of,
     layout_of,
     physics_parameters,
     planar_ay,
@@ -130,9 +138,12 @@ MEMORY_FIELDS: list[tuple[Any, ...]] = [
     ("rejected", np.float64, (READINGS,)),
 ]
 MEMORY = np.dtype(MEMORY_FIELDS)
+_NOTHING = np.zeros(1, MEMORY)
 
-_compiled_inside = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"})
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+# Without reference counts, which are slow: these functions create no arrays.
+_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
+_compiled_inside = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
+_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
 
 
 class Window(NamedTuple):
@@ -189,7 +200,7 @@ class Tuning(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """State [n], covariance [n, n] and memory [1] of a filter, moved in place."""
+    """State [n], covariance [n, n], with columns up to whole vectors, and memory [1] of a filter, moved in place."""
 
     x: FloatArray
     P: FloatArray
@@ -223,15 +234,6 @@ class HeldInputs(NamedTuple):
     friction: float
 
 
-class GateResult(NamedTuple):
-    """Result of the gate: whether it opens, whether a sample is outside, number of samples, sum of squares."""
-
-    opens: bool
-    outside: bool
-    seen: int
-    squares: float
-
-
 # ------------------------------------------------------------------------------------------------ one step
 
 
@@ -241,7 +243,7 @@ def begin_step(k, window, rules, needs_steer, memory):  # type: ignore[no-untype
     dt, steers = window.dt_s[k], math.isfinite(window.steer[k])
     restart = not dt <= RESTART_GAP_S
     if restart:
-        memory[:] = np.zeros(1, MEMORY)
+        memory[0] = _NOTHING[0]
     m = memory[0]
     steer = window.steer[k] if steers else m.steer
     m.steer_age = 0.0 if steers or restart else m.steer_age + dt
@@ -280,7 +282,7 @@ def held_inputs(inputs, k):  # type: ignore[no-untyped-def]
     return HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
 
 
-@njit(cache=True)
+@njit(cache=True, no_cpython_wrapper=True, _nrt=True)
 def starts(now, unknown_steer, tuning, model, x, P, memory):  # type: ignore[no-untyped-def]
     """Start with the first sample of speed and steering; return whether this is it.
 
@@ -292,7 +294,7 @@ def starts(now, unknown_steer, tuning, model, x, P, memory):  # type: ignore[no-
     r = now.yaw_rate if math.isfinite(now.yaw_rate) else 0.0
     x[:] = 0.0
     x[VX], x[VY], x[YAW_RATE] = now.speed, p.rear_m * r, r
-    P[:, :] = np.diag(tuning.initial_std**2)
+    P[:, : x.shape[0]] = np.diag(tuning.initial_std**2)
     if unknown_steer:
         x[layout.steer_bias] = -(p.front_m + p.rear_m) * r / max(now.speed, p.blend_low_m_s)
         P[layout.steer_bias, layout.steer_bias] = UNKNOWN_STEER_STD**2
@@ -328,17 +330,17 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled_inside
-def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points):  # type: ignore[no-untyped-def]
+def predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, away):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
     The share ``early`` of the residual's increment comes before the model's step (Strang splitting: half of it), the
-    rest behind it. Leaves the root of the former covariance in L, and deviations in place of the moved points.
+    rest behind it. Leaves the ``root`` of the former covariance, and the deviations of the moved points in ``away``.
     """
     m = changing(layout)
-    cholesky(P, L)
-    draw(x, L, places, m, points)
+    cholesky(P, root)
+    draw(x, root, places, m, points)
     move(points, columns_of(2 * m), over, rate, dt, early, layout, p, f)
-    moments(points, places, m, q, x, P)
+    moments(points, places, m, q, x, P, away)
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -355,46 +357,38 @@ def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_inline
-def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write the expected readings [3], the lower triangle of their covariance with R, and the cross covariance [3, n].
+def expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, reading, nu, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write the innovation [3], NaN for missing samples, the lower triangle of its covariance with R, and P_xz [3, n].
 
     ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
     the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
     """
-    m = changing(layout)
-    s, n = layout.force_scale, x.shape[0]
+    m, s, n, first = changing(layout), layout.force_scale, x.shape[0], layout.sensor_bias
     least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
     if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
-        z_hat[Z_AY], S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz[Z_AY])
+        ay, S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz)
     else:
-        cholesky(P, L)
-        draw(x, L, places, m, points)
+        cholesky(P, root)
+        draw(x, root, places, m, points)
         read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
-        z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
+        ay, S[Z_AY, Z_AY] = reading_moments(reading, root, m, away, Pxz, Z_AY)
+    nu[Z_AY], nu[Z_YAW_RATE], nu[Z_SPEED] = now.ay - ay, now.yaw_rate - x[YAW_RATE], now.speed - x[VX]
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
-        z_hat[i] = x[entry]
-        for a in range(x.shape[0]):
+        for a in range(Pxz.shape[1]):
             Pxz[i, a] = P[entry, a]
         for j in range(i + 1):
             S[i, j] = Pxz[j, entry]
-    if layout.sensor_bias >= 0:
-        add_biases(x, P, layout.sensor_bias, z_hat, S, Pxz)
-    for i in range(READINGS):
-        S[i, i] += r[i]
-
-
-@_inline
-def add_biases(x, P, first, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Add the biases of a_y and yaw rate, the entries from ``first``, to expected readings and their covariances."""
-    for i in range(READINGS):
+    for i in range(READINGS if first >= 0 else 0):  # the biases of a_y and yaw rate
         for j in range(min(i, Z_YAW_RATE) + 1):
             S[i, j] += Pxz[i, first + j]
             if i <= Z_YAW_RATE:
                 S[i, j] += Pxz[j, first + i] + P[first + i, first + j]
-    for i in (Z_AY, Z_YAW_RATE):
-        z_hat[i] += x[first + i]
-        for a in range(x.shape[0]):
+    for i in range(Z_SPEED if first >= 0 else 0):
+        nu[i] -= x[first + i]
+        for a in range(Pxz.shape[1]):
             Pxz[i, a] += P[first + i, a]
+    for i in range(READINGS):
+        S[i, i] += r[i]
 
 
 @_inline
@@ -404,24 +398,11 @@ def changing(layout):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def columns_of(points):  # type: ignore[no-untyped-def]
-    """Return the number of columns of a block for a centre and ``points`` others, rounded up to whole vectors."""
-    return (points + LANES) // LANES * LANES
-
-
-@_inline
-def innovate(now, z_hat, nu):  # type: ignore[no-untyped-def]
-    """Write the innovation [3], NaN for missing samples."""
-    nu[Z_AY] = now.ay - z_hat[Z_AY]
-    nu[Z_YAW_RATE] = now.yaw_rate - z_hat[Z_YAW_RATE]
-    nu[Z_SPEED] = now.speed - z_hat[Z_SPEED]
-
-
-@_inline
 def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
-    """Decide which samples are used; those that are out of the gate for too long open it (docs/method.md#gate).
+    """Return whether the gate opens and a sample is outside, the number of samples, and the sum of their squares.
 
-    Writes which samples there are (``given``), which are used, and the innovation with those beyond it at the gate.
+    Samples that are out of the gate for too long open it (docs/method.md#gate). Writes which samples there are
+    (``given``), which are used, and the innovation with those beyond it at the gate.
     """
     opens, outside, seen, squares = False, False, 0, 0.0
     for i in range(READINGS):
@@ -442,14 +423,20 @@ def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
                 m.rejected[i] = max(m.rejected[i], _JUST_REJECTED_S)
                 use[i] = m.rejected[i] > GATE_OPENS_AFTER_S
                 opens = opens or use[i]
-    return GateResult(opens, outside, seen, squares)
+    return opens, outside, seen, squares
+
+
+@njit(cache=True, no_cpython_wrapper=True, _nrt=True)
+def likelihood_of(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
+    """Return the log-likelihood of an innovation without an update."""
+    return update(x.copy(), P.copy(), nu, S.copy(), Pxz.copy(), use)[2]
 
 
 @_inline
-def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
+def settle(now, seen, squares, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
     """Average the normalised squared innovations, and contain the motion at rest; return whether the car is at rest."""
-    if gated.seen > 0:
-        m.nis += min(1.0, now.dt / DIVERGED_AVERAGE_S) * (gated.squares / gated.seen - m.nis)
+    if seen > 0:
+        m.nis += min(1.0, now.dt / DIVERGED_AVERAGE_S) * (squares / seen - m.nis)
     # Standstill: for a while the speed sensor reads zero and the car does not turn.
     turns = abs(now.yaw_rate) > rules.still_yaw_rate_rad_s
     if math.isfinite(now.speed):
@@ -508,24 +495,34 @@ def is_finite(x, P):  # type: ignore[no-untyped-def]
     return math.isfinite(total)
 
 
+@_inline
+def keep_state(x, out, k):  # type: ignore[no-untyped-def]
+    """Write a state [n] to row k of an output."""
+    for a in range(x.shape[0]):
+        out[k, a] = x[a]
+
+
+@_inline
+def keep(P, out, k):  # type: ignore[no-untyped-def]
+    """Write a covariance [n, n] to row k of an output."""
+    for a in range(P.shape[0]):
+        for b in range(P.shape[0]):
+            out[k, a, b] = P[a, b]
+
+
 # ------------------------------------------------------------------------------------------------ a window
 
 
-@njit(cache=True)
-def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyped-def]
+@_compiled
+def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore[no-untyped-def]
     """Filter one window; ``belief`` is moved in place. ``links`` are of length 0 if not requested."""
     q_std, r_std, initial_std, standstill_std, rules = tuning
     layout, places, p, car = model
     x, P, memory = belief
+    root, q, points, away, reading, nu, at_gate, r, S, Pxz, given, use = scratch
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_linked, out_predicted_P, out_cross = links
-    linked, n, bias = out_linked.shape[0] > 0, x.shape[0], layout.steer_bias
-    points, reading = np.zeros(PLACES * WIDTH), np.zeros(WIDTH)
-    L, q, r = np.zeros((n, n)), np.zeros(n), np.zeros(READINGS)
-    S, Pxz = np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
-    z_hat, nu, at_gate = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS)
-    given, use = np.zeros(READINGS, np.bool_), np.zeros(READINGS, np.bool_)
-    q_std = q_std.copy()
+    linked, bias = out_linked.shape[0] > 0, layout.steer_bias
     front_std, rear_std = (q_std[FRONT], q_std[REAR]) if layout.forces >= 0 else (0.0, 0.0)
     steer_std = q_std[bias]
     for k in range(window.dt_s.shape[0]):
@@ -552,38 +549,36 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
-            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points)
+            predict(x, P, root, over, rate, now.dt, 0.5, q, layout, places, p, f, points, away)
             if linked:
-                cross_covariance(L, points, places, changing(layout), out_cross[k])
-                out_predicted_P[k] = P
-            out_prior[k] = x
+                cross_covariance(root, changing(layout), away, out_cross, k)
+                keep(P, out_predicted_P, k)
+            keep_state(x, out_prior, k)
             alive, stands = is_finite(x, P), False
             if alive:
                 for i in range(READINGS):
                     r[i] = r_std[i] * r_std[i] + (window.extra_r[k, i] if i < Z_SPEED else 0.0)
-                expect(x, P, L, now, rate[0], r, layout, places, p, f, points, reading, z_hat, S, Pxz)
-                innovate(now, z_hat, nu)
-                gated = gate(now, m, nu, S, at_gate, given, use)
+                expect(x, P, root, now, rate[0], r, layout, places, p, f, points, away, reading, nu, S, Pxz)
+                opens, outside, seen, squares = gate(now, m, nu, S, at_gate, given, use)
                 for i in range(READINGS):
                     if given[i]:
                         out_nu[k, i] = nu[i]
-                if gated.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
-                    _, _, out_likelihood[k] = update(x.copy(), P.copy(), at_gate, S.copy(), Pxz.copy(), given)
-                if gated.opens:
+                if outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
+                    out_likelihood[k] = likelihood_of(x, P, at_gate, S, Pxz, given)
+                if opens:
                     P *= GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
-                        out_predicted_P[k] = P
-                    expect(x, P, L, now, rate[0], r, layout, places, p, f, points, reading, z_hat, S, Pxz)
-                    innovate(now, z_hat, nu)
+                        keep(P, out_predicted_P, k)
+                    expect(x, P, root, now, rate[0], r, layout, places, p, f, points, away, reading, nu, S, Pxz)
                     for i in range(READINGS):
                         if use[i]:
                             m.rejected[i] = 0.0
                 nis, dof, likelihood = update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k], out_dof[k] = nis, dof
-                    if not gated.outside:
+                    if not outside:
                         out_likelihood[k] = likelihood
-                stands = settle(now, gated, rules, standstill_std, x, P, m)
+                stands = settle(now, seen, squares, rules, standstill_std, x, P, m)
                 alive = is_finite(x, P)
             # Without steering, a_y and yaw rate the motion is unknown: the filter ends, and waits for them.
             determined = alive and not (unknown and P[bias, bias] > MAX_STEER_STD**2)
@@ -594,12 +589,12 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
             elif linked:
                 out_linked[k] = not stands
         finish_step(k, now, window.residual_rate, rules, m, out_inputs)
-        out_x[k] = x
-        out_P[k] = P
+        keep_state(x, out_x, k)
+        keep(P, out_P, k)
 
 
-@njit(cache=True)
-def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-untyped-def]
+@_compiled
+def _predict_outputs(due, held, q_std, early, model, scratch, out):  # type: ignore[no-untyped-def]
     """Predict the steps ``due`` with their inputs held; rows without a step (−1) are unchanged.
 
     Over a latency the model is nearly linear: the covariance is J P Jᵀ + Q. J is of differences away from 0, which are
@@ -609,15 +604,18 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
     held_x, held_P, inputs, residual_rate, noise = held
     out_x, out_P, out_ay = out
     layout, places, p, f = model
+    (x, q, JP), J, points = scratch
     n, m, away = held_x.shape[1], changing(layout), 1e-4  # in the unit of each entry
-    points, x, q, J, JP = np.zeros(PLACES * WIDTH), np.zeros(n), np.zeros(n), np.zeros((MOTION, m)), np.zeros(m)
     for row in range(step.shape[0]):
         k, dt = step[row], horizon_s[row]
         if k < 0 or not is_finite(held_x[k], held_P[k]):
             continue
         P, over, rate = held_P[k], held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
-        x[:] = held_x[k]
-        out_P[row] = P[:MOTION, :MOTION]
+        for a in range(n):
+            x[a] = held_x[k, a]
+        for a in range(MOTION):
+            for b in range(MOTION):
+                out_P[row, a, b] = P[a, b]
         if dt > 0.0:
             process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
             for j in range(n):
@@ -638,7 +636,7 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
                     out_P[row, a, b] = out_P[row, b, a] = s
             for j in range(n):
                 x[j] = points[places[j] * WIDTH]
-        out_x[row] = x
+        keep_state(x, out_x, row)
         out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
 
 
@@ -750,7 +748,8 @@ def predicted_track(
     x, covariance, ay = np.full((count, n), np.nan), np.full((count, MOTION, MOTION), np.nan), np.full(count, np.nan)
     due = (np.where(ahead.usable, step, -1), ahead.horizon_s)
     held = (steps.x, steps.P, steps.inputs, rate, noise)
-    _predict_outputs(due, held, q_std, early, model, (x, covariance, ay))
+    scratch = tuple(np.zeros((3, n))), np.zeros((MOTION, n)), np.zeros(PLACES * WIDTH)
+    _predict_outputs(due, held, q_std, early, model, scratch, (x, covariance, ay))
     usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[step, U_SPEED])
     return make_track(
         name,
@@ -892,7 +891,8 @@ class VehicleUkf:
         steps, belief = no_posterior(signals.stamps_ns, n, window.residual_rate), resume(state, n)
         rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
-        _filter(window, self.tuning, self.parameters, belief, steps.written, links)
+        tuning = self.tuning._replace(q_std=self.tuning.q_std.copy())  # it changes with the steering
+        _filter(window, tuning, self.parameters, belief, _scratch(n), steps.written, links)
         return LinkedSteps(steps, *links), FilterState(belief, slip)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
@@ -921,10 +921,18 @@ def _expected_ay(x, inputs, model, out):  # type: ignore[no-untyped-def]
             out[k] = reading[0] + (x[k, layout.sensor_bias] if layout.sensor_bias >= 0 else 0.0)
 
 
+def _scratch(n: int) -> tuple[Any, ...]:
+    """Return the arrays of a kernel for ``n`` states that keep nothing between steps, of the readings those from ν."""
+    root, of_readings = padded(n, n), np.zeros((3, READINGS))
+    block = (np.zeros(PLACES * WIDTH), np.zeros((root.shape[1], WIDTH)), np.zeros(WIDTH))
+    covariances, chosen = (np.zeros((READINGS, READINGS)), padded(READINGS, n)), np.zeros((2, READINGS), dtype=np.bool_)
+    return root, np.zeros(n), *block, *of_readings, *covariances, *chosen
+
+
 def resume(state: FilterState | None, n: int) -> Belief:
     """Return a copy of the state before a window, which the kernel updates in place."""
     if state is None:
-        return Belief(np.zeros(n), np.eye(n), np.zeros(1, MEMORY))
+        return Belief(np.zeros(n), np.eye(n, padded(n, n).shape[1]), np.zeros(1, MEMORY))
     return Belief(*(part.copy() for part in state.belief))
 
 

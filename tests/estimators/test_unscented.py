@@ -21,9 +21,9 @@ def random_covariance(rng: np.random.Generator, n: int) -> np.ndarray:
 
 def root_of(P: np.ndarray) -> np.ndarray:
     """Return the factor of P, which may be repaired."""
-    L = np.zeros_like(P)
-    cholesky(P, L)
-    return L
+    root = np.zeros_like(P)
+    cholesky(P, root)
+    return np.triu(root).T
 
 
 @random_cases

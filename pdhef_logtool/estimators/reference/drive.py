@@ -230,7 +230,7 @@ def _smooth(
         points[:, [s.VX, s.VY, s.HEADING]] = velocity
     for iteration in range(MAX_ITERATIONS):
         x, p, predicted_x, predicted_p, cross = s.forward_pass(
-            1.0 / RATE_HZ, rows, prior.rear_m, mean, std**2, noise, points, iteration > 1 or velocity is not None
+            1.0 / RATE_HZ, rows, prior.rear_m, mean, std**2, tuple(noise), points, iteration > 1 or velocity is not None
         )
         smoothed = rts.smooth_states(x, predicted_x, predicted_p, cross)
         before, points = points if len(points) else x, smoothed
