@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import os
 import platform
@@ -43,6 +44,12 @@ def _host() -> str:
     except OSError:
         space = ""
     return hashlib.sha256(f"{platform.node()}:{space}".encode()).hexdigest()[:8]
+
+
+def release_memory() -> None:
+    """Give freed memory back to the system: the C library keeps holes between arrays that are still in use."""
+    with contextlib.suppress(OSError, AttributeError):  # other C libraries than GNU's
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def wait_for_end(pid: int, most_s: float = 5.0) -> None:

@@ -27,6 +27,7 @@ from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import DriveIntervals, drive_intervals, spread, widened
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
+from pdhef_logtool.records.processes import release_memory
 from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -169,6 +170,7 @@ def estimate_drive(
         if varied:
             track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)
         tracks.append(track.without_sideslip_below(vehicle.standstill_m_s))
+        release_memory()
     return with_poses(drive, tracks)
 
 

@@ -28,6 +28,7 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import merge_losses
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.printable import printable
+from pdhef_logtool.records.processes import release_memory
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
@@ -122,6 +123,7 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
     label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
     causality.failed |= run.failed
     whole = drive.whole()
+    release_memory()
     estimated = estimate_drive(
         whole,
         run.model.apply(whole.signals),
@@ -146,6 +148,7 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add contradictions as notes of the drive."""
     drive = run.drive
     scored = evaluate(drive, estimated, run.model)
+    release_memory()
     digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
     scored = replace(scored, rows=[replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows])
     truth, reference = estimated.truth, estimated.read(REFERENCE)
