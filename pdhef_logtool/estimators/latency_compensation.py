@@ -23,7 +23,7 @@ from pdhef_logtool.records.steps import StepColumns, extrapolation, release
 from pdhef_logtool.records.tracks import FILED_COLUMNS, StateTrack, concatenate
 
 #: Steps that an estimator makes at a time; an hour of steps with covariances would take 350 MB per filter.
-PIECE_STEPS = 8192
+PIECE_STEPS = 4096
 
 
 def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCheck | None = None) -> StateTrack:

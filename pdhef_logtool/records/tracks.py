@@ -197,8 +197,7 @@ def _joined(parts: Sequence[NDArray[Any]], is_single: bool) -> NDArray[Any]:
 
 def scaled_covariance(covariance: FloatArray, of_vy: FloatArray) -> FloatArray:
     """Return covariances [N, 3, 3] with factors [N] on the 1-sigma of v_y; correlations stay."""
-    scale = np.ones(covariance.shape[:2])
-    scale[:, 1] = of_vy
-    scaled: FloatArray = covariance * scale[:, :, None]
-    scaled *= scale[:, None, :]
+    scaled = covariance.copy()
+    scaled[:, 1] *= of_vy[:, None]
+    scaled[:, :, 1] *= of_vy[:, None]
     return scaled

@@ -106,18 +106,23 @@ class Estimated:
     """A drive with the tracks of all estimators by name, in their order.
 
     ``truth`` is for scores, ``drawn_truth`` for outputs: with a pose, and valid if it is complete; None without ground
-    truth.
+    truth. ``start`` : x, y, yaw of the first pose.
     """
 
     signals: Signals
     truth: StateTrack | None
     drawn_truth: StateTrack | None
     tracks: dict[str, StateTrack]
+    start: tuple[float, float, float]
 
     @property
     def drawn(self) -> list[StateTrack]:
-        """The tracks for outputs: ground truth, then the estimators."""
-        return [*filter(None, [self.drawn_truth]), *self.tracks.values()]
+        """The tracks for outputs: ground truth, then the estimators, with poses."""
+        return [*filter(None, [self.drawn_truth]), *map(self.posed, self.tracks.values())]
+
+    def posed(self, track: StateTrack) -> StateTrack:
+        """Return a track with its pose, dead-reckoned from the start."""
+        return _dead_reckoned(track, self.start)
 
     def read(self, name: str) -> StateTrack | None:
         """Return the track of a name (:data:`TRUTH`: ground truth), or None."""
@@ -175,13 +180,13 @@ def estimate_drive(
 
 
 def with_poses(drive: WholeDrive, tracks: Iterable[StateTrack]) -> Estimated:
-    """Return a drive with tracks, dead-reckoned from the first pose of the ground truth."""
+    """Return a drive with tracks, which are drawn from the first pose of the ground truth."""
     plan, drawn_truth = drive.plan, drive.truth
     start = _first_pose(drawn_truth)
     if drawn_truth is not None:
         drawn_truth = drawn_truth if plan.has_truth_pose else _dead_reckoned(drawn_truth, start)
         drawn_truth = valid_as_a_whole(drawn_truth, plan.derivation, plan.vehicle.standstill_m_s)
-    return Estimated(drive.signals, drive.truth, drawn_truth, {t.name: _dead_reckoned(t, start) for t in tracks})
+    return Estimated(drive.signals, drive.truth, drawn_truth, {t.name: t for t in tracks}, start)
 
 
 def _computation(estimator: Estimator, signals: Signals) -> tuple[str, int]:

@@ -198,7 +198,7 @@ def report_drive(
         "reference": None if run.reference is None else run.reference.document,
         "largest_errors": [] if track is None else largest_errors(track, truth, others, slow),
         "faults": _faults(run, selected, estimated.read),
-        "path_drift": None if truth is None or track is None else path_drift(track, truth),
+        "path_drift": None if truth is None or track is None else path_drift(estimated.posed(track), truth),
         "metadata": {} if config.no_position else _metadata(drive),
         **stated,
     }

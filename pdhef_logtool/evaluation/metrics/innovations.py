@@ -8,9 +8,12 @@ import numpy as np
 
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Least number of pairs of stamps for an autocorrelation.
 LEAST_PAIRS = 10
+#: Rows of which the errors are in memory.
+_ROWS = 1 << 16
 _STATE = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")
 
 
@@ -19,11 +22,16 @@ def _errors(drive: EvaluatedDrive) -> Iterator[Columns]:
         return
     for track in drive.tracks.values():
         if track.covariance.shape[0]:
-            error = np.stack([getattr(track, s) - getattr(drive.truth, s) for s in _STATE], axis=1)
-            error[~(track.valid & drive.truth.valid)] = np.nan
-            covariance, of_truth = track.covariance, drive.truth.covariance
-            values = nees(error, covariance + of_truth if of_truth.shape[0] else covariance)
-            yield Columns(track.name, "state", {"nees": values})
+            parts = [slice(k, k + _ROWS) for k in range(0, len(track), _ROWS)]
+            values = [_squares(track.rows(p.start, p.stop), drive.truth.rows(p.start, p.stop)) for p in parts]
+            yield Columns(track.name, "state", {"nees": np.concatenate([np.empty(0), *values])})
+
+
+def _squares(track: StateTrack, truth: StateTrack) -> FloatArray:
+    """Return :func:`nees` of a part of a drive [N]."""
+    error = np.stack([getattr(track, s) - getattr(truth, s) for s in _STATE], axis=1)
+    error[~(track.valid & truth.valid)] = np.nan
+    return nees(error, track.covariance + truth.covariance if truth.covariance.shape[0] else track.covariance)
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:

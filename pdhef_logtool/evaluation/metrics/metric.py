@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.statistics import gathered
+from pdhef_logtool.evaluation.track_errors import selected
 from pdhef_logtool.evaluation.units import SIGNALS, read_unit
 from pdhef_logtool.records.entries import load_entries
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -209,16 +210,18 @@ def _rows(
     drive: EvaluatedDrive, columns: Columns, family: Sequence[Metric], segment: str, place: _Place
 ) -> Iterator[MetricRow]:
     """Yield the rows of one signal of one estimator in a segment."""
-    chosen: dict[tuple[str, ...], list[NDArray[Any]]] = {}
+    finite: dict[str, BoolArray] = {}
+    chosen: dict[tuple[str, str], NDArray[Any]] = {}
     for metric in family:
         over = metric.over or (metric.name,)
         if not columns.values.keys() >= {*over} or (metric.whole and segment != ALL):
             continue
-        if over not in chosen:
-            values = [columns.values[name][place] for name in over]
-            finite = np.isfinite(values[0])
-            chosen[over] = values if finite.all() else [v[finite] for v in values]
-        values, signal = chosen[over], columns.signal
+        if over[0] not in finite:
+            finite[over[0]] = np.isfinite(columns.values[over[0]][place])
+        for name in over:
+            if (over[0], name) not in chosen:
+                chosen[over[0], name] = selected(columns.values[name][place], finite[over[0]])
+        values, signal = [chosen[over[0], name] for name in over], columns.signal
         n = len(values[0])
         value = metric.formula(*values) if n else None
         if value is not None:
