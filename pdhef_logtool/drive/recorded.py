@@ -84,7 +84,8 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
     from pdhef_logtool.drive.sensor_faults import without_faults  # loads the compiler
 
     part = read_signals(log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
-    log.forget()
+    if log.messages is not None:
+        log.messages.forget()
     hashes = (channels_sha256(part.signals, plan.mapping.signals), channels_sha256(part.truth, plan.mapping.truth))
     gaps = [_gaps(channel) for channel in (*part.signals.values(), *part.truth.values())]
     signals, late_counts = align(part.signals, plan.alignment)

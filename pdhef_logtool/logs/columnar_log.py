@@ -280,7 +280,7 @@ class ColumnarLog(DriveLog):
 
     def close(self) -> None:
         """Release the files."""
-        self._kept.clear()
+        self.forget()
         for container in self.containers:
             container.close()
         self._closing.close()

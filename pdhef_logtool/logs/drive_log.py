@@ -120,9 +120,6 @@ class DriveLog(ABC):
     ) -> dict[str, Columns]:
         """Read as :meth:`read`."""
 
-    def forget(self) -> None:
-        """Release memory of what was read and is not expected to be read again."""
-
     @abstractmethod
     def close(self) -> None:
         """Release the files."""

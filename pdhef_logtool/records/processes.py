@@ -18,6 +18,7 @@ QUIET = "PDHEF_QUIET"
 quiet = QUIET in os.environ
 #: Number of this worker process, from 1; 0 in the command itself.
 worker_number = 0
+_MANY_ROWS = 1 << 15
 
 
 def process_name() -> str:
@@ -46,10 +47,11 @@ def _host() -> str:
     return hashlib.sha256(f"{platform.node()}:{space}".encode()).hexdigest()[:8]
 
 
-def release_memory() -> None:
-    """Give freed memory back to the system: the C library keeps holes between arrays that are still in use."""
+def release_memory(rows: int) -> None:
+    """Give memory of freed arrays of many rows back: the C library keeps holes between arrays that are in use."""
     with contextlib.suppress(OSError, AttributeError):  # other C libraries than GNU's
-        ctypes.CDLL(None).malloc_trim(0)
+        if rows > _MANY_ROWS:
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def wait_for_end(pid: int, most_s: float = 5.0) -> None:

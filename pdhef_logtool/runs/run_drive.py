@@ -123,7 +123,7 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
     label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
     causality.failed |= run.failed
     whole = drive.whole()
-    release_memory()
+    release_memory(len(whole.signals))
     estimated = estimate_drive(
         whole,
         run.model.apply(whole.signals),
@@ -148,7 +148,7 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add contradictions as notes of the drive."""
     drive = run.drive
     scored = evaluate(drive, estimated, run.model)
-    release_memory()
+    release_memory(len(estimated.signals))
     digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
     scored = replace(scored, rows=[replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows])
     truth, reference = estimated.truth, estimated.read(REFERENCE)

@@ -8,12 +8,9 @@ import numpy as np
 
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.records.tracks import StateTrack
 
 #: Least number of pairs of stamps for an autocorrelation.
 LEAST_PAIRS = 10
-#: Rows of which the errors are in memory.
-_ROWS = 1 << 16
 _STATE = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")
 
 
@@ -22,16 +19,11 @@ def _errors(drive: EvaluatedDrive) -> Iterator[Columns]:
         return
     for track in drive.tracks.values():
         if track.covariance.shape[0]:
-            parts = [slice(k, k + _ROWS) for k in range(0, len(track), _ROWS)]
-            values = [_squares(track.rows(p.start, p.stop), drive.truth.rows(p.start, p.stop)) for p in parts]
-            yield Columns(track.name, "state", {"nees": np.concatenate([np.empty(0), *values])})
-
-
-def _squares(track: StateTrack, truth: StateTrack) -> FloatArray:
-    """Return :func:`nees` of a part of a drive [N]."""
-    error = np.stack([getattr(track, s) - getattr(truth, s) for s in _STATE], axis=1)
-    error[~(track.valid & truth.valid)] = np.nan
-    return nees(error, track.covariance + truth.covariance if truth.covariance.shape[0] else track.covariance)
+            error = np.stack([getattr(track, s) - getattr(drive.truth, s) for s in _STATE], axis=1)
+            error[~(track.valid & drive.truth.valid)] = np.nan
+            covariance, of_truth = track.covariance, drive.truth.covariance
+            values = nees(error, covariance + of_truth if of_truth.shape[0] else covariance)
+            yield Columns(track.name, "state", {"nees": values})
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -39,17 +31,17 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
     By elimination, P = L D Lᵀ, in the lower triangle, on all matrices at once.
     """
-    left, e = covariance.transpose(1, 2, 0).copy(), error.T.copy()
+    left, e = [[*row] for row in covariance.transpose(1, 2, 0)], [*error.T]  # views, replaced one by one
     total = np.zeros(error.shape[0])
     with np.errstate(all="ignore"):
         for j, row in enumerate(left):
             pivot = np.where(row[j] > 0.0, row[j], np.nan)
             total += e[j] ** 2 / pivot
             for i in range(j + 1, len(left)):
-                share = left[i, j] / pivot
-                e[i] -= share * e[j]
+                share = left[i][j] / pivot
+                e[i] = e[i] - share * e[j]
                 for m in range(j + 1, i + 1):
-                    left[i, m] -= share * left[m, j]
+                    left[i][m] = left[i][m] - share * left[m][j]
     return total
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -210,18 +211,20 @@ def _rows(
     drive: EvaluatedDrive, columns: Columns, family: Sequence[Metric], segment: str, place: _Place
 ) -> Iterator[MetricRow]:
     """Yield the rows of one signal of one estimator in a segment."""
-    finite: dict[str, BoolArray] = {}
-    chosen: dict[tuple[str, str], NDArray[Any]] = {}
+
+    @cache
+    def known(name: str) -> BoolArray:
+        return np.asarray(np.isfinite(columns.values[name][place]))
+
+    @cache
+    def where_known(name: str, first: str) -> NDArray[Any]:
+        return selected(columns.values[name][place], known(first))
+
     for metric in family:
         over = metric.over or (metric.name,)
         if not columns.values.keys() >= {*over} or (metric.whole and segment != ALL):
             continue
-        if over[0] not in finite:
-            finite[over[0]] = np.isfinite(columns.values[over[0]][place])
-        for name in over:
-            if (over[0], name) not in chosen:
-                chosen[over[0], name] = selected(columns.values[name][place], finite[over[0]])
-        values, signal = [chosen[over[0], name] for name in over], columns.signal
+        values, signal = [where_known(name, over[0]) for name in over], columns.signal
         n = len(values[0])
         value = metric.formula(*values) if n else None
         if value is not None:
