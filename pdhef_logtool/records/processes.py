@@ -18,7 +18,6 @@ QUIET = "PDHEF_QUIET"
 quiet = QUIET in os.environ
 #: Number of this worker process, from 1; 0 in the command itself.
 worker_number = 0
-_MANY_ROWS = 1 << 15
 
 
 def process_name() -> str:
@@ -50,7 +49,7 @@ def _host() -> str:
 def release_memory(rows: int) -> None:
     """Give memory of freed arrays of many rows back: the C library keeps holes between arrays that are in use."""
     with contextlib.suppress(OSError, AttributeError):  # other C libraries than GNU's
-        if rows > _MANY_ROWS:
+        if rows > 1 << 15:  # the arrays of a short drive are small
             ctypes.CDLL(None).malloc_trim(0)
 
 
