@@ -99,6 +99,7 @@ def run_log(
                 report = report_drive(run, estimated, scored, judged, losses, main.name, main)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)
+            release_memory(len(estimated.signals))
             files.write(report, scored.rows, scored.events)
         all_silent = len(scored.silent) == len(run.estimators)
         outcome = outcome_of(
