@@ -209,7 +209,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan) -> tuple[Signals
     """
     channels = with_gnss_velocity(channels)
     stamps = _grid_stamps(channels, plan)
-    missing = np.full(stamps.shape[0], np.nan)
+    missing = np.broadcast_to(np.nan, stamps.shape)  # takes no memory
     columns = {p.target: missing for p in plan.channels}
     ready, gnss_ready = stamps.copy(), stamps.copy()
     late: dict[str, int] = {}
@@ -227,22 +227,25 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan) -> tuple[Signals
             np.maximum(ready, arrival, out=ready)
 
     wheels = np.stack([columns.get(f"wheel_speed_{w}_m_s", missing) for w in WHEELS], axis=1)
-    velocity = gnss_velocity(columns) if plan.has_gnss else np.full((stamps.shape[0], 2), np.nan)
     if plan.speed_from == "wheel speeds":
         columns["speed_m_s"] = combine_wheel_speeds(wheels)
-    elif plan.speed_from == "GNSS":
-        columns["speed_m_s"] = np.hypot(velocity[:, 0], velocity[:, 1])
+    gnss: dict[str, Any] = {}
+    if plan.has_gnss:
+        velocity = gnss["gnss_velocity_m_s"] = gnss_velocity(columns)
+        gnss["gnss_late_s"] = np.where(np.isfinite(velocity[:, 0]), (gnss_ready - stamps) * 1e-9, np.nan)
+        if plan.speed_from == "GNSS":
+            columns["speed_m_s"] = np.hypot(velocity[:, 0], velocity[:, 1])
+    if has_position(columns):
+        gnss["gnss_position_deg"] = np.stack([columns[name] for name in GNSS_POSITION], axis=1)
     signals = Signals(
         stamps_ns=stamps,
         ready_ns=np.maximum.accumulate(ready),
         wheel_speed_m_s=wheels,
         available=plan.available,
-        gnss_velocity_m_s=velocity,
         gnss_velocity_std_m_s=columns.get("gnss_velocity_accuracy_m_s", missing),
-        gnss_late_s=np.where(np.isfinite(velocity[:, 0]), (gnss_ready - stamps) * 1e-9, np.nan),
-        gnss_position_deg=np.stack([columns.get(name, missing) for name in GNSS_POSITION], axis=1),
         gnss_position_std_m=columns.get("gnss_position_accuracy_m", missing),
-        **{name: columns.get(name, missing).copy() for name in (*ALIGNED_SIGNALS, "speed_m_s", *_ALONE)},
+        **{name: columns.get(name, missing) for name in (*ALIGNED_SIGNALS, *_ALONE)},
+        **gnss,
     )
     return signals, late
 

@@ -95,7 +95,7 @@ class FrictionSource:
         if self.source is FrictionFrom.TRUTH and truth is not None:
             signals = replace(signals, friction=truth.friction)
         if self.constant is not None:
-            return replace(signals, friction=np.full(len(signals), self.constant))
+            return replace(signals, friction=np.broadcast_to(self.constant, len(signals)))
         return signals
 
 

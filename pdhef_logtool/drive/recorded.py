@@ -84,25 +84,29 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
     from pdhef_logtool.drive.sensor_faults import without_faults  # loads the compiler
 
     part = read_signals(log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
-    channels = [*part.signals.values(), *part.truth.values()]
-    aligned, late_counts = align(part.signals, plan.alignment)
-    aligned = correct_signals(aligned, plan.vehicle)
-    signals, changes = find_changes(without_impossible(aligned), unchanged)
-    signals = without_faults(signals, plan.vehicle)
+    if log.messages is not None:
+        log.messages.forget()
+    hashes = (channels_sha256(part.signals, plan.mapping.signals), channels_sha256(part.truth, plan.mapping.truth))
+    gaps = [_gaps(channel) for channel in (*part.signals.values(), *part.truth.values())]
+    signals, late_counts = align(part.signals, plan.alignment)
+    signals = correct_signals(signals, plan.vehicle)
     late = []
     for name in sorted(late_counts.keys() & part.signals.keys()):
         part.counts["signal", name]["late"] += late_counts[name]
         channel = part.signals[name]
         start_ns, end_ns = int(channel.stamps_ns[0]), int(channel.stamps_ns[-1]) + 1
         late.append(Loss("late", _LATE, channel.source, start_ns, end_ns, late_counts[name], "note"))
-    losses = merge_losses([part.losses, *map(_gaps, channels), late, _impossible(aligned)])
+    losses = merge_losses([part.losses, *gaps, late, _impossible(signals)])
+    ledger = sample_ledger(log, plan, part.counts)
     truth = None
     if plan.truth is not None:
         derived, standstill = derive_truth(part.truth, plan=plan.truth), plan.vehicle.standstill_m_s
-        at_stamps = truth_at(derived, signals.stamps_ns, plan.truth_latency_s, standstill_m_s=standstill)
-        truth = replace(at_stamps, measured_speed_m_s=_measured_speed(signals))
-    ledger = sample_ledger(log, plan, part.counts)
-    hashes = (channels_sha256(part.signals, plan.mapping.signals), channels_sha256(part.truth, plan.mapping.truth))
+        truth = truth_at(derived, signals.stamps_ns, plan.truth_latency_s, standstill_m_s=standstill)
+        del derived
+    del part  # the channels take as much memory as all that follows
+    signals, changes = find_changes(without_impossible(signals), unchanged)
+    signals = without_faults(signals, plan.vehicle)
+    truth = None if truth is None else replace(truth, measured_speed_m_s=_measured_speed(signals))
     from_truth = () if truth is None else steps_from_truth(signals, truth)
     return WholeDrive(name, plan, signals, truth, log.start_ns, changes, from_truth, losses, ledger, *hashes)
 

@@ -82,7 +82,8 @@ def without_faults(signals: Signals, vehicle: VehicleParameters) -> Signals:
     for i, name in enumerate(COLUMNS):
         sound[name][dead[cells.of_stamp, i]] = np.nan
         faults[reported[cells.of_stamp, i]] |= DEAD_AY << i
-    return replace(signals, **sound, extra_variance=extra, faults=faults.astype(np.float64))
+    stated = faults.astype(np.float64) if faults.any() else np.broadcast_to(0.0, len(faults))
+    return replace(signals, **sound, extra_variance=extra, faults=stated)
 
 
 def _without_stuck(

@@ -9,6 +9,7 @@ A smoother (:class:`~.base.Smoother`) reads later samples: it has each estimate 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -19,10 +20,10 @@ from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import StepColumns, extrapolation, release
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import FILED_COLUMNS, StateTrack, concatenate
 
 #: Steps that an estimator makes at a time; an hour of steps with covariances would take 350 MB per filter.
-PIECE_STEPS = 8192
+PIECE_STEPS = 4096
 
 
 def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCheck | None = None) -> StateTrack:
@@ -53,7 +54,7 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
             stamps_ns = signals.stamps_ns[due].copy()
             ahead = extrapolation(piece.stamps_ns, arrivals.rows(due, first), steps.valid, stamps_ns)
             tracks.append(predict_track(estimator, steps, ahead, stamps_ns))
-    return concatenate(tracks) if len(tracks) > 1 else tracks[0]
+    return replace(concatenate(tracks, single=FILED_COLUMNS), stamps_ns=signals.stamps_ns)
 
 
 def _run_piece(

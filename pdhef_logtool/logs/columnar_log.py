@@ -274,9 +274,13 @@ class ColumnarLog(DriveLog):
                     parts[columns.topic].append(columns)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
+    def forget(self) -> None:
+        """Release the blocks of the log's beginning."""
+        self._kept.clear()
+
     def close(self) -> None:
         """Release the files."""
-        self._kept.clear()
+        self.forget()
         for container in self.containers:
             container.close()
         self._closing.close()

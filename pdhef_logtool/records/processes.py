@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import os
 import platform
@@ -43,6 +44,13 @@ def _host() -> str:
     except OSError:
         space = ""
     return hashlib.sha256(f"{platform.node()}:{space}".encode()).hexdigest()[:8]
+
+
+def release_memory(rows: int) -> None:
+    """Give memory of freed arrays of many rows back: the C library keeps holes between arrays that are in use."""
+    with contextlib.suppress(OSError, AttributeError):  # other C libraries than GNU's
+        if rows > 1 << 15:  # the arrays of a short drive are small
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def wait_for_end(pid: int, most_s: float = 5.0) -> None:

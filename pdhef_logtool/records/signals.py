@@ -171,11 +171,11 @@ class Signals:
     before_ns: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
-        """Fill missing columns with NaN."""
+        """Fill missing columns with NaN, which takes no memory and cannot be written."""
         for name in SIGNAL_COLUMNS:
             column = getattr(self, name)
             if len(column) != len(self):
-                object.__setattr__(self, name, np.full((len(self), *column.shape[1:]), np.nan))
+                object.__setattr__(self, name, np.broadcast_to(np.nan, (len(self), *column.shape[1:])))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
@@ -19,6 +20,8 @@ ESTIMATED_COLUMNS = (
 #: Shares of the information on v_y of the sideslip reference, and whether (1, 0) estimators with the same IMU may be
 #: ranked by it.
 SHARE_COLUMNS = ("share_law", "share_kinematics", "share_gnss", "independent")
+#: Columns that only files contain, which round them to less than single precision.
+FILED_COLUMNS = ("r_scale", "mixture_weight", *ESTIMATED_COLUMNS)
 #: Columns of estimates.parquet in order, without ``estimator`` (the name of the track).
 TRACK_COLUMNS = (
     *("stamp_ns", "vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"),
@@ -156,7 +159,7 @@ def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | IntArray 
     """
     n = int(stamps_ns.shape[0])
     needed = [f.name for f in fields(StateTrack) if f.name not in OPTIONAL_COLUMNS]
-    values: dict[str, Any] = {c: np.full(n, np.nan) for c in needed if c not in columns}
+    values: dict[str, Any] = {c: np.broadcast_to(np.nan, n) for c in needed if c not in columns}
     values |= {"covariance": np.empty((0, 3, 3)), "valid": np.ones(n, np.bool_), "diverged": np.zeros(n, np.bool_)}
     values |= {"name": name, "stamps_ns": stamps_ns, **columns}
     if "sideslip_rad" not in columns and "vx_m_s" in columns and "vy_m_s" in columns:
@@ -174,18 +177,27 @@ def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
     return covariance
 
 
-def concatenate(tracks: list[StateTrack]) -> StateTrack:
-    """Join the pieces of one track in time order; the list is emptied, so that each column is in memory once."""
+def concatenate(tracks: list[StateTrack], *, single: Collection[str] = ()) -> StateTrack:
+    """Join the pieces of one track in time order; the list is emptied, so that each column is in memory once.
+
+    ``single`` : columns that are joined in single precision.
+    """
     name = tracks[0].name
     columns = {f.name: [getattr(t, f.name) for t in tracks] for f in fields(StateTrack) if f.name != "name"}
     tracks.clear()
-    return StateTrack(name=name, **{column: np.concatenate(columns.pop(column)) for column in [*columns]})
+    return StateTrack(name=name, **{c: _joined(columns.pop(c), c in single) for c in [*columns]})
+
+
+def _joined(parts: Sequence[NDArray[Any]], is_single: bool) -> NDArray[Any]:
+    """Join the pieces of a column; a missing one (:func:`make_track`) takes no memory."""
+    if all(part.strides == (0,) and part[:1].tobytes() == parts[0][:1].tobytes() for part in parts):
+        return np.broadcast_to(parts[0][:1], sum(map(len, parts)))
+    return np.concatenate(parts, dtype=np.float32 if is_single else None, casting="same_kind")
 
 
 def scaled_covariance(covariance: FloatArray, of_vy: FloatArray) -> FloatArray:
     """Return covariances [N, 3, 3] with factors [N] on the 1-sigma of v_y; correlations stay."""
-    scale = np.ones(covariance.shape[:2])
-    scale[:, 1] = of_vy
-    scaled: FloatArray = covariance * scale[:, :, None]
-    scaled *= scale[:, None, :]
+    scaled = covariance.copy()
+    scaled[:, 1] *= of_vy[:, None]
+    scaled[:, :, 1] *= of_vy[:, None]
     return scaled

@@ -138,7 +138,7 @@ def track_table(track: StateTrack, *, as_written: bool = False, causal: BoolArra
     schema = arrow_schema("estimates.parquet.json")
     columns: dict[str, Any] = dict(track.columns())
     if as_written:
-        columns = {n: rounded(n, values) if values.dtype == np.float64 else values for n, values in columns.items()}
+        columns = {n: rounded(n, values) if values.dtype.kind == "f" else values for n, values in columns.items()}
     if causal is not None:
         columns["causal"] = causal
     estimator = (arrow_array(np.zeros(len(track)), pa.int32()), arrow_array([track.name], pa.string()))

@@ -27,6 +27,7 @@ from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import DriveIntervals, drive_intervals, spread, widened
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
+from pdhef_logtool.records.processes import release_memory
 from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -102,21 +103,37 @@ def choose(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimated:
-    """A drive with the tracks of all estimators by name, in their order.
+    """A drive with the tracks of all estimators by name, in their order."""
 
-    ``truth`` is for scores, ``drawn_truth`` for outputs: with a pose, and valid if it is complete; None without ground
-    truth.
-    """
-
-    signals: Signals
-    truth: StateTrack | None
-    drawn_truth: StateTrack | None
+    drive: WholeDrive
     tracks: dict[str, StateTrack]
 
     @property
+    def signals(self) -> Signals:
+        """The signals of the drive."""
+        return self.drive.signals
+
+    @property
+    def truth(self) -> StateTrack | None:
+        """The ground truth for scores."""
+        return self.drive.truth
+
+    @property
     def drawn(self) -> list[StateTrack]:
-        """The tracks for outputs: ground truth, then the estimators."""
-        return [*filter(None, [self.drawn_truth]), *self.tracks.values()]
+        """The tracks for outputs, with poses: ground truth, valid where it is complete, then the estimators."""
+        plan, drawn = self.drive.plan, [self.posed(track) for track in self.tracks.values()]
+        if self.truth is not None:
+            truth = self.truth if plan.has_truth_pose else self.posed(self.truth)
+            drawn.insert(0, valid_as_a_whole(truth, plan.derivation, plan.vehicle.standstill_m_s))
+        return drawn
+
+    def posed(self, track: StateTrack) -> StateTrack:
+        """Return a track with its pose, dead-reckoned from the first pose of the ground truth."""
+        vx, vy = track.vx_m_s, track.vy_m_s
+        if not np.isfinite(vy).any():
+            vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
+        start = _first_pose(self.truth)
+        return track.with_pose(*dead_reckon(track.stamps_ns, vx, vy, track.yaw_rate_rad_s, start))
 
     def read(self, name: str) -> StateTrack | None:
         """Return the track of a name (:data:`TRUTH`: ground truth), or None."""
@@ -153,6 +170,7 @@ def estimate_drive(
             track = shared.pop(computation, None)
             if track is None:
                 track = run_estimator(estimator, given, causality)
+                release_memory(len(track))
             varied = _varied(estimator, given, drive.changes)
         except EstimatorError as error:
             if causality is None:
@@ -169,17 +187,8 @@ def estimate_drive(
         if varied:
             track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)
         tracks.append(track.without_sideslip_below(vehicle.standstill_m_s))
-    return with_poses(drive, tracks)
-
-
-def with_poses(drive: WholeDrive, tracks: Iterable[StateTrack]) -> Estimated:
-    """Return a drive with tracks, dead-reckoned from the first pose of the ground truth."""
-    plan, drawn_truth = drive.plan, drive.truth
-    start = _first_pose(drawn_truth)
-    if drawn_truth is not None:
-        drawn_truth = drawn_truth if plan.has_truth_pose else _dead_reckoned(drawn_truth, start)
-        drawn_truth = valid_as_a_whole(drawn_truth, plan.derivation, plan.vehicle.standstill_m_s)
-    return Estimated(drive.signals, drive.truth, drawn_truth, {t.name: _dead_reckoned(t, start) for t in tracks})
+        release_memory(len(track))
+    return Estimated(drive, {t.name: t for t in tracks})
 
 
 def _computation(estimator: Estimator, signals: Signals) -> tuple[str, int]:
@@ -192,14 +201,6 @@ def _varied(estimator: Estimator, given: Signals, changes: Sequence[SensorChange
     varied = (c for c in changes if math.isfinite(c.std))
     away = (c.removed(given, c.known_ns, -c.std) for c in varied)
     return [run_estimator(estimator, signals).vy_m_s for signals in away]
-
-
-def _dead_reckoned(track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
-    """Return a track with its pose, dead-reckoned from ``start``."""
-    vx, vy = track.vx_m_s, track.vy_m_s
-    if not np.isfinite(vy).any():
-        vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
-    return track.with_pose(*dead_reckon(track.stamps_ns, vx, vy, track.yaw_rate_rad_s, start))
 
 
 def _first_pose(truth: StateTrack | None) -> tuple[float, float, float]:

@@ -181,7 +181,7 @@ def _score_drive(
 
     def at(stamps_ns: IntArray, tracks: Sequence[StateTrack]) -> estimating.Estimated:
         of_reference = [] if reference is None or reference.estimator is None else [reference.estimator.at(stamps_ns)]
-        return estimating.with_poses(_drive_at(drive, truth, stamps_ns), [*tracks, *of_reference])
+        return estimating.Estimated(_drive_at(drive, truth, stamps_ns), {t.name: t for t in (*tracks, *of_reference)})
 
     tracks = [r.track for r in recorded]
     equal: dict[str, str] = {}

@@ -28,6 +28,7 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import merge_losses
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.printable import printable
+from pdhef_logtool.records.processes import release_memory
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
@@ -98,6 +99,7 @@ def run_log(
                 report = report_drive(run, estimated, scored, judged, losses, main.name, main)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)
+            release_memory(len(estimated.signals))
             files.write(report, scored.rows, scored.events)
         all_silent = len(scored.silent) == len(run.estimators)
         outcome = outcome_of(
@@ -122,6 +124,7 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
     label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
     causality.failed |= run.failed
     whole = drive.whole()
+    release_memory(len(whole.signals))
     estimated = estimate_drive(
         whole,
         run.model.apply(whole.signals),
@@ -146,6 +149,7 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add contradictions as notes of the drive."""
     drive = run.drive
     scored = evaluate(drive, estimated, run.model)
+    release_memory(len(estimated.signals))
     digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
     scored = replace(scored, rows=[replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows])
     truth, reference = estimated.truth, estimated.read(REFERENCE)
@@ -195,7 +199,7 @@ def report_drive(
         "reference": None if run.reference is None else run.reference.document,
         "largest_errors": [] if track is None else largest_errors(track, truth, others, slow),
         "faults": _faults(run, selected, estimated.read),
-        "path_drift": None if truth is None or track is None else path_drift(track, truth),
+        "path_drift": None if truth is None or track is None else path_drift(estimated.posed(track), truth),
         "metadata": {} if config.no_position else _metadata(drive),
         **stated,
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +13,20 @@ if TYPE_CHECKING:
 
 def template(path: Path, **context: Any) -> Template:
     """Return a template; ``context``: functions and constants that it uses. Fields of XML are escaped."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+    from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, StrictUndefined, select_autoescape
+
+    class Kept(FileSystemBytecodeCache):
+        """Code of templates, which takes long to compile: beside them, as Python keeps that of modules."""
+
+        def dump_bytecode(self, bucket: Any) -> None:
+            with suppress(OSError):  # a full disk, or an installation that cannot be written
+                if not sys.dont_write_bytecode:
+                    Path(self.directory).mkdir(exist_ok=True)
+                    super().dump_bytecode(bucket)
 
     made = Environment(
         loader=FileSystemLoader(path.parent),
+        bytecode_cache=Kept(str(path.with_name("__pycache__"))),
         autoescape=select_autoescape(("xml",)),
         undefined=StrictUndefined,
         trim_blocks=True,

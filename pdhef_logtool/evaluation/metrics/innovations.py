@@ -31,17 +31,17 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
     By elimination, P = L D Lᵀ, in the lower triangle, on all matrices at once.
     """
-    left, e = covariance.transpose(1, 2, 0).copy(), error.T.copy()
+    left, e = [[*row] for row in covariance.transpose(1, 2, 0)], [*error.T]  # views, replaced one by one
     total = np.zeros(error.shape[0])
     with np.errstate(all="ignore"):
         for j, row in enumerate(left):
             pivot = np.where(row[j] > 0.0, row[j], np.nan)
             total += e[j] ** 2 / pivot
             for i in range(j + 1, len(left)):
-                share = left[i, j] / pivot
-                e[i] -= share * e[j]
+                share = left[i][j] / pivot
+                e[i] = e[i] - share * e[j]
                 for m in range(j + 1, i + 1):
-                    left[i, m] -= share * left[m, j]
+                    left[i][m] = left[i][m] - share * left[m][j]
     return total
 
 

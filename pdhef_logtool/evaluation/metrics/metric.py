@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.statistics import gathered
+from pdhef_logtool.evaluation.track_errors import selected
 from pdhef_logtool.evaluation.units import SIGNALS, read_unit
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -211,16 +212,20 @@ def _rows(
     drive: EvaluatedDrive, columns: Columns, family: Sequence[Metric], segment: str, place: _Place
 ) -> Iterator[MetricRow]:
     """Yield the rows of one signal of one estimator in a segment."""
-    chosen: dict[tuple[str, ...], list[NDArray[Any]]] = {}
+
+    @cache
+    def known(name: str) -> BoolArray:
+        return np.asarray(np.isfinite(columns.values[name][place]))
+
+    @cache
+    def where_known(name: str, first: str) -> NDArray[Any]:
+        return selected(columns.values[name][place], known(first))
+
     for metric in family:
         over = metric.over or (metric.name,)
         if not columns.values.keys() >= {*over} or (metric.whole and segment != ALL):
             continue
-        if over not in chosen:
-            values = [columns.values[name][place] for name in over]
-            finite = np.isfinite(values[0])
-            chosen[over] = values if finite.all() else [v[finite] for v in values]
-        values, signal = chosen[over], columns.signal
+        values, signal = [where_known(name, over[0]) for name in over], columns.signal
         n = len(values[0])
         value = metric.formula(*values) if n else None
         if value is not None:
