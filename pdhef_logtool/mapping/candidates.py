@@ -417,9 +417,9 @@ def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tup
     return results
 
 
-def anchor_of(source: SignalSource, results: Sequence[Field]) -> Field | None:
-    """Return the anchor of a mapped source."""
-    meaning = meaning_of_signal(source.name)
+def anchor_of(name: str, results: Sequence[Field]) -> Field | None:
+    """Return the anchor of a mapped signal or ground truth."""
+    meaning = meaning_of_signal(name)
     return next((f for f in results if f.anchor and f.meaning == meaning), None)
 
 

@@ -38,6 +38,8 @@ UPRIGHT, NEAR_1_G = 0.9, 0.25
 CERTAIN = 0.9
 #: Usual lengths that convert curvature to an angle: a wheelbase, times a steering ratio for the steering wheel.
 USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
+#: Usual track of a car, and 1-sigma of its logarithm.
+USUAL_TRACK_M, USUAL_TRACKS = 1.55, 0.2
 #: Energies of rare units.
 RARE = {"mph": 1.5, "mg": 1.5, "ft/s²": 3.0}
 
@@ -209,6 +211,7 @@ def decide_units(fields: Fields) -> None:
     _by_speeding_up(fields)
     _by_turning(fields)
     _by_steering(fields)
+    _by_track(fields)
     _by_siblings(fields)
 
 
@@ -302,6 +305,19 @@ def _by_steering(fields: Fields) -> None:
     if share.max() > CERTAIN * share.sum():
         speed.use(speed.units[int(share.argmax())][0])
         speed.doubts.append(f"unit not given; taken as {speed.factors[0][0]}, with a usual ratio of the steering")
+
+
+def _by_track(fields: Fields) -> None:
+    """Determine the unit of the speed by the track with which wheel speeds of this unit differ in bends."""
+    speed, rate = fields.best("speed"), fields.best("rate")
+    left, right = (next(iter(fields.open("wheel speed", side)), None) for side in ("rl", "rr"))
+    if speed is None or rate is None or left is None or right is None:
+        return
+    times = ratio(right.seen.cells, speed.seen.cells, SLOW_M_S)
+    apart = fields.pieces.smooth(right.seen.cells - left.seen.cells)
+    relation = fit(apart, fields.pieces.smooth(rate.seen.cells))
+    if times is not None and abs(times - 1.0) < NEAR_1_G and relation is not None and abs(relation.correlation) > CLEAR:
+        settle((speed, rate), [Gain((1, -1), relation.slope / USUAL_TRACK_M, USUAL_TRACKS)], "the track of its wheels")
 
 
 def _by_siblings(fields: Fields) -> None:

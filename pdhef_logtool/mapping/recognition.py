@@ -364,8 +364,8 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Take the GNSS velocity from a twist over ground, of a navigation system first."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS and _type(t) not in BODY_TWIST_TYPES]
-    twists = [t for t in twists if not _words(t.name) & (_TOPICS["command"] | _TOPICS["estimate"])]
-    for topic in sorted(twists, key=lambda t: not _is_truth(t)):
+    twists = [t for t in twists if not _words(t.name) & _TOPICS["command"]]
+    for topic in sorted(twists, key=lambda t: (bool(_words(t.name) & _TOPICS["estimate"]), not _is_truth(t))):
         paths = tuple(_twist(topic, "linear", axis) for axis in "xy")
         axes = _axes(draft, topic, topics)
         if axes not in ("", "body"):
@@ -653,13 +653,24 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     if axes == "not ahead":
         why = "the type's convention is the body frame, although x is mostly not the direction of travel"
         draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
+    left = _left(draft, chosen)
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
         values = draft.values(chosen.name, full)
         filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
         if draft.is_given(chosen.name, full) and not filler:
-            draft.take(draft.truth, name, chosen.name, full)
+            draft.take(draft.truth, name, chosen.name, full, 1.0 if axis == "x" else left)
     return chosen
+
+
+def _left(draft: _Draft, twist: TopicInfo) -> float:
+    """Return the sign of the y axis of a device to the left: -1 if the IMU of its messages has gravity along -z."""
+    imu = draft.signals.get("ay_m_s2")
+    if imu is None or _device(imu.topic) != _device(twist.name) or _mean(draft.values(imu.topic, _GRAVITY_PATHS[2])) > -8.0:
+        return 1.0
+    why = "its IMU has axes forward, right, down, as gravity shows"
+    draft.doubt("ground-truth velocity", (twist.name,), twist.name, why)
+    return -1.0
 
 
 def _take_earth_velocity(draft: _Draft, chosen: TopicInfo, axes: str, *, is_body: bool) -> TopicInfo | None:

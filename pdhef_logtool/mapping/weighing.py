@@ -26,7 +26,7 @@ from pdhef_logtool.mapping.candidates import (
     proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
+from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio, spread
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
@@ -57,6 +57,8 @@ _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
+#: Standard deviation of the yaw rate of a car that turns; share of the time that counts as always.
+EXCITED_RATE_RAD_S, MOSTLY = 0.03, 0.9
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -96,9 +98,9 @@ def weigh(
     wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
     if not wanted:
         return Weighing(Fields(Pieces(log), {}, [], []))
-    positions = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m")]
-    pieces, weighable = look(log, wanted, vendors, [*signals.values(), *positions])
-    anchors = {n: f for n, s in signals.items() if (f := anchor_of(s, weighable)) is not None}
+    known = {n: s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")} | signals
+    pieces, weighable = look(log, wanted, vendors, [*known.values()])
+    anchors = {n: f for n in (*signals, "vx_m_s") if (f := anchor_of(n, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
@@ -185,6 +187,8 @@ class Weighing:
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
+            if axes == "not ahead" and rates and self._turn_right(x, y, rates[0].si):
+                continue
             is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
             if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
                 self._turn_down(y)
@@ -205,9 +209,18 @@ class Weighing:
         speeds = [f.si for f in self.fields.open("speed") if f is not x]
         return any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
 
+    def _turn_right(self, x: Field, y: Field, rate: FloatArray) -> bool:
+        """Read a velocity as right and ahead if its y is ahead in bends, too; return whether it is."""
+        is_turning = spread(rate) > EXCITED_RATE_RAD_S and not turns(self.fields.pieces, np.arctan2(y.si, x.si), rate)
+        is_ahead = float(np.mean((y.si > 2.0 * np.abs(x.si))[np.hypot(x.si, y.si) > SLOW_M_S])) > MOSTLY
+        if is_turning and is_ahead:
+            x.meaning, y.meaning, x.sign = y.meaning, x.meaning, -x.sign
+            y.doubts.append("x of its vector is to the right and y ahead, as its values show")
+        return is_turning and is_ahead
+
     def _turn_down(self, y: Field) -> None:
         """Turn the y of a body's velocity to the left if the accelerometer beside it has gravity along -z."""
-        down = [f for f in self.fields.candidates if f.has_gravity and words_of(f.path)[-1:] == ("z",) and f.sign < 0.0]
+        down = [f for f in self.fields.candidates if f.has_gravity and f.sign < 0.0 and f.path.endswith(("z", "Z", "[2]"))]
         if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
             y.sign = -1.0
             y.doubts.append("its device has axes forward, right, down, as gravity shows")
@@ -217,10 +230,10 @@ class Weighing:
         pieces, length = self.fields.pieces, np.hypot(x.si, y.si)
         ahead, left = pieces.rate_of(length), length * pieces.turning(x.si + 1j * y.si)
         for item in [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and f.is_axis]:
-            if (of := {"x": (x, ahead), "y": (y, left)}.get(item.meaning.part)) is not None and not item.fixed:
-                changes = (pieces.rate_of(of[0].si), of[1])
-                over, body = (correlation(pieces.smooth(item.si), change) for change in changes)
-                if over > max(CLEAR, abs(body)):
+            if (of := {"x": x, "y": y}.get(item.meaning.part)) is not None and not item.fixed:
+                # Axes of a device may be turned by a quarter.
+                over, *body = (correlation(pieces.smooth(item.si), c) for c in (pieces.rate_of(of.si), ahead, left))
+                if over > max(CLEAR, *map(abs, body)):
                     self.fields.candidates.remove(item)
                     self.notes.append(f"{item.topic.name}.{item.path} is not used: it is over ground")
 
