@@ -18,7 +18,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
+from pdhef_logtool.mapping.candidates import HYPOTHESES, MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
@@ -267,10 +267,21 @@ class _Instrument:
     @property
     def course(self) -> FloatArray:
         """Direction of the path, counter-clockwise from east, rad [M]; NaN at low speed."""
-        read = {(self.topic, path): seen for path, seen in self.seen.items()}
-        velocity = path_velocity(_on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read)))
+        velocity = path_velocity(self._path)
         nothing = np.full(len(self.pieces.starts) * self.pieces.cells_a_piece, np.nan)
         return nothing if velocity is None else _direction(*velocity)
+
+    @cached_property
+    def _path(self) -> Fields:
+        read = {(self.topic, path): seen for path, seen in self.seen.items()}
+        return _on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read))
+
+    def unit_on_path(self, speed: str) -> float | None:
+        """Return the unit in which a speed is that along the positions; None if it is not, or without positions."""
+        path = path_speed(self._path) if speed in self.seen else None
+        times = None if path is None else ratio(path, self.seen[speed].cells, SLOW_M_S)
+        units = [unit for _, unit in HYPOTHESES["speed"] if times is not None and abs(times / unit - 1.0) < NEAR_PATH]
+        return units[0] if units else None
 
     def follows(self, path: str, speed: str, scale: float, angle: float) -> bool:
         """Return whether an angle is the direction of the path; without positions, whether a course turns as the car.
@@ -334,8 +345,9 @@ def named_gnss(log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSour
 
 def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
-    speed = next((p for p, m in its.meanings.items() if m.quantity == "speed" and m.scale is not None), None)
-    if speed is None:
+    units = {p: m.scale or its.unit_on_path(p) for p, m in its.meanings.items() if m.quantity == "speed"}
+    speed, unit = next(((p, u) for p, u in units.items() if u is not None), ("", 0.0))
+    if not speed:
         return
     for path, meaning in its.angles.items():
         # A course over ground is clockwise from north by definition; the drive confirms this and determines the unit.
@@ -343,7 +355,7 @@ def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
         fitting = [c for c in fitting if path in its.seen and its.follows(path, speed, *c)]
         if fitting:
             yield its.source("gnss_course_rad", path, *fitting[0])
-            yield its.source("gnss_speed_m_s", speed, its.meanings[speed].scale or 1.0)
+            yield its.source("gnss_speed_m_s", speed, unit)
             return
 
 

@@ -345,7 +345,7 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
             draft.signals |= signals
     if not has_gnss(draft.signals):
         _map_twist(draft, others)
-        if has_gnss(draft.signals) or not has_heading(draft.truth):
+        if has_gnss(draft.signals) or not has_heading(draft.truth) or not {"lat_deg", "x_m"} & set(draft.truth):
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 

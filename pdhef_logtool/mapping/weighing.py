@@ -55,6 +55,8 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
+#: Speed over that over ground below which it is vertical.
+VERTICAL = 0.2
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
 #: Standard deviation of the yaw rate of a car that turns; share of the time that counts as always.
@@ -106,6 +108,7 @@ def weigh(
     decide_units(fields)
     weighing = Weighing(fields)
     weighing.drop_vectors_over_ground()
+    weighing.drop_vertical_speeds()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     weighing.choose_signals(set(signals))
@@ -117,6 +120,8 @@ def _is_wanted(
     quantity: str, part: str, role: Role, signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]
 ) -> bool:
     """Return whether a field can provide a missing signal, or information on one."""
+    if quantity == "over ground":  # shows which speed is vertical
+        return "speed_m_s" not in signals
     if quantity == "acceleration" and part == "z":  # shows gravity
         return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
     if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
@@ -203,6 +208,14 @@ class Weighing:
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
+
+    def drop_vertical_speeds(self) -> None:
+        """Leave out speeds that are small against the velocity north and east of their message."""
+        for north in self.fields.open("over ground", "n"):
+            level = [f.seen.largest for f in self.fields.open("over ground") if f.topic is north.topic and f.meaning.part in "en"]
+            for item in [f for f in self.fields.open("speed") if f.topic is north.topic and not f.fixed]:
+                if item.seen.largest < VERTICAL * max(level):
+                    self.fields.candidates.remove(item)
 
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
         """Return whether another speed is the length of x and y, and not x."""
