@@ -199,8 +199,8 @@ def receiver_signals(
                 for path, f in receiver.fields.items()
                 if f"{base}{path}" in there
             }
-            if "position_covariance_type" in receiver.has:  # 1 sigma: the root of the mean variance east and north
-                struct = there[f"{base}latitude"].removesuffix("latitude")
+            struct = there.get(f"{base}latitude", "").removesuffix("latitude")
+            if any(p.startswith(f"{struct}position_covariance[") for p in paths):  # 1 sigma: mean of east and north
                 squared = tuple(f"{struct}position_covariance[{i}]" for i in (0, 4))
                 accuracy = SignalSource("gnss_position_accuracy_m", topic, squared, stamp, (0.5, 0.5), combine="root")
                 sources[accuracy.name] = accuracy

@@ -427,6 +427,10 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Without a sensor, take the yaw rate from an odometry and the speed from navigation or a twist, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"])]
+    rates = [t for t in topics if _type(t) in _FIELDS["speed"] and _span(draft.values(t.name, "heading_rate")) > 0.0]
+    if "yaw_rate_rad_s" not in draft.signals and rates:
+        draft.take(draft.signals, "yaw_rate_rad_s", rates[0].name, "heading_rate")
+        draft.notes.append(f"yaw_rate_rad_s comes from {rates[0].name}.heading_rate, as no IMU gives it")
     if "yaw_rate_rad_s" not in draft.signals:
         odometries = [t for t in twists if not _is_truth(t) and _words(t.name) & _TOPICS["vehicle"]]
         odometries = [t for t in odometries if not _words(t.name) & _TOPICS["estimate"]]

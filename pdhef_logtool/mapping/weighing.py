@@ -55,8 +55,8 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Speed over that over ground below which it is vertical.
-VERTICAL = 0.2
+#: Speed over that over ground below which it is vertical; median over deviation of no steering angle.
+VERTICAL, OFF_CENTRE = 0.2, 3.0
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
 #: Standard deviation of the yaw rate of a car that turns; share of the time that counts as always.
@@ -210,12 +210,11 @@ class Weighing:
             self.notes.append(note)
 
     def drop_vertical_speeds(self) -> None:
-        """Leave out speeds that are small against the velocity north and east of their message."""
-        for north in self.fields.open("over ground", "n"):
-            level = [f.seen.largest for f in self.fields.open("over ground") if f.topic is north.topic and f.meaning.part in "en"]
-            for item in [f for f in self.fields.open("speed") if f.topic is north.topic and not f.fixed]:
-                if item.seen.largest < VERTICAL * max(level):
-                    self.fields.candidates.remove(item)
+        """Leave out speeds that are small against the velocity over ground of their message."""
+        level = [*(f for f in self.fields.open("over ground") if f.meaning.part in "en"), *self.taken.values()]
+        for item in [f for f in self.fields.candidates if f.meaning.quantity == "speed" and not f.fixed]:
+            if item.seen.largest < VERTICAL * max((f.seen.largest for f in level if f.topic is item.topic), default=0.0):
+                self.fields.candidates.remove(item)
 
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
         """Return whether another speed is the length of x and y, and not x."""
@@ -368,7 +367,8 @@ class Weighing:
                 judged.append((item.score + (0.3 if follows else 0.0), name, item))
         if not judged:
             return
-        judged.sort(key=lambda j: (-j[0], -j[2].topic.messages, j[2].topic.name, j[2].path))
+        # An angle is 0 straight ahead; a servo's command is not.
+        judged.sort(key=lambda j: (-j[0], _is_off_centre(j[2]), -j[2].topic.messages, j[2].topic.name, j[2].path))
         _, name, best = judged[0]
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
@@ -530,6 +530,10 @@ class Weighing:
 def _has_open_sign(item: Field) -> bool:
     """Return whether the sign of a field is unknown from documentation, name and mounting."""
     return not (item.fixed or item.is_downward) and (item.meaning.quantity == "steering" or not item.is_axis)
+
+
+def _is_off_centre(item: Field) -> bool:
+    return bool(abs(np.nanmedian(item.seen.values)) > OFF_CENTRE * np.nanstd(item.seen.values))
 
 
 def _share_axis(first: Field, second: Field) -> bool:
