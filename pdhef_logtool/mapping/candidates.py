@@ -51,9 +51,7 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 #: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
 #: Affix that distinguishes the name of a sign from the name of its magnitude; YawToRight belongs to YawRate.
-_SIGN = re.compile(
-    r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$|(?:_to_|To)Right$", re.IGNORECASE
-)
+_SIGN = re.compile("|".join(VOCABULARY["patterns"]["sign"]), re.IGNORECASE)
 #: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
 MOST_FIELDS = 3000
 #: Maximum number of fields to read; the best names have priority.
@@ -173,6 +171,11 @@ class Field:
     def is_downward(self) -> bool:
         """Return whether the name defines it as positive about, or along, the downward axis."""
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
+
+    @property
+    def is_off_centre(self) -> bool:
+        """Return whether it is far from 0 at all times, as a servo's command is and a steering angle is not."""
+        return bool(abs(np.nanmedian(self.seen.values)) > 3.0 * np.nanstd(self.seen.values))
 
     @property
     def score(self) -> float:

@@ -30,16 +30,14 @@ _HALF = 5
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
-#: grade and slip, and of the usual lengths among cars.
-SAME, BY_DRIVING, USUAL_LENGTHS = 0.03, 0.15, 0.4
+#: grade and slip, and of the usual lengths and tracks among cars; usual track.
+SAME, BY_DRIVING, USUAL_LENGTHS, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.4, 0.2, 1.55
 #: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
 CERTAIN = 0.9
 #: Usual lengths that convert curvature to an angle: a wheelbase, times a steering ratio for the steering wheel.
 USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
-#: Usual track of a car, and 1-sigma of its logarithm.
-USUAL_TRACK_M, USUAL_TRACKS = 1.55, 0.2
 #: Energies of rare units.
 RARE = {"mph": 1.5, "mg": 1.5, "ft/s²": 3.0}
 
@@ -310,13 +308,11 @@ def _by_steering(fields: Fields) -> None:
 def _by_track(fields: Fields) -> None:
     """Determine the unit of the speed by the track with which wheel speeds of this unit differ in bends."""
     speed, rate = fields.best("speed"), fields.best("rate")
-    left, right = (next(iter(fields.open("wheel speed", side)), None) for side in ("rl", "rr"))
-    if speed is None or rate is None or left is None or right is None:
+    wheels = [f.seen.cells for side in ("rl", "rr") for f in fields.open("wheel speed", side)[:1]]
+    if speed is None or rate is None or len(wheels) < 2 or not agree(wheels[1], speed.seen.cells):
         return
-    times = ratio(right.seen.cells, speed.seen.cells, SLOW_M_S)
-    apart = fields.pieces.smooth(right.seen.cells - left.seen.cells)
-    relation = fit(apart, fields.pieces.smooth(rate.seen.cells))
-    if times is not None and abs(times - 1.0) < NEAR_1_G and relation is not None and abs(relation.correlation) > CLEAR:
+    relation = fit(fields.pieces.smooth(wheels[1] - wheels[0]), fields.pieces.smooth(rate.seen.cells))
+    if relation is not None and abs(relation.correlation) > CLEAR:
         settle((speed, rate), [Gain((1, -1), relation.slope / USUAL_TRACK_M, USUAL_TRACKS)], "the track of its wheels")
 
 

@@ -267,21 +267,20 @@ class _Instrument:
     @property
     def course(self) -> FloatArray:
         """Direction of the path, counter-clockwise from east, rad [M]; NaN at low speed."""
-        velocity = path_velocity(self._path)
         nothing = np.full(len(self.pieces.starts) * self.pieces.cells_a_piece, np.nan)
-        return nothing if velocity is None else _direction(*velocity)
+        return nothing if self.along is None else _direction(*self.along)
 
     @cached_property
-    def _path(self) -> Fields:
+    def along(self) -> tuple[FloatArray, FloatArray] | None:
+        """Velocity north and east along the positions, m/s [M]; None without positions."""
         read = {(self.topic, path): seen for path, seen in self.seen.items()}
-        return _on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read))
+        return path_velocity(_on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read)))
 
     def unit_on_path(self, speed: str) -> float | None:
         """Return the unit in which a speed is that along the positions; None if it is not, or without positions."""
-        path = path_speed(self._path) if speed in self.seen else None
-        times = None if path is None else ratio(path, self.seen[speed].cells, SLOW_M_S)
-        units = [unit for _, unit in HYPOTHESES["speed"] if times is not None and abs(times / unit - 1.0) < NEAR_PATH]
-        return units[0] if units else None
+        seen = self.seen.get(speed)
+        times = ratio(np.hypot(*self.along), seen.cells, SLOW_M_S) if self.along and seen else None
+        return next((u for _, u in HYPOTHESES["speed"] if times is not None and abs(times / u - 1.0) < NEAR_PATH), None)
 
     def follows(self, path: str, speed: str, scale: float, angle: float) -> bool:
         """Return whether an angle is the direction of the path; without positions, whether a course turns as the car.

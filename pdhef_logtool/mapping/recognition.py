@@ -427,17 +427,14 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Without a sensor, take the yaw rate from an odometry and the speed from navigation or a twist, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"])]
-    rates = [t for t in topics if _type(t) in _FIELDS["speed"] and _span(draft.values(t.name, "heading_rate")) > 0.0]
-    if "yaw_rate_rad_s" not in draft.signals and rates:
-        draft.take(draft.signals, "yaw_rate_rad_s", rates[0].name, "heading_rate")
-        draft.notes.append(f"yaw_rate_rad_s comes from {rates[0].name}.heading_rate, as no IMU gives it")
     if "yaw_rate_rad_s" not in draft.signals:
         odometries = [t for t in twists if not _is_truth(t) and _words(t.name) & _TOPICS["vehicle"]]
-        odometries = [t for t in odometries if not _words(t.name) & _TOPICS["estimate"]]
-        odometries = [t for t in odometries if _span(draft.values(t.name, _twist(t, "angular", "z"))) > 0.0]
-        chosen = draft.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
+        paths = {t: _twist(t, "angular", "z") for t in odometries if not _words(t.name) & _TOPICS["estimate"]}
+        paths |= {t: "heading_rate" for t in topics if _type(t) in _FIELDS["speed"]}
+        turning = [t for t, path in paths.items() if _span(draft.values(t.name, path)) > 0.0]
+        chosen = draft.choose("yaw rate", turning, lambda _: (), "the first of its kind")
         if chosen is not None:
-            draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
+            draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, paths[chosen])
             draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
     if not draft.signals or has_speed(draft.signals):
         return
@@ -657,24 +654,17 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     if axes == "not ahead":
         why = "the type's convention is the body frame, although x is mostly not the direction of travel"
         draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
-    left = _left(draft, chosen)
+    imus = [t.name for t in draft.log.topics if _type(t) in IMU_TYPES and _device(t.name) == _device(chosen.name)]
+    down = any(_mean(draft.values(imu, _GRAVITY_PATHS[2])) < -0.5 for imu in imus)  # m/s² or g
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
         values = draft.values(chosen.name, full)
         filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
         if draft.is_given(chosen.name, full) and not filler:
-            draft.take(draft.truth, name, chosen.name, full, 1.0 if axis == "x" else left)
+            draft.take(draft.truth, name, chosen.name, full, -1.0 if down and axis != "x" else 1.0)
+    if down:
+        draft.doubt("ground-truth velocity", (chosen.name,), chosen.name, "z of its IMU is downward, as gravity shows")
     return chosen
-
-
-def _left(draft: _Draft, twist: TopicInfo) -> float:
-    """Return the sign of the y axis of a device to the left: -1 if the IMU of its messages has gravity along -z."""
-    imu = draft.signals.get("ay_m_s2")
-    if imu is None or _device(imu.topic) != _device(twist.name) or _mean(draft.values(imu.topic, _GRAVITY_PATHS[2])) > -8.0:
-        return 1.0
-    why = "its IMU has axes forward, right, down, as gravity shows"
-    draft.doubt("ground-truth velocity", (twist.name,), twist.name, why)
-    return -1.0
 
 
 def _take_earth_velocity(draft: _Draft, chosen: TopicInfo, axes: str, *, is_body: bool) -> TopicInfo | None:

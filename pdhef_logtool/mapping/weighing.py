@@ -55,12 +55,9 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Speed over that over ground below which it is vertical; median over deviation of no steering angle.
-VERTICAL, OFF_CENTRE = 0.2, 3.0
-#: Least correlation of a yaw rate about the right axis.
-FOLLOWS = 0.5
-#: Standard deviation of the yaw rate of a car that turns; share of the time that counts as always.
-EXCITED_RATE_RAD_S, MOSTLY = 0.03, 0.9
+#: Least correlation of a yaw rate about the right axis; its standard deviation in a car that turns; share of the time
+#: that counts as always; speed over that over ground below which it is vertical.
+FOLLOWS, EXCITED_RATE_RAD_S, MOSTLY, VERTICAL = 0.5, 0.03, 0.9, 0.2
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -102,11 +99,11 @@ def weigh(
         return Weighing(Fields(Pieces(log), {}, [], []))
     known = {n: s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")} | signals
     pieces, weighable = look(log, wanted, vendors, [*known.values()])
-    anchors = {n: f for n in (*signals, "vx_m_s") if (f := anchor_of(n, weighable)) is not None}
+    anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
-    weighing = Weighing(fields)
+    weighing = Weighing(fields, anchor_of("vx_m_s", weighable))
     weighing.drop_vectors_over_ground()
     weighing.drop_vertical_speeds()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
@@ -144,11 +141,13 @@ class Weighing:
 
     Attributes
     ----------
-    truth_from : topic of the ground truth. taken, true : selected fields by signal and by ground-truth quantity.
+    true_speed : of mapped ground truth. truth_from : topic of other ground truth. taken, true : selected fields by
+        signal and by ground-truth quantity.
     rivals : fields of a signal with nearly the same score. checks : undecided points.
     """
 
     fields: Fields
+    true_speed: Field | None = None
     truth_from: str = ""
     taken: dict[str, Field] = field(default_factory=dict)
     true: dict[str, Field] = field(default_factory=dict)
@@ -211,9 +210,9 @@ class Weighing:
 
     def drop_vertical_speeds(self) -> None:
         """Leave out speeds that are small against the velocity over ground of their message."""
-        level = [*(f for f in self.fields.open("over ground") if f.meaning.part in "en"), *self.taken.values()]
-        for item in [f for f in self.fields.candidates if f.meaning.quantity == "speed" and not f.fixed]:
-            if item.seen.largest < VERTICAL * max((f.seen.largest for f in level if f.topic is item.topic), default=0.0):
+        for side in (*self.fields.open("over ground"), *self.taken.values()):
+            speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
+            for item in [f for f in speeds if f.seen.largest < VERTICAL * side.seen.largest]:
                 self.fields.candidates.remove(item)
 
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
@@ -232,7 +231,7 @@ class Weighing:
 
     def _turn_down(self, y: Field) -> None:
         """Turn the y of a body's velocity to the left if the accelerometer beside it has gravity along -z."""
-        down = [f for f in self.fields.candidates if f.has_gravity and f.sign < 0.0 and f.path.endswith(("z", "Z", "[2]"))]
+        down = [f for f in self.fields.candidates if f.has_gravity and f.sign < 0.0 and f.path.rstrip("]")[-1] in "zZ2"]
         if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
             y.sign = -1.0
             y.doubts.append("its device has axes forward, right, down, as gravity shows")
@@ -367,8 +366,7 @@ class Weighing:
                 judged.append((item.score + (0.3 if follows else 0.0), name, item))
         if not judged:
             return
-        # An angle is 0 straight ahead; a servo's command is not.
-        judged.sort(key=lambda j: (-j[0], _is_off_centre(j[2]), -j[2].topic.messages, j[2].topic.name, j[2].path))
+        judged.sort(key=lambda j: (-j[0], j[2].is_off_centre, -j[2].topic.messages, j[2].topic.name, j[2].path))
         _, name, best = judged[0]
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
@@ -422,7 +420,7 @@ class Weighing:
 
     def _speed(self) -> Field | None:
         """Return the best speed to compare other signals with, selected or not."""
-        return self._chosen("speed_m_s") or self.fields.best("speed")
+        return self._chosen("speed_m_s") or self.fields.best("speed") or self.true_speed
 
     def _chosen(self, *names: str) -> Field | None:
         """Return the field of the first of these signals that is selected or mapped."""
@@ -530,10 +528,6 @@ class Weighing:
 def _has_open_sign(item: Field) -> bool:
     """Return whether the sign of a field is unknown from documentation, name and mounting."""
     return not (item.fixed or item.is_downward) and (item.meaning.quantity == "steering" or not item.is_axis)
-
-
-def _is_off_centre(item: Field) -> bool:
-    return bool(abs(np.nanmedian(item.seen.values)) > OFF_CENTRE * np.nanstd(item.seen.values))
 
 
 def _share_axis(first: Field, second: Field) -> bool:
