@@ -386,8 +386,8 @@ def _is_measured(name: str, seen: Seen) -> bool:
 
 def _may_be_share(item: Field, info: FieldInfo) -> bool:
     """Return whether a signed byte has no unit, or a steering signal in [-1, 1] not the name of an angle, either."""
-    is_angle = item.meaning.quantity != "steering" or {"angle", "ang", "delta"} & set(words_of(item.path))
-    is_angle = is_angle or item.meaning.part == "road"
+    named = {"angle", "ang", "delta"} & set(words_of(item.path))
+    is_angle = item.meaning.quantity != "steering" or item.meaning.part == "road" or bool(named)
     return not item.unit_known and (info.code == "i1" or not (is_angle or item.seen.largest > 1.0))
 
 
