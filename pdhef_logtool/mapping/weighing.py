@@ -97,8 +97,8 @@ def weigh(
     wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
     if not wanted:
         return Weighing(Fields(Pieces(log), {}, [], []))
-    known = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
-    pieces, weighable = look(log, wanted, vendors, [*signals.values(), *known])
+    true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
+    pieces, weighable = look(log, wanted, vendors, [*signals.values(), *true])
     anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
