@@ -50,8 +50,8 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
 #: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
-#: Affix that distinguishes the name of a sign from the name of its magnitude.
-_SIGN = re.compile(r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
+#: Affix that distinguishes the name of a sign from the name of its magnitude; YawToRight belongs to YawRate.
+_SIGN = re.compile("|".join(VOCABULARY["patterns"]["sign"]), re.IGNORECASE)
 #: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
 MOST_FIELDS = 3000
 #: Maximum number of fields to read; the best names have priority.
@@ -171,6 +171,11 @@ class Field:
     def is_downward(self) -> bool:
         """Return whether the name defines it as positive about, or along, the downward axis."""
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
+
+    @property
+    def is_off_centre(self) -> bool:
+        """Return whether it is far from 0 at all times, as a servo's command is and a steering angle is not."""
+        return bool(abs(np.nanmedian(self.seen.values)) > 3.0 * np.nanstd(self.seen.values))
 
     @property
     def score(self) -> float:
@@ -300,7 +305,8 @@ def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
 
 def _signs_of(paths: Collection[str]) -> dict[str, str]:
     """Return the paths of signs by the paths of their magnitudes."""
-    return {m: path for path in paths if (m := _SIGN.sub("", path)) != path and m in paths}
+    bases = ((_SIGN.sub("", path), path) for path in paths)
+    return {m: path for base, path in bases for m in (base, f"{base}Rate") if base != path and m in paths}
 
 
 def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
@@ -380,7 +386,8 @@ def _is_measured(name: str, seen: Seen) -> bool:
 
 def _may_be_share(item: Field, info: FieldInfo) -> bool:
     """Return whether a signed byte has no unit, or a steering signal in [-1, 1] not the name of an angle, either."""
-    is_angle = item.meaning.quantity != "steering" or {"angle", "ang", "delta"} & set(words_of(item.path))
+    named = {"angle", "ang", "delta"} & set(words_of(item.path))
+    is_angle = item.meaning.quantity != "steering" or item.meaning.part == "road" or bool(named)
     return not item.unit_known and (info.code == "i1" or not (is_angle or item.seen.largest > 1.0))
 
 
@@ -417,9 +424,9 @@ def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tup
     return results
 
 
-def anchor_of(source: SignalSource, results: Sequence[Field]) -> Field | None:
-    """Return the anchor of a mapped source."""
-    meaning = meaning_of_signal(source.name)
+def anchor_of(name: str, results: Sequence[Field]) -> Field | None:
+    """Return the anchor of a mapped signal or ground truth."""
+    meaning = meaning_of_signal(name)
     return next((f for f in results if f.anchor and f.meaning == meaning), None)
 
 

@@ -30,8 +30,8 @@ _HALF = 5
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
-#: grade and slip, and of the usual lengths among cars.
-SAME, BY_DRIVING, USUAL_LENGTHS = 0.03, 0.15, 0.4
+#: grade and slip, and of the usual lengths and tracks among cars; usual track.
+SAME, BY_DRIVING, USUAL_LENGTHS, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.4, 0.2, 1.55
 #: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
@@ -209,6 +209,7 @@ def decide_units(fields: Fields) -> None:
     _by_speeding_up(fields)
     _by_turning(fields)
     _by_steering(fields)
+    _by_track(fields)
     _by_siblings(fields)
 
 
@@ -302,6 +303,17 @@ def _by_steering(fields: Fields) -> None:
     if share.max() > CERTAIN * share.sum():
         speed.use(speed.units[int(share.argmax())][0])
         speed.doubts.append(f"unit not given; taken as {speed.factors[0][0]}, with a usual ratio of the steering")
+
+
+def _by_track(fields: Fields) -> None:
+    """Determine the unit of the speed by the track with which wheel speeds of this unit differ in bends."""
+    speed, rate = fields.best("speed"), fields.best("rate")
+    wheels = [f.seen.cells for side in ("rl", "rr") for f in fields.open("wheel speed", side)[:1]]
+    if speed is None or rate is None or len(wheels) < 2 or not agree(wheels[1], speed.seen.cells):
+        return
+    relation = fit(fields.pieces.smooth(wheels[1] - wheels[0]), fields.pieces.smooth(rate.seen.cells))
+    if relation is not None and abs(relation.correlation) > CLEAR:
+        settle((speed, rate), [Gain((1, -1), relation.slope / USUAL_TRACK_M, USUAL_TRACKS)], "the track of its wheels")
 
 
 def _by_siblings(fields: Fields) -> None:

@@ -18,7 +18,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
+from pdhef_logtool.mapping.candidates import HYPOTHESES, MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
@@ -199,8 +199,8 @@ def receiver_signals(
                 for path, f in receiver.fields.items()
                 if f"{base}{path}" in there
             }
-            if "position_covariance_type" in receiver.has:  # 1 sigma: the root of the mean variance east and north
-                struct = there[f"{base}latitude"].removesuffix("latitude")
+            struct = there.get(f"{base}latitude", "").removesuffix("latitude")
+            if any(p.startswith(f"{struct}position_covariance[") for p in paths):  # 1 sigma: mean of east and north
                 squared = tuple(f"{struct}position_covariance[{i}]" for i in (0, 4))
                 accuracy = SignalSource("gnss_position_accuracy_m", topic, squared, stamp, (0.5, 0.5), combine="root")
                 sources[accuracy.name] = accuracy
@@ -267,10 +267,20 @@ class _Instrument:
     @property
     def course(self) -> FloatArray:
         """Direction of the path, counter-clockwise from east, rad [M]; NaN at low speed."""
-        read = {(self.topic, path): seen for path, seen in self.seen.items()}
-        velocity = path_velocity(_on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read)))
         nothing = np.full(len(self.pieces.starts) * self.pieces.cells_a_piece, np.nan)
-        return nothing if velocity is None else _direction(*velocity)
+        return nothing if self.along is None else _direction(*self.along)
+
+    @cached_property
+    def along(self) -> tuple[FloatArray, FloatArray] | None:
+        """Velocity north and east along the positions, m/s [M]; None without positions."""
+        read = {(self.topic, path): seen for path, seen in self.seen.items()}
+        return path_velocity(_on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read)))
+
+    def unit_on_path(self, speed: str) -> float | None:
+        """Return the unit in which a speed is that along the positions; None if it is not, or without positions."""
+        seen = self.seen.get(speed)
+        times = ratio(np.hypot(*self.along), seen.cells, SLOW_M_S) if self.along and seen else None
+        return next((u for _, u in HYPOTHESES["speed"] if times is not None and abs(times / u - 1.0) < NEAR_PATH), None)
 
     def follows(self, path: str, speed: str, scale: float, angle: float) -> bool:
         """Return whether an angle is the direction of the path; without positions, whether a course turns as the car.
@@ -334,8 +344,9 @@ def named_gnss(log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSour
 
 def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
-    speed = next((p for p, m in its.meanings.items() if m.quantity == "speed" and m.scale is not None), None)
-    if speed is None:
+    units = {p: m.scale or its.unit_on_path(p) for p, m in its.meanings.items() if m.quantity == "speed"}
+    speed, unit = next(((p, u) for p, u in units.items() if u is not None), ("", 0.0))
+    if not speed:
         return
     for path, meaning in its.angles.items():
         # A course over ground is clockwise from north by definition; the drive confirms this and determines the unit.
@@ -343,7 +354,7 @@ def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
         fitting = [c for c in fitting if path in its.seen and its.follows(path, speed, *c)]
         if fitting:
             yield its.source("gnss_course_rad", path, *fitting[0])
-            yield its.source("gnss_speed_m_s", speed, its.meanings[speed].scale or 1.0)
+            yield its.source("gnss_speed_m_s", speed, unit)
             return
 
 

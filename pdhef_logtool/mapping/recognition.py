@@ -345,7 +345,7 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
             draft.signals |= signals
     if not has_gnss(draft.signals):
         _map_twist(draft, others)
-        if has_gnss(draft.signals) or not has_heading(draft.truth):
+        if has_gnss(draft.signals) or not has_heading(draft.truth) or not {"lat_deg", "x_m"} & set(draft.truth):
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
@@ -364,8 +364,8 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Take the GNSS velocity from a twist over ground, of a navigation system first."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS and _type(t) not in BODY_TWIST_TYPES]
-    twists = [t for t in twists if not _words(t.name) & (_TOPICS["command"] | _TOPICS["estimate"])]
-    for topic in sorted(twists, key=lambda t: not _is_truth(t)):
+    twists = [t for t in twists if not _words(t.name) & _TOPICS["command"]]
+    for topic in sorted(twists, key=lambda t: (bool(_words(t.name) & _TOPICS["estimate"]), not _is_truth(t))):
         paths = tuple(_twist(topic, "linear", axis) for axis in "xy")
         axes = _axes(draft, topic, topics)
         if axes not in ("", "body"):
@@ -429,11 +429,12 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"])]
     if "yaw_rate_rad_s" not in draft.signals:
         odometries = [t for t in twists if not _is_truth(t) and _words(t.name) & _TOPICS["vehicle"]]
-        odometries = [t for t in odometries if not _words(t.name) & _TOPICS["estimate"]]
-        odometries = [t for t in odometries if _span(draft.values(t.name, _twist(t, "angular", "z"))) > 0.0]
-        chosen = draft.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
+        paths = {t: _twist(t, "angular", "z") for t in odometries if not _words(t.name) & _TOPICS["estimate"]}
+        paths |= {t: "heading_rate" for t in topics if _type(t) in _FIELDS["speed"]}
+        turning = [t for t, path in paths.items() if _span(draft.values(t.name, path)) > 0.0]
+        chosen = draft.choose("yaw rate", turning, lambda _: (), "the first of its kind")
         if chosen is not None:
-            draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
+            draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, paths[chosen])
             draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
     if not draft.signals or has_speed(draft.signals):
         return
@@ -653,12 +654,16 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     if axes == "not ahead":
         why = "the type's convention is the body frame, although x is mostly not the direction of travel"
         draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
+    imus = [t.name for t in draft.log.topics if _type(t) in IMU_TYPES and _device(t.name) == _device(chosen.name)]
+    down = any(_mean(draft.values(imu, _GRAVITY_PATHS[2])) < -0.5 for imu in imus)  # m/s² or g
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
         values = draft.values(chosen.name, full)
         filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
         if draft.is_given(chosen.name, full) and not filler:
-            draft.take(draft.truth, name, chosen.name, full)
+            draft.take(draft.truth, name, chosen.name, full, -1.0 if down and axis != "x" else 1.0)
+    if down:
+        draft.doubt("ground-truth velocity", (chosen.name,), chosen.name, "z of its IMU is downward, as gravity shows")
     return chosen
 
 

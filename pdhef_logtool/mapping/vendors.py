@@ -41,19 +41,18 @@ class _FieldTable(_Entry):
 
     @model_validator(mode="after")
     def _is_one_quantity(self) -> _FieldTable:
-        if bool(self.signal) == bool(self.truth):
-            raise ValueError("give either signal or ground truth")
-        if self.signal and self.signal not in SIGNAL_UNITS:
-            raise ValueError(f"{self.signal!r} is no signal")
-        if self.truth and self.truth not in TRUTH_UNITS:
-            raise ValueError(f"{self.truth!r} is no ground-truth quantity")
-        if 0.0 in (self.scale if isinstance(self.scale, list) else [self.scale]):
-            raise ValueError("scale must not be 0")
-        if isinstance(self.scale, list) and not isinstance(self.field, list):
-            raise ValueError("one field has one scale")
-        columns = VECTOR_COLUMNS.get(self.truth, 1)
-        if isinstance(self.field, list) != (columns > 1) or (columns > 1 and len(self.field) != columns):
-            raise ValueError(f"{self.truth or self.signal} is made of {columns} fields")
+        scales = self.scale if isinstance(self.scale, list) else [self.scale]
+        fields, columns = len(self.field) if isinstance(self.field, list) else 0, VECTOR_COLUMNS.get(self.truth, 1)
+        wrong = {
+            "give either signal or ground truth": bool(self.signal) == bool(self.truth),
+            f"{self.signal!r} is no signal": self.signal not in {"", *SIGNAL_UNITS},
+            f"{self.truth!r} is no ground-truth quantity": self.truth not in {"", *TRUTH_UNITS},
+            "scale must not be 0": 0.0 in scales,
+            "one field has one scale": isinstance(self.scale, list) and not fields,
+            f"{self.truth or self.signal} is made of {columns} fields": fields != (columns if columns > 1 else 0),
+        }
+        if why := next((why for why, is_wrong in wrong.items() if is_wrong), ""):
+            raise ValueError(why)
         return self
 
 

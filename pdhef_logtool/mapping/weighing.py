@@ -26,7 +26,7 @@ from pdhef_logtool.mapping.candidates import (
     proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
+from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio, spread
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
@@ -55,8 +55,9 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Least correlation of a yaw rate about the right axis.
-FOLLOWS = 0.5
+#: Least correlation of a yaw rate about the right axis; its standard deviation in a car that turns; share of the time
+#: that counts as always; speed over that over ground below which it is vertical.
+FOLLOWS, EXCITED_RATE_RAD_S, MOSTLY, VERTICAL = 0.5, 0.03, 0.9, 0.2
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -96,14 +97,15 @@ def weigh(
     wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
     if not wanted:
         return Weighing(Fields(Pieces(log), {}, [], []))
-    positions = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m")]
-    pieces, weighable = look(log, wanted, vendors, [*signals.values(), *positions])
-    anchors = {n: f for n, s in signals.items() if (f := anchor_of(s, weighable)) is not None}
+    true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
+    pieces, weighable = look(log, wanted, vendors, [*signals.values(), *true])
+    anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
-    weighing = Weighing(fields)
+    weighing = Weighing(fields, anchor_of("vx_m_s", weighable))
     weighing.drop_vectors_over_ground()
+    weighing.drop_vertical_speeds()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     weighing.choose_signals(set(signals))
@@ -115,6 +117,8 @@ def _is_wanted(
     quantity: str, part: str, role: Role, signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]
 ) -> bool:
     """Return whether a field can provide a missing signal, or information on one."""
+    if quantity == "over ground":  # shows which speed is vertical
+        return "speed_m_s" not in signals
     if quantity == "acceleration" and part == "z":  # shows gravity
         return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
     if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
@@ -137,11 +141,13 @@ class Weighing:
 
     Attributes
     ----------
-    truth_from : topic of the ground truth. taken, true : selected fields by signal and by ground-truth quantity.
+    true_speed : of mapped ground truth. truth_from : topic of other ground truth. taken, true : selected fields by
+        signal and by ground-truth quantity.
     rivals : fields of a signal with nearly the same score. checks : undecided points.
     """
 
     fields: Fields
+    true_speed: Field | None = None
     truth_from: str = ""
     taken: dict[str, Field] = field(default_factory=dict)
     true: dict[str, Field] = field(default_factory=dict)
@@ -185,6 +191,8 @@ class Weighing:
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
+            if axes == "not ahead" and rates and self._turn_right(x, y, rates[0].si):
+                continue
             is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
             if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
                 self._turn_down(y)
@@ -200,14 +208,30 @@ class Weighing:
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
 
+    def drop_vertical_speeds(self) -> None:
+        """Leave out speeds that are small against the velocity over ground of their message."""
+        for side in (*self.fields.open("over ground"), *self.taken.values()):
+            speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
+            for item in [f for f in speeds if f.seen.largest < VERTICAL * side.seen.largest]:
+                self.fields.candidates.remove(item)
+
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
         """Return whether another speed is the length of x and y, and not x."""
         speeds = [f.si for f in self.fields.open("speed") if f is not x]
         return any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
 
+    def _turn_right(self, x: Field, y: Field, rate: FloatArray) -> bool:
+        """Read a velocity as right and ahead if its y is ahead in bends, too; return whether it is."""
+        is_turning = spread(rate) > EXCITED_RATE_RAD_S and not turns(self.fields.pieces, np.arctan2(y.si, x.si), rate)
+        is_ahead = float(np.mean((y.si > 2.0 * np.abs(x.si))[np.hypot(x.si, y.si) > SLOW_M_S])) > MOSTLY
+        if is_turning and is_ahead:
+            x.meaning, y.meaning, x.sign = y.meaning, x.meaning, -x.sign
+            y.doubts.append("x of its vector is to the right and y ahead, as its values show")
+        return is_turning and is_ahead
+
     def _turn_down(self, y: Field) -> None:
         """Turn the y of a body's velocity to the left if the accelerometer beside it has gravity along -z."""
-        down = [f for f in self.fields.candidates if f.has_gravity and words_of(f.path)[-1:] == ("z",) and f.sign < 0.0]
+        down = [f for f in self.fields.candidates if f.has_gravity and f.sign < 0.0 and f.path.rstrip("]")[-1] in "zZ2"]
         if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
             y.sign = -1.0
             y.doubts.append("its device has axes forward, right, down, as gravity shows")
@@ -217,10 +241,10 @@ class Weighing:
         pieces, length = self.fields.pieces, np.hypot(x.si, y.si)
         ahead, left = pieces.rate_of(length), length * pieces.turning(x.si + 1j * y.si)
         for item in [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and f.is_axis]:
-            if (of := {"x": (x, ahead), "y": (y, left)}.get(item.meaning.part)) is not None and not item.fixed:
-                changes = (pieces.rate_of(of[0].si), of[1])
-                over, body = (correlation(pieces.smooth(item.si), change) for change in changes)
-                if over > max(CLEAR, abs(body)):
+            if (of := {"x": x, "y": y}.get(item.meaning.part)) is not None and not item.fixed:
+                # Axes of a device may be turned by a quarter.
+                over, *body = (correlation(pieces.smooth(item.si), c) for c in (pieces.rate_of(of.si), ahead, left))
+                if over > max(CLEAR, *map(abs, body)):
                     self.fields.candidates.remove(item)
                     self.notes.append(f"{item.topic.name}.{item.path} is not used: it is over ground")
 
@@ -342,7 +366,7 @@ class Weighing:
                 judged.append((item.score + (0.3 if follows else 0.0), name, item))
         if not judged:
             return
-        judged.sort(key=lambda j: (-j[0], -j[2].topic.messages, j[2].topic.name, j[2].path))
+        judged.sort(key=lambda j: (-j[0], j[2].is_off_centre, -j[2].topic.messages, j[2].topic.name, j[2].path))
         _, name, best = judged[0]
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
@@ -396,7 +420,7 @@ class Weighing:
 
     def _speed(self) -> Field | None:
         """Return the best speed to compare other signals with, selected or not."""
-        return self._chosen("speed_m_s") or self.fields.best("speed")
+        return self._chosen("speed_m_s") or self.fields.best("speed") or self.true_speed
 
     def _chosen(self, *names: str) -> Field | None:
         """Return the field of the first of these signals that is selected or mapped."""
