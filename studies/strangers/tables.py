@@ -388,6 +388,17 @@ def _hdf5(path: Path, topics: Sequence[Topic]) -> None:
                 group.create_dataset(name, data=values, compression="gzip").attrs["unit"] = unit
 
 
+def _hdf5_signals(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a group for each signal: its values, and their times in µs."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for topic in topics:
+            for title, values in topic.fields.items():
+                group = file.create_group(_split(title)[0])
+                group["timestamp"], group["data"] = topic.arrival_ns // 1000, values
+
+
 def _mat_hdf5(path: Path, topics: Sequence[Topic]) -> None:
     """Write version 7.3: each variable is a row vector, which HDF5 stores as a column."""
     import h5py
@@ -457,6 +468,7 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "json-channels": (".json", _json_channels),
     "mat-values": (".mat", _mat_values),
     "hdf5": (".h5", _hdf5),
+    "hdf5-signals": (".hdf5", _hdf5_signals),
     "parquet-measures": (".parquet", _measures_parquet),
     "mdf": (".mf4", _mdf),
 }
