@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.table_clocks import (
-    NAMED_UNITS,
     NO_TIME,
     TIME_UNITS_NS,
     Clock,
     ascending_rows,
+    named_unit,
     number_clock,
     rate_clock,
     rescaled,
@@ -271,7 +271,7 @@ def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float
     column, columns = sheet.columns[name], {name}
     if isinstance(column, np.ndarray):
         text = snake(name)
-        unit = sheet.units.get(name, "") or NAMED_UNITS.get(text, text.rpartition("_")[2])
+        unit = sheet.units.get(name, "") or named_unit(text, column) or text.rpartition("_")[2]
         clock = number_clock(column, unit, name, others, rate_hz)
     else:
         date = next((n for n in sheet.columns if n != name and PATTERNS["date"].fullmatch(snake(n))), name)
@@ -373,10 +373,10 @@ def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:
 def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
     """Return names, values and units of a table in long form, None for another table."""
     named = {snake(name): column for name, column in sheet.columns.items()}
-    of_long = (PATTERNS[name] for name in ("signal", "long_value"))
-    signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in of_long)
+    of_long = (PATTERNS[name] for name in ("signal", "long_value", "unit_column"))
+    signal, value, unit = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in of_long)
     is_long = signal is not None and not isinstance(signal, np.ndarray) and isinstance(value, np.ndarray)
-    return (signal, value, named.get("unit", named.get("units"))) if is_long else None
+    return (signal, value, unit) if is_long else None
 
 
 def _rows_by(texts: Series) -> dict[str, IntArray]:

@@ -22,7 +22,7 @@ from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
-from pdhef_logtool.mapping.naming import Meaning, meaning_of, words_of
+from pdhef_logtool.mapping.naming import Meaning, meaning_among, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
@@ -222,7 +222,8 @@ class _Instrument:
         self.yaw_rate, mapped = signals.get("yaw_rate_rad_s"), signals.get("speed_m_s")
         self.stamp = stamp_path_of(self.fields)
         numbers = (f for f in self.fields if f.kind == "number")
-        named = ((f.path, meaning_of(topic.name, topic.type_name, f.path, f.unit)) for f in numbers)
+        there = {f.path for f in self.fields}
+        named = ((f.path, meaning_among(topic.name, topic.type_name, f.path, f.unit, there)) for f in numbers)
         self.meanings = {path: meaning for path, meaning in named if meaning is not None}
         if mapped is not None and mapped.topic == topic.name and isinstance(mapped.scale, float):
             units = {p: replace(self.meanings[p], scale=mapped.scale) for p in mapped.paths if p in self.meanings}
