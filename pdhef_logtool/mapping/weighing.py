@@ -26,7 +26,7 @@ from pdhef_logtool.mapping.candidates import (
     proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
+from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio, spread
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
@@ -55,8 +55,12 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Least correlation of a yaw rate about the right axis.
-FOLLOWS = 0.5
+#: Least correlation of a yaw rate about the right axis; of an acceleration ahead whose sign is otherwise open.
+FOLLOWS, FAINT = 0.5, 0.25
+#: Loss of score of a speed that is constant.
+STEADY = 0.1
+#: Least ratio of the yaw rate to the rates about other axes of a device with unknown axes.
+MOSTLY = 3.0
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -174,7 +178,7 @@ class Weighing:
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
-        usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
+        usable = [f for f in usable if (f.seen.changes or f.fixed or _is_steady(f)) and f.section != "truth"]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
             item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
@@ -232,7 +236,10 @@ class Weighing:
                 yield from ((x, y) for x in [f for f in beside if f.meaning.quantity == "speed" and f.seen.changes][:1])
 
     def _take(self, name: str, candidates: Sequence[Field]) -> None:
-        ordered = sorted(candidates, key=lambda f: (-f.score, -f.topic.messages, f.topic.name, f.path))
+        # A speed before the x of a velocity, which is ahead in some axes only; what is constant last.
+        ordered = sorted(
+            candidates, key=lambda f: (-f.score, f.meaning.part, -f.topic.messages, f.topic.name, f.path)
+        )
         good = [f for f in ordered if f.score >= LEAST_SCORE]
         if not good:
             return
@@ -246,11 +253,21 @@ class Weighing:
             self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
 
     def _turn_about(self) -> None:
-        """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's."""
+        """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's.
+
+        Without a_y, it is the axis about which the car turns most.
+        """
         rate, ay, speed = self.taken.get("yaw_rate_rad_s"), self._chosen("ay_m_s2"), self._speed()
-        if rate is None or ay is None or speed is None or rate.fixed or not rate.is_axis or ay.is_axis:
+        if rate is None or speed is None or rate.fixed or not rate.is_axis:
             return
         rates = [f for f in self.fields.candidates if f.meaning.quantity == "rate" and triad_of(f) == triad_of(rate)]
+        if ay is None:
+            *others, most = sorted(rates, key=lambda f: spread(f.seen.cells))
+            if others and spread(most.seen.cells) > MOSTLY * spread(others[-1].seen.cells):
+                self.taken["yaw_rate_rad_s"] = most
+            return
+        if ay.is_axis:
+            return
         fits = [(abs(r.correlation), r.slope, f) for f in rates if (r := self.fields.turning(ay.si, f.si, speed.si))]
         surest, slope, best = max(fits, key=lambda f: f[0], default=(0.0, 1.0, rate))
         if best is not rate and surest > 0.9 and all(c < FOLLOWS for c, _, f in fits if f is rate):
@@ -260,16 +277,18 @@ class Weighing:
 
     def _turn_level(self) -> None:
         """Turn the axes of a level device by quarters of a turn if its names are letters, as speed or path shows."""
-        ax, speed = self.taken.get("ax_m_s2"), self._speed()
+        ax, speed, rate = self.taken.get("ax_m_s2"), self._speed(), self.taken.get("yaw_rate_rad_s")
         across = [f for f in self.fields.candidates if ax and triad_of(f) == triad_of(ax) and f.meaning.part == "y"]
         across = [f for f in across if f.meaning.quantity == "acceleration"]
-        if ax is None or speed is None or ax.fixed or not ax.is_axis or len(across) != 1:
+        if ax is None or ax.fixed or not ax.is_axis or len(across) != 1:
             return
         ay, pieces, path = across[0], self.fields.pieces, path_velocity(self.fields)
-        change = pieces.rate_of(speed.si)
-        ahead = [correlation(pieces.smooth(f.si), change) for f in (ax, ay)]
-        turning = np.full_like(change, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
-        left = [correlation(pieces.smooth(f.si), pieces.smooth(turning * speed.si)) for f in (ax, ay)]
+        pace = np.ones_like(ax.si) if speed is None else speed.si
+        ahead = [correlation(pieces.smooth(f.si), pieces.rate_of(pace)) for f in (ax, ay)]
+        turning = np.full_like(pace, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
+        if path is None and rate is not None and rate.is_axis and place_of(rate) == place_of(ax):
+            turning = rate.si
+        left = [correlation(pieces.smooth(f.si), pieces.smooth(turning * pace)) for f in (ax, ay)]
         if abs(ahead[1]) > CLEAR and abs(ahead[0]) < FOLLOWS:
             ahead_sign = math.copysign(1.0, ahead[1])
         elif abs(left[0]) > CLEAR and abs(left[1]) < FOLLOWS:
@@ -278,7 +297,10 @@ class Weighing:
             ahead_sign = 0.0
         else:
             return
-        turned = ((ay, ahead_sign), (ax, -ahead_sign)) if ahead_sign else ((ax, -1.0), (ay, -1.0))
+        # Two axes without a third have no handedness.
+        three = sum(triad_of(f) == triad_of(ax) and f.meaning.quantity == "acceleration" for f in self.fields.candidates)
+        along = math.copysign(1.0, ahead[1]) if three < len("xyz") and abs(ahead[1]) > FAINT else ahead_sign
+        turned = ((ay, along), (ax, -ahead_sign)) if ahead_sign else ((ax, -1.0), (ay, -1.0))
         for name, (item, factor) in zip(("ax_m_s2", "ay_m_s2"), turned, strict=True):
             item.sign, item.is_turned = item.sign * factor, True
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
@@ -499,6 +521,16 @@ class Weighing:
             if name and item.role in ("truth", "navigation") and not self.true:
                 candidates.append(item.candidate(name, "truth", taken=False))
         return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
+
+
+def _is_steady(item: Field) -> bool:
+    """Return whether a speed with a unit is constant, as in a simulation; it is taken if nothing else is a speed."""
+    is_speed = item.meaning.quantity == "speed" and item.unit_known and item.role == "sensor"
+    if not is_speed or item.seen.changes or not SLOW_M_S < item.seen.largest * item.scale:
+        return False
+    item.bonus -= STEADY
+    item.doubts.append("it is constant in the parts of the log that were read")
+    return True
 
 
 def _has_open_sign(item: Field) -> bool:
