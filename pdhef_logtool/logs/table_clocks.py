@@ -42,7 +42,9 @@ _DAY_NS, _HOUR_NS, _MINUTE_NS, _SECONDS = (TIME_UNITS_NS[name] for name in ("day
 _DAY_S = _DAY_NS / _SECONDS
 #: Units of columns with published names; the first of each explains no other column.
 _NAMED_UNITS: dict[str, list[str]] = {name: units.split() for name, units in _CLOCKS["columns"].items()}
-_SUBUNITS = tuple(ns for ns in _UNITS if ns <= _SECONDS and ns not in {TIME_UNITS_NS[u[0]] for u in _NAMED_UNITS.values()})
+_SUBUNITS = tuple(
+    ns for ns in _UNITS if ns <= _SECONDS and ns not in {TIME_UNITS_NS[u[0]] for u in _NAMED_UNITS.values()}
+)
 #: Times that count from the start of a recording follow this instant, 1970-01-02, so that none is negative.
 RELATIVE_NS = _DAY_NS
 #: 1970-01-01 in the days of Excel, and of MATLAB's ``datenum``.

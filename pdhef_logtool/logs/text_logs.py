@@ -605,9 +605,21 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
     """Yield paths and values of the texts and finite numbers in an object."""
     if isinstance(value, str) or (isinstance(value, int | float) and abs(value) < _LARGEST):
         yield path, value
+    elif isinstance(value, list) and value and depth and all(map(_name_of, value)):
+        for inner in value:
+            leaves = [
+                leaf for leaf in _leaves(inner, f"{path}.{_name_of(inner)}", depth - 1) if leaf[1] != _name_of(inner)
+            ]
+            yield from ((f"{path}.{_name_of(inner)}" if len(leaves) == 1 else place, leaf) for place, leaf in leaves)
     elif depth and isinstance(value, dict | list) and (isinstance(value, dict) or len(value) <= _MOST_ELEMENTS):
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _leaves(inner, f"{path}.{key}" if path else str(key), depth - 1)
+
+
+def _name_of(value: Any) -> str:
+    """Return the name in an object with a name and a value; empty without one."""
+    named = value.items() if isinstance(value, dict) else ()
+    return next((v for k, v in named if isinstance(v, str) and PATTERNS["signal"].fullmatch(k.lower())), "")
 
 
 def _json_column(name: str, given: _Cells, lines: Sequence[int], file: TableFile, losses: list[Loss]) -> Any:

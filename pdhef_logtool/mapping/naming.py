@@ -221,7 +221,10 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
 
 def _described(leaf_words: tuple[str, ...]) -> set[str]:
     """Return the words of a leaf that describe its quantity."""
-    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
+    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured;
+    # a controller before "vehicle" is the sender.
+    if leaf_words[1:2] == ("vehicle",) and leaf_words[2:]:
+        leaf_words = leaf_words[leaf_words[0] in _WORDS["controllers"] :]
     kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
     kept |= {w for w in leaf_words[-1:] if (w not in STATES and leaf_words[-2:-1] != ("per",)) or len(leaf_words) == 1}
     return kept

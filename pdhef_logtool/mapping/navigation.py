@@ -21,7 +21,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
-from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
+from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, in_radians, path_speed, path_velocity
 from pdhef_logtool.mapping.naming import Meaning, meaning_among, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
@@ -229,8 +229,7 @@ class _Instrument:
             units = {p: replace(self.meanings[p], scale=mapped.scale) for p in mapped.paths if p in self.meanings}
             self.meanings |= units
         first = {m.quantity: path for path, m in reversed(self.meanings.items())}
-        places = {name: first[q] for name, q in _PLACES.items() if q in first}
-        self.places = {name: self.source(name, p, self.meanings[p].scale or 1.0) for name, p in places.items()}
+        self.place_paths = {name: first[q] for name, q in _PLACES.items() if q in first}
         self.named_velocities = [*_horizontal(self.meanings)]
         angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
         self.angles = {path: meaning for meaning, path in angles}
@@ -240,11 +239,18 @@ class _Instrument:
         return SignalSource(name, self.topic, path, self.stamp, scale, offset)
 
     @cached_property
+    def places(self) -> dict[str, SignalSource]:
+        """Latitude and longitude in degrees."""
+        seen = [self.seen[p].largest for p in self.place_paths.values() if p in self.seen]
+        usual = math.degrees(1.0) if len(seen) == len(_PLACES) and in_radians(*seen) else 1.0
+        return {n: self.source(n, p, self.meanings[p].scale or usual) for n, p in self.place_paths.items()}
+
+    @cached_property
     def seen(self) -> dict[str, Seen]:
         """Values of velocities, angles and positions in a few pieces of the log, by path."""
         paths = [*(p for v in self.named_velocities for p in v.values()), *self.angles]
         paths += [p for p, m in self.meanings.items() if m.quantity == "speed"]
-        paths += [s.paths[0] for s in self.places.values()]
+        paths += self.place_paths.values()
         return {path: seen for (_, path), seen in self.pieces.read((self.topic, p) for p in paths).items()}
 
     @cached_property
@@ -319,7 +325,7 @@ def named_gnss(log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSour
     direction of the path is a course.
     """
     its = _Instrument(log, topic, signals)
-    if len(its.places) < len(_PLACES):
+    if len(its.place_paths) < len(_PLACES):
         return {s.name: s for s in its.over_ground or _speed_and_course(its)}
     if not its.has_place:
         return {}

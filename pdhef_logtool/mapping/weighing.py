@@ -237,9 +237,7 @@ class Weighing:
 
     def _take(self, name: str, candidates: Sequence[Field]) -> None:
         # A speed before the x of a velocity, which is ahead in some axes only; what is constant last.
-        ordered = sorted(
-            candidates, key=lambda f: (-f.score, f.meaning.part, -f.topic.messages, f.topic.name, f.path)
-        )
+        ordered = sorted(candidates, key=lambda f: (-f.score, f.meaning.part, -f.topic.messages, f.topic.name, f.path))
         good = [f for f in ordered if f.score >= LEAST_SCORE]
         if not good:
             return
@@ -298,7 +296,9 @@ class Weighing:
         else:
             return
         # Two axes without a third have no handedness.
-        three = sum(triad_of(f) == triad_of(ax) and f.meaning.quantity == "acceleration" for f in self.fields.candidates)
+        three = sum(
+            triad_of(f) == triad_of(ax) and f.meaning.quantity == "acceleration" for f in self.fields.candidates
+        )
         along = math.copysign(1.0, ahead[1]) if three < len("xyz") and abs(ahead[1]) > FAINT else ahead_sign
         turned = ((ay, along), (ax, -ahead_sign)) if ahead_sign else ((ax, -1.0), (ay, -1.0))
         for name, (item, factor) in zip(("ax_m_s2", "ay_m_s2"), turned, strict=True):
