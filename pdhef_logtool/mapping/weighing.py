@@ -526,7 +526,7 @@ class Weighing:
 def _is_steady(item: Field) -> bool:
     """Return whether a speed with a unit is constant, as in a simulation; it is taken if nothing else is a speed."""
     is_speed = item.meaning.quantity == "speed" and item.unit_known and item.role == "sensor"
-    if not is_speed or item.seen.changes or not SLOW_M_S < item.seen.largest * item.scale:
+    if not is_speed or item.seen.changes or not item.seen.largest * item.scale > SLOW_M_S:
         return False
     item.bonus -= STEADY
     item.doubts.append("it is constant in the parts of the log that were read")

@@ -410,6 +410,15 @@ def _hdf5_frame(path: Path, topics: Sequence[Topic]) -> None:
         frame["block0_values"] = np.stack([v for topic in topics for v in topic.fields.values()], 1)
 
 
+def _hdf5_pairs(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a matrix of times and values for each signal, with its unit as an attribute."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for seconds, name, unit, values in _signals(topics):
+            file.create_dataset(f"channels/{name}", data=np.stack([seconds, values], 1)).attrs["unit"] = unit
+
+
 def _hdf5_signals(path: Path, topics: Sequence[Topic]) -> None:
     """Write a group for each signal: its values, and their times in µs."""
     import h5py
@@ -501,6 +510,7 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "hdf5": (".h5", _hdf5),
     "hdf5-signals": (".hdf5", _hdf5_signals),
     "hdf5-frame": (".h5", _hdf5_frame),
+    "hdf5-pairs": (".h5", _hdf5_pairs),
     "parquet-measures": (".parquet", _measures_parquet),
     "mdf": (".mf4", _mdf),
 }
