@@ -166,7 +166,7 @@ def _in_parts(sheet: Sheet, names: Mapping[str, str]) -> Clock | None:
     if week is not None and seconds is not None:
         clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
         return replace(clock, columns=frozenset({week, seconds}))
-    places = {re.sub("^(utc|gps)_", "", n): name for n, name in names.items()}
+    places = {re.sub("^min$", "minute", re.sub("^(utc|gps)_", "", n)): name for n, name in names.items()}
     parts = [places.get(part, "") for part in ("year", "month", "day", "hour", "minute", "second")]
     if not all(parts):
         return None

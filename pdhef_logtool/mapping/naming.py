@@ -55,7 +55,7 @@ def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
     name = _PATTERNS["no_words"].sub("", name)
-    name = _PATTERNS["sides"].sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
+    name = _PATTERNS["sides"].sub(lambda m: "_" + "".join(g[0] for g in m.groups() if g), name.translate(LATIN))
     name = _PATTERNS["corner_at_end"].sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
         for piece in [part] if part.lower() in _WHOLE else _CAMEL.findall(part):

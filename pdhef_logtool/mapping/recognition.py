@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
@@ -33,7 +34,7 @@ from pdhef_logtool.mapping.navigation import (
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighing, weigh
-from pdhef_logtool.records.signals import FloatArray, has_gnss
+from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
 TRUTH_WORDS, NAVIGATION_WORDS = _TOPICS["truth"], _TOPICS["navigation"]
@@ -355,10 +356,19 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
         fields = () if _type(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
         if fields and (topic in others or has_path(fields, RAW_COURSE)):
             signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
+            signals |= _in_degrees(draft.log, {n: s for n, s in signals.items() if n in GNSS_POSITION})
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
             signals = named_gnss(draft.log, topic, draft.signals) if by_name else signals
             if signals:
                 yield signals
+
+
+def _in_degrees(log: DriveLog, places: _Sources) -> _Sources:
+    """Return positions with a documented unit in degrees if their values are degrees, as programs convert them."""
+    seen = Pieces(log).read((s.topic, s.paths[0]) for s in places.values() if s.scale != 1.0)
+    largest = {path: values.largest for (_, path), values in seen.items()}
+    is_small = {n: math.pi < largest.get(s.paths[0], 0.0) < 180.0 for n, s in places.items()}
+    return {n: replace(s, scale=1.0) if any(is_small.values()) else s for n, s in places.items()}
 
 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:

@@ -325,7 +325,9 @@ class Weighing:
             times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
         beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
         in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
-        best, reasons, doubt = _unit_of_wheels(times, sigma, by, in_si=in_si)
+        likely = [u for u in WHEEL_UNITS if first.meaning.quantity in ("wheel speed", u.quantity)]
+        likely = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in likely]
+        best, reasons, doubt = _unit_of_wheels(likely, times, sigma, by)
         if times is not None and not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
         for item in wheels:
@@ -607,12 +609,11 @@ def truth_topic(weighable: Sequence[Field]) -> str:
     return best[1]
 
 
-def _unit_of_wheels(times: float | None, sigma: float, by: str, *, in_si: bool) -> tuple[Unit, list[str], str]:
+def _unit_of_wheels(units: Sequence[Unit], times: float | None, sigma: float, by: str) -> tuple[Unit, list[str], str]:
     """Return the likeliest unit of wheel speeds if ``times`` of it are 1 m/s, the reasons and the doubt."""
     if times is None or not times > 0.0:
-        doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
-        return WHEEL_UNITS[0], [], doubt
-    units = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in WHEEL_UNITS]
+        unit = units[0].name
+        return units[0], [], f"the unit of the wheel speeds is not given, and no speed to compare with; taken as {unit}"
     best, *others = _likely(units, times, sigma, POSSIBLE)
     doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
     return best, [f"{times:.4g} of it is 1 m/s by {by}"], doubt
