@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from os.path import commonprefix
 from typing import Any
 
 import numpy as np
@@ -22,16 +21,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
-from pdhef_logtool.logs.table_columns import (
-    Sheet,
-    clock_notes,
-    field_name,
-    find_clock,
-    is_unit,
-    split_unit,
-    tables_of,
-    unique,
-)
+from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
@@ -48,6 +38,8 @@ _CELL, _STRUCT, _OBJECT, _CHARACTERS = range(1, 5)
 _UNUSABLE, _ENCODINGS = numbered(_MAT["unusable"]), numbered(_MAT["encodings"])
 #: Structs inside one another; columns of a matrix that become fields, without and with titles.
 _DEEPEST, _MOST_COLUMNS, _MOST_TITLES = 8, 16, 1000
+#: Letters of the name of a block in a data frame that is stored in HDF5.
+_BLOCK = len("block0")
 #: Filters of HDF5 that are a part of it: deflate, shuffle, checksum.
 _FILTERS = frozenset({1, 2, 3})
 #: Names of the values of a struct that has the name of the signal. What separates the parts of a path.
@@ -355,17 +347,14 @@ def _with_titles(variables: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in variables.items():
         shape = value.shape if isinstance(value, np.ndarray) and value.ndim == 2 else ()
-        its = sorted((n for n in lists if len(lists[n]) in shape), key=lambda n: -len(commonprefix([n, name])))
-        its.sort(key=lambda n: 2 * sum(map(is_unit, lists[n])) > len(lists[n]))
-        if not its:
-            found[name] = value
-            continue
-        titles, units = (
-            lists[its[0]],
-            [f" [{unit.replace(_SLASH, ' per ')}]" if unit else "" for unit in lists[its[-1]]],
-        )
-        named = titles if len(its) == 1 or its[0] == its[-1] else [t + u for t, u in zip(titles, units, strict=True)]
-        found |= zip(named, value if len(titles) == shape[0] else value.T, strict=True)
+        # Units last, and those of another block.
+        its = sorted((n for n in lists if len(lists[n]) in shape), key=lambda n: n[:_BLOCK] != name[:_BLOCK])
+        its.sort(key=lambda n: "unit" in n.lower())
+        titles = lists[its[0]] if its else []
+        units = lists[its[-1]] if its[1:] and "unit" in its[-1].lower() else [""] * len(titles)
+        named = (f"{t} [{unit.replace(_SLASH, ' per ')}]" for t, unit in zip(titles, units, strict=True))
+        columns = value.T if titles and len(titles) != shape[0] else value
+        found |= zip(named, columns, strict=True) if titles else {name: value}
     return found
 
 

@@ -67,8 +67,11 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
 MOST: dict[str, float] = VOCABULARY["largest"]
 #: The same where no other unit is possible: five turns of a truck's steering wheel, in degrees.
 MOST_OTHERWISE = {**MOST, "steering": 32.0}
+CONSTANT = "constant in the parts of the log that were read"
 #: Strength of the meaning of a field that only the drive gives, and least strength of a name.
 PROPOSED, LEAST_NAMED = 0.55, 0.6
+#: Least constant speed that is no filler.
+STEADY_M_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +171,12 @@ class Field:
         return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words) and not is_guess
 
     @property
+    def is_steady(self) -> bool:
+        """Return whether it is a constant speed with a unit, as in a simulation."""
+        is_speed = self.meaning.quantity == "speed" and self.unit_known and not self.fixed
+        return is_speed and not self.seen.changes and abs(self.seen.largest * self.scale) > STEADY_M_S
+
+    @property
     def is_downward(self) -> bool:
         """Return whether the name defines it as positive about, or along, the downward axis."""
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
@@ -179,6 +188,7 @@ class Field:
             return 0.95
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
         score += 0.15 if self.meaning.unit else 0.0
+        score -= 0.0 if self.seen.changes else 0.1
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
         score -= {"device": 0.1, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
@@ -198,7 +208,7 @@ class Field:
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
             source = replace(source, valid_min=-most, valid_max=most)
         reason = "; ".join([self.meaning.why, *self.reasons])
-        doubts = [*self.doubts, *([] if self.seen.changes else ["constant in the parts of the log that were read"])]
+        doubts = dict.fromkeys([*self.doubts, *([] if self.seen.changes else [CONSTANT])])
         return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
 
 

@@ -27,8 +27,6 @@ EXCITED_A_M_S2 = 0.25
 EXCITED_CURVATURE_1_M, SLOW_M_S = 0.0001, 1.0
 #: Half of the window for a course from positions, in cells.
 _HALF = 5
-#: Latitude in radians above which a position without a unit is one; simulators begin at 0.
-LEAST_LATITUDE = 0.1
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
@@ -123,11 +121,6 @@ def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
     return None
 
 
-def in_radians(latitude: float, longitude: float) -> bool:
-    """Return whether largest magnitudes of a position are radians: as degrees, it would be in the Gulf of Guinea."""
-    return LEAST_LATITUDE < latitude <= math.pi / 2.0 and longitude <= math.pi
-
-
 def path_velocity(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
     """Return the velocity north and east along the path of positions, m/s [M]; None without positions."""
     steps = _path(fields)
@@ -211,23 +204,12 @@ def settle(items: Sequence[Field], gains: Sequence[Gain], by: str, bonus: float 
 
 def decide_units(fields: Fields) -> None:
     """Determine units that no name gives: by gravity first, then by relations between quantities."""
-    _positions(fields)
     _by_gravity(fields)
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
     _by_steering(fields)
     _by_siblings(fields)
-
-
-def _positions(fields: Fields) -> None:
-    """Take positions in radians for such."""
-    by_quantity = {f.meaning.quantity: f for f in reversed(fields.positions) if not f.unit_known}
-    its = [by_quantity.get(quantity) for quantity in PLACES[:2]]
-    open_ = [f for f in its if f is not None]
-    if len(open_) == len(its) and in_radians(*(f.seen.largest for f in open_)):
-        for item in open_:
-            item.factors, item.unit_known = (("rad", math.degrees(1.0)),), True
 
 
 def _by_gravity(fields: Fields) -> None:

@@ -21,7 +21,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
-from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, in_radians, path_speed, path_velocity
+from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
 from pdhef_logtool.mapping.naming import Meaning, meaning_among, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
@@ -33,6 +33,8 @@ MOVING_M_S = 3.0
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 #: Positions by quantity.
 _PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
+#: Latitude of places that are not near the origin of a simulator.
+FROM_ORIGIN = 0.1
 #: Largest plausible extent of a log.
 WIDEST_DEG = 10.0
 #: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
@@ -240,9 +242,10 @@ class _Instrument:
 
     @cached_property
     def places(self) -> dict[str, SignalSource]:
-        """Latitude and longitude in degrees."""
-        seen = [self.seen[p].largest for p in self.place_paths.values() if p in self.seen]
-        usual = math.degrees(1.0) if len(seen) == len(_PLACES) and in_radians(*seen) else 1.0
+        """Latitude and longitude in degrees; as degrees, usual ones in radians would be in the Gulf of Guinea."""
+        reach = [self.seen[p].largest for p in self.place_paths.values() if p in self.seen]
+        is_small = len(reach) == len(_PLACES) and FROM_ORIGIN < reach[0] <= math.pi / 2.0 and reach[1] <= math.pi
+        usual = math.degrees(1.0) if is_small else 1.0
         return {n: self.source(n, p, self.meanings[p].scale or usual) for n, p in self.place_paths.items()}
 
     @cached_property

@@ -14,6 +14,7 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import (
+    CONSTANT,
     HYPOTHESES,
     LEAST_SCORE,
     Candidate,
@@ -57,8 +58,6 @@ _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: Least correlation of a yaw rate about the right axis; of an acceleration ahead whose sign is otherwise open.
 FOLLOWS, FAINT = 0.5, 0.25
-#: Loss of score of a speed that is constant.
-STEADY = 0.1
 #: Least ratio of the yaw rate to the rates about other axes of a device with unknown axes.
 MOSTLY = 3.0
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
@@ -178,7 +177,7 @@ class Weighing:
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
-        usable = [f for f in usable if (f.seen.changes or f.fixed or _is_steady(f)) and f.section != "truth"]
+        usable = [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
             item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
@@ -492,7 +491,7 @@ class Weighing:
                 f"speed_m_s comes from the navigation system's {item.topic.name}.{item.path}: "
                 "if it is the ground truth too, the estimator's input is the true speed"
             )
-        item.doubts += item.unit_doubt
+        item.doubts += [*item.unit_doubt, *([CONSTANT] if item.is_steady else [])]
         if item.doubts:
             evidence = f"{item.topic.name}.{item.path} is taken, but {'; '.join(item.doubts)}"
             remedy = f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"'
@@ -523,16 +522,6 @@ class Weighing:
             if name and item.role in ("truth", "navigation") and not self.true:
                 candidates.append(item.candidate(name, "truth", taken=False))
         return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
-
-
-def _is_steady(item: Field) -> bool:
-    """Return whether a speed with a unit is constant, as in a simulation; it is taken if nothing else is a speed."""
-    is_speed = item.meaning.quantity == "speed" and item.unit_known and item.role == "sensor"
-    if not is_speed or item.seen.changes or not item.seen.largest * item.scale > SLOW_M_S:
-        return False
-    item.bonus -= STEADY
-    item.doubts.append("it is constant in the parts of the log that were read")
-    return True
 
 
 def _has_open_sign(item: Field) -> bool:
