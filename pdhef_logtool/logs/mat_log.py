@@ -353,7 +353,7 @@ def _with_titles(variables: Mapping[str, Any]) -> dict[str, Any]:
         titles = lists[its[0]] if its else []
         units = lists[its[-1]] if its[1:] and "unit" in its[-1].lower() else [""] * len(titles)
         named = (f"{t} [{unit.replace(_SLASH, ' per ')}]" for t, unit in zip(titles, units, strict=True))
-        columns = value.T if titles and len(titles) != shape[0] else value
+        columns = value.T if titles and len(titles) != len(value) else value
         found |= zip(named, columns, strict=True) if titles else {name: value}
     return found
 

@@ -607,10 +607,8 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
         yield path, value
     elif isinstance(value, list) and value and depth and all(map(_name_of, value)):
         for inner in value:
-            leaves = [
-                leaf for leaf in _leaves(inner, f"{path}.{_name_of(inner)}", depth - 1) if leaf[1] != _name_of(inner)
-            ]
-            yield from ((f"{path}.{_name_of(inner)}" if len(leaves) == 1 else place, leaf) for place, leaf in leaves)
+            values = (v for _, v in _leaves(inner, "", depth - 1) if v != _name_of(inner))
+            yield from ((f"{path}.{_name_of(inner)}", v) for v in islice(values, 1))
     elif depth and isinstance(value, dict | list) and (isinstance(value, dict) or len(value) <= _MOST_ELEMENTS):
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _leaves(inner, f"{path}.{key}" if path else str(key), depth - 1)

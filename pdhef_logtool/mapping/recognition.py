@@ -11,6 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping import navigation
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
@@ -19,18 +20,6 @@ from pdhef_logtool.mapping.evidence import Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
-from pdhef_logtool.mapping.navigation import (
-    NEVER_NEGATIVE,
-    RAW_COURSE,
-    Axes,
-    gnss_signals,
-    has_heading,
-    length_of,
-    named_gnss,
-    navigation_truth,
-    receiver_signals,
-    twist_axes,
-)
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighing, weigh
@@ -113,7 +102,7 @@ class _Draft:
     quality: QualityGate | None = None
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    axes: dict[tuple[str, ...], Axes] = field(default_factory=dict)
+    axes: dict[tuple[str, ...], navigation.Axes] = field(default_factory=dict)
 
     def values(self, topic: str, path: str) -> FloatArray:
         seen = self.samples.get((topic, path))
@@ -172,7 +161,11 @@ def auto_map(
     vendors : documented types; by default the shipped ones and the user's.
     """
     vendors = load_vendors() if vendors is None else vendors
-    there = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
+    there = [
+        t
+        for t in log.topics
+        if t.messages > 0 and not (t.name.startswith(OWN_PREFIX) or _type(t).startswith("pdhef_msgs/"))
+    ]
     there = [vendors.typed(t, log.fields(t.name, quiet=True)) for t in there]
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
@@ -326,8 +319,8 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         return
     unknown = [t for t in topics if not _is_well_known(t) and not vendors.of(t.type_name).fields]
     # A table has no topic with the name of an instrument: velocity north and east with a heading are those of an INS.
-    truth = navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
-    truth = truth or navigation_truth(draft.log, [t for t in unknown if _role(t) == "sensor"], whole=True)
+    truth = navigation.navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
+    truth = truth or navigation.navigation_truth(draft.log, [t for t in unknown if _role(t) == "sensor"], whole=True)
     if truth is None or (draft.truth and len(truth[0]) <= len(draft.truth)):
         return
     draft.replace_truth(truth[0])
@@ -336,8 +329,10 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 
 def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
-    draft.signals |= gnss_signals(draft.signals, draft.truth)
-    instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
+    draft.signals |= navigation.gnss_signals(draft.signals, draft.truth)
+    instruments = (
+        {_device(source.topic) for source in draft.truth.values()} if navigation.has_heading(draft.truth) else set()
+    )
     topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS]
     others = [t for t in topics if _device(t.name) not in instruments]
     receivers = list(_receivers(draft, topics, others, vendors))
@@ -346,7 +341,7 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
             draft.signals |= signals
     if not has_gnss(draft.signals):
         _map_twist(draft, others)
-        if has_gnss(draft.signals) or not has_heading(draft.truth):
+        if has_gnss(draft.signals) or not navigation.has_heading(draft.truth):
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
@@ -354,11 +349,11 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
     """Yield the signals of each receiver among ``others``, and of any topic with the course of a single antenna."""
     for topic in topics:
         fields = () if _type(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
-        if fields and (topic in others or has_path(fields, RAW_COURSE)):
-            signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
+        if fields and (topic in others or has_path(fields, navigation.RAW_COURSE)):
+            signals = navigation.receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
             signals |= _in_degrees(draft.log, {n: s for n, s in signals.items() if n in GNSS_POSITION})
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
-            signals = named_gnss(draft.log, topic, draft.signals) if by_name else signals
+            signals = navigation.named_gnss(draft.log, topic, draft.signals) if by_name else signals
             if signals:
                 yield signals
 
@@ -384,7 +379,7 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
             return
 
 
-def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
+def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> navigation.Axes:
     """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate."""
     x, y = (_twist(twist, "linear", axis) for axis in "xy")
     if not (draft.is_given(twist.name, x) and draft.is_given(twist.name, y)):
@@ -401,7 +396,7 @@ def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
     key = (twist.name, *(source.label for source in references.values()))
     if key not in draft.axes:  # asked for speed, ground truth and GNSS
         velocity = SignalSource("speed_m_s", twist.name, (x, y))
-        draft.axes[key] = twist_axes(draft.log, velocity, [*references.values()])
+        draft.axes[key] = navigation.twist_axes(draft.log, velocity, [*references.values()])
     return draft.axes[key]
 
 
@@ -464,7 +459,7 @@ def _speed_of_receiver(draft: _Draft) -> None:
         return
     source = replace(velocity[0], name="speed_m_s", field=paths, scale=scales, combine="norm")
     draft.signals["speed_m_s"] = source
-    draft.notes.append(f"speed_m_s comes from {source.topic}: it is {NEVER_NEGATIVE}")
+    draft.notes.append(f"speed_m_s comes from {source.topic}: it is {navigation.NEVER_NEGATIVE}")
     draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
 
 
@@ -483,10 +478,10 @@ def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
     if _role(source) != "navigation" and (_role(source) != "sensor" or _is_well_known(source)):
         return
     forward = truth.name == "vx_m_s"
-    draft.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else length_of(truth)
+    draft.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else navigation.length_of(truth)
     draft.notes.append(
         f"speed_m_s comes from {source.name}, which is also the ground truth, as no other source gives a speed: "
-        "the estimator's input is the true speed" + ("" if forward else f"; it is {NEVER_NEGATIVE}")
+        "the estimator's input is the true speed" + ("" if forward else f"; it is {navigation.NEVER_NEGATIVE}")
     )
 
 
@@ -520,10 +515,6 @@ def _words(name: str) -> frozenset[str]:
     if "ground" in words and "truth" in words:
         words.add("groundtruth")
     return frozenset(words)
-
-
-def _is_ours(topic: TopicInfo) -> bool:
-    return topic.name.startswith(OWN_PREFIX) or _type(topic).startswith("pdhef_msgs/")
 
 
 def _is_truth(topic: TopicInfo) -> bool:

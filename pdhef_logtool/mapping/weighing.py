@@ -56,10 +56,9 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Least correlation of a yaw rate about the right axis; of an acceleration ahead whose sign is otherwise open.
-FOLLOWS, FAINT = 0.5, 0.25
-#: Least ratio of the yaw rate to the rates about other axes of a device with unknown axes.
-MOSTLY = 3.0
+#: Least correlation of a yaw rate about the right axis; of an acceleration ahead whose sign is otherwise open; least
+#: ratio of the yaw rate to the rates about other axes of a device with unknown axes.
+FOLLOWS, FAINT, MOSTLY = 0.5, 0.25, 3.0
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
