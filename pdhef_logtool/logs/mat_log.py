@@ -344,7 +344,7 @@ def _clock_of(struct_: str, length: int, clocks: Mapping[tuple[str, int], Clock]
 def _with_titles(variables: Mapping[str, Any]) -> dict[str, Any]:
     """Return variables with the columns of a matrix apart if as many texts are beside it: titles, and perhaps units."""
     lists = {n: v for n, v in variables.items() if isinstance(v, list) and v and all(isinstance(t, str) for t in v)}
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name, value in variables.items():
         shape = value.shape if isinstance(value, np.ndarray) and value.ndim == 2 else ()
         # Units last, and those of another block.
@@ -354,8 +354,8 @@ def _with_titles(variables: Mapping[str, Any]) -> dict[str, Any]:
         units = lists[its[-1]] if its[1:] and "unit" in its[-1].lower() else [""] * len(titles)
         named = (f"{t} [{unit.replace(_SLASH, ' per ')}]" for t, unit in zip(titles, units, strict=True))
         columns = value.T if titles and len(titles) != len(value) else value
-        found |= zip(named, columns, strict=True) if titles else {name: value}
-    return found
+        results |= zip(named, columns, strict=True) if titles else {name: value}
+    return results
 
 
 def _has_times(array: NDArray[Any]) -> bool:

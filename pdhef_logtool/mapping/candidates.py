@@ -56,8 +56,6 @@ MOST_OTHERWISE = {**MOST, "steering": 32.0}
 CONSTANT = "constant in the parts of the log that were read"
 #: Strength of the meaning of a field that only the drive gives, and least strength of a name.
 PROPOSED, LEAST_NAMED = 0.55, 0.6
-#: Least constant speed that is no filler.
-STEADY_M_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +155,7 @@ class Field:
     def is_steady(self) -> bool:
         """Return whether it is a constant speed with a unit, as in a simulation."""
         is_speed = self.meaning.quantity == "speed" and self.unit_known and not self.fixed
-        return is_speed and not self.seen.changes and abs(self.seen.largest * self.scale) > STEADY_M_S
+        return is_speed and not self.seen.changes and abs(self.seen.largest * self.scale) > 1.0  # others are fillers
 
     @property
     def is_downward(self) -> bool:

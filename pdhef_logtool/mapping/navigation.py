@@ -33,10 +33,8 @@ MOVING_M_S = 3.0
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 #: Positions by quantity.
 _PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
-#: Latitude of places that are not near the origin of a simulator.
-FROM_ORIGIN = 0.1
-#: Largest plausible extent of a log.
-WIDEST_DEG = 10.0
+#: Largest plausible extent of a log, and least latitude in rad: simulators begin at 0.
+WIDEST_DEG, FROM_ORIGIN_RAD = 10.0, 0.1
 #: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
 _CONVENTIONS = tuple(
     (f"{unit} {sense}", sign * factor, angle)
@@ -244,7 +242,7 @@ class _Instrument:
     def places(self) -> dict[str, SignalSource]:
         """Latitude and longitude in degrees; as degrees, usual ones in radians would be in the Gulf of Guinea."""
         reach = [self.seen[p].largest for p in self.place_paths.values() if p in self.seen]
-        is_small = len(reach) == len(_PLACES) and FROM_ORIGIN < reach[0] <= math.pi / 2.0 and reach[1] <= math.pi
+        is_small = len(reach) == len(_PLACES) and FROM_ORIGIN_RAD < reach[0] <= math.pi / 2.0 and reach[1] <= math.pi
         usual = math.degrees(1.0) if is_small else 1.0
         return {n: self.source(n, p, self.meanings[p].scale or usual) for n, p in self.place_paths.items()}
 

@@ -272,19 +272,15 @@ class Weighing:
             self.notes.append(f"yaw_rate_rad_s is {best.path} of {best.topic.name}, with its sign: it follows a_y / v")
 
     def _turn_level(self) -> None:
-        """Turn the axes of a level device by quarters of a turn if its names are letters, as speed or path shows."""
-        ax, speed, rate = self.taken.get("ax_m_s2"), self._speed(), self.taken.get("yaw_rate_rad_s")
-        across = [f for f in self.fields.candidates if ax and triad_of(f) == triad_of(ax) and f.meaning.part == "y"]
-        across = [f for f in across if f.meaning.quantity == "acceleration"]
+        """Turn the axes of a level device by quarters of a turn if its names are letters, as the motion shows."""
+        ax = self.taken.get("ax_m_s2")
+        triad = [f for f in self.fields.candidates if ax is not None and triad_of(f) == triad_of(ax)]
+        triad = [f for f in triad if f.meaning.quantity == "acceleration"]
+        across = [f for f in triad if f.meaning.part == "y"]
         if ax is None or ax.fixed or not ax.is_axis or len(across) != 1:
             return
-        ay, pieces, path = across[0], self.fields.pieces, path_velocity(self.fields)
-        pace = np.ones_like(ax.si) if speed is None else speed.si
-        ahead = [correlation(pieces.smooth(f.si), pieces.rate_of(pace)) for f in (ax, ay)]
-        turning = np.full_like(pace, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
-        if path is None and rate is not None and rate.is_axis and place_of(rate) == place_of(ax):
-            turning = rate.si
-        left = [correlation(pieces.smooth(f.si), pieces.smooth(turning * pace)) for f in (ax, ay)]
+        ay = across[0]
+        ahead, left = self._motion_along(ax, ay)
         if abs(ahead[1]) > CLEAR and abs(ahead[0]) < FOLLOWS:
             ahead_sign = math.copysign(1.0, ahead[1])
         elif abs(left[0]) > CLEAR and abs(left[1]) < FOLLOWS:
@@ -294,15 +290,23 @@ class Weighing:
         else:
             return
         # Two axes without a third have no handedness.
-        three = sum(
-            triad_of(f) == triad_of(ax) and f.meaning.quantity == "acceleration" for f in self.fields.candidates
-        )
-        along = math.copysign(1.0, ahead[1]) if three < len("xyz") and abs(ahead[1]) > FAINT else ahead_sign
+        along = math.copysign(1.0, ahead[1]) if len(triad) < len("xyz") and abs(ahead[1]) > FAINT else ahead_sign
         turned = ((ay, along), (ax, -ahead_sign)) if ahead_sign else ((ax, -1.0), (ay, -1.0))
         for name, (item, factor) in zip(("ax_m_s2", "ay_m_s2"), turned, strict=True):
             item.sign, item.is_turned = item.sign * factor, True
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
             self.taken[name] = item
+
+    def _motion_along(self, *axes: Field) -> tuple[list[float], list[float]]:
+        """Return the correlations of accelerations with speeding up, and with turning left by the path or the gyro."""
+        speed, rate, pieces = self._speed(), self.taken.get("yaw_rate_rad_s"), self.fields.pieces
+        pace, path = np.ones_like(axes[0].si) if speed is None else speed.si, path_velocity(self.fields)
+        turning = np.full_like(pace, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
+        if path is None and rate is not None and rate.is_axis and place_of(rate) == place_of(axes[0]):
+            turning = rate.si
+        changes = pieces.rate_of(pace), pieces.smooth(np.where(pace > 0.0, turning, np.nan) * pace)
+        ahead, left = ([correlation(pieces.smooth(f.si), change) for f in axes] for change in changes)
+        return ahead, left
 
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
@@ -323,8 +327,8 @@ class Weighing:
             times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
         beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
         in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
-        likely = [u for u in WHEEL_UNITS if first.meaning.quantity in ("wheel speed", u.quantity)]
-        likely = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in likely]
+        units = [u._replace(energy=in_si * IN_SI[u.name]) for u in WHEEL_UNITS]
+        likely = [u for u in units if first.meaning.quantity in ("wheel speed", u.quantity)]
         best, reasons, doubt = _unit_of_wheels(likely, times, sigma, by)
         if times is not None and not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
