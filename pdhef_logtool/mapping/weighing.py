@@ -73,7 +73,7 @@ WHEEL_UNITS = (
     *(Unit(*u, "wheel speed") for u in HYPOTHESES["wheel speed"]),
     *(Unit(n, f * USUAL_RADIUS_M, "wheel rate", 0.4) for n, f in HYPOTHESES["wheel rate"]),
 )
-IN_SI = {"m/s": 0.0, "km/h": 3.0, "mph": 3.0, "rad/s": 0.0, "rpm": 3.0, "1/s": 3.0}
+IN_SI = {"m/s": 0.0, "km/h": 3.0, "mph": 3.0, "rad/s": 0.0, "rpm": 3.0}
 #: Probability of a unit over the highest one from which the unit is a doubt: of wheels, and of a steering angle.
 POSSIBLE, LIKELY = 0.05, 0.25
 
