@@ -120,9 +120,10 @@ def _triad(log: DriveLog, mapping: Mapping, names: tuple[str, ...]) -> Triad | N
 def _siblings(paths: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
     """Yield possible triples of paths that contain a path."""
     path = paths[0]
-    if index := re.fullmatch(r"(.*)\[(\d+)\]", path):
+    if index := re.fullmatch(r"(.*[\[_])(\d+)(\]?)", path):
         start = int(index[2]) - int(index[2]) % 3
-        yield f"{index[1]}[{start}]", f"{index[1]}[{start + 1}]", f"{index[1]}[{start + 2}]"
+        a, b, c = (f"{index[1]}{start + i}{index[3]}" for i in range(3))
+        yield a, b, c
     leaf = path.rfind(".") + 1
     for word in _RATE_WORDS:
         position = path.lower().find(word, leaf)

@@ -36,8 +36,10 @@ _TAG_BYTES = struct.calcsize("II")
 _ELEMENTS, _NUMBERS = numbered(_MAT["elements"]), numbered(_MAT["numbers"])
 _CELL, _STRUCT, _OBJECT, _CHARACTERS = range(1, 5)
 _UNUSABLE, _ENCODINGS = numbered(_MAT["unusable"]), numbered(_MAT["encodings"])
-#: Structs inside one another; columns of a matrix that become fields.
-_DEEPEST, _MOST_COLUMNS = 8, 16
+#: Structs inside one another; columns of a matrix that become fields, without and with titles.
+_DEEPEST, _MOST_COLUMNS, _MOST_TITLES = 8, 16, 1000
+#: Letters of the name of a block in a data frame that is stored in HDF5.
+_BLOCK = len("block0")
 #: Filters of HDF5 that are a part of it: deflate, shuffle, checksum.
 _FILTERS = frozenset({1, 2, 3})
 #: Names of the values of a struct that has the name of the signal. What separates the parts of a path.
@@ -71,7 +73,7 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
     arrays: dict[str, dict[str, NDArray[Any]]] = {}
     units: dict[str, dict[str, str]] = {}
     unusable = []
-    leaves = (leaf for name, value in variables for leaf in _leaves(name, value, 0))
+    leaves = (leaf for name, value in _with_titles(dict(variables)).items() for leaf in _leaves(name, value, 0))
     rate_hz = file.settings.rate_hz
     for path, value, unit in leaves:
         struct_, _, title = path.rpartition(_SLASH)
@@ -258,6 +260,8 @@ def _dataset(h5py: Any, dataset: Any, file: TableFile) -> Any:
     attributes = {n: dataset.attrs[n] for n in ("MATLAB_class", "MATLAB_empty") if n in dataset.attrs}
     if attributes.get("MATLAB_empty"):
         return None
+    if h5py.check_string_dtype(dataset.dtype) and dataset.ndim == 1 and dataset.size <= _MOST_TITLES:
+        return [str(text) for text in dataset.asstr(errors="replace")[()]]
     if dataset.dtype.kind not in "iufb":
         return _Unusable(f"texts, cells or complex numbers ({dataset.dtype})")
     file.limits.check_unpacked(dataset.dtype.itemsize * math.prod(dataset.chunks or ()), file.size, file.name)
@@ -337,6 +341,23 @@ def _clock_of(struct_: str, length: int, clocks: Mapping[tuple[str, int], Clock]
     return clocks[struct_, length]
 
 
+def _with_titles(variables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return variables with the columns of a matrix apart if as many texts are beside it: titles, and perhaps units."""
+    lists = {n: v for n, v in variables.items() if isinstance(v, list) and v and all(isinstance(t, str) for t in v)}
+    results: dict[str, Any] = {}
+    for name, value in variables.items():
+        shape = value.shape if isinstance(value, np.ndarray) and value.ndim == 2 else ()
+        # Units last, and those of another block.
+        its = sorted((n for n in lists if len(lists[n]) in shape), key=lambda n: n[:_BLOCK] != name[:_BLOCK])
+        its.sort(key=lambda n: "unit" in n.lower())
+        titles = lists[its[0]] if its else []
+        units = lists[its[-1]] if its[1:] and "unit" in its[-1].lower() else [""] * len(titles)
+        named = (f"{t} [{unit.replace(_SLASH, ' per ')}]" for t, unit in zip(titles, units, strict=True))
+        columns = value.T if titles and len(titles) != len(value) else value
+        results |= zip(named, columns, strict=True) if titles else {name: value}
+    return results
+
+
 def _has_times(array: NDArray[Any]) -> bool:
     """Return whether an array is a matrix of rising times and of values."""
     is_pair = array.ndim == 2 and array.shape[1] == 2 and len(array) >= _MAT["fewest"] and array.dtype.kind in "iuf"
@@ -364,7 +385,7 @@ def _leaves(path: str, value: Any, depth: int, unit: str = "") -> Iterator[tuple
     elif isinstance(value, dict | list) and depth >= _DEEPEST:
         yield path, _Unusable("too deep inside of structs"), unit
     elif isinstance(value, dict):
-        for name, inner in value.items():
+        for name, inner in _with_titles(value).items():
             yield from _leaves(f"{path}{_SLASH}{name}", inner, depth + 1, _text_of(value, "unit", "units"))
     elif isinstance(value, list):
         structs = [v for v in value if isinstance(v, dict)][:_MOST_COLUMNS]

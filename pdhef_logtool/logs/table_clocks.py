@@ -40,9 +40,11 @@ _UNITS: dict[int, list[str]] = {ns: spellings.split() for ns, spellings in numbe
 TIME_UNITS_NS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
 _DAY_NS, _HOUR_NS, _MINUTE_NS, _SECONDS = (TIME_UNITS_NS[name] for name in ("days", "hours", "minutes", "seconds"))
 _DAY_S = _DAY_NS / _SECONDS
-#: Units of columns with published names; they explain no other column.
-NAMED_UNITS: dict[str, str] = _CLOCKS["columns"]
-_SUBUNITS = tuple(ns for ns in _UNITS if ns <= _SECONDS and not {*NAMED_UNITS.values()} & {*_UNITS[ns]})
+#: Units of columns with published names; the first of each explains no other column.
+_NAMED_UNITS: dict[str, list[str]] = {name: units.split() for name, units in _CLOCKS["columns"].items()}
+_SUBUNITS = tuple(
+    ns for ns in _UNITS if ns <= _SECONDS and ns not in {TIME_UNITS_NS[u[0]] for u in _NAMED_UNITS.values()}
+)
 #: Times that count from the start of a recording follow this instant, 1970-01-02, so that none is negative.
 RELATIVE_NS = _DAY_NS
 #: 1970-01-01 in the days of Excel, and of MATLAB's ``datenum``.
@@ -101,6 +103,12 @@ def rescaled(clock: Clock, decades: int, note: str) -> Clock:
     has_time = clock.stamps_ns != NO_TIME
     since = _scaled((clock.stamps_ns - RELATIVE_NS) * 10.0**decades, 1, 0, has_time)
     return replace(clock, stamps_ns=placed(since), notes=(*clock.notes, note))
+
+
+def named_unit(name: str, values: NDArray[Any]) -> str:
+    """Return the unit of a column with a published name by its usual step; empty for another column."""
+    steps = ((u, _steps(values)[0] * TIME_UNITS_NS[u] / _SECONDS) for u in _NAMED_UNITS.get(name, ()))
+    return next((unit for unit, step_s in steps if _is_within(step_s, _CLOCKS["usual_step_s"])), "")
 
 
 def number_clock(

@@ -14,21 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs import table_clocks
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
-from pdhef_logtool.logs.table_clocks import (
-    NAMED_UNITS,
-    NO_TIME,
-    TIME_UNITS_NS,
-    Clock,
-    ascending_rows,
-    number_clock,
-    rate_clock,
-    rescaled,
-    spread,
-    text_clock,
-    week_clock,
-    with_fractions,
-)
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, Clock
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.geometry import DEGREE_M
@@ -143,7 +131,7 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     chosen, *rivals = _best_clocks(clocks, grades)
     if not chosen:
         if rate_hz:
-            return rate_clock(max(map(len, sheet.columns.values()), default=0), rate_hz)
+            return table_clocks.rate_clock(max(map(len, sheet.columns.values()), default=0), rate_hz)
         expected = "a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)"
         got = ", ".join([*sheet.columns][:8]) or "no columns"
         raise LogError(expected=expected, got=got, where=f"{where}, {sheet.name}", remedy=CONSTANTS["clocks"]["remedy"])
@@ -164,15 +152,15 @@ def _in_parts(sheet: Sheet, names: Mapping[str, str]) -> Clock | None:
     of_gps = (PATTERNS[name] for name in ("week", "week_time"))
     week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in of_gps)
     if week is not None and seconds is not None:
-        clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
+        clock = table_clocks.week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
         return replace(clock, columns=frozenset({week, seconds}))
-    places = {re.sub("^(utc|gps)_", "", n): name for n, name in names.items()}
+    places = {re.sub("^min$", "minute", re.sub("^(utc|gps)_", "", n)): name for n, name in names.items()}
     parts = [places.get(part, "") for part in ("year", "month", "day", "hour", "minute", "second")]
     if not all(parts):
         return None
     *whole, second = (pl.Series(_numbers(sheet.columns[part])) for part in parts)
     date = [part.cast(pl.Int64, strict=False) for part in whole]
-    clock = text_clock(pl.select(pl.format("{}-{}-{} {}:{}:{}", *date, second)).to_series())
+    clock = table_clocks.text_clock(pl.select(pl.format("{}-{}-{} {}:{}:{}", *date, second)).to_series())
     return _in_two_columns(replace(clock, columns=frozenset(parts)), sheet, parts[-1], names)
 
 
@@ -184,7 +172,7 @@ def _in_two_columns(clock: Clock, sheet: Sheet, name: str, names: Mapping[str, s
     for unit, ns in TIME_UNITS_NS.items():
         within = names.get(f"{rest[1]}_{unit}".strip("_"))
         if within is not None and ns < _SECOND_NS:
-            return with_fractions(clock, _numbers(sheet.columns[within]), ns, within)
+            return table_clocks.with_fractions(clock, _numbers(sheet.columns[within]), ns, within)
     return clock
 
 
@@ -194,7 +182,7 @@ def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
     columns = {snake(name): column for name, column in sheet.columns.items()}
     decades = _decades_too_short(columns, rows, clock.stamps_ns[rows])
     note = f"{name}: speed and positions show times that are 10^{decades} as long: corrected"
-    return rescaled(clock, decades, note) if decades else clock
+    return table_clocks.rescaled(clock, decades, note) if decades else clock
 
 
 def _decades_too_short(columns: Mapping[str, Any], rows: IntArray, stamps: IntArray) -> int:
@@ -239,7 +227,7 @@ def _grade(sheet: Sheet, name: str) -> int | None:
         given = column.drop_nulls().head(20)
         named = _TIME_LIKE.search(text) or PATTERNS["date"].fullmatch(text)
         grade, others = (0, 0) if is_time else (1, 1) if named else (2, max(1, len(given) - 1))
-        return grade if len({*text_clock(given).stamps_ns.tolist()} - {NO_TIME}) > others else None
+        return grade if len({*table_clocks.text_clock(given).stamps_ns.tolist()} - {NO_TIME}) > others else None
     if column.dtype.kind not in "iufM":
         return None
     given = column[~np.isnat(column)].view(np.int64) if column.dtype.kind == "M" else column[np.isfinite(column)]
@@ -271,12 +259,12 @@ def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float
     column, columns = sheet.columns[name], {name}
     if isinstance(column, np.ndarray):
         text = snake(name)
-        unit = sheet.units.get(name, "") or NAMED_UNITS.get(text, text.rpartition("_")[2])
-        clock = number_clock(column, unit, name, others, rate_hz)
+        unit = sheet.units.get(name, "") or table_clocks.named_unit(text, column) or text.rpartition("_")[2]
+        clock = table_clocks.number_clock(column, unit, name, others, rate_hz)
     else:
         date = next((n for n in sheet.columns if n != name and PATTERNS["date"].fullmatch(snake(n))), name)
         dates = sheet.columns[date]
-        clock = text_clock(column, None if date == name or isinstance(dates, np.ndarray) else dates)
+        clock = table_clocks.text_clock(column, None if date == name or isinstance(dates, np.ndarray) else dates)
         columns = {name, date}
     return replace(clock, columns=frozenset(columns))
 
@@ -305,9 +293,9 @@ def tables_of(
             yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
         if parts:
             return
-    rows, lost = ascending_rows(stamps, f"{where}, {sheet.name}")
+    rows, lost = table_clocks.ascending_rows(stamps, f"{where}, {sheet.name}")
     losses.extend(lost)
-    times, note = spread(stamps[rows]) if used else (stamps[rows], "")
+    times, note = table_clocks.spread(stamps[rows]) if used else (stamps[rows], "")
     losses.extend(clock_notes([note] if note else (), where))
     groups: dict[bytes, tuple[BoolArray, dict[str, NDArray[Any]]]] = {}
     unusable = []
@@ -373,10 +361,10 @@ def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:
 def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
     """Return names, values and units of a table in long form, None for another table."""
     named = {snake(name): column for name, column in sheet.columns.items()}
-    of_long = (PATTERNS[name] for name in ("signal", "long_value"))
-    signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in of_long)
+    of_long = (PATTERNS[name] for name in ("signal", "long_value", "unit_column"))
+    signal, value, unit = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in of_long)
     is_long = signal is not None and not isinstance(signal, np.ndarray) and isinstance(value, np.ndarray)
-    return (signal, value, named.get("unit", named.get("units"))) if is_long else None
+    return (signal, value, unit) if is_long else None
 
 
 def _rows_by(texts: Series) -> dict[str, IntArray]:

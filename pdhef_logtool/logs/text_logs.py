@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 
 #: Lines at the start of a CSV file in which its header must be; cells below it that show the decimal mark; lines that
 #: show numbers with names; cells that are in memory as texts at the same time.
-_HEAD_LINES, _CELLS_OF_HEAD, _PAIRED, _CELLS_AT_ONCE = 200, 10_000, 20, 1 << 23
+#: Least share of values in rows of long forms.
+_HEAD_LINES, _CELLS_OF_HEAD, _PAIRED, _CELLS_AT_ONCE, _LEAST_VALUES = 200, 10_000, 20, 1 << 23, 0.3
 _CELL_END, _SPACES = "\x1f", r"\s{2,}"
 codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
 
@@ -228,7 +229,9 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     rows = [_uncommented(row, width) for row in rows]
     header = max((i for i, row in enumerate(rows) if row and PATTERNS["end_of_header"].fullmatch(row[0])), default=-1)
     data = _data_rows(rows, width)
-    numbers = [i for i in data if i > header and len(rows[i]) == width > 1 and _share(rows[i], _is_value) >= 0.5]
+    shares = {i: _share(rows[i], _is_value) for i in data if i > header and len(rows[i]) == width > 1}
+    # Rows of a value with its name, its unit and its device.
+    numbers = [i for i in shares if shares[i] >= 0.5] or [i for i in shares if shares[i] >= _LEAST_VALUES]
     # Above the titles there may be a row with the numbers of the channels.
     full, above = next(((n, above) for n in numbers[:2] if (above := _titles(rows[: n + 1], width, header))), (0, []))
     listed = [m[1] for row in rows if (m := PATTERNS["listed"].fullmatch(", ".join(row))) is not None]
@@ -261,7 +264,7 @@ def _head(
 
 def _units(row: Sequence[str]) -> list[str]:
     """Return the units of a row, without its label."""
-    units = ["" if re.search("(?i)unit|einheit", c) and not is_unit(c) else c for c in row]
+    units = ["" if (not i or re.search("(?i)unit|einheit", c)) and not is_unit(c) else c for i, c in enumerate(row)]
     return [PATTERNS["unit_label"].sub("", c).strip("[](){} ") for c in units]
 
 
@@ -602,9 +605,19 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
     """Yield paths and values of the texts and finite numbers in an object."""
     if isinstance(value, str) or (isinstance(value, int | float) and abs(value) < _LARGEST):
         yield path, value
+    elif isinstance(value, list) and value and depth and all(map(_name_of, value)):
+        for inner in value:
+            values = (v for _, v in _leaves(inner, "", depth - 1) if v != _name_of(inner))
+            yield from ((f"{path}.{_name_of(inner)}", v) for v in islice(values, 1))
     elif depth and isinstance(value, dict | list) and (isinstance(value, dict) or len(value) <= _MOST_ELEMENTS):
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _leaves(inner, f"{path}.{key}" if path else str(key), depth - 1)
+
+
+def _name_of(value: Any) -> str:
+    """Return the name in an object with a name and a value; empty without one."""
+    named = value.items() if isinstance(value, dict) else ()
+    return next((v for k, v in named if isinstance(v, str) and PATTERNS["signal"].fullmatch(k.lower())), "")
 
 
 def _json_column(name: str, given: _Cells, lines: Sequence[int], file: TableFile, losses: list[Loss]) -> Any:

@@ -17,27 +17,13 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.mapping import naming
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import (
-    COUNTING,
-    KNOWN,
-    NOT_VALUES,
-    OTHER_QUANTITIES,
-    STATES,
-    UNIT_TEXTS,
-    UNITS,
-    VOCABULARY,
-    Meaning,
-    is_command,
-    meaning_among,
-    plain_unit,
-    unit_of,
-    words_of,
-)
+from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, UNITS, VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
@@ -67,6 +53,7 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
 MOST: dict[str, float] = VOCABULARY["largest"]
 #: The same where no other unit is possible: five turns of a truck's steering wheel, in degrees.
 MOST_OTHERWISE = {**MOST, "steering": 32.0}
+CONSTANT = "constant in the parts of the log that were read"
 #: Strength of the meaning of a field that only the drive gives, and least strength of a name.
 PROPOSED, LEAST_NAMED = 0.55, 0.6
 
@@ -92,11 +79,8 @@ class Candidate:
     def __str__(self) -> str:
         """Return one line for a report or a comment."""
         doubt = f"; unsure: {self.doubt}" if self.doubt else ""
-        return f"{self.source.label}, scale {_short(self.source.scale)}: score {self.score:.2f}, {self.reason}{doubt}"
-
-
-def _short(scale: float | tuple[float, ...]) -> str:
-    return f"{scale:.6g}" if isinstance(scale, float) else ", ".join(f"{s:.6g}" for s in scale)
+        scales = ", ".join(f"{s:.6g}" for s in np.atleast_1d(self.source.scale))
+        return f"{self.source.label}, scale {scales}: score {self.score:.2f}, {self.reason}{doubt}"
 
 
 @dataclass(slots=True)
@@ -168,6 +152,12 @@ class Field:
         return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words) and not is_guess
 
     @property
+    def is_steady(self) -> bool:
+        """Return whether it is a constant speed with a unit, as in a simulation."""
+        is_speed = self.meaning.quantity == "speed" and self.unit_known and not self.fixed
+        return is_speed and not self.seen.changes and abs(self.seen.largest * self.scale) > 1.0  # others are fillers
+
+    @property
     def is_downward(self) -> bool:
         """Return whether the name defines it as positive about, or along, the downward axis."""
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
@@ -184,6 +174,7 @@ class Field:
             return 0.95
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
         score += 0.15 if self.meaning.unit else 0.0
+        score -= 0.0 if self.seen.changes else 0.1
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
         score -= {"device": 0.1, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
@@ -203,7 +194,7 @@ class Field:
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
             source = replace(source, valid_min=-most, valid_max=most)
         reason = "; ".join([self.meaning.why, *self.reasons])
-        doubts = [*self.doubts, *([] if self.seen.changes else ["constant in the parts of the log that were read"])]
+        doubts = dict.fromkeys([*self.doubts, *([] if self.seen.changes else [CONSTANT])])
         return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
 
 
@@ -227,7 +218,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             if its := documented.entries(info.path):
                 results += [(topic, role, replace(info, path=p), entry.meaning, True) for p, entry in its.items()]
             elif not documented.fields or info.path.count(".") or documented.has:
-                meaning = meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
+                meaning = naming.meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
 
@@ -283,18 +274,18 @@ def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tu
 def _units_without_name(info: FieldInfo) -> Units:
     """Return the possible units of a field by quantity, if its name contains no word with another meaning."""
     words = set(words_of(info.path)) - STATES
-    unit = plain_unit(info.unit)
+    unit = naming.plain_unit(info.unit)
     named = f"{info.path.rpartition('.')[2]}_{unit}"
     kinds = {"speed": "speed", "acceleration": "acceleration", "rate": "rate", "steering": "angle"}
-    given = {q: ((u, s),) for q, kind in kinds.items() for u, s in [unit_of(named, kind)] if s is not None}
+    given = {q: ((u, s),) for q, kind in kinds.items() for u, s in [naming.unit_of(named, kind)] if s is not None}
     if "acceleration" in given:  # m/s is a part of m/s², and deg of deg/s
         given.pop("speed", None)
-    if OTHER_QUANTITIES & words:
+    if naming.OTHER_QUANTITIES & words:
         given.pop("steering", None)
     given.pop("steering" if "rate" in given and given["rate"][0][0] not in UNITS["angle"] else "rate", None)
     if given and not words & NOT_VALUES and not is_command(info.path):
         return given
-    unknown = all(len(w) == 1 or w.isdigit() or w in COUNTING or w not in KNOWN for w in words)
+    unknown = all(len(w) == 1 or w.isdigit() or w in naming.COUNTING or w not in naming.KNOWN for w in words)
     return {q: HYPOTHESES[q][:2] for q in kinds} if unknown and not unit and not words & NOT_VALUES else {}
 
 
@@ -350,7 +341,7 @@ def _weighable(
     path = info.path.removesuffix("[]")
     for name in [path] if (topic.name, path) in samples else [f"{path}[{i}]" for i in range(MOST_COLUMNS)]:
         seen = samples.get((topic.name, name))
-        its = meaning if name == path else meaning_among(topic.name, topic.type_name, name, info.unit)
+        its = meaning if name == path else naming.meaning_among(topic.name, topic.type_name, name, info.unit)
         if its is None and meaning.quantity == "speed":
             its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
         if seen is None or its is None or not _is_measured(name, seen):
@@ -366,7 +357,7 @@ def _weighable(
             _document(item, vendors.of(topic.type_name).fields[info.path])
         elif its.scale is not None:
             item.unit_known = True
-            item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
+            item.reasons.append(f"unit {naming.UNIT_TEXTS.get(its.unit, its.unit)}")
         if its.strength < LEAST_NAMED:
             item.doubts.append("its values alone identify it")
         if _may_be_share(item, info):

@@ -32,19 +32,13 @@ def choose_mapping(
         return AutoMapping(mapping, (), missing)
     auto = auto_map(log, prefer_truth=prefer_truth)
     if runs := next((a.candidates for a in auto.ambiguities if a.subject == RUN), ()):
-        raise MappingError(
-            expected="signals and ground truth of one run",
-            got=f"{len(runs)} runs: {', '.join(runs)}",
-            where=str(log.path),
-            remedy=f'choose one: --set group={runs[0]}, or group = "{runs[0]}" in the mapping file',
-        )
+        expected, got = "signals and ground truth of one run", f"{len(runs)} runs: {', '.join(runs)}"
+        remedy = f'choose one: --set group={runs[0]}, or group = "{runs[0]}" in the mapping file'
+        raise MappingError(expected=expected, got=got, where=str(log.path), remedy=remedy)
     if require_signals and not auto.mapping.signals:
-        raise MappingError(
-            expected="fields that are a car's sensors",
-            got="; ".join(auto.mapping.notes) or _topics_there_are(log),
-            where=str(log.path),
-            remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
-        )
+        expected, got = "fields that are a car's sensors", "; ".join(auto.mapping.notes) or _topics_there_are(log)
+        remedy = "pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml"
+        raise MappingError(expected=expected, got=got, where=str(log.path), remedy=remedy)
     return auto
 
 
@@ -76,12 +70,9 @@ def mapping_for_recorder(log: DriveLog, mapping: Mapping) -> Mapping:
         return replace(best[0], notes=(*best[0].notes, f"mapping {best[0].file}: it is for this recorder"))
     names = f"{len(sources)} ({', '.join(sources)})" if sources else "; ".join(f"{n}: {p}" for n, p in problems.items())
     remedy = "add one: pdhef inspect LOG --write-mapping FOLDER/NAME.toml"
-    raise MappingError(
-        expected=f"one mapping in {mapping.file} for the recorder of this log",
-        got=names,
-        where=str(log.path),
-        remedy="[recorder] in a mapping file names the types of its topics" if sources else remedy,
-    )
+    remedy = "[recorder] in a mapping file names the types of its topics" if sources else remedy
+    expected = f"one mapping in {mapping.file} for the recorder of this log"
+    raise MappingError(expected=expected, got=names, where=str(log.path), remedy=remedy)
 
 
 def _misfit(log: DriveLog, mapping: Mapping) -> str:
@@ -99,14 +90,11 @@ def _misfit(log: DriveLog, mapping: Mapping) -> str:
 
 def _filled(mapping: Mapping, auto: Mapping) -> Mapping:
     """Return the mapping, with missing signals, or all ground truth if missing, filled in from recognised types."""
-    return replace(
-        mapping,
-        signals={**auto.signals, **mapping.signals},
-        truth=mapping.truth or auto.truth,
-        quality=mapping.quality if mapping.truth else mapping.quality or auto.quality,
-        notes=(*mapping.notes, *auto.notes),
-        checks=tuple(c for c in auto.checks if c.subject not in mapping.signals),
-    )
+    signals, truth = {**auto.signals, **mapping.signals}, mapping.truth or auto.truth
+    quality = mapping.quality if mapping.truth else mapping.quality or auto.quality
+    notes = (*mapping.notes, *auto.notes)
+    checks = tuple(c for c in auto.checks if c.subject not in mapping.signals)
+    return replace(mapping, signals=signals, truth=truth, quality=quality, notes=notes, checks=checks)
 
 
 def _topics_there_are(log: DriveLog) -> str:

@@ -410,12 +410,9 @@ def _clock_of(
     period_s = float(np.median(steps_s)) if steps_s.shape[0] else float("nan")
     if n == 0:
         if source.clock == "device":
-            raise MappingError(
-                expected="stamps of the device clock",
-                got="no usable stamp in the span that is read",
-                where=f"{source.topic}.{source.stamp}",
-                remedy='use stamp = "log_time"',
-            )
+            expected, got = "stamps of the device clock", "no usable stamp in the span that is read"
+            where = f"{source.topic}.{source.stamp}"
+            raise MappingError(expected=expected, got=got, where=where, remedy='use stamp = "log_time"')
         return ClockModel()
     line = ClockModel()
     if source.clock == "device":

@@ -72,12 +72,9 @@ def choose_estimates(
     chosen = {n: dict(t) for n, t in tables.items() if name in (None, n)}
     if not chosen:
         others = f" but {', '.join(tables)}" if tables else ""
-        raise UsageError(
-            expected="an estimate to score",
-            got="none" if name is None else f"none called {name!r}{others}",
-            where="pdhef metrics",
-            remedy="give --estimate [SIGNAL=]TOPIC.FIELD, or [estimates.NAME.SIGNAL] tables in a mapping file",
-        )
+        got = "none" if name is None else f"none called {name!r}{others}"
+        remedy = "give --estimate [SIGNAL=]TOPIC.FIELD, or [estimates.NAME.SIGNAL] tables in a mapping file"
+        raise UsageError(expected="an estimate to score", got=got, where="pdhef metrics", remedy=remedy)
     for n, signals in chosen.items():
         _base(signals, f"estimates.{n}")
     return tuple(EstimateSource(n, signals, can=can) for n, signals in chosen.items())
@@ -125,12 +122,9 @@ def sources_of(
             covariances += covariance
         for name, field_path in matches.items():
             if name in sources:
-                raise UsageError(
-                    expected="each signal once",
-                    got=f"{name} from {sources[name].label} and from {topic.name}.{field_path}",
-                    where=option,
-                    remedy="for several estimators use a mapping file with [estimates.NAME.SIGNAL] tables",
-                )
+                got = f"{name} from {sources[name].label} and from {topic.name}.{field_path}"
+                remedy = "for several estimators use a mapping file with [estimates.NAME.SIGNAL] tables"
+                raise UsageError(expected="each signal once", got=got, where=option, remedy=remedy)
             sources[name] = SignalSource(name=name, topic=topic.name, field=field_path)
     return sources, covariances[0] if len(covariances) == 1 else None
 
@@ -153,12 +147,9 @@ def _split_topic(log: DriveLog, text: str, option: str) -> tuple[TopicInfo, str]
         topic = max(fitting, key=lambda t: len(t.name))
         return topic, text[len(topic.name) + 1 :]
     names = [t.name for t in log.topics]
-    raise MappingError(
-        expected="TOPIC.FIELD with a topic of this log",
-        got=text + (near(text, names, 0.5) or near(text.split(".")[0], names, 0.6)),
-        where=f"{log.path} {option}",
-        remedy="pdhef inspect lists the topics",
-    )
+    got = text + (near(text, names, 0.5) or near(text.split(".")[0], names, 0.6))
+    expected, remedy = "TOPIC.FIELD with a topic of this log", "pdhef inspect lists the topics"
+    raise MappingError(expected=expected, got=got, where=f"{log.path} {option}", remedy=remedy)
 
 
 def _recognise(
@@ -177,10 +168,7 @@ def _recognise(
             covariance = [CovarianceSource(topic.name, TWIST_COVARIANCES[kind].removesuffix("[0]"), 6, (0, 1, 5))]
     matches = {name: field_path for name, field_path in path_of.items() if name in units and path in ("", field_path)}
     if not matches:
-        raise UsageError(
-            expected="SIGNAL=TOPIC.FIELD, as the type does not give the signal",
-            got=f"{text} ({topic.type_name or 'no type'})",
-            where=option,
-            remedy=f"SIGNAL is one of {', '.join(units)}",
-        )
+        expected = "SIGNAL=TOPIC.FIELD, as the type does not give the signal"
+        got, remedy = f"{text} ({topic.type_name or 'no type'})", f"SIGNAL is one of {', '.join(units)}"
+        raise UsageError(expected=expected, got=got, where=option, remedy=remedy)
     return matches, covariance if path == "" else []

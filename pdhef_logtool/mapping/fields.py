@@ -39,7 +39,7 @@ CERTAIN = 0.9
 #: Usual lengths that convert curvature to an angle: a wheelbase, times a steering ratio for the steering wheel.
 USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
 #: Energies of rare units.
-RARE = {"mph": 1.5, "mg": 1.5, "ft/s²": 3.0}
+RARE = {"mph": 1.5, "mg": 1.5, "ft/s²": 3.0, "kn": 5.0}
 
 
 @dataclass(slots=True)

@@ -133,12 +133,8 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
         problems += [f"{name}: field = {CAN_PREFIX}... needs [can] with a dbc" for name in names]
     problems += contradictions(mapping)
     if problems:
-        raise MappingFileError(
-            expected="the entries of mapping.toml",
-            got="; ".join(problems),
-            where=where,
-            remedy="see docs/formats.md for every entry and its unit",
-        )
+        expected, remedy = "the entries of mapping.toml", "see docs/formats.md for every entry and its unit"
+        raise MappingFileError(expected=expected, got="; ".join(problems), where=where, remedy=remedy)
     return mapping
 
 

@@ -55,7 +55,7 @@ def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
     name = _PATTERNS["no_words"].sub("", name)
-    name = _PATTERNS["sides"].sub(lambda m: f"_{(m[1] or m[3])[0]}{(m[2] or m[4])[0]}", name.translate(LATIN))
+    name = _PATTERNS["sides"].sub(lambda m: "_" + "".join(g[0] for g in m.groups() if g), name.translate(LATIN))
     name = _PATTERNS["corner_at_end"].sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
         for piece in [part] if part.lower() in _WHOLE else _CAMEL.findall(part):
@@ -221,7 +221,10 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
 
 def _described(leaf_words: tuple[str, ...]) -> set[str]:
     """Return the words of a leaf that describe its quantity."""
-    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
+    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured;
+    # a controller before "vehicle" is the sender.
+    if leaf_words[1:2] == ("vehicle",) and leaf_words[2:]:
+        leaf_words = leaf_words[leaf_words[0] in _WORDS["controllers"] :]
     kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
     kept |= {w for w in leaf_words[-1:] if (w not in STATES and leaf_words[-2:-1] != ("per",)) or len(leaf_words) == 1}
     return kept

@@ -22,7 +22,7 @@ from pdhef_logtool.mapping.candidates import HYPOTHESES, MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
-from pdhef_logtool.mapping.naming import Meaning, meaning_of, words_of
+from pdhef_logtool.mapping.naming import Meaning, meaning_among, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
@@ -33,8 +33,8 @@ MOVING_M_S = 3.0
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 #: Positions by quantity.
 _PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
-#: Largest plausible extent of a log.
-WIDEST_DEG = 10.0
+#: Largest plausible extent of a log, and least latitude in rad: simulators begin at 0.
+WIDEST_DEG, FROM_ORIGIN_RAD = 10.0, 0.1
 #: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
 _CONVENTIONS = tuple(
     (f"{unit} {sense}", sign * factor, angle)
@@ -222,14 +222,14 @@ class _Instrument:
         self.yaw_rate, mapped = signals.get("yaw_rate_rad_s"), signals.get("speed_m_s")
         self.stamp = stamp_path_of(self.fields)
         numbers = (f for f in self.fields if f.kind == "number")
-        named = ((f.path, meaning_of(topic.name, topic.type_name, f.path, f.unit)) for f in numbers)
+        there = {f.path for f in self.fields}
+        named = ((f.path, meaning_among(topic.name, topic.type_name, f.path, f.unit, there)) for f in numbers)
         self.meanings = {path: meaning for path, meaning in named if meaning is not None}
         if mapped is not None and mapped.topic == topic.name and isinstance(mapped.scale, float):
             units = {p: replace(self.meanings[p], scale=mapped.scale) for p in mapped.paths if p in self.meanings}
             self.meanings |= units
         first = {m.quantity: path for path, m in reversed(self.meanings.items())}
-        places = {name: first[q] for name, q in _PLACES.items() if q in first}
-        self.places = {name: self.source(name, p, self.meanings[p].scale or 1.0) for name, p in places.items()}
+        self.place_paths = {name: first[q] for name, q in _PLACES.items() if q in first}
         self.named_velocities = [*_horizontal(self.meanings)]
         angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
         self.angles = {path: meaning for meaning, path in angles}
@@ -239,11 +239,19 @@ class _Instrument:
         return SignalSource(name, self.topic, path, self.stamp, scale, offset)
 
     @cached_property
+    def places(self) -> dict[str, SignalSource]:
+        """Latitude and longitude in degrees; as degrees, usual ones in radians would be in the Gulf of Guinea."""
+        reach = [self.seen[p].largest for p in self.place_paths.values() if p in self.seen]
+        is_small = len(reach) == len(_PLACES) and FROM_ORIGIN_RAD < reach[0] <= math.pi / 2.0 and reach[1] <= math.pi
+        usual = math.degrees(1.0) if is_small else 1.0
+        return {n: self.source(n, p, self.meanings[p].scale or usual) for n, p in self.place_paths.items()}
+
+    @cached_property
     def seen(self) -> dict[str, Seen]:
         """Values of velocities, angles and positions in a few pieces of the log, by path."""
         paths = [*(p for v in self.named_velocities for p in v.values()), *self.angles]
         paths += [p for p, m in self.meanings.items() if m.quantity == "speed"]
-        paths += [s.paths[0] for s in self.places.values()]
+        paths += self.place_paths.values()
         return {path: seen for (_, path), seen in self.pieces.read((self.topic, p) for p in paths).items()}
 
     @cached_property
@@ -328,7 +336,7 @@ def named_gnss(log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSour
     direction of the path is a course.
     """
     its = _Instrument(log, topic, signals)
-    if len(its.places) < len(_PLACES):
+    if len(its.place_paths) < len(_PLACES):
         return {s.name: s for s in its.over_ground or _speed_and_course(its)}
     if not its.has_place:
         return {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
@@ -10,6 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping import navigation
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
@@ -18,22 +20,10 @@ from pdhef_logtool.mapping.evidence import Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
-from pdhef_logtool.mapping.navigation import (
-    NEVER_NEGATIVE,
-    RAW_COURSE,
-    Axes,
-    gnss_signals,
-    has_heading,
-    length_of,
-    named_gnss,
-    navigation_truth,
-    receiver_signals,
-    twist_axes,
-)
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighing, weigh
-from pdhef_logtool.records.signals import FloatArray, has_gnss
+from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
 TRUTH_WORDS, NAVIGATION_WORDS = _TOPICS["truth"], _TOPICS["navigation"]
@@ -112,7 +102,7 @@ class _Draft:
     quality: QualityGate | None = None
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    axes: dict[tuple[str, ...], Axes] = field(default_factory=dict)
+    axes: dict[tuple[str, ...], navigation.Axes] = field(default_factory=dict)
 
     def values(self, topic: str, path: str) -> FloatArray:
         seen = self.samples.get((topic, path))
@@ -171,7 +161,11 @@ def auto_map(
     vendors : documented types; by default the shipped ones and the user's.
     """
     vendors = load_vendors() if vendors is None else vendors
-    there = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
+    there = [
+        t
+        for t in log.topics
+        if t.messages > 0 and not (t.name.startswith(OWN_PREFIX) or _type(t).startswith("pdhef_msgs/"))
+    ]
     there = [vendors.typed(t, log.fields(t.name, quiet=True)) for t in there]
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
@@ -325,8 +319,8 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
         return
     unknown = [t for t in topics if not _is_well_known(t) and not vendors.of(t.type_name).fields]
     # A table has no topic with the name of an instrument: velocity north and east with a heading are those of an INS.
-    truth = navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
-    truth = truth or navigation_truth(draft.log, [t for t in unknown if _role(t) == "sensor"], whole=True)
+    truth = navigation.navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
+    truth = truth or navigation.navigation_truth(draft.log, [t for t in unknown if _role(t) == "sensor"], whole=True)
     if truth is None or (draft.truth and len(truth[0]) <= len(draft.truth)):
         return
     draft.replace_truth(truth[0])
@@ -335,8 +329,10 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 
 def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
-    draft.signals |= gnss_signals(draft.signals, draft.truth)
-    instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
+    draft.signals |= navigation.gnss_signals(draft.signals, draft.truth)
+    instruments = (
+        {_device(source.topic) for source in draft.truth.values()} if navigation.has_heading(draft.truth) else set()
+    )
     topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS]
     others = [t for t in topics if _device(t.name) not in instruments]
     receivers = list(_receivers(draft, topics, others, vendors))
@@ -345,7 +341,11 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
             draft.signals |= signals
     if not has_gnss(draft.signals):
         _map_twist(draft, others)
-        if has_gnss(draft.signals) or not has_heading(draft.truth) or not {"lat_deg", "x_m"} & set(draft.truth):
+        if (
+            has_gnss(draft.signals)
+            or not navigation.has_heading(draft.truth)
+            or not {"lat_deg", "x_m"} & set(draft.truth)
+        ):
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
@@ -353,12 +353,21 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
     """Yield the signals of each receiver among ``others``, and of any topic with the course of a single antenna."""
     for topic in topics:
         fields = () if _type(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
-        if fields and (topic in others or has_path(fields, RAW_COURSE)):
-            signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
+        if fields and (topic in others or has_path(fields, navigation.RAW_COURSE)):
+            signals = navigation.receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
+            signals |= _in_degrees(draft.log, {n: s for n, s in signals.items() if n in GNSS_POSITION})
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
-            signals = named_gnss(draft.log, topic, draft.signals) if by_name else signals
+            signals = navigation.named_gnss(draft.log, topic, draft.signals) if by_name else signals
             if signals:
                 yield signals
+
+
+def _in_degrees(log: DriveLog, places: _Sources) -> _Sources:
+    """Return positions with a documented unit in degrees if their values are degrees, as programs convert them."""
+    seen = Pieces(log).read((s.topic, s.paths[0]) for s in places.values() if s.scale != 1.0)
+    largest = {path: values.largest for (_, path), values in seen.items()}
+    is_small = {n: math.pi < largest.get(s.paths[0], 0.0) < 180.0 for n, s in places.items()}
+    return {n: replace(s, scale=1.0) if any(is_small.values()) else s for n, s in places.items()}
 
 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
@@ -374,7 +383,7 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
             return
 
 
-def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
+def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> navigation.Axes:
     """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate."""
     x, y = (_twist(twist, "linear", axis) for axis in "xy")
     if not (draft.is_given(twist.name, x) and draft.is_given(twist.name, y)):
@@ -391,7 +400,7 @@ def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
     key = (twist.name, *(source.label for source in references.values()))
     if key not in draft.axes:  # asked for speed, ground truth and GNSS
         velocity = SignalSource("speed_m_s", twist.name, (x, y))
-        draft.axes[key] = twist_axes(draft.log, velocity, [*references.values()])
+        draft.axes[key] = navigation.twist_axes(draft.log, velocity, [*references.values()])
     return draft.axes[key]
 
 
@@ -455,7 +464,7 @@ def _speed_of_receiver(draft: _Draft) -> None:
         return
     source = replace(velocity[0], name="speed_m_s", field=paths, scale=scales, combine="norm")
     draft.signals["speed_m_s"] = source
-    draft.notes.append(f"speed_m_s comes from {source.topic}: it is {NEVER_NEGATIVE}")
+    draft.notes.append(f"speed_m_s comes from {source.topic}: it is {navigation.NEVER_NEGATIVE}")
     draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
 
 
@@ -474,10 +483,10 @@ def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
     if _role(source) != "navigation" and (_role(source) != "sensor" or _is_well_known(source)):
         return
     forward = truth.name == "vx_m_s"
-    draft.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else length_of(truth)
+    draft.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else navigation.length_of(truth)
     draft.notes.append(
         f"speed_m_s comes from {source.name}, which is also the ground truth, as no other source gives a speed: "
-        "the estimator's input is the true speed" + ("" if forward else f"; it is {NEVER_NEGATIVE}")
+        "the estimator's input is the true speed" + ("" if forward else f"; it is {navigation.NEVER_NEGATIVE}")
     )
 
 
@@ -511,10 +520,6 @@ def _words(name: str) -> frozenset[str]:
     if "ground" in words and "truth" in words:
         words.add("groundtruth")
     return frozenset(words)
-
-
-def _is_ours(topic: TopicInfo) -> bool:
-    return topic.name.startswith(OWN_PREFIX) or _type(topic).startswith("pdhef_msgs/")
 
 
 def _is_truth(topic: TopicInfo) -> bool:

@@ -194,12 +194,8 @@ def _read(path: Path) -> Vendors:
         for m in _tables(raw, "receivers", _ReceiverTable, problems)
     )
     if problems:
-        raise MappingFileError(
-            expected="entries as in docs/formats.md",
-            got="; ".join(problems),
-            where=str(path),
-            remedy="see docs/formats.md for every entry",
-        )
+        expected, remedy = "entries as in docs/formats.md", "see docs/formats.md for every entry"
+        raise MappingFileError(expected=expected, got="; ".join(problems), where=str(path), remedy=remedy)
     return Vendors(types, receivers)
 
 

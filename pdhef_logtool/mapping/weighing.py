@@ -14,6 +14,7 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import (
+    CONSTANT,
     HYPOTHESES,
     LEAST_SCORE,
     Candidate,
@@ -55,9 +56,12 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Least correlation of a yaw rate about the right axis; its standard deviation in a car that turns; share of the time
-#: that counts as always; speed over that over ground below which it is vertical.
-FOLLOWS, EXCITED_RATE_RAD_S, MOSTLY, VERTICAL = 0.5, 0.03, 0.9, 0.2
+#: Least correlation of a yaw rate about the right axis, and of an acceleration ahead whose sign is otherwise open.
+FOLLOWS, FAINT = 0.5, 0.25
+#: Standard deviation of the yaw rate of a car that turns; share of the time that counts as always; speed over that over
+#: ground below which it is vertical; least ratio of the yaw rate to the rates about other axes of a device with unknown
+#: axes.
+EXCITED_RATE_RAD_S, MOSTLY, VERTICAL, OUTWEIGHS = 0.03, 0.9, 0.2, 3.0
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -180,7 +184,7 @@ class Weighing:
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
-        usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
+        usable = [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
             item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
@@ -256,7 +260,8 @@ class Weighing:
                 yield from ((x, y) for x in [f for f in beside if f.meaning.quantity == "speed" and f.seen.changes][:1])
 
     def _take(self, name: str, candidates: Sequence[Field]) -> None:
-        ordered = sorted(candidates, key=lambda f: (-f.score, -f.topic.messages, f.topic.name, f.path))
+        # A speed before the x of a velocity, which is ahead in some axes only; what is constant last.
+        ordered = sorted(candidates, key=lambda f: (-f.score, f.meaning.part, -f.topic.messages, f.topic.name, f.path))
         good = [f for f in ordered if f.score >= LEAST_SCORE]
         if not good:
             return
@@ -270,11 +275,21 @@ class Weighing:
             self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
 
     def _turn_about(self) -> None:
-        """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's."""
+        """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's.
+
+        Without a_y, it is the axis about which the car turns most.
+        """
         rate, ay, speed = self.taken.get("yaw_rate_rad_s"), self._chosen("ay_m_s2"), self._speed()
-        if rate is None or ay is None or speed is None or rate.fixed or not rate.is_axis or ay.is_axis:
+        if rate is None or speed is None or rate.fixed or not rate.is_axis:
             return
         rates = [f for f in self.fields.candidates if f.meaning.quantity == "rate" and triad_of(f) == triad_of(rate)]
+        if ay is None:
+            *others, most = sorted(rates, key=lambda f: spread(f.seen.cells))
+            if others and spread(most.seen.cells) > OUTWEIGHS * spread(others[-1].seen.cells):
+                self.taken["yaw_rate_rad_s"] = most
+            return
+        if ay.is_axis:
+            return
         fits = [(abs(r.correlation), r.slope, f) for f in rates if (r := self.fields.turning(ay.si, f.si, speed.si))]
         surest, slope, best = max(fits, key=lambda f: f[0], default=(0.0, 1.0, rate))
         if best is not rate and surest > 0.9 and all(c < FOLLOWS for c, _, f in fits if f is rate):
@@ -283,17 +298,15 @@ class Weighing:
             self.notes.append(f"yaw_rate_rad_s is {best.path} of {best.topic.name}, with its sign: it follows a_y / v")
 
     def _turn_level(self) -> None:
-        """Turn the axes of a level device by quarters of a turn if its names are letters, as speed or path shows."""
-        ax, speed = self.taken.get("ax_m_s2"), self._speed()
-        across = [f for f in self.fields.candidates if ax and triad_of(f) == triad_of(ax) and f.meaning.part == "y"]
-        across = [f for f in across if f.meaning.quantity == "acceleration"]
-        if ax is None or speed is None or ax.fixed or not ax.is_axis or len(across) != 1:
+        """Turn the axes of a level device by quarters of a turn if its names are letters, as the motion shows."""
+        ax = self.taken.get("ax_m_s2")
+        triad = [f for f in self.fields.candidates if ax is not None and triad_of(f) == triad_of(ax)]
+        triad = [f for f in triad if f.meaning.quantity == "acceleration"]
+        across = [f for f in triad if f.meaning.part == "y"]
+        if ax is None or ax.fixed or not ax.is_axis or len(across) != 1:
             return
-        ay, pieces, path = across[0], self.fields.pieces, path_velocity(self.fields)
-        change = pieces.rate_of(speed.si)
-        ahead = [correlation(pieces.smooth(f.si), change) for f in (ax, ay)]
-        turning = np.full_like(change, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
-        left = [correlation(pieces.smooth(f.si), pieces.smooth(turning * speed.si)) for f in (ax, ay)]
+        ay = across[0]
+        ahead, left = self._motion_along(ax, ay)
         if abs(ahead[1]) > CLEAR and abs(ahead[0]) < FOLLOWS:
             ahead_sign = math.copysign(1.0, ahead[1])
         elif abs(left[0]) > CLEAR and abs(left[1]) < FOLLOWS:
@@ -302,11 +315,24 @@ class Weighing:
             ahead_sign = 0.0
         else:
             return
-        turned = ((ay, ahead_sign), (ax, -ahead_sign)) if ahead_sign else ((ax, -1.0), (ay, -1.0))
+        # Two axes without a third have no handedness.
+        along = math.copysign(1.0, ahead[1]) if len(triad) < len("xyz") and abs(ahead[1]) > FAINT else ahead_sign
+        turned = ((ay, along), (ax, -ahead_sign)) if ahead_sign else ((ax, -1.0), (ay, -1.0))
         for name, (item, factor) in zip(("ax_m_s2", "ay_m_s2"), turned, strict=True):
             item.sign, item.is_turned = item.sign * factor, True
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
             self.taken[name] = item
+
+    def _motion_along(self, *axes: Field) -> tuple[list[float], list[float]]:
+        """Return the correlations of accelerations with speeding up, and with turning left by the path or the gyro."""
+        speed, rate, pieces = self._speed(), self.taken.get("yaw_rate_rad_s"), self.fields.pieces
+        pace, path = np.ones_like(axes[0].si) if speed is None else speed.si, path_velocity(self.fields)
+        turning = np.full_like(pace, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
+        if path is None and rate is not None and rate.is_axis and place_of(rate) == place_of(axes[0]):
+            turning = rate.si
+        changes = pieces.rate_of(pace), pieces.smooth(np.where(pace > 0.0, turning, np.nan) * pace)
+        ahead, left = ([correlation(pieces.smooth(f.si), change) for f in axes] for change in changes)
+        return ahead, left
 
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
@@ -327,7 +353,9 @@ class Weighing:
             times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
         beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
         in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
-        best, reasons, doubt = _unit_of_wheels(times, sigma, by, in_si=in_si)
+        units = [u._replace(energy=in_si * IN_SI[u.name]) for u in WHEEL_UNITS]
+        likely = [u for u in units if first.meaning.quantity in ("wheel speed", u.quantity)]
+        best, reasons, doubt = _unit_of_wheels(likely, times, sigma, by)
         if times is not None and not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
         for item in wheels:
@@ -492,7 +520,7 @@ class Weighing:
                 f"speed_m_s comes from the navigation system's {item.topic.name}.{item.path}: "
                 "if it is the ground truth too, the estimator's input is the true speed"
             )
-        item.doubts += item.unit_doubt
+        item.doubts += [*item.unit_doubt, *([CONSTANT] if item.is_steady else [])]
         if item.doubts:
             evidence = f"{item.topic.name}.{item.path} is taken, but {'; '.join(item.doubts)}"
             remedy = f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"'
@@ -599,12 +627,11 @@ def truth_topic(weighable: Sequence[Field]) -> str:
     return best[1]
 
 
-def _unit_of_wheels(times: float | None, sigma: float, by: str, *, in_si: bool) -> tuple[Unit, list[str], str]:
+def _unit_of_wheels(units: Sequence[Unit], times: float | None, sigma: float, by: str) -> tuple[Unit, list[str], str]:
     """Return the likeliest unit of wheel speeds if ``times`` of it are 1 m/s, the reasons and the doubt."""
     if times is None or not times > 0.0:
-        doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
-        return WHEEL_UNITS[0], [], doubt
-    units = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in WHEEL_UNITS]
+        unit = units[0].name
+        return units[0], [], f"the unit of the wheel speeds is not given, and no speed to compare with; taken as {unit}"
     best, *others = _likely(units, times, sigma, POSSIBLE)
     doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
     return best, [f"{times:.4g} of it is 1 m/s by {by}"], doubt

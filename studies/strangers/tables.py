@@ -283,6 +283,16 @@ def _mat_columns(path: Path, topics: Sequence[Topic]) -> None:
     savemat(path, {name: np.stack([seconds, values], 1) for seconds, name, _, values in _signals(topics)})
 
 
+def _mat_names(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a matrix, and the names and units of its columns as cells."""
+    from scipy.io import savemat
+
+    seconds, columns = next(_signals(topics))[0], [*_signals(topics)]
+    cells = {"names": ["Time", *(n for _, n, _, _ in columns)], "units": ["s", *(u for _, _, u, _ in columns)]}
+    table = {"data": np.stack([seconds, *(v for *_, v in columns)], 1)}
+    savemat(path, table | {key: np.array(texts, dtype=object) for key, texts in cells.items()})
+
+
 def _mat_values(path: Path, topics: Sequence[Topic]) -> None:
     """Write a struct for each channel with its times, values and units."""
     from scipy.io import savemat
@@ -388,6 +398,38 @@ def _hdf5(path: Path, topics: Sequence[Topic]) -> None:
                 group.create_dataset(name, data=values, compression="gzip").attrs["unit"] = unit
 
 
+def _hdf5_frame(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a data frame in the fixed format: names, index, and blocks of values."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        names = np.array([name for topic in topics for name in topic.fields], "S")
+        frame = file.create_group("df")
+        frame["axis0"], frame["block0_items"] = names, names
+        frame["axis1"] = topics[0].arrival_ns * 1e-9
+        frame["block0_values"] = np.stack([v for topic in topics for v in topic.fields.values()], 1)
+
+
+def _hdf5_pairs(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a matrix of times and values for each signal, with its unit as an attribute."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for seconds, name, unit, values in _signals(topics):
+            file.create_dataset(f"channels/{name}", data=np.stack([seconds, values], 1)).attrs["unit"] = unit
+
+
+def _hdf5_signals(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a group for each signal: its values, and their times in µs."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for topic in topics:
+            for title, values in topic.fields.items():
+                group = file.create_group(_split(title)[0])
+                group["timestamp"], group["data"] = topic.arrival_ns // 1000, values
+
+
 def _mat_hdf5(path: Path, topics: Sequence[Topic]) -> None:
     """Write version 7.3: each variable is a row vector, which HDF5 stores as a column."""
     import h5py
@@ -414,6 +456,13 @@ def _parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), path)
 
 
+def _seconds_parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table({**columns, "timestamps": (stamps - stamps[0]) * 1e-9}), path)
+
+
 def _mdf(path: Path, topics: Sequence[Topic]) -> None:
     import asammdf
 
@@ -432,6 +481,7 @@ def _mdf(path: Path, topics: Sequence[Topic]) -> None:
 _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]] = {
     "parquet-nested": (".parquet", _nested_parquet),
     "parquet": (".parquet", _parquet),
+    "parquet-seconds": (".parquet", _seconds_parquet),
     "vbo": (".vbo", _vbo),
     "vbo-fewer": (".vbo", partial(_vbo, fewer=1)),
 }
@@ -456,7 +506,11 @@ _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "json-columns": (".json", _json_columns),
     "json-channels": (".json", _json_channels),
     "mat-values": (".mat", _mat_values),
+    "mat-names": (".mat", _mat_names),
     "hdf5": (".h5", _hdf5),
+    "hdf5-signals": (".hdf5", _hdf5_signals),
+    "hdf5-frame": (".h5", _hdf5_frame),
+    "hdf5-pairs": (".h5", _hdf5_pairs),
     "parquet-measures": (".parquet", _measures_parquet),
     "mdf": (".mf4", _mdf),
 }

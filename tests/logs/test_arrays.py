@@ -45,6 +45,14 @@ def _losses(tables: Tables) -> list[tuple[str, str]]:
     return [(loss.severity, loss.what) for loss in tables.losses]
 
 
+def test_columns_of_a_matrix_have_the_titles_and_units_beside_it() -> None:
+    out = io.BytesIO()
+    cells = {"names": np.array(["t", "v"], object), "units": np.array(["s", "km/h"], object)}
+    savemat(out, {"data": np.stack([TIME_S, AY], axis=1), **cells})
+    (table,) = open_mat(_file(out.getvalue())).tables
+    assert {f.path: f.unit for f in table.fields} == {"v": "km per h"}
+
+
 # ------------------------------------------------------------------------------------------------ Parquet
 
 

@@ -21,6 +21,12 @@ BLOCKS = "Version\t2\n\n{Block}\nTime\tvCar[kph]\n" + "".join(f"{i}\t{i}\n" for 
 BLOCKS += "\n{Block}\nTime\taSteer[deg]\n" + "".join(f"{i}\t{2 * i}\n" for i in ROWS)
 RATED = "# Sampling frequency: 50 Hz\nSample,Speed\n" + "".join(f"{i},{i * i}\n" for i in ROWS)
 SENSORS = json.dumps([{"sensor": s, "time": 1.5e9 + i, "x": f"{i}"} for i in ROWS for s in ("acc", "gyro")])
+REPORT = '"Device","Date","Diagnostic","Value","Unit of measure"\n' + "".join(
+    f'"Car 3","01/01/2026 12:00:{i:02d}","Vehicle speed","{i}","km/h"\n' for i in ROWS
+)
+KEYS = "".join(
+    json.dumps({"data": [{"key": "VehicleSpeed", "value": {"doubleValue": i}}], "time": 1.5e9 + i}) + "\n" for i in ROWS
+)
 CHANNELS = json.dumps({"channels": [{"name": "Speed", "unit": "km/h", "samplerate": 10, "data": [*ROWS]}]})
 
 
@@ -34,6 +40,8 @@ CHANNELS = json.dumps({"channels": [{"name": "Speed", "unit": "km/h", "samplerat
         ("a.csv", RATED, "csv", "Speed", np.arange(20) ** 2),
         ("a.json", SENSORS, "gyro", "x", np.arange(20)),
         ("a.json", CHANNELS, "channels", "Speed", np.arange(20)),
+        ("a.csv", REPORT, "csv", "Vehicle_speed", np.arange(20)),
+        ("a.jsonl", KEYS, "json", "data_VehicleSpeed", np.arange(20)),
     ],
 )
 def test_layouts(name: str, text: str, topic: str, field: str, values: np.ndarray, tmp_path: Path) -> None:

@@ -58,6 +58,13 @@ def unsettled(auto: AutoMapping) -> set[str]:
     return {c.subject for c in auto.mapping.checks if c.name.endswith((".sign", ".candidate", ".corrected"))}
 
 
+def test_a_constant_speed_with_a_unit_is_taken_with_a_doubt_and_a_filler_is_not() -> None:
+    steady = topic(speed_mps=np.full(N, 20.0), yaw_rate_radps=RATE, ay_mps2=20.0 * RATE)
+    assert found(car=steady).mapping.signals["speed_m_s"].field == "speed_mps"
+    assert "speed_m_s.candidate" in {c.name for c in found(car=steady).mapping.checks}
+    assert "speed_m_s" not in found(car=topic(speed_mps=np.zeros(N), yaw_rate_radps=RATE)).mapping.signals
+
+
 def taken(auto: AutoMapping) -> dict[str, tuple[str, float]]:
     return {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.signals.items()}  # type: ignore[arg-type]
 

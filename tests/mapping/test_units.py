@@ -11,7 +11,8 @@ from pdhef_logtool.mapping.candidates import HYPOTHESES
 from pdhef_logtool.mapping.fields import BY_DRIVING, CERTAIN, RARE, SAME, Gain, Unit, posterior
 
 SPEED, RATE = (
-    [Unit(*u, energy=RARE.get(u[0], 0.0)) for u in units] for units in (HYPOTHESES["speed"], HYPOTHESES["steering"])
+    [Unit(*u, energy=RARE.get(u[0], 0.0)) for u in units]
+    for units in (HYPOTHESES["speed"][:3], HYPOTHESES["steering"])  # only an accurate gain separates knots from mph
 )
 
 
