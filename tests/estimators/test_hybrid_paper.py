@@ -154,7 +154,8 @@ def test_it_is_the_papers_equations_in_plain_numpy(weaving, constants):
         "r_scale": track.r_scale, "ay": track.ay_m_s2, "vy_var": track.vy_std_m_s**2,
     }  # fmt: skip
     for name, values in want.items():
-        np.testing.assert_allclose(got[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
+        rtol = 1e-6 if name in ("beta", "r_scale") else 1e-9  # kept in single precision, for files
+        np.testing.assert_allclose(got[name], values, rtol=rtol, atol=1e-9, err_msg=name)
     assert np.ptp(want["beta"][5:]) > 0.5  # the drive covers the whole table
     assert np.nanmax(want["r_scale"]) > 5.0
 

@@ -39,7 +39,7 @@ def small_log(n: int = 3000, period_ms: int = 10) -> FakeLog:
         publish_time_ns=stamps + 1_000_000,
     )
     imu.fields["linear_acceleration.y"][5] = np.nan
-    vendor = FakeTopic("vendor_msgs/msg/Box", stamps[::10] + 3_000_000, {"speed_kmh": np.full(len(stamps[::10]), 50.0)})
+    vendor = FakeTopic("vendor_msgs/msg/Box", stamps[::10] + 3_000_000, {"speed_kmh": np.zeros(len(stamps[::10]))})
     lost = (Loss("truncated", "the file ends early", "memory.mcap", start_ns=int(stamps[-1])),)
     return FakeLog({"/imu": imu, "/vendor": vendor}, lost=lost)
 
