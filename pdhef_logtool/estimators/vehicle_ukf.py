@@ -695,18 +695,11 @@ class LinkedSteps(StepColumns):
 
 def make_window(signals: Signals, residual_rate: FloatArray | None = None, extra_r: FloatArray | None = None) -> Window:
     """Return the window that a kernel reads; without ``residual_rate`` or ``extra_r`` they are 0."""
-    nothing = np.zeros((len(signals), 2))
-    return Window(
-        signals.steps_s,
-        signals.steer_rad,
-        signals.ax_m_s2,
-        signals.ay_m_s2,
-        signals.yaw_rate_rad_s,
-        signals.speed_m_s,
-        signals.friction,
-        nothing if residual_rate is None else residual_rate,
-        nothing if extra_r is None else extra_r,
-    )
+    s, nothing = signals, np.zeros((len(signals), 2))
+    columns = [s.steps_s, s.steer_rad, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s, s.friction]
+    columns += [nothing if residual_rate is None else residual_rate, nothing if extra_r is None else extra_r]
+    # Numba would compile the kernel again for a read-only column, or one number for all steps.
+    return Window._make(np.require(column, requirements=["C", "W"]) for column in columns)
 
 
 def no_posterior(stamps_ns: IntArray, n: int, residual_rate: FloatArray) -> PosteriorSteps:
