@@ -32,22 +32,19 @@ class Estimates:
     Attributes
     ----------
     model : of the drive; its car is calibrated on the drive as by a run.
+    tracks : by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence, intervals.
     algorithms : by name. skipped : estimators that could not run, with reasons.
     """
 
     drive: Drive
     model: DriveModel
     estimated: Estimated
+    tracks: dict[str, StateTrack]
     algorithms: dict[str, Algorithm]
     skipped: tuple[Skipped, ...]
 
     def __repr__(self) -> str:
         return f"<Estimates of {self.drive.name}: {', '.join(self.estimated.tracks)}>"
-
-    @property
-    def tracks(self) -> dict[str, StateTrack]:
-        """Tracks by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence, intervals."""
-        return {track.name: track for track in self.estimated.drawn}
 
     @property
     def signals(self) -> Signals:
@@ -114,7 +111,8 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     estimators, skipped = choose(drive, names, model.car)
     intervals = drive_intervals(model.car, estimators)
     estimated = estimate_drive(whole, model.apply(whole.signals), estimators, intervals=intervals)
-    return Estimates(drive, model, estimated, {e.name: resolve(e) for e in estimators}, tuple(skipped))
+    tracks = {track.name: track for track in estimated.drawn}
+    return Estimates(drive, model, estimated, tracks, {e.name: resolve(e) for e in estimators}, tuple(skipped))
 
 
 def score(estimates: Estimates) -> pl.DataFrame:
