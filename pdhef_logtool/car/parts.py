@@ -116,7 +116,8 @@ class FilterNoise(Record):
     q_std : per square root of second, of v_x, v_y and yaw rate, and optionally of the a_x bias; for ``physics`` also of
         the two axle forces. Empty for the filter's default.
     r_std : by measurement; the filter's default for missing ones.
-    limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0 without.
+    limit_gain : growth of the process noise of axle forces and yaw rate of ``physics`` beyond the linear range; 0
+        without.
     score_deg : objective of the noise search, lower is better; None without a search. trial : number of its trial.
     """
 
@@ -165,12 +166,15 @@ class TriedParts(Record):
 class FittedPhysics(Record):
     """Values and noise that were identified with the filter ``physics``, and the evidence for its model parts.
 
-    ``smoothing``: as :data:`SMOOTHING`, found with the smoother.
+    ``smoothing``: as :data:`SMOOTHING`, found with the smoother. ``beside_residual``: noise of the filters that have the
+    network's residual, as a factor on the process noise of v_y, yaw rate and axle forces, and its growth
+    ``limit_gain``.
     """
 
     values: FittedValues
     noise: FilterNoise
     smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = SMOOTHING
+    beside_residual: Annotated[tuple[Positive, NonNegative], Field(strict=False)] = (1.0, 0.0)
     tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
 
 

@@ -170,17 +170,20 @@ class AdaptivePhysics:
     physics : the car's filter with its parts and noise.
     network : of the model's residual, None without; trust : residual gain of F1, in [0, 1].
     adaptive : False leaves the mechanism out: no detector, and the car's filter alone, with its cures as states.
+    beside_residual : the filter with the noise that the residual leaves; None is ``physics``. The parallel filter stays
+        as the network knows it.
     notes : texts for the report, such as the reason for its residual gain.
     """
 
     algorithm = "adaptive-physics"
     version = 2
-    options = ("physics", "trust", "adaptive")
+    options = ("physics", "trust", "adaptive", "beside_residual")
 
     physics: VehicleUkf
     network: ResidualModel | None = None
     trust: float = 0.0
     adaptive: bool = True
+    beside_residual: VehicleUkf | None = None
     name: str = "pd-hef"
     causal: bool = True
     notes: tuple[str, ...] = ()
@@ -198,12 +201,13 @@ class AdaptivePhysics:
     @property
     def filters(self) -> tuple[VehicleUkf, ...]:
         """F1, and one filter for each cure that the car has."""
-        vehicle, cures = self.physics.vehicle, self.cures
+        physics, cures = self.beside_residual or self.physics, self.cures
         if not cures:
-            return (self.physics,)
+            return (physics,)
+        vehicle = physics.vehicle
         parts = [vehicle.physics.model_copy(update={c: c == cure for c in CURES}) for cure in ("", *cures)]
         vehicles = [vehicle.model_copy(update={"physics": p}) for p in parts]
-        return tuple(replace(self.physics, vehicle=v) for v in vehicles)
+        return tuple(replace(physics, vehicle=v) for v in vehicles)
 
     def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
         """Return faults and the residual at gain 1, and the state."""

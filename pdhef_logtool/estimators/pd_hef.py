@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import SMOOTHING
+from pdhef_logtool.car.parts import SMOOTHING, FittedPhysics
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.presets import Options, options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
-from pdhef_logtool.estimators.vehicle_ukf import of_car
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car
 
 #: The preset that uses the taught part of a car.
 PRESET = "pd-hef"
@@ -38,21 +38,30 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     """Return ``physics`` of a car with its network."""
     gain, note = _gain(name, car)
+    physics, network = of_car(car, use_speed=options.use_speed), car.network if gain > 0.0 else None
     return AdaptivePhysics(
-        of_car(car, use_speed=options.use_speed),
-        car.network.residual_model if gain > 0.0 and car.network is not None else None,
+        physics,
+        None if network is None else network.residual_model,
         gain,
         adaptive="fixed-r" not in options_of(name),
+        beside_residual=None if network is None or car.fitted_physics is None else _quieter(physics, car.fitted_physics),
         name=name,
         notes=(f"residual gain {gain:g}: {note}",) if note else (),
     )
+
+
+def _quieter(physics: VehicleUkf, fitted: FittedPhysics) -> VehicleUkf:
+    """Return the filter with the process noise that a network's residual leaves."""
+    (along, vy, rate, ax_bias, *forces), (share, limit_gain) = physics.q_std, fitted.beside_residual
+    q_std = (along, share * vy, share * rate, ax_bias, *(share * force for force in forces))
+    return replace(physics, q_std=q_std, limit_gain=max(limit_gain, physics.limit_gain))
 
 
 def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
     """Return the smoothed filter, with the noise for smoothing; ``name`` is the name of the result."""
     filtered = _with_network(name, car, options)
     factors = SMOOTHING if car.fitted_physics is None else car.fitted_physics.smoothing
-    filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors))
+    filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors), beside_residual=None)
     taught = () if car.model is None or car.model.residual is None else (FILTER_ALONE,)
     return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *taught, *filtered.notes))
 
