@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -114,8 +113,6 @@ def _finish(result: RunResult) -> NoReturn:
         summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
         console.show(summary, render_fleet)
     else:
-        if not console.as_json:  # the tables read the reports: a copy of all metric rows would be unused
-            result = replace(result, results=tuple(replace(entry, rows=()) for entry in result.results))
         console.show(result, render_run)
         for entry in result.results:
             if entry.outcome.failed is not None and entry.report is not None:  # the tables show the others

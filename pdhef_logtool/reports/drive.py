@@ -14,7 +14,6 @@ from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import Roles, drive_figures
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.reports.pages import Page
-from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.selected_estimate import NAIVE, figures_of
 from pdhef_logtool.results.sink import TRUTH
@@ -35,8 +34,8 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
     """
     report = log.report()
     if report is None or not isinstance(report.get("log"), dict):
-        cause, remedy = cause_and_remedy(log.outcome.removeprefix("failed: "))
-        return Page(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
+        reason = log.outcome.removeprefix("failed: ")
+        return Page(render("failed.html", label=log.label, reason=reason, back=back), Charts())
     figures, path, wrong = None, None, ""
     roles = roles_of(report)
     if roles is not None:

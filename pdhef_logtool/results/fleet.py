@@ -36,13 +36,6 @@ WORST = 20
 _MOST_FOLDERS = 3
 #: Most labels of a group of failures, and most groups.
 NAMED, _MOST_GROUPS = 10, 50
-#: Remedies by the first words of a supervisor's reason.
-_REMEDIES = {
-    "nothing heard": "Allow more time: --set log_timeout_s=SECONDS.",
-    "the worker was killed": "If memory was short, use fewer --jobs; pdhef inspect LOG shows the size of the log.",
-    "there was no more memory": "Use fewer --jobs, or a machine with more memory.",
-    "took more than": "Allow more memory: --set max_memory_mb=MB.",
-}
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -136,11 +129,6 @@ class Failures:
     reason: str
     count: int
     labels: tuple[str, ...]
-
-    @property
-    def explanation(self) -> tuple[str, str]:
-        """The cause, and the remedy, empty where none is known."""
-        return cause_and_remedy(self.reason)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -364,22 +352,6 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
         )
         for name in order
     ]
-
-
-def cause_and_remedy(reason: str) -> tuple[str, str]:
-    """Return the cause of a failure and its remedy, empty where the reason contains none.
-
-    An error of this tool reads ``WHERE: expected EXPECTED, got GOT; REMEDY``.
-    """
-    expected, got, rest = reason.partition(", got ")
-    if not got or "expected " not in expected:
-        return _sentence(reason), next((remedy for start, remedy in _REMEDIES.items() if reason.startswith(start)), "")
-    cause, _, remedy = rest.rpartition("; ") if "; " in rest else (rest, "", "")
-    return f"{_sentence(cause)} (expected: {expected.rpartition('expected ')[2]}).", _sentence(remedy)
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def grouped(failures: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:

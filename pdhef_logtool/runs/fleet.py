@@ -346,7 +346,6 @@ class _Fleet:
             self.job.validation,
             self.job.report and keep == "full",
             self._name,
-            () if self.stored is None else self.stored.there(label),
             label == self.plan.logs[0].log.stem,
         )
 

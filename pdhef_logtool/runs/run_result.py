@@ -40,12 +40,13 @@ class LogResult:
     @property
     def report(self) -> dict[str, Any] | None:
         """The document of report.json, None if the log failed; raises OutputError for a damaged file."""
-        return self.document if self.document is not None or self.output is None else self.opened.report()
+        return None if self.document is None and self.output is None else self.opened.report()
 
     @property
     def opened(self) -> OpenedLog:
         """The log as commands read it back from its files."""
-        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output or Path(), asdict(self.outcome))
+        entry, folder = asdict(self.outcome), self.output or Path()
+        return OpenedLog(self.outcome.log, self.outcome.outcome, folder, entry, document=self.document)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

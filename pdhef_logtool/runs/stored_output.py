@@ -61,7 +61,7 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
         try:
             if report in names:
                 stale = {f"{here}/{name}" for name in STALE_FILES}.difference(names)
-                objects.remove(sorted({report, *stale}.intersection(task.stored)))
+                objects.remove(sorted({report, *stale}))
             for name in names:
                 tell(f"{task.log.stem}: puts {Path(name).name}", 1.0)
                 objects.put(name, folder / name)
@@ -69,6 +69,10 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
             return error
         needed = [name for name in names if name == report or name.startswith(f"{PARTS}/")]
         return StoredEnd(end, tuple(names), {name: (folder / name).read_bytes() for name in needed})
+
+
+def _is_page(name: str) -> bool:
+    return name == REPORT_FILE or name.endswith(PAGE_FILE)
 
 
 class StoredOutput(Mirror):
@@ -84,8 +88,7 @@ class StoredOutput(Mirror):
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
-        self._there: dict[str, set[str]] = {}
-        self._own: set[str] = set()
+        self._names: set[str] = set()
         self._uploaded_s = 0.0
 
     def __enter__(self) -> Self:
@@ -105,15 +108,10 @@ class StoredOutput(Mirror):
 
     def _see(self, name: str) -> None:
         """Record an object of the store."""
-        parts = name.split("/")
-        if parts[0] == LOGS and len(parts) > 2:
-            self._there.setdefault(parts[1], set()).add(name)
-        is_page = parts[-1] == PAGE_FILE or name == REPORT_FILE
-        if is_page:
+        self._names.add(name)
+        if _is_page(name):
             (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
             (self.folder / name).touch()
-        if is_page or name.startswith(f"{PARTS}/"):
-            self._own.add(name)
 
     def check_no_input(self, inputs: Iterable[LogInput]) -> None:
         """Refuse logs that lie among the outputs; raises UsageError."""
@@ -130,12 +128,8 @@ class StoredOutput(Mirror):
     def fetch_journal(self) -> None:
         """Fetch the journal of an earlier run, and figures and reports of its drives."""
         if self.fetch(JOURNAL_FILE) is not None:
-            reports = [n for names in self._there.values() for n in names if n.endswith(f"/{REPORT_FILE}")]
-            self.objects.get_all(sorted([*(n for n in self._own if n.startswith(f"{PARTS}/")), *reports]), self.folder)
-
-    def there(self, label: str) -> tuple[str, ...]:
-        """Return the names of a drive's objects in the store."""
-        return tuple(sorted(self._there.get(label, ())))
+            needed = (n for n in self._names if n.startswith(f"{PARTS}/") or n.endswith(f"/{REPORT_FILE}"))
+            self.objects.get_all(sorted(needed), self.folder)
 
     def uploading(self, work: Work) -> Callable[[DriveTask, Tell], StoredEnd | OutputError]:
         """Return the work on a drive that also uploads its files."""
@@ -156,9 +150,10 @@ class StoredOutput(Mirror):
     def begin(self) -> None:
         """Upload the journal of the start of the run; remove figures that it does not list."""
         self._put_journal()
-        gone = sorted(name for name in self._own if not (self.folder / name).is_file())
+        own = (name for name in self._names if _is_page(name) or name.startswith(f"{PARTS}/"))
+        gone = sorted(name for name in own if not (self.folder / name).is_file())
         self.objects.remove(gone)
-        self._own.difference_update(gone)
+        self._names.difference_update(gone)
 
     def note_end(self) -> None:
         """Upload the journal after the end of a drive, unless it was uploaded recently."""

@@ -39,7 +39,7 @@ class DriveTask:
     ----------
     log : the log with its label in the run. output : folder of the run.
     page : whether the drive's page is written.
-    run : name of this run in its process, the key of cars that were read. stored : names of the drive's stored files.
+    run : name of this run in its process, the key of cars that were read.
     is_first : whether the log is the first of the run's list, which has the full causality check.
     """
 
@@ -49,7 +49,6 @@ class DriveTask:
     validation: ValidationPlan
     page: bool
     run: str
-    stored: tuple[str, ...] = ()
     is_first: bool = False
 
 

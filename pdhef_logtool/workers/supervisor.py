@@ -116,16 +116,13 @@ def supervise(
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     if jobs == 1 and limits == Limits():
-        return _in_this_process(work, items, progress)
-    if not can_fork():
+        yield from _in_this_process(work, items, progress)
+    elif not can_fork():
         warn("worker processes need Linux: one process does all the work, without limits on memory and time")
-        return _in_this_process(work, items, progress)
-
-    def in_workers() -> Generator[Ended[T, R], None, None]:
+        yield from _in_this_process(work, items, progress)
+    else:
         with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload, warn=warn) as crew:
             yield from crew.each(items, progress)
-
-    return in_workers()
 
 
 def _in_this_process(

@@ -76,6 +76,10 @@ def test_a_log_that_failed_has_a_page_with_its_reason(tmp_path):
     outcome = "failed: a.mcap: expected an IMU, got a damaged log <b>; copy it again"
     page = page_of(write_run(tmp_path, [], outcome=outcome))
     assert "A damaged log &lt;b&gt; (expected: an IMU)." in page and "<p>Copy it again</p>" in page
+    page = page_of(write_run(tmp_path / "2", [], outcome="failed: nothing heard for 2 s, 2 tries"))
+    assert "<p>Nothing heard for 2 s, 2 tries</p>" in page and "--set log_timeout_s=SECONDS." in page
+    page = page_of(write_run(tmp_path / "3", [], outcome="failed: something else"))
+    assert "<p>Something else</p>" in page and "<p>pdhef inspect LOG shows what the log contains.</p>" in page
 
 
 @pytest.mark.parametrize("damage", ["absent", "cut", "empty"])

@@ -148,7 +148,7 @@ def test_a_fork_server_that_dies_again_and_again_is_one_error(deaths: Path, monk
 
 def test_no_jobs_are_refused_before_anything_is_pulled() -> None:
     with pytest.raises(UsageError, match="at least one process"):
-        supervise(planted, [], jobs=0)
+        list(supervise(planted, [], jobs=0))
 
 
 def test_items_are_pulled_as_workers_become_free() -> None:

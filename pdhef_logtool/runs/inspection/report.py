@@ -205,14 +205,6 @@ class Sample:
     of_chunks: int
     times: Literal["index", "sample"]
 
-    def __str__(self) -> str:
-        """Return the extent in one line for a report."""
-        what, index = ("values", "counts and rates") if self.times == "index" else ("values and rates", "counts")
-        return (
-            f"{what} from {self.chunks} of {self.of_chunks} chunks, {index} from the index; "
-            "--all reads everything and finds damage within chunks"
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
