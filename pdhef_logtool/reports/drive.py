@@ -20,9 +20,6 @@ from pdhef_logtool.results.sink import TRUTH
 
 #: The best filter with physics only; the errors of the baseline would hide all others in a figure.
 _PHYSICS = "physics"
-#: Keys of the figures, in the order of the page.
-OVER_TIME = ("sideslip", "error", "steer", "yaw_rate", "ay", "speed", "strip")
-IN_PLANE = ("path", "ay_sideslip")
 #: Maximum number of rows of tables that grow with the length of the log.
 _MOST_ROWS = 200
 
@@ -70,8 +67,6 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
         losses=(report.get("losses") or ())[:_MOST_ROWS],
         samples=report["ledger"]["samples"][:_MOST_ROWS],
         ay_note=AY_NOTE,
-        over_time=OVER_TIME,
-        in_plane=IN_PLANE,
     )
     return Page(html, charts, wrong, key_figures=key_figures)
 

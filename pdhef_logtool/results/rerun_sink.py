@@ -271,11 +271,8 @@ class _Drawing:
 
 
 def _strips(points: FloatArray) -> list[FloatArray]:
-    """Return the strips of at least two finite points [N, 2] of a path, thinned to every 2^k-th point."""
-    stride = 1
-    while len(points) > stride * MOST_TRAJECTORY_POINTS:
-        stride *= 2
-    points = points[::stride]
+    """Return the strips of at least two finite points [N, 2] of a path, thinned to every k-th point."""
+    points = points[:: max(1, -(-len(points) // MOST_TRAJECTORY_POINTS))]
     is_finite = np.isfinite(points).all(axis=1)
     pieces = np.split(points, np.flatnonzero(np.diff(is_finite)) + 1)
     return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]

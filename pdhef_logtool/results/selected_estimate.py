@@ -139,7 +139,7 @@ def failed_checks(report: Report) -> list[str]:
 def degrees(value_rad: float) -> str:
     """Return an angle in degrees as text, with digits by its size."""
     shown = value_rad * DEGREES
-    return f"{shown:.3f}°" if shown < 1.0 else f"{shown:.2f}°"
+    return f"{shown:.3f}°" if abs(shown) < 1.0 else f"{shown:.2f}°"
 
 
 def is_worse(error: float | None, naive: float | None) -> bool:

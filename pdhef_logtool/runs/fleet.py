@@ -364,7 +364,7 @@ class _Fleet:
         failed = end.outcome.failed is not None and end.part is None
         entry = Entry(
             log.log.stem, log.place, end.identity or log.identity, self.plan.setting, car, keep, end.part,
-            end.failed_checks, end.error_rad, failed, end.again, quarantined,
+            end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
         self.plan.add(entry, end)
         if self.stored is not None:
@@ -393,7 +393,7 @@ def collect(plan: Plan, config: RunConfig, validation: ValidationPlan) -> tuple[
         part = None if entry.part is None else output / entry.part
         place = None if part is None else output / log_place(entry.label)
         outcome = replace(plan.journal.outcome(entry), folder=folder)
-        results.append(LogResult(outcome, place, part=part, failed_checks=entry.failed_checks))
+        results.append(LogResult(outcome, place, part=part))
     write_run_tables(output, results)
     cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
     networks = {cars[e.car]["network"] and tuple(cars[e.car]["network"]) for e, _ in entries if e.car is not None}

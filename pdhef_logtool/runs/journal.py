@@ -25,9 +25,9 @@ from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
-_FORMAT = {"format": "pdhef.journal", "version": 4}
+_FORMAT = {"format": "pdhef.journal", "version": 5}
 #: Included in each checksum, so that lines of other versions of the format are ignored as damaged lines are.
-_VERSION = b"pdhef.journal 4"
+_VERSION = b"pdhef.journal 5"
 _DIGITS = 16
 #: Bytes of the last entry of a line: the checksum of all bytes before it.
 _SUM_BYTES = len(b',"sum":""}\n') + _DIGITS
@@ -80,7 +80,7 @@ class Entry:
     ----------
     identity : of the log's content, None if it cannot be read. setting, car : digests of settings and car (None: no
         car). keep : kept files.
-    part : the file of its rows of the tables below the run's folder, None without. failed_checks : those that count.
+    part : the file of its rows of the tables below the run's folder, None without.
     error_rad : RMSE of the selected sideslip, None without independent ground truth.
     failed : whether there is no result. again : whether a repetition may succeed, as after a full disk.
     quarantined : whether it took its worker along.
@@ -94,7 +94,6 @@ class Entry:
     car: str | None
     keep: str
     part: str | None = None
-    failed_checks: int = 0
     error_rad: float | None = None
     failed: bool = False
     again: bool = False

@@ -185,7 +185,7 @@ class Plan:
 
     def add_car(self, record: dict[str, Any]) -> str:
         """Write a car's record into the journal; return its digest."""
-        digest: str = record["digest"]
+        digest = digest_of(record["parts"])
         self.journal.describe("car", digest, record)
         self.cars_of_run()[digest] = record
         return digest

@@ -110,12 +110,12 @@ def run_log(
             main=main.name,
             algorithms={e.name: resolve(e).identity for e in run.estimators},
             files=files_of(change.target),
+            failed_checks=sum(c.verdict == "failed" and not c.waived for c in drive.checks),
             failed=_ALL_SILENT.format("; ".join(dict.fromkeys(scored.silent.values()))) if all_silent else None,
         )
-        failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
     reporter.progress(drive.name, 1.0)
     part = drive_part(outcome, report, scored.rows, judged["plan"])
-    return LogResult(outcome, change.target, report, tuple(scored.rows), failed_checks, part)
+    return LogResult(outcome, change.target, report, tuple(scored.rows), part)
 
 
 def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter) -> tuple[PreparedDrive, Estimated]:

@@ -27,14 +27,12 @@ class LogResult:
     output : folder of the log, None if no file was written.
     document : report in memory, None: in the folder. rows : figures in memory.
     part : its rows of the tables (:mod:`~pdhef_logtool.results.tables`), or their file; None: it has no report.
-    failed_checks : number of failed checks that are not waived.
     """
 
     outcome: LogOutcome
     output: Path | None
     document: dict[str, Any] | None = None
     rows: tuple[MetricRow, ...] = ()
-    failed_checks: int = 0
     part: Any = None
 
     @property
@@ -81,7 +79,11 @@ class RunResult:
             return EXIT_FAILURE
         if self.requirements is not None and self.requirements.closes_gate:
             return EXIT_GATE
-        return EXIT_OK if all(r.outcome.outcome == "ok" and not r.failed_checks for r in self.results) else EXIT_PARTIAL
+        return (
+            EXIT_OK
+            if all(r.outcome.outcome == "ok" and not r.outcome.failed_checks for r in self.results)
+            else EXIT_PARTIAL
+        )
 
     def _shown(self, folder: Path) -> str:
         return str(folder) if self.output is None else str(folder).replace(str(self.output), str(self.place), 1)

@@ -67,7 +67,6 @@ class DriveEnd:
     identity: str | None
     car: dict[str, Any] | None = None
     part: str | None = None
-    failed_checks: int = 0
     error_rad: float | None = None
     warned: tuple[str, ...] = ()
     again: bool = False
@@ -154,7 +153,6 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         validation=task.validation, is_first=task.is_first,
         reporter=Reporter(progress=tell, warn=warned.append),
     )  # fmt: skip
-    record = car_record(car)
     part = f"{PARTS}/part-{digest_of(task.log.stem)}.parquet"
     write_part(task.output / part, result.part)
     if task.page:
@@ -165,9 +163,8 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     return DriveEnd(
         result.outcome,
         _identity_of_slice(task.log, str(result.outcome.sha256)),
-        {"digest": digest_of(record["parts"]), **record},
+        car_record(car),
         part,
-        result.failed_checks,
         result.part["drives"][0][0]["sideslip_rmse_rad"].as_py(),
         tuple(warned),
         outputs=states_of(task.output, [part, *(f"{log_place(task.log.stem)}/{name}" for name in LOG_FILES)]),
