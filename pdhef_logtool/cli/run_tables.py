@@ -81,19 +81,23 @@ def render_run(result: RunResult, console: Console) -> None:
 
 def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
     """Return the first three lines: result, assumptions, next step."""
-    plan = None if result.requirements is None else result.requirements.to_dict()
     texts = [_texts(report) for report in reports]
     failed = [r.outcome.log for r in result.results if r.report is None]
     alone = len(result.results) == 1
     said = _range(reports) if not alone else selected.result_of(reports[0]) if reports else "the log failed"
     steps = [f"{', '.join(failed[:_MOST_FAILED])} failed: read the cause below"] if failed else []
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
-    steps = next_steps(plan, steps)
-    return three_lines(
-        said if plan is None else Text.assemble(said, "; ", plan_line(plan)),
-        "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none"),
-        steps[0] if steps else "no action needed",
-    )
+    plan = None if result.requirements is None else result.requirements.to_dict()
+    text = "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none")
+    return _three_lines(said, text, plan, steps, "no action needed")
+
+
+def _three_lines(
+    said: str, assumed: str, plan: Mapping[str, Any] | None, steps: Sequence[str], otherwise: str
+) -> Table:
+    """Return result, with the counts of a plan, assumptions, and the first step, ``otherwise`` without any."""
+    result = Text.assemble(said, "; ", plan_line(plan)) if plan else said
+    return three_lines(result, assumed, next(iter(next_steps(plan, steps)), otherwise))
 
 
 def _range(reports: Sequence[_Report]) -> str:
@@ -107,16 +111,11 @@ def _range(reports: Sequence[_Report]) -> str:
 
 def _fleet_head(summary: Mapping[str, Any]) -> Table:
     """Return the three lines of a run of many logs."""
-    plan = summary["plan"] or {}
     errors = summary["errors"]
     rmse = f"median sideslip RMSE {degrees(errors[0]['median_rad'])}" if errors else "no drive is scored"
-    said = f"{rmse} of {summary['scored']} drives"
-    steps = next_steps(plan, ["read the failures below"] if summary["failed"] else ())
-    return three_lines(
-        Text.assemble(said, "; ", plan_line(plan)) if plan.get("requirements") else said,
-        "differs by drive, see report.json",
-        steps[0] if steps else f"open {Path(summary['output']) / PAGE_FILE}",
-    )
+    said, steps = f"{rmse} of {summary['scored']} drives", ["read the failures below"] if summary["failed"] else []
+    page = f"open {Path(summary['output']) / PAGE_FILE}"
+    return _three_lines(said, "differs by drive, see report.json", summary["plan"], steps, page)
 
 
 def render_fleet(summary: Mapping[str, Any], console: Console) -> None:

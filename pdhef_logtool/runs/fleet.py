@@ -273,8 +273,7 @@ class _Fleet:
                 outputs.sweep()
                 sweep_parts(journal, output)
             results, verdicts = collect(self.plan, self.job.config, self.job.validation)
-            if verdicts is not None:
-                write_verdicts(self.job.junit, verdicts, results)
+            write_verdicts(self.job.junit, verdicts, results)
             failed = {e.label for p in self.plan.logs if (e := self.plan.entry(p)) is not None and e.failed}
             pages = failed | self.plan.damaged_pages() if self.job.config.kept == "full" else ()
             write_run_pages(output, self.job.report, pages, self.reporter)

@@ -210,11 +210,6 @@ class Journal:
         self._keep(entry)
         return entry
 
-    def add_place(self, label: str, place: Place, identity: str) -> None:
-        """Record another place of a known log."""
-        self._append({"label": label, "place": asdict(place), "identity": identity, "moved": True})
-        self._places[place.key] = place, identity, label
-
     def describe(self, kind: Literal["setting", "car"], digest: str, description: Mapping[str, Any]) -> None:
         """Record the values of a setting or a car once."""
         if digest not in self.described[kind]:
@@ -234,9 +229,6 @@ class Journal:
         if "is" in document:
             kind = "setting" if "setting" in document else "car"
             self.described[kind][document[kind]] = document["is"]
-        elif "moved" in document:
-            place = Place(**document["place"])
-            self._places[place.key] = place, document["identity"], document["label"]
         elif "label" in document:
             content = {k: v for k, v in document.items() if k not in ("outcome", "outputs")}
             self._keep(Entry(**{**content, "place": Place(**content["place"])}, offset=offset))

@@ -85,9 +85,6 @@ class RunResult:
             else EXIT_PARTIAL
         )
 
-    def _shown(self, folder: Path) -> str:
-        return str(folder) if self.output is None else str(folder).replace(str(self.output), str(self.place), 1)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document; of many logs without their reports."""
         return {
@@ -98,7 +95,7 @@ class RunResult:
                 {
                     "log": r.outcome.log,
                     "outcome": r.outcome.outcome,
-                    "output": None if r.output is None else self._shown(r.output),
+                    "output": None if r.output is None else str(r.output).replace(str(self.output), str(self.place), 1),
                     "report": None if self.is_fleet else r.report,
                 }
                 for r in self.results

@@ -15,8 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.records.extras import required
@@ -34,14 +33,8 @@ _LOOK_S = 5.0
 _CONNECT_S = 20.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Orders:
-    """The work of a node; ``run`` identifies the run."""
-
-    run: str
-    work: Callable[[Any, Tell], Any]
-    limits: Limits
-    preload: tuple[str, ...]
+#: The work of a node: a name of the run, the work, its limits, and modules to load before.
+_Orders: TypeAlias = tuple[str, Callable[[Any, Tell], Any], Limits, tuple[str, ...]]
 
 
 def supervise_on_ray(
@@ -66,7 +59,7 @@ def supervise_on_ray(
     UsageError : Ray is not installed, or there is no cluster.
     WorkerError : the cluster is lost, or its nodes cannot run workers.
     """
-    orders = _Orders(f"{process_name()}-{next(_RUNS)}", work, limits, tuple(preload))
+    orders = f"{process_name()}-{next(_RUNS)}", work, limits, tuple(preload)
     with _connected(address) as ray:
         try:
             yield from _submitted(ray, orders, items)
@@ -145,10 +138,11 @@ _crews: dict[str, Crew[Any, Any]] = {}
 
 def _end_on_node(orders: _Orders, item: Any) -> tuple[Any, Failure | None]:
     """Do the work on an item in a worker process, which is kept for further tasks of the run."""
-    if orders.run not in _crews:
+    run, work, limits, preload = orders
+    if run not in _crews:
         _dismiss()
-        _crews[orders.run] = Crew(orders.work, jobs=1, limits=orders.limits, preload=orders.preload)
-    (ended,) = _crews[orders.run].each([item])
+        _crews[run] = Crew(work, jobs=1, limits=limits, preload=preload)
+    (ended,) = _crews[run].each([item])
     return ended.result, ended.failure
 
 
