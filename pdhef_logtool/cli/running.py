@@ -161,15 +161,9 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
 
 
 def serve_catalog(recordings: Sequence[Path], name: str, *, web: bool) -> int:
-    """Serve recordings as one dataset of Rerun's catalog on this machine, until the viewer or the command ends.
+    """Serve recordings as one dataset of Rerun's catalog on this machine, until the viewer or the command ends."""
+    from rerun.server import Server
 
-    Raises UsageError if the installed Rerun has no server.
-    """
-    try:
-        from rerun.server import Server
-    except ImportError as error:
-        remedy = "pip install --upgrade rerun-sdk, or leave out --catalog"
-        raise UsageError(expected="a catalog server", got=str(error), where="--catalog", remedy=remedy) from error
     with Server(host="127.0.0.1", datasets={name: recordings}) as server:
         console.stdout().print(f"catalog at {server.url()}, dataset {name}; Ctrl-C ends it", soft_wrap=True)
         if web or console.has_display():

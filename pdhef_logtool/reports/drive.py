@@ -35,15 +35,14 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
         return Page(render("failed.html", label=log.label, reason=reason, back=back), Charts())
     figures, path, wrong = None, None, ""
     roles = roles_of(report)
-    if roles is not None:
-        try:
-            path = log.file(ESTIMATES_FILE)
-            figures = None if path is None else drive_figures(path, report, roles)
-        except OutputError as error:
-            wrong = f"the figures cannot be drawn: {error}"
+    try:
+        path = log.file(ESTIMATES_FILE)
+        figures = None if path is None else drive_figures(path, report, roles)
+    except OutputError as error:
+        wrong = f"the figures cannot be drawn: {error}"
     charts = Charts() if figures is None else figures["charts"]
-    texts, names = (report.get("answer") or {}).get("texts") or {}, () if roles is None else roles.names
-    key_figures = whole_figures(report, (TRUTH, *names), manoeuvres=True)
+    texts = (report.get("answer") or {}).get("texts") or {}
+    key_figures = whole_figures(report, (TRUTH, *roles.names), manoeuvres=True)
     html = render(
         "drive.html",
         charts,
@@ -53,15 +52,15 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
         roles=roles,
         outcome=log.outcome,
         steps=next_steps(report.get("plan"), texts.get("next", "").split("; ")),
-        identical=[] if roles is None else identical_to(report, roles.main),
+        identical=identical_to(report, roles.main),
         drawn=figures,
         path=path,
         wrong=wrong,
-        scores=[] if roles is None else scores(report, roles),
-        segments=[] if roles is None else by_segment(report, roles),
-        consistency=whole_figures(report, names, manoeuvres=False),
+        scores=scores(report, roles),
+        segments=by_segment(report, roles),
+        consistency=whole_figures(report, roles.names, manoeuvres=False),
         key_figures=key_figures,
-        apart={} if roles is None else disagreements(report, roles.main),
+        apart=disagreements(report, roles.main),
         definitions=definitions(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
@@ -71,13 +70,11 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
     return Page(html, charts, wrong, key_figures=key_figures)
 
 
-def roles_of(report: Mapping[str, Any]) -> Roles | None:
+def roles_of(report: Mapping[str, Any]) -> Roles:
     """Return the names to draw: the selected estimate, physics (else the first other filter), others."""
     names: list[str] = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
-    if not names:
-        return None
     selected = report.get("selected_estimate")
-    main: str = selected if selected in names else names[0]
+    main: str = selected if selected in names else next(iter(names), "")
     identical = identical_to(report, main)
     others = [n for n in names if n not in identical]
     rival = next((n for n in (_PHYSICS, *sorted(others, key=lambda n: n == NAIVE)) if n in others and n != main), "")

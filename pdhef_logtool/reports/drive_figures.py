@@ -134,7 +134,7 @@ _DASHES: tuple[tuple[int, ...], ...] = ((6, 3), (2, 2), (8, 3, 2, 3), (4, 4), (1
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """Names of the selected estimate, the best physics (empty without), and the others that ran."""
+    """Names of the selected estimate, the best physics (each empty without), and the others that ran."""
 
     main: str
     rival: str

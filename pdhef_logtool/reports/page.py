@@ -77,7 +77,7 @@ def _environment() -> Environment:
     made = environment(_HERE / "templates")
     made.finalize = _printed
     of_results = result_of, assumptions_of, failed_checks, shown
-    of_numbers = number, duration, degrees, percent, stamp, unit
+    of_numbers = number, duration, degrees, percent, stamp
     made.filters |= {function.__name__: function for function in (*of_results, *of_numbers)} | {
         "joint_notes": lambda plan: joint_notes({str(r["id"]): r.get("notes") or () for r in plan["requirements"]}),
         "reason": _reason,
@@ -156,11 +156,6 @@ def number(value: float | None, factor: float = 1.0) -> str:
     if value is None or not math.isfinite(value):
         return DASH
     return f"{value * factor:.3g}" if abs(value * factor) < 1000.0 else f"{value * factor:.0f}"
-
-
-def unit(text: str) -> str:
-    """Return a unit for display: m/s² for m/s^2, empty for a plain number."""
-    return "" if text == "1" else text.replace("^2", "²")
 
 
 def degrees(value_rad: float | None) -> str:

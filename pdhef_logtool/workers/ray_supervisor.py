@@ -12,7 +12,6 @@ import logging
 import signal
 import socket
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TypeAlias, TypeVar
@@ -79,11 +78,8 @@ def _submitted(ray: Any, orders: _Orders, items: Iterable[T]) -> Iterator[Ended[
     task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES, retry_exceptions=False)(_end_on_node)
     waiting = enumerate(items)
     under_way: dict[Any, tuple[int, T]] = {}
-    room, looked = 0, -_LOOK_S
     while True:
-        if time.monotonic() - looked > _LOOK_S:
-            looked = time.monotonic()
-            room = _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        room = _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
         for number, item in itertools.islice(waiting, max(0, room - len(under_way))):
             under_way[task.remote(orders, item)] = number, item
         if not under_way:
