@@ -30,7 +30,7 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
     ``back``: address of the page of the whole run, empty without one. Raises OutputError for a damaged report.json.
     """
     report = log.report()
-    if report is None or not isinstance(report.get("log"), dict):
+    if report is None:
         reason = log.outcome.removeprefix("failed: ")
         return Page(render("failed.html", label=log.label, reason=reason, back=back), Charts())
     figures, path, wrong = None, None, ""
@@ -60,7 +60,7 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
         segments=by_segment(report, roles),
         consistency=whole_figures(report, roles.names, manoeuvres=False),
         key_figures=key_figures,
-        apart=disagreements(report, roles.main),
+        apart=disagreements(report),
         definitions=definitions(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
@@ -89,7 +89,7 @@ def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
             figures.setdefault(m["estimator"], {})[m["signal"], m["metric"]] = m["value"]
     errors = figures.get(main, {})
     same = [n for n, f in figures.items() if n != main and "~" not in n and len(f) > 1 and f == errors]
-    return [*dict.fromkeys([*same, *(n for n, apart in disagreements(report, main).items() if apart == 0.0)])]
+    return [*dict.fromkeys([*same, *(n for n, apart in disagreements(report).items() if apart == 0.0)])]
 
 
 _Table: TypeAlias = dict[str, Any]
@@ -156,14 +156,10 @@ def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres
     return {"heads": heads, "rows": rows} if rows else None
 
 
-def disagreements(report: Mapping[str, Any], main: str) -> dict[str, float]:
+def disagreements(report: Mapping[str, Any]) -> dict[str, float]:
     """Return the RMS sideslip difference in rad between each other estimator and the selected estimate."""
-    values = {}
-    for (pair, _, segment, metric), value in figures_of(report).items():
-        first, _, second = pair.partition("~")
-        if (metric, segment) == ("disagreement_rms", "all") and main in (first, second) and value is not None:
-            values[second if first == main else first] = value
-    return values
+    figures = figures_of(report).items()
+    return {name: v for (name, *_, segment, m), v in figures if (segment, m) == ("all", "from_main") and v is not None}
 
 
 def _by_signal(report: Mapping[str, Any]) -> _BySignal:

@@ -152,7 +152,7 @@ def _rows(distributions: Sequence[Distribution]) -> list[dict[str, Any]]:
     rows = []
     for d in distributions:
         unit, factor = read_unit(d.unit)
-        quantiles = d.median.value, d.median.low, d.median.high, d.quantile(0.1), d.quantile(0.9), float(d.values[-1])
+        quantiles = d.median.value, d.median.low, d.median.high, *np.quantile(d.values, [0.1, 0.9, 1.0]).tolist()
         row = {"signal": LABELS[d.signal], "unit": unit, "estimator": d.estimator, "drives": d.drives}
         rows.append(row | {"figures": [x * factor for x in quantiles]})
     return sorted(rows, key=lambda r: [*LABELS.values()].index(r["signal"]))

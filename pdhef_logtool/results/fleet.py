@@ -102,10 +102,6 @@ class Distribution:
         """Drives with the figure."""
         return len(self.values)
 
-    def quantile(self, share: float) -> float:
-        """Return a quantile of the errors."""
-        return float(np.quantile(self.values, share))
-
 
 @dataclass(frozen=True, slots=True)
 class Rank:
@@ -590,13 +586,13 @@ def summarise(run: OpenedRun, exit_code: int) -> dict[str, Any]:
     """
     drives = run.table("drives").collect()
     scored = drives.drop_nulls("sideslip_rmse_rad").sort("sideslip_rmse_rad", "log", descending=[True, False])
-    errors = sideslip_errors(run).collect()
-    selected, failed = set(scored["estimator"]), drives.filter(outcome="failed")
-    names = list(dict.fromkeys(errors["estimator"]))
+    errors, failed = sideslip_errors(run).select("log", "estimator", "value").collect(), drives.filter(outcome="failed")
+    selected, every, value = set(scored["estimator"]), errors, pl.col("value")
     if len(selected) > 1:
-        selected, names = {ANSWER}, [ANSWER, *names]
-    else:
-        names.sort(key=lambda name: name not in selected)
+        answers = scored.select("log", estimator=pl.lit(ANSWER), value="sideslip_rmse_rad")
+        selected, every = {ANSWER}, pl.concat([answers, errors])
+    figures = {"median_rad": value.median(), "p90_rad": value.quantile(0.9, "linear"), "max_rad": value.max()}
+    by_name = every.group_by("estimator", maintain_order=True).agg(drives=pl.len(), **figures).to_dicts()
     worst = scored.head(_IN_SUMMARY).select("log", "estimator").rows()
     return {
         "output": str(run.place),
@@ -606,10 +602,7 @@ def summarise(run: OpenedRun, exit_code: int) -> dict[str, Any]:
         "lost": len(drives.filter(outcome="lost")),
         "scored": len(scored),
         "remaining": int(run.document.get("remaining", 0)),
-        "errors": [
-            _errors_of(n, scored["sideslip_rmse_rad"] if n in selected else errors.filter(estimator=n)["value"])
-            for n in names
-        ],
+        "errors": sorted(by_name, key=lambda of: of["estimator"] not in selected),
         "worst": [
             {"log": log, "main": main, "errors_rad": dict(errors.filter(log=log).select("estimator", "value").rows())}
             for log, main in worst
@@ -618,9 +611,3 @@ def summarise(run: OpenedRun, exit_code: int) -> dict[str, Any]:
         "checks_failed": drives.filter(drives["failed_checks"] > 0)["log"].to_list(),
         "plan": run.document.get("plan"),
     }
-
-
-def _errors_of(estimator: str, values: pl.Series) -> dict[str, Any]:
-    """Return the distribution of the sideslip RMSE in rad of one estimator over drives."""
-    median, p90, largest = (values.quantile(q, "linear") for q in (0.5, 0.9, 1.0))
-    return {"estimator": estimator, "drives": len(values), "median_rad": median, "p90_rad": p90, "max_rad": largest}

@@ -122,11 +122,6 @@ class Journal:
     _end: int = 0
 
     @classmethod
-    def of(cls, folder: Path) -> Journal:
-        """Return an empty journal of a folder, also if the folder has one."""
-        return cls(folder / JOURNAL_FILE)
-
-    @classmethod
     def read(cls, folder: Path) -> Journal:
         """Return the journal of a folder, empty if there is none; damaged lines are ignored and counted.
 
@@ -135,7 +130,7 @@ class Journal:
         OutputError
             It cannot be read.
         """
-        journal = cls.of(folder)
+        journal = cls(folder / JOURNAL_FILE)
         for line in journal._lines():
             if (document := _document(line)) is None:
                 journal.damaged += 1

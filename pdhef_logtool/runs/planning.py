@@ -159,11 +159,6 @@ class Plan:
             return None
         return entry
 
-    @property
-    def done(self) -> int:
-        """Number of logs that are done."""
-        return sum(self.entry(p) is not None for p in self.logs)
-
     def pending(self, names: Sequence[str] | None, keep: Keep, retry: bool, note: Reporter) -> list[PlannedLog]:
         """Return the logs to process, of all or of those named, and report why logs are repeated or left out."""
         chosen = [p for p in self.logs if names is None or p.log.stem in set(names)]

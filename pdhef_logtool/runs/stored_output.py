@@ -8,9 +8,8 @@ ends, at most every 30 s, and all files at the end of the run.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -130,10 +129,6 @@ class StoredOutput(Mirror):
         if self.fetch(JOURNAL_FILE) is not None:
             needed = (n for n in self._names if n.startswith(f"{PARTS}/") or n.endswith(f"/{REPORT_FILE}"))
             self.objects.get_all(sorted(needed), self.folder)
-
-    def uploading(self, work: Work) -> Callable[[DriveTask, Tell], StoredEnd | OutputError]:
-        """Return the work on a drive that also uploads its files."""
-        return partial(stored_drive, self.objects, work)
 
     def take(self, stored: StoredEnd | None) -> DriveEnd | None:
         """Store the files of a drive and return its result; None if there is none."""
