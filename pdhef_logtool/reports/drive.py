@@ -52,7 +52,7 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
         roles=roles,
         outcome=log.outcome,
         steps=next_steps(report.get("plan"), texts.get("next", "").split("; ")),
-        identical=identical_to(report, roles.main),
+        identical=identical_to_selected(report),
         drawn=figures,
         path=path,
         wrong=wrong,
@@ -75,21 +75,15 @@ def roles_of(report: Mapping[str, Any]) -> Roles:
     names: list[str] = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
     selected = report.get("selected_estimate")
     main: str = selected if selected in names else next(iter(names), "")
-    identical = identical_to(report, main)
+    identical = identical_to_selected(report)
     others = [n for n in names if n not in identical]
     rival = next((n for n in (_PHYSICS, *sorted(others, key=lambda n: n == NAIVE)) if n in others and n != main), "")
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
 
 
-def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
-    """Return the estimators with bit-identical errors to ``main``: the same filter with another name."""
-    figures: dict[str, dict[tuple[str, str], Any]] = {}
-    for m in report["metrics"]:
-        if m["segment"] == "all" and m["metric"] in ("rmse", "max_abs", "nis") and m["value"] is not None:
-            figures.setdefault(m["estimator"], {})[m["signal"], m["metric"]] = m["value"]
-    errors = figures.get(main, {})
-    same = [n for n, f in figures.items() if n != main and "~" not in n and len(f) > 1 and f == errors]
-    return [*dict.fromkeys([*same, *(n for n, apart in disagreements(report).items() if apart == 0.0)])]
+def identical_to_selected(report: Mapping[str, Any]) -> list[str]:
+    """Return the estimators with the same sideslip as the selected estimate: the same filter with another name."""
+    return [name for name, apart in disagreements(report).items() if apart == 0.0]
 
 
 _Table: TypeAlias = dict[str, Any]
@@ -136,12 +130,11 @@ def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres
 
     A table has heads, and rows of a name and its values; None without any value.
     """
-    by_signal = _by_signal(report)
+    figures = figures_of(report)
 
     def value(name: str, signal: str, metric: Metric) -> float | None:
-        rows = by_signal.get(signal, {}).get(name, {})
-        figure, over = _read(rows, metric.name), _read(rows, "nis_dof") if metric.name == "nis" else 1.0
-        return figure / over if figure is not None and over else None
+        figure = figures.get((name, signal, "all", "nis_ratio" if metric.name == "nis" else metric.name))
+        return None if figure is None else figure * read_unit(metric.unit_of(signal))[1]
 
     wanted = [m for m in registered().values() if (m.columns is responses) == manoeuvres]
     wanted = [m for m in wanted if not m.of_truth and m.name != "nis_dof"]

@@ -129,10 +129,11 @@ class Failures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Space:
-    """Seconds and RMSE of sideslip in rad by cell of speed and |a_y|, [speeds, accelerations]; NaN: not scored."""
+    """Seconds and RMSE of sideslip in rad by cell of speed and |a_y|, [speeds, accelerations]; NaN: not scored.
 
-    speed_edges_m_s: FloatArray
-    ay_edges_m_s2: FloatArray
+    The cells begin at the edges of :mod:`~pdhef_logtool.evaluation.operating_space`.
+    """
+
     seconds: FloatArray
     rmse_rad: FloatArray
     drives: int
@@ -250,7 +251,7 @@ def _space(run: OpenedRun) -> Space | None:
         cell = SPEED_EDGES_M_S.index(speed), AY_EDGES_M_S2.index(ay)
         seconds[cell], rmse[cell] = spent, error
     drives = run.table("exposure").select(pl.col("log").n_unique()).collect().item()
-    return Space(np.array(SPEED_EDGES_M_S), np.array(AY_EDGES_M_S2), seconds, rmse, drives)
+    return Space(seconds, rmse, drives)
 
 
 def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.LazyFrame:

@@ -287,9 +287,8 @@ def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) ->
 
 def judged_drive(log: OpenedLog) -> JudgedDrive:
     """Return a log of a run to judge."""
-    main = log.entry.get("main")
     factors = {"car": (log.entry.get("car") or {}).get("name"), **{k: log.entry.get(k) for k in ("day", "route")}}
-    return JudgedDrive(log.label, None if main is None else str(main), cache(log.readable_report), factors)
+    return JudgedDrive(log.label, log.main() or None, cache(log.readable_report), factors)
 
 
 def in_space(drive: JudgedDrive, report: Mapping[str, Any]) -> JudgedDrive:
