@@ -145,8 +145,8 @@ class StoredOutput(Mirror):
     def begin(self) -> None:
         """Upload the journal of the start of the run; remove figures that it does not list."""
         self._put_journal()
-        own = (name for name in self._names if _is_page(name) or name.startswith(f"{PARTS}/"))
-        gone = sorted(name for name in own if not (self.folder / name).is_file())
+        mirrored = (name for name in self._names if _is_page(name) or name.startswith(f"{PARTS}/"))
+        gone = sorted(name for name in mirrored if not (self.folder / name).is_file())
         self.objects.remove(gone)
         self._names.difference_update(gone)
 
