@@ -46,7 +46,7 @@ _AGAIN = "run the log again"
 class OpenedLog:
     """Outputs of a run for one log. ``entry`` is its record in run.json; files are read on demand.
 
-    ``document``: report.json in memory, None: in the folder.
+    ``document``: report.json of a log without a folder.
 
     Files of a run at a URL are fetched into a local folder on demand.
     """

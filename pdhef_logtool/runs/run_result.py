@@ -38,13 +38,13 @@ class LogResult:
     @property
     def report(self) -> dict[str, Any] | None:
         """The document of report.json, None if the log failed; raises OutputError for a damaged file."""
-        return None if self.document is None and self.output is None else self.opened.report()
+        return self.document if self.document is not None or self.output is None else self.opened.report()
 
     @property
     def opened(self) -> OpenedLog:
-        """The log as commands read it back from its files."""
-        entry, folder = asdict(self.outcome), self.output or Path()
-        return OpenedLog(self.outcome.log, self.outcome.outcome, folder, entry, document=self.document)
+        """The log as commands read it back from its files; without any, with its report in memory."""
+        entry, document = asdict(self.outcome), None if self.output else self.document
+        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output or Path(), entry, document=document)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
