@@ -77,9 +77,7 @@ def events(
     if is_url(output) and clip:
         options.local_folder(output)
     run = open_run(output)
-    events_found = find_events(run, condition, estimator=estimator, least_s=least_s, pad_s=pad_s)
-    for line in events_found.damaged:
-        console.warn(line)
+    events_found = find_events(run, condition, estimator=estimator, least_s=least_s, pad_s=pad_s, tell=console.warn)
     if clip:
         from pdhef_logtool.results.clips import write_clips
 

@@ -23,7 +23,7 @@ from pdhef_logtool.results import selected_estimate as selected
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_report import lines_of
-from pdhef_logtool.results.selected_estimate import Figures, assumptions_of, degrees, figures_of
+from pdhef_logtool.results.selected_estimate import assumptions_of, degrees, figures_of
 from pdhef_logtool.runs.run_result import RunResult
 
 _Report: TypeAlias = Mapping[str, Any]
@@ -81,24 +81,30 @@ def render_run(result: RunResult, console: Console) -> None:
 
 def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
     """Return the first three lines: result, assumptions, next step."""
-    plan = None if result.requirements is None else result.requirements.to_dict()
     texts = [_texts(report) for report in reports]
     failed = [r.outcome.log for r in result.results if r.report is None]
     alone = len(result.results) == 1
     said = _range(reports) if not alone else selected.result_of(reports[0]) if reports else "the log failed"
     steps = [f"{', '.join(failed[:_MOST_FAILED])} failed: read the cause below"] if failed else []
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
-    steps = next_steps(plan, steps)
-    return three_lines(
-        said if plan is None else Text.assemble(said, "; ", plan_line(plan)),
-        "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none"),
-        steps[0] if steps else "no action needed",
-    )
+    plan = None if result.requirements is None else result.requirements.to_dict()
+    text = "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none")
+    return _three_lines(said, text, plan, steps, "no action needed")
+
+
+def _three_lines(
+    said: str, assumed: str, plan: Mapping[str, Any] | None, steps: Sequence[str], otherwise: str
+) -> Table:
+    """Return result, with the counts of a plan, assumptions, and the first step, ``otherwise`` without any."""
+    result = Text.assemble(said, "; ", plan_line(plan)) if plan else said
+    return three_lines(result, assumed, next(iter(next_steps(plan, steps)), otherwise))
 
 
 def _range(reports: Sequence[_Report]) -> str:
     """Return the lowest and highest sideslip error of the selected estimate over several logs."""
-    errors = [_figures(r).get((r["selected_estimate"], "sideslip_rad", "all", "rmse")) for r in reports if r["answer"]]
+    errors = [
+        figures_of(r).get((r["selected_estimate"], "sideslip_rad", "all", "rmse")) for r in reports if r["answer"]
+    ]
     scored = [e for e in errors if e is not None]
     if not scored:
         return f"sideslip of {len(reports)} logs is not scored" if reports else "all logs failed"
@@ -107,16 +113,11 @@ def _range(reports: Sequence[_Report]) -> str:
 
 def _fleet_head(summary: Mapping[str, Any]) -> Table:
     """Return the three lines of a run of many logs."""
-    plan = summary["plan"] or {}
     errors = summary["errors"]
     rmse = f"median sideslip RMSE {degrees(errors[0]['median_rad'])}" if errors else "no drive is scored"
-    said = f"{rmse} of {summary['scored']} drives"
-    steps = next_steps(plan, ["read the failures below"] if summary["failed"] else ())
-    return three_lines(
-        Text.assemble(said, "; ", plan_line(plan)) if plan.get("requirements") else said,
-        "differs by drive, see report.json",
-        steps[0] if steps else f"open {Path(summary['output']) / PAGE_FILE}",
-    )
+    said, steps = f"{rmse} of {summary['scored']} drives", ["read the failures below"] if summary["failed"] else []
+    page = f"open {Path(summary['output']) / PAGE_FILE}"
+    return _three_lines(said, "differs by drive, see report.json", summary["plan"], steps, page)
 
 
 def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
@@ -169,7 +170,7 @@ def _render_log(report: _Report, console: Console, common: Sequence[str] | None 
         shown |= {"next": "; ".join(later)} if later else {}
         lines = lines_of("checks", report, True)
     else:
-        is_scored = _figures(report).get((report["selected_estimate"], "sideslip_rad", "all", "rmse")) is not None
+        is_scored = figures_of(report).get((report["selected_estimate"], "sideslip_rad", "all", "rmse")) is not None
         rest = [clause for clause in assumptions_of(report) if clause not in common]
         shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
         shown |= {"assumed": "; ".join(rest)} if rest else {}
@@ -210,21 +211,9 @@ def _shown(report: _Report) -> list[Mapping[str, Any]]:
     return sorted(ran.values(), key=lambda e: not e["causal"])
 
 
-def _figures(report: _Report) -> Figures:
-    """Return the figures of a report, including ratios and differences of two."""
-    values, main = figures_of(report), report["selected_estimate"]
-    for (name, signal, segment, metric), value in list(values.items()):
-        if metric == "nis" and value is not None and (dof := values.get((name, signal, segment, "nis_dof"))):
-            values[name, signal, segment, "nis_ratio"] = value / dof
-        if metric == "disagreement_rms" and main in (pair := name.split("~")):
-            other = next((n for n in pair if n != main), main)
-            values[str(other), signal, segment, "from_main"] = value
-    return values
-
-
 def _table(report: _Report, console: Console) -> Table:
     """Return the table of the displayed estimators, with as many columns as fit the terminal."""
-    values, truth = _figures(report), report["truth"]
+    values, truth = figures_of(report), report["truth"]
     shown = [e for e in _shown(report) if any(name == e["name"] for name, *_ in values)]  # --keep metrics has less
     asked = _columns(truth=truth["available"], main=report["selected_estimate"] or "").items()
     columns = [(k, c) for k, c in asked if any(values.get((e["name"], *k)) is not None for e in shown)]
@@ -280,7 +269,7 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
     joint = table("\nlog", ">\ns", head, *(f">{n}\nRMSE °" for n in rivals), ">CI 95 %\ncovers", "\nlook at", fold=1)
     joint.columns[-1].overflow = "fold"
     for report in reports:
-        values, main = _figures(report), report["selected_estimate"]
+        values, main = figures_of(report), report["selected_estimate"]
         errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), DEGREES, 3) for n in (main, *rivals)]
         compared = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, "zero"))
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))

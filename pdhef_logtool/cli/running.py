@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -114,8 +113,6 @@ def _finish(result: RunResult) -> NoReturn:
         summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
         console.show(summary, render_fleet)
     else:
-        if not console.as_json:  # the tables read the reports: a copy of all metric rows would be unused
-            result = replace(result, results=tuple(replace(entry, rows=()) for entry in result.results))
         console.show(result, render_run)
         for entry in result.results:
             if entry.outcome.failed is not None and entry.report is not None:  # the tables show the others
@@ -164,15 +161,9 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
 
 
 def serve_catalog(recordings: Sequence[Path], name: str, *, web: bool) -> int:
-    """Serve recordings as one dataset of Rerun's catalog on this machine, until the viewer or the command ends.
+    """Serve recordings as one dataset of Rerun's catalog on this machine, until the viewer or the command ends."""
+    from rerun.server import Server
 
-    Raises UsageError if the installed Rerun has no server.
-    """
-    try:
-        from rerun.server import Server
-    except ImportError as error:
-        remedy = "pip install --upgrade rerun-sdk, or leave out --catalog"
-        raise UsageError(expected="a catalog server", got=str(error), where="--catalog", remedy=remedy) from error
     with Server(host="127.0.0.1", datasets={name: recordings}) as server:
         console.stdout().print(f"catalog at {server.url()}, dataset {name}; Ctrl-C ends it", soft_wrap=True)
         if web or console.has_display():

@@ -140,7 +140,6 @@ gnss_longitude_deg = { topic = "/rtk/fix", field = "longitude" }
 def compile_() -> None:
     """Compile the filters in advance, so that the first run starts at once."""
     import time
-    from pathlib import Path
     from tempfile import TemporaryDirectory
 
     from pdhef_logtool.compiled.sources import compiled_digest

@@ -43,8 +43,6 @@ def all_printable(value: Any) -> Any:
         return type(value)(printable(value))
     if isinstance(value, Mapping):
         return {all_printable(k): all_printable(v) for k, v in value.items()}
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*map(all_printable, value))
     if isinstance(value, list | tuple | set | frozenset):
         return type(value)(map(all_printable, value))
     if is_dataclass(value) and not isinstance(value, type):

@@ -6,10 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 
-def _ignore(*_: object) -> None:
-    pass
-
-
 @dataclass(frozen=True, slots=True)
 class Reporter:
     """Receiver of a command's lines, which ignores them by default.
@@ -20,9 +16,9 @@ class Reporter:
     warn : called with a warning. note : called with a line of information.
     """
 
-    progress: Callable[[str, float], None] = _ignore
-    warn: Callable[[str], None] = _ignore
-    note: Callable[[str], None] = _ignore
+    progress: Callable[[str, float], None] = lambda *_: None
+    warn: Callable[[str], None] = lambda *_: None
+    note: Callable[[str], None] = lambda *_: None
 
 
 #: Ignores all lines.

@@ -205,7 +205,8 @@ class Charts:
         grid = self.grid
         if grid is None:
             return None
-        return {"start": (grid.start_ns - self.origin_ns) * S_PER_NS, "cell": grid.cell_s, "cells": grid.cells}
+        start_s, cell_s = (grid.start_ns - self.origin_ns) * S_PER_NS, grid.cell_ns * S_PER_NS
+        return {"start": start_s, "cell": cell_s, "cells": grid.cells}
 
     def document(self) -> tuple[dict[str, Any], dict[str, str]]:
         """Return the document for the page's script, and the text blocks that it refers to, by name."""

@@ -14,16 +14,12 @@ from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import Roles, drive_figures
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.reports.pages import Page
-from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.selected_estimate import NAIVE, figures_of
 from pdhef_logtool.results.sink import TRUTH
 
 #: The best filter with physics only; the errors of the baseline would hide all others in a figure.
 _PHYSICS = "physics"
-#: Keys of the figures, in the order of the page.
-OVER_TIME = ("sideslip", "error", "steer", "yaw_rate", "ay", "speed", "strip")
-IN_PLANE = ("path", "ay_sideslip")
 #: Maximum number of rows of tables that grow with the length of the log.
 _MOST_ROWS = 200
 
@@ -34,20 +30,19 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
     ``back``: address of the page of the whole run, empty without one. Raises OutputError for a damaged report.json.
     """
     report = log.report()
-    if report is None or not isinstance(report.get("log"), dict):
-        cause, remedy = cause_and_remedy(log.outcome.removeprefix("failed: "))
-        return Page(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
+    if report is None:
+        reason = log.outcome.removeprefix("failed: ")
+        return Page(render("failed.html", label=log.label, reason=reason, back=back), Charts())
     figures, path, wrong = None, None, ""
     roles = roles_of(report)
-    if roles is not None:
-        try:
-            path = log.file(ESTIMATES_FILE)
-            figures = None if path is None else drive_figures(path, report, roles)
-        except OutputError as error:
-            wrong = f"the figures cannot be drawn: {error}"
+    try:
+        path = log.file(ESTIMATES_FILE)
+        figures = None if path is None else drive_figures(path, report, roles)
+    except OutputError as error:
+        wrong = f"the figures cannot be drawn: {error}"
     charts = Charts() if figures is None else figures["charts"]
-    texts, names = (report.get("answer") or {}).get("texts") or {}, () if roles is None else roles.names
-    key_figures = whole_figures(report, (TRUTH, *names), manoeuvres=True)
+    texts = (report.get("answer") or {}).get("texts") or {}
+    key_figures = whole_figures(report, (TRUTH, *roles.names), manoeuvres=True)
     html = render(
         "drive.html",
         charts,
@@ -57,48 +52,38 @@ def drive_page(log: OpenedLog, back: str = "") -> Page:
         roles=roles,
         outcome=log.outcome,
         steps=next_steps(report.get("plan"), texts.get("next", "").split("; ")),
-        identical=[] if roles is None else identical_to(report, roles.main),
+        identical=identical_to_selected(report),
         drawn=figures,
         path=path,
         wrong=wrong,
-        scores=[] if roles is None else scores(report, roles),
-        segments=[] if roles is None else by_segment(report, roles),
-        consistency=whole_figures(report, names, manoeuvres=False),
+        scores=scores(report, roles),
+        segments=by_segment(report, roles),
+        consistency=whole_figures(report, roles.names, manoeuvres=False),
         key_figures=key_figures,
-        apart={} if roles is None else disagreements(report, roles.main),
+        apart=disagreements(report),
         definitions=definitions(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
         samples=report["ledger"]["samples"][:_MOST_ROWS],
         ay_note=AY_NOTE,
-        over_time=OVER_TIME,
-        in_plane=IN_PLANE,
     )
     return Page(html, charts, wrong, key_figures=key_figures)
 
 
-def roles_of(report: Mapping[str, Any]) -> Roles | None:
+def roles_of(report: Mapping[str, Any]) -> Roles:
     """Return the names to draw: the selected estimate, physics (else the first other filter), others."""
     names: list[str] = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
-    if not names:
-        return None
     selected = report.get("selected_estimate")
-    main: str = selected if selected in names else names[0]
-    identical = identical_to(report, main)
+    main: str = selected if selected in names else next(iter(names), "")
+    identical = identical_to_selected(report)
     others = [n for n in names if n not in identical]
     rival = next((n for n in (_PHYSICS, *sorted(others, key=lambda n: n == NAIVE)) if n in others and n != main), "")
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
 
 
-def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
-    """Return the estimators with bit-identical errors to ``main``: the same filter with another name."""
-    figures: dict[str, dict[tuple[str, str], Any]] = {}
-    for m in report["metrics"]:
-        if m["segment"] == "all" and m["metric"] in ("rmse", "max_abs", "nis") and m["value"] is not None:
-            figures.setdefault(m["estimator"], {})[m["signal"], m["metric"]] = m["value"]
-    errors = figures.get(main, {})
-    same = [n for n, f in figures.items() if n != main and "~" not in n and len(f) > 1 and f == errors]
-    return [*dict.fromkeys([*same, *(n for n, apart in disagreements(report, main).items() if apart == 0.0)])]
+def identical_to_selected(report: Mapping[str, Any]) -> list[str]:
+    """Return the estimators with the same sideslip as the selected estimate: the same filter with another name."""
+    return [name for name, apart in disagreements(report).items() if apart == 0.0]
 
 
 _Table: TypeAlias = dict[str, Any]
@@ -145,12 +130,11 @@ def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres
 
     A table has heads, and rows of a name and its values; None without any value.
     """
-    by_signal = _by_signal(report)
+    figures = figures_of(report)
 
     def value(name: str, signal: str, metric: Metric) -> float | None:
-        rows = by_signal.get(signal, {}).get(name, {})
-        figure, over = _read(rows, metric.name), _read(rows, "nis_dof") if metric.name == "nis" else 1.0
-        return figure / over if figure is not None and over else None
+        figure = figures.get((name, signal, "all", "nis_ratio" if metric.name == "nis" else metric.name))
+        return None if figure is None else figure * read_unit(metric.unit_of(signal))[1]
 
     wanted = [m for m in registered().values() if (m.columns is responses) == manoeuvres]
     wanted = [m for m in wanted if not m.of_truth and m.name != "nis_dof"]
@@ -165,14 +149,10 @@ def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres
     return {"heads": heads, "rows": rows} if rows else None
 
 
-def disagreements(report: Mapping[str, Any], main: str) -> dict[str, float]:
+def disagreements(report: Mapping[str, Any]) -> dict[str, float]:
     """Return the RMS sideslip difference in rad between each other estimator and the selected estimate."""
-    values = {}
-    for (pair, _, segment, metric), value in figures_of(report).items():
-        first, _, second = pair.partition("~")
-        if (metric, segment) == ("disagreement_rms", "all") and main in (first, second) and value is not None:
-            values[second if first == main else first] = value
-    return values
+    figures = figures_of(report).items()
+    return {name: v for (name, *_, segment, m), v in figures if (segment, m) == ("all", "from_main") and v is not None}
 
 
 def _by_signal(report: Mapping[str, Any]) -> _BySignal:

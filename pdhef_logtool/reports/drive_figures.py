@@ -134,7 +134,7 @@ _DASHES: tuple[tuple[int, ...], ...] = ((6, 3), (2, 2), (8, 3, 2, 3), (4, 4), (1
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """Names of the selected estimate, the best physics (empty without), and the others that ran."""
+    """Names of the selected estimate, the best physics (each empty without), and the others that ran."""
 
     main: str
     rival: str
@@ -159,8 +159,8 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> dict[s
     """Return the figures of a drive; None if the file contains no row of the selected estimate.
 
     ``charts``, and for the texts of the page: ``peaks`` (the largest errors), ``scored`` (whether any sideslip error is
-    available), ``moves`` (any sideslip above the low-speed blend), ``in_plane`` (a figure without a time axis), and
-    ``absent`` (estimators of the report that the file does not contain).
+    available), ``moves`` (any sideslip above the low-speed blend), and ``absent``
+    (estimators of the report that the file does not contain).
 
     Parameters
     ----------
@@ -206,13 +206,13 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> dict[s
             "|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °", clouds
         )
     _add_worst(charts, answer, reference, peaks)
-    shown = {
+    return {
+        "charts": charts,
         "peaks": peaks,
         "scored": scored,
         "moves": moves,
         "absent": [n for n in roles.names if n not in tracks.names],
     }
-    return {**shown, "charts": charts, "in_plane": not charts.figures.keys().isdisjoint(("path", "ay_sideslip"))}
 
 
 def _reference(tracks: Tracks, peaks: Sequence[_Peak]) -> Reference | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: Width of a cell: 10 Hz, finer for a drive below ten minutes, coarser above an hour.
 CELL_NS = 100_000_000
@@ -31,11 +31,6 @@ class Grid:
     start_ns: int
     cell_ns: int
     cells: int
-
-    @property
-    def cell_s(self) -> float:
-        """Width of a cell."""
-        return self.cell_ns * S_PER_NS
 
 
 def grid_of(stamps_ns: IntArray) -> Grid:

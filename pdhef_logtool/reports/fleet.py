@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
@@ -152,7 +153,7 @@ def _rows(distributions: Sequence[Distribution]) -> list[dict[str, Any]]:
     rows = []
     for d in distributions:
         unit, factor = read_unit(d.unit)
-        quantiles = d.median.value, d.median.low, d.median.high, d.quantile(0.1), d.quantile(0.9), float(d.values[-1])
+        quantiles = d.median.value, d.median.low, d.median.high, *np.quantile(d.values, [0.1, 0.9, 1.0]).tolist()
         row = {"signal": LABELS[d.signal], "unit": unit, "estimator": d.estimator, "drives": d.drives}
         rows.append(row | {"figures": [x * factor for x in quantiles]})
     return sorted(rows, key=lambda r: [*LABELS.values()].index(r["signal"]))
@@ -160,8 +161,8 @@ def _rows(distributions: Sequence[Distribution]) -> list[dict[str, Any]]:
 
 def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[dict[str, Any]]]], int, int]:
     """Return heads, rows with the highest speed first, and the numbers of empty and of all cells."""
-    rows = _reach(space.speed_edges_m_s, space.seconds.any(axis=1), _SPEED_M_S)
-    columns = _reach(space.ay_edges_m_s2, space.seconds.any(axis=0), _AY_M_S2)
+    rows = _reach(SPEED_EDGES_M_S, space.seconds.any(axis=1), _SPEED_M_S)
+    columns = _reach(AY_EDGES_M_S2, space.seconds.any(axis=0), _AY_M_S2)
     seconds = space.seconds[:rows, :columns]
     most = float(seconds.max()) or 1.0
     made = []
@@ -173,21 +174,21 @@ def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[dict[str,
             level = max(0, _LEVELS + math.floor(math.log(spent / most, 3.0))) if spent else 0
             kind = f"h{min(level, _LEVELS)}" if spent else "empty"
             cells.append({"kind": kind, "minutes": _time(spent), "rmse_rad": rmse if math.isfinite(rmse) else None})
-        made.append((_bin(space.speed_edges_m_s, i), cells))
+        made.append((_bin(SPEED_EDGES_M_S, i), cells))
     return (
-        [_bin(space.ay_edges_m_s2, j) for j in range(columns)],
+        [_bin(AY_EDGES_M_S2, j) for j in range(columns)],
         made,
         int(np.count_nonzero(seconds == 0.0)),
         seconds.size,
     )
 
 
-def _reach(edges: FloatArray, used: Any, least: float) -> int:
+def _reach(edges: Sequence[float], used: Any, least: float) -> int:
     last = int(np.flatnonzero(used)[-1]) + 1 if used.any() else 0
     return max(last, int(np.searchsorted(edges, least)))
 
 
-def _bin(edges: FloatArray, i: int) -> str:
+def _bin(edges: Sequence[float], i: int) -> str:
     return f"{edges[i]:g}–{edges[i + 1]:g}" if i + 1 < len(edges) else f"above {edges[i]:g}"
 
 

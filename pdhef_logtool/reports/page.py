@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment
 from markupsafe import Markup
 
 from pdhef_logtool.evaluation.requirement_verdicts import joint_notes
@@ -29,7 +29,9 @@ from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import NS_PER_S, FloatArray
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
+from pdhef_logtool.results import selected_estimate
 from pdhef_logtool.results.selected_estimate import assumptions_of, failed_checks, result_of
+from pdhef_logtool.storage.templates import environment
 
 _HERE = Path(__file__).parent
 #: Scripts in order: before.js sets the drawing resolution for uPlot.
@@ -72,16 +74,10 @@ def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
 
 @cache
 def _environment() -> Environment:
-    made = Environment(
-        loader=FileSystemLoader(_HERE / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=_printed,
-    )
+    made = environment(_HERE / "templates")
+    made.finalize = _printed
     of_results = result_of, assumptions_of, failed_checks, shown
-    of_numbers = number, duration, degrees, percent, stamp, unit
+    of_numbers = number, duration, degrees, percent, stamp
     made.filters |= {function.__name__: function for function in (*of_results, *of_numbers)} | {
         "joint_notes": lambda plan: joint_notes({str(r["id"]): r.get("notes") or () for r in plan["requirements"]}),
         "reason": _reason,
@@ -162,17 +158,9 @@ def number(value: float | None, factor: float = 1.0) -> str:
     return f"{value * factor:.3g}" if abs(value * factor) < 1000.0 else f"{value * factor:.0f}"
 
 
-def unit(text: str) -> str:
-    """Return a unit for display: m/s² for m/s^2, empty for a plain number."""
-    return "" if text == "1" else text.replace("^2", "²")
-
-
 def degrees(value_rad: float | None) -> str:
     """Return an angle in degrees as text, with digits by its size; a dash for None."""
-    if value_rad is None or not math.isfinite(value_rad):
-        return DASH
-    value = math.degrees(value_rad)
-    return f"{value:.3f}°" if abs(value) < 1.0 else f"{value:.2f}°"
+    return DASH if value_rad is None or not math.isfinite(value_rad) else selected_estimate.degrees(value_rad)
 
 
 def percent(share: float | None, sign: str = "") -> str:

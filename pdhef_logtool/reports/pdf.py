@@ -97,7 +97,7 @@ def _print(browser: str, page: Path, made: Path, target: Path) -> None:
 def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
     """Return the document as HTML."""
     document = run.document
-    reports = [(log, _report(log)) for log in run.logs]
+    reports = [(log, log.readable_report()) for log in run.logs]
     ranked = sorted(reports, key=lambda pair: _gravity(pair[1]))[:_MOST_DRIVES]
     seconds = sum(r["log"]["duration_s"] for _, r in reports if r is not None)
     plan = document.get("plan") or {}
@@ -125,11 +125,6 @@ def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
     )
     ranked = sorted(labels.items(), key=lambda of: (not of[0].startswith(("FAILED", "waived")), -len(of[1])))
     return {text: "" if len(of) == len(reports) else listed(of) for text, of in ranked}
-
-
-def _report(log: OpenedLog) -> dict[str, Any] | None:
-    report = log.readable_report()
-    return report if report is not None and isinstance(report.get("log"), dict) else None
 
 
 def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:

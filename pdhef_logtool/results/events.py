@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,8 +57,8 @@ class FoundEvents:
     ----------
     where : the condition. of : estimator of its columns. searched : drives that were looked at. events : in the order
         of the run's drives.
-    left_out : drives that could not be looked at, with the reason; ``damaged``: a line for each damaged one.
-        ``unreadable``: number of damaged and failed drives. failed : whether something of the run could not be read.
+    left_out : drives that could not be looked at, with the reason; ``unreadable``: number of damaged and failed ones.
+        failed : whether something of the run could not be read.
     clips : files that were written.
     """
 
@@ -69,7 +69,6 @@ class FoundEvents:
     of: str = "the selected estimates"
     failed: bool = False
     unreadable: int = 0
-    damaged: tuple[str, ...] = ()
     clips: tuple[str, ...] = ()
 
     @property
@@ -95,7 +94,13 @@ def event_condition(text: str) -> Condition:
 
 
 def find_events(
-    run: OpenedRun, condition: Condition, *, estimator: str | None = None, least_s: float = 0.0, pad_s: float = 0.0
+    run: OpenedRun,
+    condition: Condition,
+    *,
+    estimator: str | None = None,
+    least_s: float = 0.0,
+    pad_s: float = 0.0,
+    tell: Callable[[str], None] = lambda _text: None,
 ) -> FoundEvents:
     """Search all drives of a run, one at a time, reading only the columns of the condition.
 
@@ -104,6 +109,7 @@ def find_events(
     estimator : track of columns without a prefix; None: the selected estimate of each drive.
     least_s : minimum duration of an event.
     pad_s : events closer than twice this become one.
+    tell : called with a line for people on each damaged drive.
 
     Raises
     ------
@@ -111,9 +117,9 @@ def find_events(
     """
     events: list[FoundEvent] = []
     left_out: dict[str, str] = {}
-    damaged: dict[str, str] = {}
     estimators: set[str] = set()
     drives = _drives(run)
+    unreadable = sum(log.outcome.startswith("failed") for log in run.logs)
     for log in run.logs:
         main = estimator or log.main()
         try:
@@ -125,16 +131,16 @@ def find_events(
                 events += _events_of(log, condition, main, drives[log.label], least_s, pad_s)
         except OutputError as error:
             reason = error.got
-            damaged[log.label] = str(error)
+            unreadable += not log.outcome.startswith("failed")
+            tell(str(error))
         if reason:
             left_out[log.label] = reason
     searched = len(run.logs) - len(left_out)
     if not searched and estimators:
         _check_tracks(estimators, condition, estimator, selected=any(log.main() for log in run.logs))
-    unreadable = sum(log.label in damaged or log.outcome.startswith("failed") for log in run.logs)
     where = condition.text + (f" for {least_s:g} s" if least_s else "")
-    of, lines = estimator or "the selected estimates", tuple(damaged.values())
-    return FoundEvents(where, searched, tuple(events), left_out, of, unreadable > 0, unreadable, lines)
+    of = estimator or "the selected estimates"
+    return FoundEvents(where, searched, tuple(events), left_out, of, unreadable > 0, unreadable)
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,13 +36,6 @@ WORST = 20
 _MOST_FOLDERS = 3
 #: Most labels of a group of failures, and most groups.
 NAMED, _MOST_GROUPS = 10, 50
-#: Remedies by the first words of a supervisor's reason.
-_REMEDIES = {
-    "nothing heard": "Allow more time: --set log_timeout_s=SECONDS.",
-    "the worker was killed": "If memory was short, use fewer --jobs; pdhef inspect LOG shows the size of the log.",
-    "there was no more memory": "Use fewer --jobs, or a machine with more memory.",
-    "took more than": "Allow more memory: --set max_memory_mb=MB.",
-}
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -109,10 +102,6 @@ class Distribution:
         """Drives with the figure."""
         return len(self.values)
 
-    def quantile(self, share: float) -> float:
-        """Return a quantile of the errors."""
-        return float(np.quantile(self.values, share))
-
 
 @dataclass(frozen=True, slots=True)
 class Rank:
@@ -137,18 +126,14 @@ class Failures:
     count: int
     labels: tuple[str, ...]
 
-    @property
-    def explanation(self) -> tuple[str, str]:
-        """The cause, and the remedy, empty where none is known."""
-        return cause_and_remedy(self.reason)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Space:
-    """Seconds and RMSE of sideslip in rad by cell of speed and |a_y|, [speeds, accelerations]; NaN: not scored."""
+    """Seconds and RMSE of sideslip in rad by cell of speed and |a_y|, [speeds, accelerations]; NaN: not scored.
 
-    speed_edges_m_s: FloatArray
-    ay_edges_m_s2: FloatArray
+    The cells begin at the edges of :mod:`~pdhef_logtool.evaluation.operating_space`.
+    """
+
     seconds: FloatArray
     rmse_rad: FloatArray
     drives: int
@@ -266,7 +251,7 @@ def _space(run: OpenedRun) -> Space | None:
         cell = SPEED_EDGES_M_S.index(speed), AY_EDGES_M_S2.index(ay)
         seconds[cell], rmse[cell] = spent, error
     drives = run.table("exposure").select(pl.col("log").n_unique()).collect().item()
-    return Space(np.array(SPEED_EDGES_M_S), np.array(AY_EDGES_M_S2), seconds, rmse, drives)
+    return Space(seconds, rmse, drives)
 
 
 def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.LazyFrame:
@@ -364,22 +349,6 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
         )
         for name in order
     ]
-
-
-def cause_and_remedy(reason: str) -> tuple[str, str]:
-    """Return the cause of a failure and its remedy, empty where the reason contains none.
-
-    An error of this tool reads ``WHERE: expected EXPECTED, got GOT; REMEDY``.
-    """
-    expected, got, rest = reason.partition(", got ")
-    if not got or "expected " not in expected:
-        return _sentence(reason), next((remedy for start, remedy in _REMEDIES.items() if reason.startswith(start)), "")
-    cause, _, remedy = rest.rpartition("; ") if "; " in rest else (rest, "", "")
-    return f"{_sentence(cause)} (expected: {expected.rpartition('expected ')[2]}).", _sentence(remedy)
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def grouped(failures: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
@@ -618,13 +587,13 @@ def summarise(run: OpenedRun, exit_code: int) -> dict[str, Any]:
     """
     drives = run.table("drives").collect()
     scored = drives.drop_nulls("sideslip_rmse_rad").sort("sideslip_rmse_rad", "log", descending=[True, False])
-    errors = sideslip_errors(run).collect()
-    selected, failed = set(scored["estimator"]), drives.filter(outcome="failed")
-    names = list(dict.fromkeys(errors["estimator"]))
+    errors, failed = sideslip_errors(run).select("log", "estimator", "value").collect(), drives.filter(outcome="failed")
+    selected, every, value = set(scored["estimator"]), errors, pl.col("value")
     if len(selected) > 1:
-        selected, names = {ANSWER}, [ANSWER, *names]
-    else:
-        names.sort(key=lambda name: name not in selected)
+        answers = scored.select("log", estimator=pl.lit(ANSWER), value="sideslip_rmse_rad")
+        selected, every = {ANSWER}, pl.concat([answers, errors])
+    figures = {"median_rad": value.median(), "p90_rad": value.quantile(0.9, "linear"), "max_rad": value.max()}
+    by_name = every.group_by("estimator", maintain_order=True).agg(drives=pl.len(), **figures).to_dicts()
     worst = scored.head(_IN_SUMMARY).select("log", "estimator").rows()
     return {
         "output": str(run.place),
@@ -634,10 +603,7 @@ def summarise(run: OpenedRun, exit_code: int) -> dict[str, Any]:
         "lost": len(drives.filter(outcome="lost")),
         "scored": len(scored),
         "remaining": int(run.document.get("remaining", 0)),
-        "errors": [
-            _errors_of(n, scored["sideslip_rmse_rad"] if n in selected else errors.filter(estimator=n)["value"])
-            for n in names
-        ],
+        "errors": sorted(by_name, key=lambda of: of["estimator"] not in selected),
         "worst": [
             {"log": log, "main": main, "errors_rad": dict(errors.filter(log=log).select("estimator", "value").rows())}
             for log, main in worst
@@ -646,9 +612,3 @@ def summarise(run: OpenedRun, exit_code: int) -> dict[str, Any]:
         "checks_failed": drives.filter(drives["failed_checks"] > 0)["log"].to_list(),
         "plan": run.document.get("plan"),
     }
-
-
-def _errors_of(estimator: str, values: pl.Series) -> dict[str, Any]:
-    """Return the distribution of the sideslip RMSE in rad of one estimator over drives."""
-    median, p90, largest = (values.quantile(q, "linear") for q in (0.5, 0.9, 1.0))
-    return {"estimator": estimator, "drives": len(values), "median_rad": median, "p90_rad": p90, "max_rad": largest}

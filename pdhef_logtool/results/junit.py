@@ -7,23 +7,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.selected_estimate import TEMPLATES
-from pdhef_logtool.results.tables import checks_of
-from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
 
 #: Characters that XML 1.0 cannot contain.
 _NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
-
-
-def write_junit(path: Path, verdicts: PlanVerdicts, parts: Mapping[str, Any]) -> None:
-    """Write the verdicts of a plan, and the checks of the logs' parts of tables; raises OutputError."""
-    write_bytes(path, junit_bytes(verdicts, {log: checks_of(part) for log, part in parts.items()}))
 
 
 def junit_bytes(

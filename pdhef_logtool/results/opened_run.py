@@ -46,6 +46,8 @@ _AGAIN = "run the log again"
 class OpenedLog:
     """Outputs of a run for one log. ``entry`` is its record in run.json; files are read on demand.
 
+    ``document``: report.json of a log without a folder.
+
     Files of a run at a URL are fetched into a local folder on demand.
     """
 
@@ -54,6 +56,7 @@ class OpenedLog:
     folder: Path
     entry: dict[str, Any]
     mirror: Mirror | None = None
+    document: dict[str, Any] | None = None
     _sound: set[str] = field(default_factory=set, repr=False, compare=False)
 
     def file(self, name: str) -> Path | None:
@@ -74,9 +77,9 @@ class OpenedLog:
 
     def report(self) -> dict[str, Any] | None:
         """Return report.json, None where the log failed; raises OutputError for a damaged one."""
-        path = self.file(REPORT_FILE)
+        path = self.file(REPORT_FILE) if self.document is None else None
         if path is None:
-            return None
+            return self.document
         report = read_json(path, "a report.json", OutputError, _AGAIN, MAX_DOCUMENT_BYTES)
         if report.get("format") != "pdhef.report":
             got = f"format {report.get('format')!r}"

@@ -42,11 +42,6 @@ class Pair:
         left, other = self.a.entry.get(key), self.b.entry.get(key)
         return None if left is None or other is None else bool(left == other)
 
-    @property
-    def same_file(self) -> bool:
-        """Whether the files of both sides are known to be the same."""
-        return self.same("sha256") is True
-
 
 @dataclass(frozen=True, slots=True)
 class Pairing:
@@ -82,7 +77,7 @@ def run_differences(a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> tuple[
     def changed(key: str) -> list[Pair]:
         return [pair for pair in pairs if pair.same(key) is False]
 
-    names = [p for p in pairs if p.by == "name" and p.same("signals_sha256") is not False and not p.same_file]
+    names = [p for p in pairs if p.by == "name" and p.same("signals_sha256") is not False and not p.same("sha256")]
     text = template(TEMPLATES / "differences.txt").render(
         a=a.document,
         b=b.document,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
@@ -284,11 +285,10 @@ def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) ->
     return figures_of_file(run.table("metrics"), plan, [d.main for d in partners.values()]), partners
 
 
-def judged_drive(log: OpenedLog, read_report: Callable[[], Mapping[str, Any] | None] | None = None) -> JudgedDrive:
-    """Return a log of a run to judge; ``read_report`` None: from its file."""
-    main = log.entry.get("main")
+def judged_drive(log: OpenedLog) -> JudgedDrive:
+    """Return a log of a run to judge."""
     factors = {"car": (log.entry.get("car") or {}).get("name"), **{k: log.entry.get(k) for k in ("day", "route")}}
-    return JudgedDrive(log.label, None if main is None else str(main), read_report or log.readable_report, factors)
+    return JudgedDrive(log.label, log.main() or None, cache(log.readable_report), factors)
 
 
 def in_space(drive: JudgedDrive, report: Mapping[str, Any]) -> JudgedDrive:

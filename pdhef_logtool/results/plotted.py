@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.reasons import reason_intervals
-from pdhef_logtool.evaluation.track_errors import NORMAL_95, truth_speed
-from pdhef_logtool.records.geometry import DEGREES, wrap_angle
+from pdhef_logtool.evaluation.track_errors import NORMAL_95, signal_error
+from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import NS_PER_S, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -77,22 +77,13 @@ def drawn(track: StateTrack, plot: Plot, min_speed_m_s: float) -> FloatArray:
 
 
 def errors(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -> dict[str, FloatArray]:
-    """Return the errors [N] by the names of :data:`ERRORS`, NaN where ground truth or estimate is not known.
+    """Return the scored errors [N] by the names of :data:`ERRORS`; NaN without ground truth at the same stamps.
 
     ``min_speed_m_s``: of the ground truth, below which there is no error of sideslip.
     """
-    columns = {plot.name: np.full(len(track), np.nan) for plot in ERRORS}
-    if truth is None:
-        return columns
-    _, of_track, of_truth = np.intersect1d(track.stamps_ns, truth.stamps_ns, assume_unique=True, return_indices=True)
-    valid = track.valid[of_track] & truth.valid[of_truth]
-    fast = truth_speed(truth)[of_truth] >= min_speed_m_s
-    for plot in ERRORS:
-        error = np.asarray(getattr(track, plot.column))[of_track] - getattr(truth, plot.column)[of_truth]
-        is_slip = plot.column == _SIDESLIP
-        error = (wrap_angle(error) if is_slip else error) * plot.factor
-        columns[plot.name][of_track] = np.where(valid & fast if is_slip else valid, error, np.nan)
-    return columns
+    if truth is None or not np.array_equal(track.stamps_ns, truth.stamps_ns):
+        return {plot.name: np.full(len(track), np.nan) for plot in ERRORS}
+    return {plot.name: signal_error(track, truth, plot.column, min_speed_m_s) * plot.factor for plot in ERRORS}
 
 
 def plotted_fields(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -> dict[str, FloatArray]:

@@ -114,26 +114,21 @@ def write_recording(
     truth = next((t for t in tracks if t.name == TRUTH), None)
     # In memory, because Rerun's writer thread ends on an error of the disk, and other threads then wait for it forever.
     memory = recording.memory_recording()
-    try:
-        recording.send_blueprint(_blueprint(), make_active=False, make_default=True)
-        recording.send_recording_name(log_name)
-        recording.send_recording_start_time_nanos(start_ns)
-        drawing = _Drawing(recording, start_ns, is_long, min_speed_m_s)
-        if signals is not None:
-            inputs = {p.name: np.asarray(getattr(signals, p.column))[:, None] * p.factor for p in _INPUTS}
-            drawing.send_sparse("/inputs", _SIGNALS, signals.stamps_ns, inputs)
-        for track in tracks:
-            drawing.draw_track(track, truth, places[track.name], colour_rgb(track.name, colours or {}))
-            drawing.draw_reasons(track)
-        drawing.draw_texts(report, events, tracks)
-        for name, values in _properties(report).items():
-            if values:
-                recording.send_property(name, rr.AnyValues(**values))
-        data = memory.drain_as_bytes()
-    except RuntimeError as error:
-        raise OutputError(
-            expected="a recording by Rerun", got=str(error), where=str(path), remedy="run the log again"
-        ) from error
+    recording.send_blueprint(_blueprint(), make_active=False, make_default=True)
+    recording.send_recording_name(log_name)
+    recording.send_recording_start_time_nanos(start_ns)
+    drawing = _Drawing(recording, start_ns, is_long, min_speed_m_s)
+    if signals is not None:
+        inputs = {p.name: np.asarray(getattr(signals, p.column))[:, None] * p.factor for p in _INPUTS}
+        drawing.send_sparse("/inputs", _SIGNALS, signals.stamps_ns, inputs)
+    for track in tracks:
+        drawing.draw_track(track, truth, places[track.name], colour_rgb(track.name, colours or {}))
+        drawing.draw_reasons(track)
+    drawing.draw_texts(report, events, tracks)
+    for name, values in _properties(report).items():
+        if values:
+            recording.send_property(name, rr.AnyValues(**values))
+    data = memory.drain_as_bytes()
     with writing(path), open_new(path) as file:
         file.write(data)
 
@@ -271,11 +266,8 @@ class _Drawing:
 
 
 def _strips(points: FloatArray) -> list[FloatArray]:
-    """Return the strips of at least two finite points [N, 2] of a path, thinned to every 2^k-th point."""
-    stride = 1
-    while len(points) > stride * MOST_TRAJECTORY_POINTS:
-        stride *= 2
-    points = points[::stride]
+    """Return the strips of at least two finite points [N, 2] of a path, thinned to every k-th point."""
+    points = points[:: max(1, -(-len(points) // MOST_TRAJECTORY_POINTS))]
     is_finite = np.isfinite(points).all(axis=1)
     pieces = np.split(points, np.flatnonzero(np.diff(is_finite)) + 1)
     return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]

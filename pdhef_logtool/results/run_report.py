@@ -46,6 +46,7 @@ class LogOutcome:
     ``main``: the estimator of the selected estimate. ``folder`` of the log, below the folder of the run.
     ``algorithms``: the identity of each estimator that ran. ``files``: sha256 by name of the files in the log's folder
     that commands read back. ``day`` (UTC) and ``route``: drives that share them depend on one another.
+    ``failed_checks``: number of those that are not waived.
     """
 
     log: str
@@ -63,6 +64,7 @@ class LogOutcome:
     files: Mapping[str, str] = field(default_factory=dict)
     day: str | None = None
     route: str | None = None
+    failed_checks: int = 0
 
     @property
     def outcome(self) -> str:
@@ -169,7 +171,7 @@ def build_run(
 
 def _run_entry(outcome: LogOutcome) -> dict[str, Any]:
     entry = asdict(outcome) | {"file": PurePath(outcome.file).name, "outcome": outcome.outcome}
-    return {key: value for key, value in entry.items() if key not in ("failed", "lost")}
+    return {key: value for key, value in entry.items() if key not in ("failed", "lost", "failed_checks")}
 
 
 def json_bytes(document: Mapping[str, Any]) -> bytes:

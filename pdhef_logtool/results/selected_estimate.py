@@ -81,8 +81,18 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
 
 
 def figures_of(report: Report) -> Figures:
-    """Return the figures of a document."""
-    return {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
+    """Return the figures of a document.
+
+    ``nis_ratio`` is the NIS per degree of freedom, ``from_main`` the difference from the selected estimate.
+    """
+    values = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
+    main = report.get("selected_estimate")
+    for (name, signal, segment, metric), value in [*values.items()]:
+        if metric == "nis" and value is not None and (dof := values.get((name, signal, segment, "nis_dof"))):
+            values[name, signal, segment, "nis_ratio"] = value / dof
+        if metric == "disagreement_rms" and main in (pair := name.split("~")):
+            values[next((n for n in pair if n != main), name), signal, segment, "from_main"] = value
+    return values
 
 
 def _interval(report: Report) -> list[float] | None:
@@ -139,7 +149,7 @@ def failed_checks(report: Report) -> list[str]:
 def degrees(value_rad: float) -> str:
     """Return an angle in degrees as text, with digits by its size."""
     shown = value_rad * DEGREES
-    return f"{shown:.3f}°" if shown < 1.0 else f"{shown:.2f}°"
+    return f"{shown:.3f}°" if abs(shown) < 1.0 else f"{shown:.2f}°"
 
 
 def is_worse(error: float | None, naive: float | None) -> bool:

@@ -157,9 +157,7 @@ class RunConfig:
         document = asdict(self)
         for key in _NO_RESULT:
             del document[key]
-        document["waived"] = list(self.waived)
         document |= {"annotate": self.annotation, "keep": self.kept}
-        document["estimators"] = None if self.estimators is None else list(self.estimators)
         for key in _FILES:
             path = document[key]
             document[key] = None if path is None else Path(path).name

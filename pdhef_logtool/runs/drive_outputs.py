@@ -65,7 +65,7 @@ class DriveOutputs:
         self, folders: tuple[FolderTransaction, Path], run: PreparedDrive, estimated: Estimated, main: MainFacts
     ) -> None:
         (self._change, self._run_folder), self._run, self._main = folders, run, main
-        self._signals, names = estimated.signals, run.names
+        self._signals, names, self._is_copy = estimated.signals, run.names, run.config.annotation == "full"
         steer_rad = estimated.signals.steer_rad
         tracks = [t if t.name == TRUTH else replace(t, steer_rad=steer_rad) for t in estimated.drawn]
         self.tracks = [without_pose(track) for track in tracks] if run.config.no_position else tracks
@@ -97,10 +97,6 @@ class DriveOutputs:
             min_speed_m_s=self._min_speed_m_s,
             left_out=left_out,
         )
-
-    @property
-    def _is_copy(self) -> bool:
-        return self._run.config.annotation == "full"
 
     def _left_out(self) -> frozenset[str]:
         """Return the topics that ``--no-position`` keeps out of the copy, if there is one; add a remark."""

@@ -33,7 +33,7 @@ from pdhef_logtool.runs.journal import Entry, Journal
 from pdhef_logtool.runs.judging import judge, read_validation_plan, write_verdicts
 from pdhef_logtool.runs.planning import Plan, PlannedLog, plan_logs, settings_of, sweep_parts
 from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult, RunResult
-from pdhef_logtool.runs.stored_output import StoredOutput
+from pdhef_logtool.runs.stored_output import StoredOutput, stored_drive
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
 from pdhef_logtool.storage.object_store import is_url
 from pdhef_logtool.storage.outputs import OutputFolder
@@ -174,20 +174,12 @@ def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> Ru
     log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
     _check_names([log], output, job, reporter)
     with OutputFolder(output, (LOGS,)) as outputs:
-        try:
-            result = run_log(
-                log, outputs, config, car, job.mapping,
-                validation=job.validation, reporter=reporter,
-            )  # fmt: skip
-        except BaseException as stop:
-            if not isinstance(stop, Exception):
-                stop.add_note("0 of 1 logs are done")
-            raise
+        result = run_log(log, outputs, config, car, job.mapping, validation=job.validation, reporter=reporter)
         verdicts = judge(job.validation, [result], config.strict)
         write_run_tables(output, [result])
         network = None if car.network is None else (Path(car.network_name).name, car.network.sha256)
         write_run(output, config.to_dict(), [result], verdicts, network)
-        journal = Journal.of(output)  # of a run that this one replaces
+        journal = Journal(output / JOURNAL_FILE)  # of a run that this one replaces
         journal.path.unlink(missing_ok=True)
         sweep_parts(journal, output)
         write_verdicts(job.junit, verdicts, [result])
@@ -223,7 +215,7 @@ def _prepare(
         stored.check_no_input(inputs)
         if schedule.resumes:
             stored.fetch_journal()
-    journal = Journal.read(output) if schedule.resumes else Journal.of(output)
+    journal = Journal.read(output) if schedule.resumes else Journal(output / JOURNAL_FILE)
     if journal.damaged:
         lines = "1 line is" if journal.damaged == 1 else f"{journal.damaged} lines are"
         reporter.note(f"{JOURNAL_FILE}: {lines} damaged or of another version: the drives of these are run again")
@@ -273,8 +265,7 @@ class _Fleet:
                 outputs.sweep()
                 sweep_parts(journal, output)
             results, verdicts = collect(self.plan, self.job.config, self.job.validation)
-            if verdicts is not None:
-                write_verdicts(self.job.junit, verdicts, results)
+            write_verdicts(self.job.junit, verdicts, results)
             failed = {e.label for p in self.plan.logs if (e := self.plan.entry(p)) is not None and e.failed}
             pages = failed | self.plan.damaged_pages() if self.job.config.kept == "full" else ()
             write_run_pages(output, self.job.report, pages, self.reporter)
@@ -284,7 +275,8 @@ class _Fleet:
 
     def _save(self, stop: BaseException) -> None:
         """Write the files of the drives that are done when a run is interrupted."""
-        notes = [f"{self.plan.done} of {len(self.plan.logs)} logs are done", "--resume goes on"]
+        logs, done = self.plan.logs, sum(self.plan.entry(p) is not None for p in self.plan.logs)
+        notes = [f"{done} of {len(logs)} logs are done", "--resume goes on"]
         if isinstance(stop, OutputError | WorkerError):
             stop.remedy = "; ".join(filter(None, [stop.remedy, *notes]))
         else:
@@ -318,7 +310,9 @@ class _Fleet:
         self, tasks: Iterator[DriveTask], update: Callable[[int, str, float], None]
     ) -> Iterator[Ended[DriveTask, DriveEnd]]:
         """Yield how the tasks end, on this machine or on a cluster."""
-        work: Callable[[DriveTask, Tell], Any] = self.work if self.stored is None else self.stored.uploading(self.work)
+        work: Callable[[DriveTask, Tell], Any] = self.work
+        if self.stored is not None:
+            work = partial(stored_drive, self.stored.objects, work)
         schedule, limits = self.schedule, self.limits
         if schedule.ray is None:
             ends = supervise(
@@ -346,7 +340,6 @@ class _Fleet:
             self.job.validation,
             self.job.report and keep == "full",
             self._name,
-            () if self.stored is None else self.stored.there(label),
             label == self.plan.logs[0].log.stem,
         )
 
@@ -365,7 +358,7 @@ class _Fleet:
         failed = end.outcome.failed is not None and end.part is None
         entry = Entry(
             log.log.stem, log.place, end.identity or log.identity, self.plan.setting, car, keep, end.part,
-            end.failed_checks, end.error_rad, failed, end.again, quarantined,
+            end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
         self.plan.add(entry, end)
         if self.stored is not None:
@@ -394,7 +387,7 @@ def collect(plan: Plan, config: RunConfig, validation: ValidationPlan) -> tuple[
         part = None if entry.part is None else output / entry.part
         place = None if part is None else output / log_place(entry.label)
         outcome = replace(plan.journal.outcome(entry), folder=folder)
-        results.append(LogResult(outcome, place, part=part, failed_checks=entry.failed_checks))
+        results.append(LogResult(outcome, place, part=part))
     write_run_tables(output, results)
     cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
     networks = {cars[e.car]["network"] and tuple(cars[e.car]["network"]) for e, _ in entries if e.car is not None}

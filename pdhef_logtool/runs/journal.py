@@ -25,9 +25,9 @@ from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
-_FORMAT = {"format": "pdhef.journal", "version": 4}
+_FORMAT = {"format": "pdhef.journal", "version": 5}
 #: Included in each checksum, so that lines of other versions of the format are ignored as damaged lines are.
-_VERSION = b"pdhef.journal 4"
+_VERSION = b"pdhef.journal 5"
 _DIGITS = 16
 #: Bytes of the last entry of a line: the checksum of all bytes before it.
 _SUM_BYTES = len(b',"sum":""}\n') + _DIGITS
@@ -80,7 +80,7 @@ class Entry:
     ----------
     identity : of the log's content, None if it cannot be read. setting, car : digests of settings and car (None: no
         car). keep : kept files.
-    part : the file of its rows of the tables below the run's folder, None without. failed_checks : those that count.
+    part : the file of its rows of the tables below the run's folder, None without.
     error_rad : RMSE of the selected sideslip, None without independent ground truth.
     failed : whether there is no result. again : whether a repetition may succeed, as after a full disk.
     quarantined : whether it took its worker along.
@@ -94,7 +94,6 @@ class Entry:
     car: str | None
     keep: str
     part: str | None = None
-    failed_checks: int = 0
     error_rad: float | None = None
     failed: bool = False
     again: bool = False
@@ -123,11 +122,6 @@ class Journal:
     _end: int = 0
 
     @classmethod
-    def of(cls, folder: Path) -> Journal:
-        """Return an empty journal of a folder, also if the folder has one."""
-        return cls(folder / JOURNAL_FILE)
-
-    @classmethod
     def read(cls, folder: Path) -> Journal:
         """Return the journal of a folder, empty if there is none; damaged lines are ignored and counted.
 
@@ -136,7 +130,7 @@ class Journal:
         OutputError
             It cannot be read.
         """
-        journal = cls.of(folder)
+        journal = cls(folder / JOURNAL_FILE)
         for line in journal._lines():
             if (document := _document(line)) is None:
                 journal.damaged += 1
@@ -211,11 +205,6 @@ class Journal:
         self._keep(entry)
         return entry
 
-    def add_place(self, label: str, place: Place, identity: str) -> None:
-        """Record another place of a known log."""
-        self._append({"label": label, "place": asdict(place), "identity": identity, "moved": True})
-        self._places[place.key] = place, identity, label
-
     def describe(self, kind: Literal["setting", "car"], digest: str, description: Mapping[str, Any]) -> None:
         """Record the values of a setting or a car once."""
         if digest not in self.described[kind]:
@@ -235,9 +224,6 @@ class Journal:
         if "is" in document:
             kind = "setting" if "setting" in document else "car"
             self.described[kind][document[kind]] = document["is"]
-        elif "moved" in document:
-            place = Place(**document["place"])
-            self._places[place.key] = place, document["identity"], document["label"]
         elif "label" in document:
             content = {k: v for k, v in document.items() if k not in ("outcome", "outputs")}
             self._keep(Entry(**{**content, "place": Place(**content["place"])}, offset=offset))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,10 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results import plan_verdicts
 from pdhef_logtool.results.plan_verdicts import JudgedDrive, PlanVerdicts
+from pdhef_logtool.results.tables import checks_of
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import jsonable
+from pdhef_logtool.storage.files import write_bytes
 
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
@@ -77,10 +78,10 @@ def judge(
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
     if not plan.file and len(done) < LEAST_DRIVES:
         return None
-    drives: Sequence[JudgedDrive] = [plan_verdicts.judged_drive(r.opened, partial(_report, r)) for r in done]
+    drives: Sequence[JudgedDrive] = [plan_verdicts.judged_drive(r.opened) for r in done]
     if tables is None:
         figures = plan_verdicts.figures_of_rows(row for r in done for row in r.rows)
-        drives = [plan_verdicts.in_space(d, _report(r) or {}) for d, r in zip(drives, done, strict=True)]
+        drives = [plan_verdicts.in_space(d, d.read_report() or {}) for d in drives]
     else:
         import polars as pl
 
@@ -91,14 +92,9 @@ def judge(
     return plan_verdicts.plan_verdicts(plan, figures, drives, strict=strict, against=against)
 
 
-@lru_cache(maxsize=LEAST_DRIVES)
-def _report(result: LogResult) -> Mapping[str, Any] | None:
-    return result.report
-
-
 def write_verdicts(junit: Path | None, verdicts: PlanVerdicts | None, results: Sequence[LogResult]) -> None:
     """Write JUnit XML if ``junit`` is a file; raises OutputError."""
     if junit is not None and verdicts is not None:
-        from pdhef_logtool.results.junit import write_junit
+        from pdhef_logtool.results.junit import junit_bytes
 
-        write_junit(junit, verdicts, {r.outcome.log: r.part for r in results})
+        write_bytes(junit, junit_bytes(verdicts, {r.outcome.log: checks_of(r.part) for r in results}))

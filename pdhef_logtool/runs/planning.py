@@ -35,12 +35,11 @@ _GONE = "their outputs are gone"
 
 @dataclass(frozen=True, slots=True)
 class PlannedLog:
-    """A log under its label; ``moved``: the journal has it under another path."""
+    """A log under its label."""
 
     log: LogInput
     place: Place
     identity: str | None = None
-    moved: bool = False
 
 
 def plan_logs(
@@ -103,7 +102,7 @@ class _Labels:
         """Return a log with the first label that is free: of its content, of its path, or a new one."""
         for label in () if identity is None else self.journal.labels.get(identity, ()):
             if label not in self.claimed:
-                return PlannedLog(replace(log, stem=label), place, identity, moved=True)
+                return PlannedLog(replace(log, stem=label), place, identity)
         if (was := self.journal.known(place)[0]) and was not in self.claimed:
             return PlannedLog(replace(log, stem=was), place, identity)  # another content: it is run again
         log = replace(log, stem=neutral_stem(identity)) if self.neutral else log
@@ -149,12 +148,9 @@ class Plan:
         self.setting = digest_of(self.settings)
 
     def begin(self) -> None:
-        """Begin the journal with the settings and the new places of logs."""
+        """Begin the journal with the settings."""
         self.journal.begin()
         self.journal.describe("setting", self.setting, self.settings)
-        for log in self.logs:
-            if log.moved:
-                self.journal.add_place(log.log.stem, log.place, log.identity or "")
 
     def entry(self, log: PlannedLog) -> Entry | None:
         """Return the journal's entry of a log if it is done, whichever files were kept."""
@@ -162,11 +158,6 @@ class Plan:
         if entry is None or self._reason(log, "metrics", retry=False) not in (None, _REPEATED):
             return None
         return entry
-
-    @property
-    def done(self) -> int:
-        """Number of logs that are done."""
-        return sum(self.entry(p) is not None for p in self.logs)
 
     def pending(self, names: Sequence[str] | None, keep: Keep, retry: bool, note: Reporter) -> list[PlannedLog]:
         """Return the logs to process, of all or of those named, and report why logs are repeated or left out."""
@@ -185,7 +176,7 @@ class Plan:
 
     def add_car(self, record: dict[str, Any]) -> str:
         """Write a car's record into the journal; return its digest."""
-        digest: str = record["digest"]
+        digest = digest_of(record["parts"])
         self.journal.describe("car", digest, record)
         self.cars_of_run()[digest] = record
         return digest

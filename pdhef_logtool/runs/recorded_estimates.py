@@ -348,16 +348,16 @@ def read_estimate(
     if source.covariance is not None:
         requests[source.covariance.topic].append(source.covariance.field)
     losses: list[Loss] = []
-    base = next(name for name in BASE_ORDER if name in mapping.signals)
     columns = log.read(requests, start_ns, end_ns)
+    there = {name for name, s in mapping.signals.items() if len(columns.get(s.read_topic) or ())}
+    base = next((name for name in BASE_ORDER if name in there), "")
     channels: dict[str, Channel] = {}
     for name, s in mapping.signals.items():
-        topic = columns.get(s.read_topic)
-        if topic is None or len(topic) == 0:
-            channels[name] = Channel(
-                name, ESTIMATE_UNITS[name], s.label, *2 * (np.empty(0, dtype=np.int64),), np.empty(0)
-            )
+        if name not in there:
+            none = np.empty(0, dtype=np.int64)
+            channels[name] = Channel(name, ESTIMATE_UNITS[name], s.label, none, none, np.empty(0))
             continue
+        topic = columns[s.read_topic]
         stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
         stamps = stamps - np.int64(round(s.latency_s * 1e9))
         kept = _in_order(stamps, topic.log_time_ns, usable)

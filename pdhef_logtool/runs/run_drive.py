@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
@@ -46,9 +45,6 @@ from pdhef_logtool.runs.selection import choose_main, contradiction
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.storage.templates import lines, template
-
-if TYPE_CHECKING:
-    from jinja2 import Template
 
 _SILENT = "{} has no valid row although the car moves: {}"
 _ALL_SILENT = "no estimator has a valid row although the car moves: {}"
@@ -110,12 +106,12 @@ def run_log(
             main=main.name,
             algorithms={e.name: resolve(e).identity for e in run.estimators},
             files=files_of(change.target),
+            failed_checks=sum(c.verdict == "failed" and not c.waived for c in drive.checks),
             failed=_ALL_SILENT.format("; ".join(dict.fromkeys(scored.silent.values()))) if all_silent else None,
         )
-        failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
     reporter.progress(drive.name, 1.0)
     part = drive_part(outcome, report, scored.rows, judged["plan"])
-    return LogResult(outcome, change.target, report, tuple(scored.rows), failed_checks, part)
+    return LogResult(outcome, change.target, report, tuple(scored.rows), part)
 
 
 def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter) -> tuple[PreparedDrive, Estimated]:
@@ -159,7 +155,7 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
         for text in contradictions:
             drive.tell(text)
     if against := contradiction(scored.rows):
-        drive.notes.append(f"WARNING: {against.text}")  # the text of the selected estimate gives the consequence
+        drive.notes.append(f"WARNING: {against[1]}")  # the text of the selected estimate gives the consequence
     if not scored.moves:
         drive.tell(_NEVER_MOVES.format(run.car.vehicle.low_speed_blend_m_s))
     return scored
@@ -278,7 +274,7 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
             "quantities": {n: sources[n].label if n in sources and not how else how for n, how in derivation.items()},
             "latency_s": None if plan.latency is None else plan.truth_latency_s,
             "not_independent": sorted({row.signal for row in rows if not row.independent}),
-            "notes": lines(_truth_notes().render(p=plan)),
+            "notes": lines(template(Path(__file__).with_name("templates") / "truth_notes.txt").render(p=plan)),
         },
         "model": {
             "source": "log" if drive.earlier is None else "file",
@@ -292,11 +288,6 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
         "checks": [{k: getattr(c, k) for k in _OF_CHECK} for c in drive.checks],
         "versions": run_versions(),
     }
-
-
-@cache
-def _truth_notes() -> Template:
-    return template(Path(__file__).with_name("templates") / "truth_notes.txt")
 
 
 def car_entry(car: Car) -> dict[str, Any]:

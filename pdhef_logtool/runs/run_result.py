@@ -27,14 +27,12 @@ class LogResult:
     output : folder of the log, None if no file was written.
     document : report in memory, None: in the folder. rows : figures in memory.
     part : its rows of the tables (:mod:`~pdhef_logtool.results.tables`), or their file; None: it has no report.
-    failed_checks : number of failed checks that are not waived.
     """
 
     outcome: LogOutcome
     output: Path | None
     document: dict[str, Any] | None = None
     rows: tuple[MetricRow, ...] = ()
-    failed_checks: int = 0
     part: Any = None
 
     @property
@@ -44,8 +42,9 @@ class LogResult:
 
     @property
     def opened(self) -> OpenedLog:
-        """The log as commands read it back from its files."""
-        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output or Path(), asdict(self.outcome))
+        """The log as commands read it back from its files; without any, with its report in memory."""
+        entry, document = asdict(self.outcome), None if self.output else self.document
+        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output or Path(), entry, document=document)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,10 +79,11 @@ class RunResult:
             return EXIT_FAILURE
         if self.requirements is not None and self.requirements.closes_gate:
             return EXIT_GATE
-        return EXIT_OK if all(r.outcome.outcome == "ok" and not r.failed_checks for r in self.results) else EXIT_PARTIAL
-
-    def _shown(self, folder: Path) -> str:
-        return str(folder) if self.output is None else str(folder).replace(str(self.output), str(self.place), 1)
+        return (
+            EXIT_OK
+            if all(r.outcome.outcome == "ok" and not r.outcome.failed_checks for r in self.results)
+            else EXIT_PARTIAL
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document; of many logs without their reports."""
@@ -95,7 +95,7 @@ class RunResult:
                 {
                     "log": r.outcome.log,
                     "outcome": r.outcome.outcome,
-                    "output": None if r.output is None else self._shown(r.output),
+                    "output": None if r.output is None else str(r.output).replace(str(self.output), str(self.place), 1),
                     "report": None if self.is_fleet else r.report,
                 }
                 for r in self.results

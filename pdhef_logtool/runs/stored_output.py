@@ -8,9 +8,8 @@ ends, at most every 30 s, and all files at the end of the run.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -61,7 +60,7 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
         try:
             if report in names:
                 stale = {f"{here}/{name}" for name in STALE_FILES}.difference(names)
-                objects.remove(sorted({report, *stale}.intersection(task.stored)))
+                objects.remove(sorted({report, *stale}))
             for name in names:
                 tell(f"{task.log.stem}: puts {Path(name).name}", 1.0)
                 objects.put(name, folder / name)
@@ -69,6 +68,10 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
             return error
         needed = [name for name in names if name == report or name.startswith(f"{PARTS}/")]
         return StoredEnd(end, tuple(names), {name: (folder / name).read_bytes() for name in needed})
+
+
+def _is_page(name: str) -> bool:
+    return name == REPORT_FILE or name.endswith(PAGE_FILE)
 
 
 class StoredOutput(Mirror):
@@ -84,8 +87,7 @@ class StoredOutput(Mirror):
 
     def __init__(self, url: str) -> None:
         super().__init__(url)
-        self._there: dict[str, set[str]] = {}
-        self._own: set[str] = set()
+        self._names: set[str] = set()
         self._uploaded_s = 0.0
 
     def __enter__(self) -> Self:
@@ -105,15 +107,10 @@ class StoredOutput(Mirror):
 
     def _see(self, name: str) -> None:
         """Record an object of the store."""
-        parts = name.split("/")
-        if parts[0] == LOGS and len(parts) > 2:
-            self._there.setdefault(parts[1], set()).add(name)
-        is_page = parts[-1] == PAGE_FILE or name == REPORT_FILE
-        if is_page:
+        self._names.add(name)
+        if _is_page(name):
             (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
             (self.folder / name).touch()
-        if is_page or name.startswith(f"{PARTS}/"):
-            self._own.add(name)
 
     def check_no_input(self, inputs: Iterable[LogInput]) -> None:
         """Refuse logs that lie among the outputs; raises UsageError."""
@@ -130,16 +127,8 @@ class StoredOutput(Mirror):
     def fetch_journal(self) -> None:
         """Fetch the journal of an earlier run, and figures and reports of its drives."""
         if self.fetch(JOURNAL_FILE) is not None:
-            reports = [n for names in self._there.values() for n in names if n.endswith(f"/{REPORT_FILE}")]
-            self.objects.get_all(sorted([*(n for n in self._own if n.startswith(f"{PARTS}/")), *reports]), self.folder)
-
-    def there(self, label: str) -> tuple[str, ...]:
-        """Return the names of a drive's objects in the store."""
-        return tuple(sorted(self._there.get(label, ())))
-
-    def uploading(self, work: Work) -> Callable[[DriveTask, Tell], StoredEnd | OutputError]:
-        """Return the work on a drive that also uploads its files."""
-        return partial(stored_drive, self.objects, work)
+            needed = (n for n in self._names if n.startswith(f"{PARTS}/") or n.endswith(f"/{REPORT_FILE}"))
+            self.objects.get_all(sorted(needed), self.folder)
 
     def take(self, stored: StoredEnd | None) -> DriveEnd | None:
         """Store the files of a drive and return its result; None if there is none."""
@@ -156,9 +145,10 @@ class StoredOutput(Mirror):
     def begin(self) -> None:
         """Upload the journal of the start of the run; remove figures that it does not list."""
         self._put_journal()
-        gone = sorted(name for name in self._own if not (self.folder / name).is_file())
+        mirrored = (name for name in self._names if _is_page(name) or name.startswith(f"{PARTS}/"))
+        gone = sorted(name for name in mirrored if not (self.folder / name).is_file())
         self.objects.remove(gone)
-        self._own.difference_update(gone)
+        self._names.difference_update(gone)
 
     def note_end(self) -> None:
         """Upload the journal after the end of a drive, unless it was uploaded recently."""

@@ -39,7 +39,7 @@ class DriveTask:
     ----------
     log : the log with its label in the run. output : folder of the run.
     page : whether the drive's page is written.
-    run : name of this run in its process, the key of cars that were read. stored : names of the drive's stored files.
+    run : name of this run in its process, the key of cars that were read.
     is_first : whether the log is the first of the run's list, which has the full causality check.
     """
 
@@ -49,7 +49,6 @@ class DriveTask:
     validation: ValidationPlan
     page: bool
     run: str
-    stored: tuple[str, ...] = ()
     is_first: bool = False
 
 
@@ -68,7 +67,6 @@ class DriveEnd:
     identity: str | None
     car: dict[str, Any] | None = None
     part: str | None = None
-    failed_checks: int = 0
     error_rad: float | None = None
     warned: tuple[str, ...] = ()
     again: bool = False
@@ -155,7 +153,6 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         validation=task.validation, is_first=task.is_first,
         reporter=Reporter(progress=tell, warn=warned.append),
     )  # fmt: skip
-    record = car_record(car)
     part = f"{PARTS}/part-{digest_of(task.log.stem)}.parquet"
     write_part(task.output / part, result.part)
     if task.page:
@@ -166,9 +163,8 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     return DriveEnd(
         result.outcome,
         _identity_of_slice(task.log, str(result.outcome.sha256)),
-        {"digest": digest_of(record["parts"]), **record},
+        car_record(car),
         part,
-        result.failed_checks,
         result.part["drives"][0][0]["sideslip_rmse_rad"].as_py(),
         tuple(warned),
         outputs=states_of(task.output, [part, *(f"{log_place(task.log.stem)}/{name}" for name in LOG_FILES)]),

@@ -32,10 +32,6 @@ _AT_ONCE = 16
 _CREDENTIALS = "give credentials that permit this, by the environment: docs/remote.md"
 
 
-class HeldError(OutputError):
-    """The folder is locked by another command."""
-
-
 def is_url(place: Path | str) -> bool:
     """Return whether an output is a URL rather than a local folder."""
     return isinstance(place, str) and _URL.match(place) is not None
@@ -93,7 +89,7 @@ class ObjectFolder:
             list(several.map(remove_one, names))
 
     def acquire(self) -> None:
-        """Create the lock object of the folder; raises HeldError if another command has locked it.
+        """Create the lock object of the folder; raises OutputError if another command has locked it.
 
         The lock of a command that has ended on this machine, or has not renewed it for long, is replaced.
         """
@@ -108,7 +104,7 @@ class ObjectFolder:
                 raise self._held(holder) from None
 
     def renew(self) -> None:
-        """Renew the lock of the folder; raises HeldError if it is lost."""
+        """Renew the lock of the folder; raises OutputError if it is lost."""
         with self._asking() as (store, root):
             if (holder := self._holder()) != process_name():
                 raise self._held(holder or "")
@@ -135,9 +131,9 @@ class ObjectFolder:
             age = datetime.now(UTC) - store.modified(f"{root}/{LOCK_FILE}").astimezone(UTC)
             return bool(age.total_seconds() > LEFT_OVER_S)
 
-    def _held(self, holder: str) -> HeldError:
+    def _held(self, holder: str) -> OutputError:
         process = ".".join(holder.split("-")[1:2])
-        return HeldError(
+        return OutputError(
             expected="an output folder that no other command is writing to",
             got=f"one that process {process} of this or another machine is writing to",
             where=self.shown,

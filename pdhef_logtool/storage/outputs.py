@@ -82,13 +82,10 @@ class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
             raise cannot_write(self.target, error) from error
 
     def _make(self) -> None:
-        for left in reversed(range(_TRIES)):
-            try:
+        for _ in range(_TRIES):
+            with contextlib.suppress(FileNotFoundError):  # a command beside this one removed the empty folder of both
                 self._new.mkdir(parents=True)
-                break
-            except FileNotFoundError:  # a command beside this one has removed the folder of both while it was empty
-                if not left:
-                    raise
+                return
 
     def file(self, name: str) -> Path:
         """Return where to write the file of a name."""

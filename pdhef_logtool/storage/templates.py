@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jinja2 import Template
+    from jinja2 import Environment, Template
 
 
-def template(path: Path, **context: Any) -> Template:
-    """Return a template; ``context``: functions and constants that it uses. Fields of XML are escaped."""
+def environment(folder: Path) -> Environment:
+    """Return the environment of the templates in a folder; fields of XML and HTML are escaped."""
     from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, StrictUndefined, select_autoescape
 
     class Kept(FileSystemBytecodeCache):
@@ -24,16 +24,20 @@ def template(path: Path, **context: Any) -> Template:
                     Path(self.directory).mkdir(exist_ok=True)
                     super().dump_bytecode(bucket)
 
-    made = Environment(
-        loader=FileSystemLoader(path.parent),
-        bytecode_cache=Kept(str(path.with_name("__pycache__"))),
-        autoescape=select_autoescape(("xml",)),
+    return Environment(
+        loader=FileSystemLoader(folder),
+        bytecode_cache=Kept(str(folder / "__pycache__")),
+        autoescape=select_autoescape(("xml", "html")),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    return made.get_template(path.name, globals=context)
+
+
+def template(path: Path, **context: Any) -> Template:
+    """Return a template; ``context``: functions and constants that it uses."""
+    return environment(path.parent).get_template(path.name, globals=context)
 
 
 def one_line(text: object) -> str:

@@ -12,11 +12,9 @@ import logging
 import signal
 import socket
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.records.extras import required
@@ -34,14 +32,8 @@ _LOOK_S = 5.0
 _CONNECT_S = 20.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Orders:
-    """The work of a node; ``run`` identifies the run."""
-
-    run: str
-    work: Callable[[Any, Tell], Any]
-    limits: Limits
-    preload: tuple[str, ...]
+#: The work of a node: a name of the run, the work, its limits, and modules to load before.
+_Orders: TypeAlias = tuple[str, Callable[[Any, Tell], Any], Limits, tuple[str, ...]]
 
 
 def supervise_on_ray(
@@ -66,7 +58,7 @@ def supervise_on_ray(
     UsageError : Ray is not installed, or there is no cluster.
     WorkerError : the cluster is lost, or its nodes cannot run workers.
     """
-    orders = _Orders(f"{process_name()}-{next(_RUNS)}", work, limits, tuple(preload))
+    orders = f"{process_name()}-{next(_RUNS)}", work, limits, tuple(preload)
     with _connected(address) as ray:
         try:
             yield from _submitted(ray, orders, items)
@@ -86,11 +78,8 @@ def _submitted(ray: Any, orders: _Orders, items: Iterable[T]) -> Iterator[Ended[
     task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES, retry_exceptions=False)(_end_on_node)
     waiting = enumerate(items)
     under_way: dict[Any, tuple[int, T]] = {}
-    room, looked = 0, -_LOOK_S
     while True:
-        if time.monotonic() - looked > _LOOK_S:
-            looked = time.monotonic()
-            room = _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        room = _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
         for number, item in itertools.islice(waiting, max(0, room - len(under_way))):
             under_way[task.remote(orders, item)] = number, item
         if not under_way:
@@ -145,10 +134,11 @@ _crews: dict[str, Crew[Any, Any]] = {}
 
 def _end_on_node(orders: _Orders, item: Any) -> tuple[Any, Failure | None]:
     """Do the work on an item in a worker process, which is kept for further tasks of the run."""
-    if orders.run not in _crews:
+    run, work, limits, preload = orders
+    if run not in _crews:
         _dismiss()
-        _crews[orders.run] = Crew(orders.work, jobs=1, limits=orders.limits, preload=orders.preload)
-    (ended,) = _crews[orders.run].each([item])
+        _crews[run] = Crew(work, jobs=1, limits=limits, preload=preload)
+    (ended,) = _crews[run].each([item])
     return ended.result, ended.failure
 
 

@@ -81,10 +81,6 @@ class Ended(Generic[T, R]):
     failure: Failure | None = None
 
 
-def _silent(_number: int, _text: str, _share: float) -> None:
-    pass
-
-
 def supervise(
     work: Callable[[T, Tell], R],
     items: Iterable[T],
@@ -92,7 +88,7 @@ def supervise(
     jobs: int,
     limits: Limits = Limits(),
     preload: Sequence[str] = (),
-    progress: Progress = _silent,
+    progress: Progress = lambda *_: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> Generator[Ended[T, R], None, None]:
     """Do the work on every item and yield how each ended, in the order of ending.
@@ -116,16 +112,13 @@ def supervise(
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     if jobs == 1 and limits == Limits():
-        return _in_this_process(work, items, progress)
-    if not can_fork():
+        yield from _in_this_process(work, items, progress)
+    elif not can_fork():
         warn("worker processes need Linux: one process does all the work, without limits on memory and time")
-        return _in_this_process(work, items, progress)
-
-    def in_workers() -> Generator[Ended[T, R], None, None]:
+        yield from _in_this_process(work, items, progress)
+    else:
         with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload, warn=warn) as crew:
             yield from crew.each(items, progress)
-
-    return in_workers()
 
 
 def _in_this_process(
@@ -184,7 +177,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
     limits: Limits = Limits()
     preload: Sequence[str] = ()
     warn: Callable[[str], None] = lambda _text: None
-    _progress: Progress = _silent
+    _progress: Progress = lambda *_: None
     _server: ForkServer | None = None
     _deaths: int = 0
     _workers: list[_Worker[T]] = field(default_factory=list)
@@ -201,7 +194,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
         if self._server is not None:
             self._server.end()
 
-    def each(self, items: Iterable[T], progress: Progress = _silent) -> Generator[Ended[T, R], None, None]:
+    def each(self, items: Iterable[T], progress: Progress = lambda *_: None) -> Generator[Ended[T, R], None, None]:
         """Do the work on every item, as :func:`supervise` does."""
         self._progress, self._deaths, self._lost = progress, 0, []
         try:
@@ -220,7 +213,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
     def _run(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[Ended[T, R]]:
         """Try items, ``jobs`` at once, and yield the outcome of each that is not tried again."""
         while True:
-            yield from self._hand_out(attempts, jobs)
+            self._hand_out(attempts, jobs)
             busy = [w for w in self._workers if w.attempt is not None]
             if not busy:
                 return
@@ -234,17 +227,13 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
                     yield ended
             del ended, worker, busy
 
-    def _hand_out(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[Ended[T, R]]:
-        """Hand items to workers; yield those that cannot be sent."""
+    def _hand_out(self, attempts: Iterator[_Attempt[T]], jobs: int) -> None:
+        """Hand items to workers."""
         while sum(w.attempt is not None for w in self._workers) < jobs:
             if (attempt := next(attempts, None)) is None:
                 return
             attempt.tries, attempt.last = attempt.tries + 1, ""
-            try:
-                packed = pickle.dumps((self.work, attempt.item))
-            except Exception as error:  # noqa: BLE001 (any error of a pickler)
-                yield attempt.failed(f"it cannot be sent to a worker: {describe_error(error)}")
-                continue
+            packed = pickle.dumps((self.work, attempt.item))
             worker = next((w for w in self._workers if w.attempt is None), None) or self._start()
             worker.attempt, worker.silent_s = attempt, 0.0
             with contextlib.suppress(OSError):  # the end of a worker is noticed by _hear, its hanging by _watch
@@ -305,10 +294,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
         worker.attempt = None
         if kind == "failed":
             return attempt.failed(said[0])
-        try:
-            return Ended(attempt.number, attempt.item, pickle.loads(said[0]))  # noqa: S301 (from our own process)
-        except Exception as error:  # noqa: BLE001 (any error of a pickle)
-            return attempt.failed(f"its result cannot be read: {describe_error(error)}")
+        return Ended(attempt.number, attempt.item, pickle.loads(said[0]))  # noqa: S301 (from our own process)
 
     def _watch(self, worker: _Worker[T]) -> Ended[T, R] | None:
         """End a worker that has been silent for too long or has grown too big."""
@@ -372,21 +358,14 @@ def _answer(connection: Connection, packed: bytes) -> tuple[str, *tuple[Any, ...
 
     try:
         work, item = pickle.loads(packed)  # noqa: S301 (from our own process)
-        result = work(item, tell)
+        return "done", pickle.dumps(work(item, tell))
     except MemoryError:
         return ("memory",)
     except BaseException as error:  # noqa: BLE001 (a worker survives any error of an item)
         return "failed", f"raised {describe_error(error)}"
-    try:
-        return "done", pickle.dumps(result)
-    except Exception as error:  # noqa: BLE001 (any error of a pickler)
-        return "failed", f"its result cannot be sent: {describe_error(error)}"
 
 
 def describe_error(error: BaseException) -> str:
     """Return an exception as one line."""
-    try:
-        text = " ".join(str(error).split())
-    except Exception:  # noqa: BLE001 (an exception without a text)
-        text = ""
+    text = " ".join(str(error).split())
     return printable(f"{type(error).__name__}: {text}", _LONGEST_TEXT) if text else type(error).__name__

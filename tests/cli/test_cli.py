@@ -6,7 +6,6 @@ import json
 import re
 import socket
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -219,10 +218,6 @@ def test_view_serves_a_catalog_of_the_recordings(tmp_path: Path, monkeypatch: py
     assert done.returncode == 0
     assert opened[0].startswith("rerun+http://127.0.0.1:")
     assert f"catalog at {opened[0]}, dataset recording" in done.stdout
-    monkeypatch.setitem(sys.modules, "rerun.server", None)
-    without = called("view", str(recording), "--catalog")
-    assert without.returncode == 2
-    assert "pip install --upgrade rerun-sdk" in _one_line_error(without)
 
 
 def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from made_runs import START_NS, drive_tracks, write_run
 
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
-from pdhef_logtool.reports.drive import OVER_TIME, drive_page
+from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 from tests.run_report import text_of
@@ -76,6 +76,10 @@ def test_a_log_that_failed_has_a_page_with_its_reason(tmp_path):
     outcome = "failed: a.mcap: expected an IMU, got a damaged log <b>; copy it again"
     page = page_of(write_run(tmp_path, [], outcome=outcome))
     assert "A damaged log &lt;b&gt; (expected: an IMU)." in page and "<p>Copy it again</p>" in page
+    page = page_of(write_run(tmp_path / "2", [], outcome="failed: nothing heard for 2 s, 2 tries"))
+    assert "<p>Nothing heard for 2 s, 2 tries</p>" in page and "--set log_timeout_s=SECONDS." in page
+    page = page_of(write_run(tmp_path / "3", [], outcome="failed: something else"))
+    assert "<p>Something else</p>" in page and "<p>pdhef inspect LOG shows what the log contains.</p>" in page
 
 
 @pytest.mark.parametrize("damage", ["absent", "cut", "empty"])
@@ -167,7 +171,11 @@ def test_steering_and_motion_are_drawn_over_time(tmp_path):
     steer = np.radians(2.0) * np.sin(np.arange(len(tracks[1])) / 100.0)
     tracks[1] = replace(tracks[1], steer_rad=steer)
     page = drive_page(open_run(write_run(tmp_path, tracks)).logs[0])
-    over_time = [key for key in OVER_TIME if f'data-figure="{key}"' in page.html.decode()]
+    over_time = [
+        key
+        for key in page.charts.figures
+        if key not in ("worst", "path", "ay_sideslip") and f'data-figure="{key}"' in page.html.decode()
+    ]
     assert over_time == ["sideslip", "error", "steer", "yaw_rate", "ay", "speed", "strip"]
     (line,) = page.charts.figures["steer"].series
     assert line.label == "measured" and np.nanmax(line.values) == pytest.approx(2.0, abs=1e-3)

@@ -65,7 +65,7 @@ def test_an_envelope_has_the_extremes_of_each_cell_in_the_order_in_which_they_ca
 def test_cells_are_a_tenth_of_a_second_finer_for_short_drives_and_never_emptied_by_the_rate(n, step_ns, cell_s):
     at = stamps(n, step_ns) + np.random.default_rng(0).integers(-step_ns // 5, step_ns // 5, n)
     grid = grid_of(at)
-    assert grid.cell_s == pytest.approx(cell_s, rel=0.02)
+    assert grid.cell_ns * 1e-9 == pytest.approx(cell_s, rel=0.02)
     assert grid.cells <= MOST_CELLS
     assert np.isfinite(envelope(grid, at, np.ones(n))).all()
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.results.fleet import ANSWER, Fleet, cause_and_remedy, read_fleet
+from pdhef_logtool.results.fleet import ANSWER, Fleet, read_fleet
 from pdhef_logtool.results.opened_run import open_run
 from tests.results.made_run import entry, row, write_run
 from tests.run_report import TRUTH, report, truth
@@ -135,15 +135,3 @@ def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: Run) -> None
     assert found.seconds[4, 1] == 10.0 and found.seconds.sum() == 11.0
     assert found.rmse_rad[4, 1] == pytest.approx(0.01) and found.rmse_rad[0, 2] == pytest.approx(0.03)
     assert np.isnan(found.rmse_rad[1, 1])
-
-
-def test_a_failure_is_read_as_cause_and_remedy() -> None:
-    cut = "a.mcap: expected sensors, got a damaged log: it ends at byte 3. /imu has no messages; copy it again"
-    assert cause_and_remedy(cut) == (
-        "A damaged log: it ends at byte 3. /imu has no messages (expected: sensors).",
-        "Copy it again",
-    )
-    assert cause_and_remedy("expected a log, got 3 bytes") == ("3 bytes (expected: a log).", "")
-    cause, remedy = cause_and_remedy("nothing heard for 2 s, 2 tries; last heard: before it hangs")
-    assert cause.startswith("Nothing heard for 2 s") and "log_timeout_s" in remedy
-    assert cause_and_remedy("something else") == ("Something else", "")

@@ -16,7 +16,7 @@ from pdhef_logtool.results.opened_run import JOURNAL_FILE, METRICS_FILE, open_ru
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.storage import object_store
-from pdhef_logtool.storage.object_store import LEFT_OVER_S, HeldError
+from pdhef_logtool.storage.object_store import LEFT_OVER_S
 from pdhef_logtool.storage.outputs import LOCK_FILE
 from pdhef_logtool.workers.supervisor import Tell
 from tests.runs.stub_drives import stub_drive
@@ -124,13 +124,13 @@ def test_one_command_at_a_time_holds_the_place(tmp_path: Path, memory: Any, monk
     logs, lock = named_logs(tmp_path / "logs", "a"), f"/fleet/out/{LOCK_FILE}"
 
     def within(task: DriveTask, tell: Tell) -> DriveEnd:
-        with pytest.raises(HeldError, match=r"one that process \d+ of this or another machine is writing to"):
+        with pytest.raises(OutputError, match=r"one that process \d+ of this or another machine is writing to"):
             run(logs, URL)
         return stub_drive(task, tell)
 
     run(logs, URL, work=within)
     memory.pipe_file(lock, b"00000000-17-1")  # of another machine
-    with pytest.raises(HeldError, match=f"or remove {LOCK_FILE} there if that process has ended"):
+    with pytest.raises(OutputError, match=f"or remove {LOCK_FILE} there if that process has ended"):
         run(logs, URL)
     monkeypatch.setattr(object_store, "LEFT_OVER_S", -1.0)
     run(logs, URL)
@@ -149,7 +149,7 @@ def test_what_has_lost_its_hold_ends(tmp_path: Path, memory: Any, monkeypatch: p
         memory.pipe_file(lock, b"00000000-17-1")
         return stub_drive(task, tell)
 
-    with pytest.raises(HeldError):
+    with pytest.raises(OutputError):
         run(logs, URL, work=taken)
     assert memory.cat_file(lock) == b"00000000-17-1", "it is theirs"
     memory.rm(lock)
@@ -173,7 +173,7 @@ def test_what_cannot_be_an_output_is_told_in_one_line(tmp_path: Path, s3: S3Stor
     with pytest.raises(UsageError, match="which lies in it"):
         run([f"{s3.url}/out/logs/a/annotated.mcap"], f"{s3.url}/out")
     s3.put(f"held/{LOCK_FILE}", b"00000000-17-1")
-    with pytest.raises(HeldError):
+    with pytest.raises(OutputError):
         run(logs, f"{s3.url}/held")
 
 

@@ -42,17 +42,6 @@ class Odd:
         raise TypeError("not me")
 
 
-class Unreadable:
-    """A result or item that can be pickled but not unpickled."""
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return (_burst, ())
-
-
-def _burst() -> None:
-    raise ValueError("burst")
-
-
 def planted(item: Item, tell: Tell) -> object:
     """Run the fault or action that the item selects."""
     what, value = item
@@ -160,7 +149,6 @@ _FAULTS = {
     "raise": _raise,
     "quit": lambda _value, _tell: sys.exit(3),
     "odd": lambda _value, _tell: Odd(),
-    "unreadable": lambda _value, _tell: Unreadable(),
     "alone": _alone,
     "burn": _burn,
     "wait": _wait,

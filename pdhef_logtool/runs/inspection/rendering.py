@@ -37,8 +37,6 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         f"{inspection.kind}, {inspection.duration_s:.1f} s {start}, {messages} messages on {topics} "
         f"topic{'' if topics == 1 else 's'}"
     )
-    if inspection.sample is not None:
-        console.print(Text(str(inspection.sample), "cyan"))
     if inspection.topics:
         console.print(_topics_table(inspection.topics))
     if inspection.signals or inspection.truth:

@@ -205,14 +205,6 @@ class Sample:
     of_chunks: int
     times: Literal["index", "sample"]
 
-    def __str__(self) -> str:
-        """Return the extent in one line for a report."""
-        what, index = ("values", "counts and rates") if self.times == "index" else ("values and rates", "counts")
-        return (
-            f"{what} from {self.chunks} of {self.of_chunks} chunks, {index} from the index; "
-            "--all reads everything and finds damage within chunks"
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
@@ -323,14 +315,11 @@ def inspect_drive_log(
     index: ColumnarLog | None = None,
 ) -> Inspection:
     """Inspect an open log as :func:`inspect_log` does; with its ``index`` a sample of it is read."""
-    ambiguities: tuple[Ambiguity, ...] = ()
-    candidates: tuple[Candidate, ...] = ()
     if given is None:
-        auto = auto_map(log, prefer_truth=prefer_truth)
-        mapping, ambiguities, candidates = auto.mapping, auto.ambiguities, auto.candidates
+        chosen = auto_map(log, prefer_truth=prefer_truth)
     else:
-        mapping = choose_mapping(log, given, prefer_truth=prefer_truth, require_signals=False).mapping
-    mapping = resolve_mapping(log, mapping)
+        chosen = choose_mapping(log, given, prefer_truth=prefer_truth, require_signals=False)
+    mapping = resolve_mapping(log, chosen.mapping)
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
     windows, timed = [(log.start_ns, log.end_ns)], tuple(t.name for t in log.topics)
     if index is not None:
@@ -361,13 +350,13 @@ def inspect_drive_log(
         signals=signals,
         truth=truth,
         missing=missing_signals(mapping),
-        ambiguities=ambiguities,
+        ambiguities=chosen.ambiguities,
         notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
         checks=looked_at.checks,
         proposals=mapping_proposals(looked_at),
         # Last, since a log has all its losses only after it was read through.
         lost=merge_losses([log.lost, losses]),
-        candidates=candidates,
+        candidates=chosen.candidates,
         sample=None if index is None else Sample(*index.chunks_read, "sample" if index.is_remote else "index"),
         refused=looked_at.refused(),
     )
