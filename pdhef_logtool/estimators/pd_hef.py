@@ -14,6 +14,7 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.presets import Options, options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 from pdhef_logtool.estimators.vehicle_ukf import of_car
+from pdhef_logtool.residual_model.interface import PlugInModel
 
 #: The preset that uses the taught part of a car.
 PRESET = "pd-hef"
@@ -38,9 +39,10 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     """Return ``physics`` of a car with its network."""
     gain, note = _gain(name, car)
+    network = car.network.plug_in if isinstance(car.network, PlugInModel) else car.network
     return AdaptivePhysics(
         of_car(car, use_speed=options.use_speed),
-        car.network.residual_model if gain > 0.0 and car.network is not None else None,
+        network if gain > 0.0 else None,
         gain,
         adaptive="fixed-r" not in options_of(name),
         name=name,
