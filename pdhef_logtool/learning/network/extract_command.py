@@ -361,7 +361,7 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
             rows = replace(rows, chosen=condition.is_true(columns))
         progress(job.log_input.stem, 1.0)
         start_s, end_s = ((int(stamp) - drive.log.start_ns) * S_PER_NS for stamp in rows.stamps_ns[[0, -1]])
-        entry = {
+        entry: dict[str, Any] = {
             **identity,
             "log": job.log_input.stem,
             "source": {"file": job.log_input.path.name, "sha256": source},
