@@ -9,7 +9,7 @@ stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -29,11 +29,10 @@ _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s
 
 @dataclass(frozen=True, slots=True)
 class DirectNetwork:
-    """The estimator of this file; ``weights`` is the word for the learned part of the model in its note."""
+    """The estimator of this file."""
 
     algorithm = "direct-network"
     version = 1
-    weights: ClassVar[str] = "network"
 
     vehicle: VehicleParameters
     network: ModelBundle | LinearModel
@@ -44,7 +43,7 @@ class DirectNetwork:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return the model's hash; run.json only contains the residual network's."""
-        return (f"{self.weights} {self.network.sha256}",)
+        return (f"{self.algorithm} {self.network.sha256}",)
 
     def run(self, signals: Signals, state: tuple[FilterState, Any] | None) -> tuple[Steps, tuple[FilterState, Any]]:
         """Process one window (see :class:`~.base.Estimator`); the state is the filter's and the model's."""
@@ -66,7 +65,6 @@ class LinearRegression(DirectNetwork):
     """Sideslip by a linear regression on the network's features, through a low pass: v_y = v_x tan β."""
 
     algorithm = "linear-regression"
-    weights: ClassVar[str] = "coefficients"
 
 
 def build(name: str, car: Car, options: Options) -> DirectNetwork:

@@ -14,6 +14,7 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.presets import Options, options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car
+from pdhef_logtool.residual_model.interface import PlugInModel
 
 #: The preset that uses the taught part of a car.
 PRESET = "pd-hef"
@@ -38,10 +39,12 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     """Return ``physics`` of a car with its network."""
     gain, note = _gain(name, car)
-    physics, network = of_car(car, use_speed=options.use_speed), car.network if gain > 0.0 else None
+    physics = of_car(car, use_speed=options.use_speed)
+    network = car.network.plug_in if isinstance(car.network, PlugInModel) else car.network
+    network = network if gain > 0.0 else None
     return AdaptivePhysics(
         physics,
-        None if network is None else network.residual_model,
+        network,
         gain,
         adaptive="fixed-r" not in options_of(name),
         beside_residual=None if network is None or car.fitted_physics is None else _quieter(physics, car.fitted_physics),

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from traceback import extract_tb
 from typing import Any
@@ -26,7 +25,7 @@ def package_of(code: Any) -> str:
 def contained(name: str, package: str) -> Iterator[None]:
     """Run the code of ``package`` for the estimator ``name``; code of this package (empty) runs without isolation.
 
-    Output is redirected to stderr, and a change of the working folder is undone.
+    Output is redirected to stderr.
 
     Raises
     ------
@@ -36,7 +35,6 @@ def contained(name: str, package: str) -> Iterator[None]:
     if not package:
         yield
         return
-    folder = Path.cwd()
     try:
         with redirect_stdout(sys.stderr):
             yield
@@ -47,6 +45,3 @@ def contained(name: str, package: str) -> Iterator[None]:
         last = next((f for f in reversed(frames) if package in f.filename), frames[-1])
         got = f"{type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno})"
         raise EstimatorError(expected="an estimator that runs", got=got, where=f"{name} (plug-in {package})") from error
-    finally:
-        with suppress(OSError):
-            os.chdir(folder)

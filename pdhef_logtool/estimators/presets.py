@@ -1,4 +1,4 @@
-"""Names of estimators: a preset, with options after a colon, such as ``pd-hef:gain=1,fixed-r``."""
+"""Names of estimators: a preset, with an option after a colon, such as ``pd-hef:gain=1``."""
 
 from __future__ import annotations
 
@@ -50,5 +50,5 @@ def preset_of(name: str) -> str:
 
 def options_of(name: str) -> dict[str, str]:
     """Return the options in a name with their values as text; the value of a switch is empty."""
-    given = name.partition(":")[2]
-    return dict(option.partition("=")[::2] for option in given.split(",")) if given else {}
+    option = name.partition(":")[2]
+    return {key: value for key, _, value in [option.partition("=")] if key}

@@ -11,8 +11,7 @@ smoother). b is the difference to a run with a constant rate, less the share of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 
@@ -25,32 +24,12 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 PROBE_M_S2 = 0.05
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ResidualResponse:
-    """Responses of the filters [H] of a drive.
+def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the response on a drive; ``row`` [N] is the newest step of each stamp.
 
-    ``transition`` : A of the steps [H, K, n, n]. ``drive`` : b [H, K, n]. ``sideslip`` : change of the mixture's
-    sideslip per change of v_y [H, K], rad/(m/s). ``row`` : newest step of each stamp [N].
+    It is a function that returns the changes of the sideslip at the stamps [N, m] by residual rates of v_y at the
+    steps [K, m].
     """
-
-    transition: Sequence[FloatArray]
-    drive: Sequence[FloatArray]
-    sideslip: FloatArray
-    row: IntArray
-
-    def __call__(self, rates: FloatArray) -> FloatArray:
-        """Return the changes of the sideslip at the stamps [N, m] by residual rates of v_y at the steps [K, m]."""
-        out = np.zeros(rates.shape)
-        for transition, drive, sideslip in zip(self.transition, self.drive, self.sideslip, strict=True):
-            state = np.zeros((drive.shape[1], rates.shape[1]))
-            for k in range(1, len(rates)):
-                state = transition[k] @ state + np.outer(drive[k], rates[k - 1])
-                out[k] += sideslip[k] * state[VY]
-        return out[self.row]
-
-
-def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray) -> ResidualResponse:
-    """Return the response on a drive; ``row`` [N] is the newest step of each stamp."""
     checked, _ = physics.inputs(signals, None)
     probe = np.zeros((len(signals), 2))
     probe[:, 0] = PROBE_M_S2
@@ -68,7 +47,17 @@ def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray)
         drives.append(drive)
     weights = weights_of(runs, signals.steps_s, np.zeros(len(runs)))
     sideslip = np.stack([w * _sideslip_per_vy(s) for w, s in zip(weights.T, runs, strict=True)])
-    return ResidualResponse(transitions, drives, sideslip, row)
+
+    def response(rates: FloatArray) -> FloatArray:
+        out = np.zeros(rates.shape)
+        for transition, drive, of_vy in zip(transitions, drives, sideslip, strict=True):
+            state = np.zeros((drive.shape[1], rates.shape[1]))
+            for k in range(1, len(rates)):
+                state = transition[k] @ state + np.outer(drive[k], rates[k - 1])
+                out[k] += of_vy[k] * state[VY]
+        return np.asarray(out[row])
+
+    return response
 
 
 def _transition(links: LinkedSteps) -> FloatArray:

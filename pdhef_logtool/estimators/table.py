@@ -42,8 +42,9 @@ receives read-only signals, and its errors are contained (:mod:`~.plug_ins`). Ex
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
@@ -59,7 +60,6 @@ from pdhef_logtool.estimators.presets import (
     OPEN_LOOP,
     SELF_CALIBRATED,
     calibration_of,
-    options_of,
     preset_of,
 )
 from pdhef_logtool.estimators.presets import Options as Options
@@ -162,14 +162,8 @@ FILTERS = ("pdhef_logtool.estimators.*", "pdhef_logtool.compiled.cache:load_kept
 #: Groups, in place of names: the estimators of this tool and published ones, as far as they can run on the car.
 ALL_ESTIMATORS: Final = "all"
 PEERS: Final = "peers"
-#: Options of each preset, after a colon: None for a switch, the allowed range for an option with a value.
-OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
-    "zero": {"no-lateral": None},
-    "open-loop": {"calibrated": None},
-    "phy-ukf": {"tuned": None},
-    "pd-hef": {"gain": (0.0, 1.0), "fixed-r": None},
-    "linear-kf": {"open-loop": None},
-}
+#: The estimator whose name has a number, and its names.
+GAIN, _GAINS = "pd-hef:gain=1", re.compile(r"pd-hef:gain=(0(\.\d*)?|\.\d+|1(\.0*)?)")
 #: Estimators of this package, in the order of the tables. A preset with an option has an entry if it differs.
 SPECS: tuple[Spec, ...] = (
     Spec("zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors",
@@ -197,7 +191,7 @@ SPECS: tuple[Spec, ...] = (
          "pd_hef:build", _INPUTS, 0x117733, network="residual"),
     Spec("pd-hef-smoothed", "pd-hef smoothed with later samples: not causal, ranked apart",
          "pd_hef:build_smoothed", _SPEED, 0x332288, causal=False, network="optional", one_of=_LATERAL),
-    Spec("pd-hef:gain=1", "pd-hef at a residual gain from 0 to 1 on any car (needs a network)",
+    Spec(GAIN, "pd-hef at a residual gain from 0 to 1 on any car (needs a network)",
          "pd_hef:build", _INPUTS, 0x882255, group="", network="residual"),
     Spec("pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, unchanged (needs its network)",
          "hybrid_paper:build", FEATURES, 0xCC6677, network="paper"),
@@ -261,47 +255,17 @@ def spec_of(name: str) -> Spec:
     """Return the spec of a name; raises UsageError for an unknown name."""
     check_names((name,))
     lines = {s.name: s for s in all_specs()}
-    if name in lines:
-        return lines[name]
-    given = options_of(name)
-    alike = [s for s in lines.values() if preset_of(s.name) == preset_of(name) and given.keys() & options_of(s.name)]
-    return replace(alike[0], name=name, group="")
-
-
-def split_names(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list of names; an option belongs to the name before it."""
-    names: list[str] = []
-    for part in filter(None, map(str.strip, text.split(","))):
-        if names and ":" in names[-1] and part.partition("=")[0] in OPTIONS.get(preset_of(names[-1]), ()):
-            names[-1] += f",{part}"
-        else:
-            names.append(part)
-    return tuple(names)
+    return lines[name] if name in lines else replace(lines[GAIN], name=name)
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise UsageError for an unknown or repeated name, an unknown option or value of a preset, and for no names."""
-    presets = [ALL_ESTIMATORS, PEERS, *dict.fromkeys(preset_of(s.name) for s in all_specs())]
-    wrong = [n for n in names if preset_of(n) not in presets] + sorted({n for n in names if names.count(n) > 1})
+    """Raise UsageError for an unknown or repeated name, and for no names."""
+    existing = [ALL_ESTIMATORS, PEERS, *(s.name for s in all_specs())]
+    wrong = [n for n in names if n not in existing and not _GAINS.fullmatch(n)]
+    wrong += sorted({n for n in names if names.count(n) > 1})
     if wrong or not names:
-        raise UsageError(
-            expected=f"estimators out of {', '.join(presets)}", got=", ".join(wrong) or "none", where="--estimators"
-        )
-    for name in names:
-        allowed, given = OPTIONS.get(preset_of(name), {}), options_of(name)
-        if ":" in name and not (given and all(k in allowed and _fits(v, allowed[k]) for k, v in given.items())):
-            texts = [k if limits is None else f"{k}={limits[0]:g}..{limits[1]:g}" for k, limits in allowed.items()]
-            expected = f"options of {preset_of(name)}: {', '.join(texts) or 'none'}"
-            raise UsageError(expected=expected, got=name, where="--estimators")
-
-
-def _fits(value: str, limits: tuple[float, float] | None) -> bool:
-    if limits is None:
-        return not value
-    try:
-        return limits[0] <= float(value) <= limits[1]
-    except ValueError:
-        return False
+        expected = f"estimators out of {', '.join(existing)} (0 to 1)"
+        raise UsageError(expected=expected, got=", ".join(wrong) or "none", where="--estimators")
 
 
 def all_names(car: Car, group: str = ALL_ESTIMATORS) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.track_errors import signal_error
-from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -30,10 +29,7 @@ def largest_errors(
     for reference in (truth, *others):
         if reference is None or len(reference) != len(estimate):
             continue
-        if reference is truth:
-            error = signal_error(estimate, reference, "sideslip_rad", low_speed_m_s)
-        else:
-            error = wrap_angle(_known(estimate, low_speed_m_s) - _known(reference, low_speed_m_s))
+        error = signal_error(estimate, reference, "sideslip_rad", low_speed_m_s)
         scored = np.flatnonzero(np.isfinite(error))
         if len(scored):
             settled = int(np.searchsorted(estimate.stamps_ns, estimate.stamps_ns[scored[0]] + round(_SETTLED_S * 1e9)))
@@ -51,15 +47,8 @@ def largest_errors(
     return []
 
 
-def _known(track: StateTrack, low_speed_m_s: float) -> FloatArray:
-    """Return the sideslip [N], NaN if it is invalid or the car is too slow for a direction."""
-    return np.where(track.valid, track.without_sideslip_below(low_speed_m_s).sideslip_rad, np.nan)
-
-
 def _largest_places(stamps_ns: IntArray, error: FloatArray) -> list[int]:
     """Return the rows of the largest absolute errors [N], the largest first, without NaN."""
-    if not len(stamps_ns):
-        return []
     size = np.nan_to_num(np.abs(error), nan=0.0)
     apart_ns = int(max(_APART_S * 1e9, _APART_SHARE * float(stamps_ns[-1] - stamps_ns[0])))
     rows: list[int] = []

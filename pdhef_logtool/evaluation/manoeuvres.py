@@ -20,7 +20,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, runs, smooth
+from pdhef_logtool.evaluation.smoothing import runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
 
@@ -112,17 +112,6 @@ class _Swing:
     half_s: float
 
 
-def _speed(signals: Signals) -> FloatArray:
-    """Return the speed [N] from the speed sensor, otherwise from the wheels, otherwise from GNSS."""
-    speed = signals.speed_m_s
-    if not np.isfinite(speed).any():
-        counts = np.isfinite(signals.wheel_speed_m_s).sum(axis=1)
-        speed = np.nansum(signals.wheel_speed_m_s, axis=1) / np.where(counts == 0, np.nan, counts)
-    if not np.isfinite(speed).any():
-        speed = np.hypot(*signals.gnss_velocity_m_s.T)
-    return np.abs(last_known(signals.stamps_ns, speed))
-
-
 def _gain(speed_m_s: FloatArray, wheelbase_m: float) -> FloatArray:
     squared = speed_m_s**2
     return np.asarray(squared / (wheelbase_m * (1.0 + squared / RULES.characteristic_speed_m_s**2)))
@@ -133,7 +122,7 @@ def _zeros(signals: Signals, wheelbase_m: float) -> tuple[float, float]:
 
     Steering: the median after subtraction of the steady-state angle; gyro: the median with straight wheels.
     """
-    speed, rate = _speed(signals), signals.yaw_rate_rad_s
+    speed, rate = np.abs(last_known(signals.stamps_ns, signals.speed_m_s)), signals.yaw_rate_rad_s
     straight = (np.abs(rate * speed) < RULES.straight_m_s2) & (speed > RULES.least_speed_m_s)
     rows = np.flatnonzero(straight[::_ZERO_EVERY]) * _ZERO_EVERY
     steer, rates = signals.steer_rad[rows], rate[rows]
@@ -147,14 +136,15 @@ def _zeros(signals: Signals, wheelbase_m: float) -> tuple[float, float]:
 def _runs_of(signals: Signals, wheelbase_m: float, zeros: tuple[float, float]) -> Iterator[_Run]:
     """Yield the runs without gaps in which speed, yaw rate and steering are known."""
     stamps = signals.stamps_ns
-    speed, yaw_rate = _speed(signals), signals.yaw_rate_rad_s - zeros[1]
+    speed, yaw_rate = np.abs(last_known(stamps, signals.speed_m_s)), signals.yaw_rate_rad_s - zeros[1]
     steer = signals.steer_rad - zeros[0]
     if not np.isfinite(steer).any():  # curvature of the path instead
         with np.errstate(divide="ignore", invalid="ignore"):
             steer = yaw_rate * speed / _gain(speed, wheelbase_m)
     finite = np.isfinite(speed) & np.isfinite(yaw_rate) & np.isfinite(steer) & (speed > RULES.least_speed_m_s)
-    for a, b in runs(stamps, _bridged(stamps, finite)):
-        rows = np.flatnonzero(finite[a:b]) + a
+    usable = np.flatnonzero(finite)
+    for a, b in runs(stamps[usable], finite[usable]):
+        rows = usable[a:b]
         first, last = -(-int(stamps[rows[0]]) // _STEP_NS), int(stamps[rows[-1]]) // _STEP_NS
         grid_ns = np.arange(first, last + 1, dtype=np.int64) * _STEP_NS
         if len(grid_ns) * _STEP_S < 1.0:
@@ -181,16 +171,6 @@ def _on_grid(stamps_ns: IntArray, grid_ns: IntArray, values: FloatArray, cutoff_
         return np.zeros(len(grid_ns))
     times_s, to_s = ((t - stamps_ns[0]) * 1e-9 for t in (stamps_ns[finite], grid_ns))
     return smooth(grid_ns, np.interp(to_s, times_s, values[finite]), cutoff_hz, _STEP_NS)
-
-
-def _bridged(stamps_ns: IntArray, finite: BoolArray) -> BoolArray:
-    """Fill gaps that are too short to end a run."""
-    rows = np.flatnonzero(finite)
-    filled = finite.copy()
-    for i in np.flatnonzero(np.diff(rows) > 1):
-        if stamps_ns[rows[i + 1]] - stamps_ns[rows[i]] <= RUN_GAP_S * 1e9:
-            filled[rows[i] : rows[i + 1]] = True
-    return filled
 
 
 def _manoeuvres_of(run: _Run) -> list[Manoeuvre]:
@@ -243,11 +223,8 @@ def _swings(run: _Run) -> list[_Swing]:
 
 
 def _repeated(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """Yield slalom, continuous sine, sine sweep: swings of alternating sign with regular spacing, long series first."""
-    parts = _regular_parts(swings)
-    long = [p for p in parts if len(p) >= RULES.sweep_repeated]
-    steady = [p for p in long if min(s.peak for s in p[-2:]) >= 0.5 * max(s.peak for s in p)]
-    for part in (*steady, *parts):
+    """Yield slalom, continuous sine, sine sweep: swings of alternating sign with regular spacing."""
+    for part in _regular_parts(swings):
         yield _name_of_repeated(part), part[0].start, part[-1].end
 
 
@@ -274,9 +251,7 @@ def _middle(swing: _Swing) -> float:
 def _name_of_repeated(part: Sequence[_Swing]) -> str:
     spacing_s = np.diff([_middle(s) for s in part]) * _STEP_S
     frequency = 0.5 / spacing_s
-    quarter = max(1, len(frequency) // 4)
-    grown = float(frequency[-quarter:].mean() / frequency[:quarter].mean())
-    if len(part) >= RULES.sweep_repeated and grown >= RULES.sweep_ratio:
+    if len(part) >= RULES.sweep_repeated and frequency[-1] >= RULES.sweep_ratio * frequency[0]:
         return "sine-sweep"
     is_slow = len(part) < RULES.sweep_repeated or frequency.mean() < RULES.slalom_hz
     return "slalom" if is_slow else "continuous-sine"
@@ -285,9 +260,6 @@ def _name_of_repeated(part: Sequence[_Swing]) -> str:
 def _lane_changes(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:
     """Yield double lane changes: out, back, and straight at the end, within the length of a course."""
     for i in range(len(swings)):
-        before = swings[i - 1] if i and (swings[i].start - swings[i - 1].end) * _STEP_S < RULES.swing_gap_s else None
-        if before is not None and before.peak > RULES.equal_peaks * swings[i].peak:
-            continue
         for last in range(i + 3, min(i + 7, len(swings)) + 1):
             side_m = _side_lane_m(run, swings[i:last])
             if RULES.side_m[0] <= side_m <= RULES.side_m[1]:
@@ -303,7 +275,7 @@ def _side_lane_m(run: _Run, swings: Sequence[_Swing]) -> float:
     In a double lane change, the path leaves to one side and returns once. Heading and offset return on average over the
     exit lane, in which the driver may steer.
     """
-    sides = [s.sign for s in swings if s.peak >= 0.25 * max(w.peak for w in swings)]
+    sides = [s.sign for s in swings]
     changes = sum(a != b for a, b in pairwise(sides))
     if changes < 2 or sides[0] != sides[-1] or max(s.peak for s in swings) < RULES.strong_m_s2:
         return 0.0
@@ -317,7 +289,7 @@ def _side_lane_m(run: _Run, swings: Sequence[_Swing]) -> float:
     peak = float(way.max())
     is_one = (
         RULES.offset_m[0] <= peak <= RULES.offset_m[1]
-        and max(left, -left * RULES.overshoot, way[-1]) <= RULES.returned * peak
+        and max(abs(left), way[-1]) <= RULES.returned * peak
         and np.abs(np.diff(way)).sum() <= (1.2 + RULES.sideways * (len(swings) - 3)) * (2.0 * peak - way[-1])
         and abs(heading[after].mean()) <= RULES.heading_left * np.abs(heading).max()
     )
@@ -344,20 +316,10 @@ def _two_swings(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int,
             yield "fishhook", first.start, second.end
         elif not RULES.sine_hz[0] <= 1.0 / period_s <= RULES.sine_hz[1]:
             continue
-        elif RULES.dwell_s[0] <= longer_s <= RULES.dwell_s[1] and _has_dwell(run, first, second):
+        elif RULES.dwell_s[0] <= longer_s <= RULES.dwell_s[1]:
             yield "sine-with-dwell", first.start, second.end
         elif min(first.half_s, second.half_s) >= RULES.sine_equal * max(first.half_s, second.half_s):
             yield "sine-steer", first.start, second.end
-
-
-def _has_dwell(run: _Run, first: _Swing, second: _Swing) -> bool:
-    """Return whether the second swing is held near its peak for longer than the first."""
-
-    def held(swing: _Swing) -> int:
-        side = np.abs(run.steer[swing.start : swing.end])
-        return int((side >= 0.85 * side.max()).sum())
-
-    return held(second) - held(first) >= 10
 
 
 # ---- steps, ramps, circles, slowing in a turn ----
@@ -401,7 +363,7 @@ def _ramps(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]
         t = np.linspace(-1.0, 1.0, n)
         slope = float((t * side).mean() / (t * t).mean())
         misfit = np.sqrt(np.mean((side - side.mean() - slope * t) ** 2))
-        rises = slope > 0.0 and 2.0 * slope >= 0.6 * side[-1] and side[-1] * run.gain[row - 1] >= RULES.ramp_m_s2
+        rises = slope > 0.0 and side[-1] * run.gain[row - 1] >= RULES.ramp_m_s2
         if rises and misfit <= RULES.ramp_misfit * 2.0 * slope + 0.5 * RULES.slack_m_s2 / run.gain[row - 1]:
             yield "ramp-steer", swing.start, row
 
@@ -433,45 +395,29 @@ def _slowing(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, in
     change = (total[rows + lag + ahead] - total[rows + lag]) / ahead - before
     for a, b in _spans(change < -RULES.power_off_m_s2):
         row = a + int(np.argmin(change[a:b]))
-        onset = _onset(run, int(rows[row]), float(before[row]), float(change[row]), pre)
+        first = int(rows[row])
+        fallen = run.ax[first : first + 40] < before[row] + 0.25 * change[row]  # by a quarter of its change
+        onset = max(first + int(np.argmax(fallen)), pre)
         fall, turn = -float(change[row]), float(np.mean(np.abs(run.turn[onset - pre : onset])))
         if turn < RULES.turn_m_s2 or not _steady_before(run, onset, pre, ahead):
             continue
-        end = _slowing_end(run, onset, float(before[row]) - 0.5 * fall)
+        over = run.ax[onset : onset + round(RULES.longest_slowing_s / _STEP_S)] > before[row] - 0.5 * fall
+        over[:25] = False
+        end = onset + (int(np.argmax(over)) if over.any() else len(over))
         if (end - onset) * _STEP_S >= RULES.slowing_s:
             braked = fall >= min(RULES.brake_m_s2, max(RULES.gentle_brake_m_s2, RULES.brake_share * turn))
             yield "brake-in-turn" if braked else "power-off-in-turn", onset - pre, end
 
 
-def _onset(run: _Run, row: int, before: float, change: float, pre: int) -> int:
-    """Return the row near ``row`` at which a_x has fallen by a quarter of its change."""
-    here = run.ax[row : row + 40] < before + 0.25 * change
-    return max(row + (int(np.argmax(here)) if here.any() else 0), pre)
-
-
 def _steady_before(run: _Run, onset: int, pre: int, ahead: int) -> bool:
-    """Return whether speed, curvature and steering were held before, and the steering after."""
+    """Return whether speed and steering were held before, and the steering after."""
     speed = run.speed[onset - pre : onset]
-    curvature = run.curvature[onset - pre : onset]
     level = float(np.mean(run.steer[onset - pre : onset]))
     steer = run.steer[onset - pre : onset + ahead]
     tolerance = _tolerance(level, float(run.gain[onset]))
-    return bool(
-        np.ptp(speed) <= RULES.turn_speed * speed.mean()
-        and np.ptp(curvature) <= 2.0 * RULES.held * abs(curvature.mean())
-        and np.abs(steer - level).max() <= tolerance
-    )
+    return bool(np.ptp(speed) <= RULES.turn_speed * speed.mean() and np.abs(steer - level).max() <= tolerance)
 
 
 def _tolerance(level_rad: float, gain: float) -> float:
     """Return the tolerance of a held steering angle in rad."""
     return float(RULES.held * abs(level_rad) + RULES.slack_m_s2 / gain)
-
-
-def _slowing_end(run: _Run, onset: int, limit_m_s2: float) -> int:
-    """Return the row at which the deceleration or the held steering ends."""
-    last = min(onset + round(RULES.longest_slowing_s / _STEP_S), len(run))
-    level = float(run.steer[onset])
-    over = (run.ax[onset:last] > limit_m_s2) | (np.abs(run.steer[onset:last] - level) > 2.0 * RULES.held * abs(level))
-    over[:25] = False
-    return onset + int(np.argmax(over)) if over.any() else last

@@ -58,8 +58,6 @@ def sensor_faults(track: StateTrack) -> list[dict[str, Any]] | None:
     """Return the sensor faults that an estimator detected; None if the source provides no reasons."""
     if not len(track.reason) == len(track) > 0:
         return None
-    faults = []
-    for name, intervals in reason_intervals(track).items():
-        kind, _, sensor = name.partition("_")
-        faults.append(sensor_fault(_SENSORS[sensor], kind, intervals))
+    named = ((name.partition("_"), intervals) for name, intervals in reason_intervals(track).items())
+    faults = (sensor_fault(_SENSORS[sensor], kind, intervals) for (kind, _, sensor), intervals in named)
     return sorted(faults, key=lambda f: str(f["sensor"]))

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive
 from pdhef_logtool.evaluation.metrics.errors import errors_of
+from pdhef_logtool.evaluation.metrics.metric import registered, rms
 from pdhef_logtool.evaluation.smoothing import median_step_ns
-from pdhef_logtool.evaluation.track_errors import NORMAL_95, scorable, truth_speed
+from pdhef_logtool.evaluation.track_errors import scorable, truth_speed
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import MEANS, POOLED, SQUARES, Requirement
-from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
 #: Errors are correlated over seconds (docs/method.md#evaluation).
@@ -66,12 +66,10 @@ def requirement_blocks(
             continue
         if not _has_blocks(requirement, drive, estimated=truth.name == REFERENCE):
             continue
-        named = [name, *([requirement.baseline] if requirement.baseline != requirement.other_run else [])]
-        tracks = [drive.tracks.get(n) for n in named if n is not None]
-        if all(track is not None and len(track) == len(truth) for track in tracks):
-            blocks = _blocks(requirement, [t for t in tracks if t is not None], truth, drive)
-            if blocks is not None:
-                results.append(blocks)
+        names = [name, *filter(None, {requirement.baseline} - {requirement.other_run})]
+        if {*names} <= drive.tracks.keys():
+            blocks = _blocks(requirement, [drive.tracks[n] for n in names], truth, drive)
+            results += [] if blocks is None else [blocks]
     return results
 
 
@@ -90,62 +88,40 @@ def _has_blocks(requirement: Requirement, drive: EvaluatedDrive, *, estimated: b
 def _blocks(
     requirement: Requirement, tracks: Sequence[StateTrack], truth: StateTrack, drive: EvaluatedDrive
 ) -> RequirementBlocks | None:
-    """Return the summands of one requirement, summed over blocks of time."""
-    estimated = truth.name == REFERENCE
+    """Return the metric of one requirement in blocks of time."""
     if not len(truth):
         return None
+    estimated, metric = truth.name == REFERENCE, registered()[requirement.metric]
     since_ns = truth.stamps_ns - truth.stamps_ns[0]
     block_s = BLOCK_S * max(1, math.ceil(float(since_ns[-1]) * 1e-9 / (BLOCK_S * _MOST_BLOCKS)))
     step_s = median_step_ns(truth.stamps_ns) * 1e-9
-    columns = _summands(requirement, tracks, truth, drive.low_speed_m_s)
-    used = np.isfinite(columns).all(axis=0) & drive.masks[requirement.segment]
-    block = since_ns[used] // round(block_s * 1e9)
-    way = np.nan_to_num(truth_speed(truth)[used]) * step_s
-    std = truth.sideslip_std_rad[used] ** 2 if estimated else np.zeros(len(block))
-    sums = np.stack([np.bincount(block, weights) for weights in (np.ones(len(block)), way, std, *columns[:, used])])
-    numbers = np.flatnonzero(sums[0])
-    kept = sums[:, numbers]
-    if not kept.shape[1]:
+    scored = scorable(truth, requirement.signal, drive.low_speed_m_s)
+    if estimated:
+        scored = np.logical_and.reduce([truth.valid, *(t.vx_m_s > drive.low_speed_m_s for t in (truth, *tracks))])
+    columns = [errors_of(track, truth, requirement.signal, scored) for track in tracks]
+    if not all(columns_of.keys() >= {*metric.over} for columns_of in columns):
         return None
-    counts, metres, variance, *scored = kept
-    power = 0.5 if requirement.metric in SQUARES else 1.0
-    values = [_rounded((s / counts) ** power) for s in scored]
+    used = np.all([np.isfinite(c[metric.over[0]]) for c in columns], axis=0) & drive.masks[requirement.segment]
+    numbers, firsts = np.unique(since_ns[used] // round(block_s * 1e9), return_index=True)
+    if not len(numbers):
+        return None
+    parts, way = np.split(np.flatnonzero(used), firsts[1:]), np.nan_to_num(truth_speed(truth)) * step_s
+    values = [_rounded(metric.formula(*(c[name][p] for name in metric.over)) for p in parts) for c in columns]
     return RequirementBlocks(
         requirement.measured,
         block_s,
         numbers.tolist(),
-        [int(c) for c in counts],
-        _rounded(counts * step_s),
-        _rounded(metres),
+        [len(p) for p in parts],
+        _rounded(len(p) * step_s for p in parts),
+        _rounded(way[p].sum() for p in parts),
         values[0],
         values[1] if len(values) > 1 else (),
-        _rounded(np.sqrt(variance / counts)) if estimated else (),
+        _rounded(rms(truth.sideslip_std_rad[p]) for p in parts) if estimated else (),
     )
 
 
-def _rounded(values: FloatArray) -> list[float]:
+def _rounded(values: Iterable[float | None]) -> list[float]:
     return [float(f"{v:.9g}") for v in values]
-
-
-def _summands(
-    requirement: Requirement, tracks: Sequence[StateTrack], truth: StateTrack, low_speed_m_s: float
-) -> FloatArray:
-    """Return the values [tracks, M] that the metric averages; NaN at stamps that are not scored."""
-    used, rows = scorable(truth, requirement.signal, low_speed_m_s), []
-    for track in tracks:
-        if truth.name == REFERENCE:
-            used = truth.valid & (truth.vx_m_s > low_speed_m_s) & (track.vx_m_s > low_speed_m_s)
-        columns = errors_of(track, truth, requirement.signal, used)
-        error, std = columns["error"], columns.get("std", np.full(len(track), np.nan))
-        values = {
-            "rmse": error**2,
-            "mae": np.abs(error),
-            "bias": error,
-            "availability": columns["available"],
-            "coverage95": np.where(np.isfinite(std), np.abs(error) <= NORMAL_95 * std, np.nan),
-        }
-        rows.append(values[requirement.metric])
-    return np.stack(rows)
 
 
 def from_document(documents: Sequence[Mapping[str, object]]) -> list[RequirementBlocks]:

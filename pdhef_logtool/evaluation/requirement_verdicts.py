@@ -169,13 +169,15 @@ def _ratios(drives: Sequence[DriveValue]) -> FloatArray:
 
 def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> statistics.Bounded:
     """Return the statistic of a requirement over drives, with bounds from drives or from blocks within them."""
+    if not drives:
+        return statistics.Bounded(math.nan, math.nan, math.nan, 0)
     count, factors = len(drives), {name: [d.factors.get(name) for d in drives] for name in statistics.FACTORS}
     if requirement.statistic != POOLED:
         return _of_drives(requirement, _ratios(drives), factors)
     if count >= statistics.LEAST_DRIVES and requirement.other_run is not None:
         return _change(drives, requirement.confidence, factors)
     total = _pooled(requirement, drives, factors)
-    if count >= statistics.LEAST_DRIVES or not count:
+    if count >= statistics.LEAST_DRIVES:
         return total
     return _from_blocks(requirement, total, [d.blocks for d in drives])
 
@@ -184,8 +186,6 @@ def _of_drives(requirement: Requirement, values: FloatArray, factors: statistics
     """Return a quantile of the drives, or the worst drive, which has no confidence interval."""
     if requirement.quantile is not None:
         return statistics.quantile(values, requirement.quantile, requirement.confidence, factors)
-    if not len(values):
-        return statistics.Bounded(math.nan, math.nan, math.nan, 0)
     worst = np.min if requirement.metric in AT_LEAST else np.max
     largest = float(worst(np.abs(values)))
     return statistics.Bounded(largest, largest, largest, len(values))

@@ -71,7 +71,8 @@ def segment_masks(
     slow = vehicle.low_speed_blend_m_s
     lateral = taken(signals, truth, "ay_m_s2")
     friction = taken(signals, truth, "friction")
-    linear, nonlinear = _grip_masks(friction, stamps, lateral, step_ns, vehicle)
+    grip = np.abs(smooth(stamps, lateral, GRIP_SMOOTHING_HZ, step_ns))
+    grip /= np.where(np.isfinite(friction), friction, vehicle.assumed_friction) * GRAVITY_M_S2
     ay = smooth(stamps, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns)
     driven = manoeuvre_masks(stamps, manoeuvres)
     slalom = driven["slalom"]
@@ -86,8 +87,8 @@ def segment_masks(
     ax = smooth(stamps, signals.ax_m_s2, MANOEUVRE_SMOOTHING_HZ, step_ns)
     return {
         "all": np.ones(len(signals), dtype=np.bool_),
-        "linear": linear,
-        "nonlinear": nonlinear,
+        "linear": grip < LINEAR_SHARE,
+        "nonlinear": grip > NONLINEAR_SHARE,
         "standstill": standing,
         "straight": straight,
         "cornering-left": left,
@@ -96,15 +97,6 @@ def segment_masks(
         "accelerating": _lasting(stamps, (ax > ACCELERATING_M_S2) & moving, PEDAL_S),
         **driven,
     }
-
-
-def _grip_masks(
-    friction: FloatArray, stamps: IntArray, ay: FloatArray, step_ns: float, vehicle: VehicleParameters
-) -> tuple[BoolArray, BoolArray]:
-    """Return the masks of low and high grip utilization, [N]."""
-    grip = np.abs(smooth(stamps, ay, GRIP_SMOOTHING_HZ, step_ns))
-    grip /= np.where(np.isfinite(friction), friction, vehicle.assumed_friction) * GRAVITY_M_S2
-    return grip < LINEAR_SHARE, grip > NONLINEAR_SHARE
 
 
 def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehicleParameters) -> BoolArray:

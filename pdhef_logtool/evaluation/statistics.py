@@ -151,9 +151,7 @@ def dependence(scores: FloatArray, factors: Factors, weights: FloatArray | None 
         if stated and part.max() > 0 and not any(np.array_equal(part, other) for other in parts.values()):
             parts[name] = part
     levels = tuple((name, len({v for v in factors[name] if v is not None})) for name in parts)
-    if not np.any(x):
-        return Dependence(levels=levels)
-    alone = {name: _correlation(x, [part]) for name, part in parts.items()}
+    alone = {name: _correlation(x, [part]) for name, part in parts.items()} if np.any(x) else {}
     excesses = {name: r * _shared(weights, [parts[name]]) for name, r in alone.items() if r > 0.0}
     if not excesses:
         return Dependence(levels=levels)
@@ -172,7 +170,7 @@ def _pairs(values: FloatArray, parts: Sequence[IntArray]) -> float:
     products = 0.0
     for size in range(1, len(parts) + 1):  # inclusion and exclusion: a pair with several common factors counts once
         for some in combinations(parts, size):
-            sums = _sums(values, some)
+            sums = np.bincount(np.unique(np.stack(some), axis=1, return_inverse=True)[1].ravel(), values)
             products -= (-1.0) ** size * (float(sums @ sums) - square)
     return products
 
@@ -193,14 +191,6 @@ def _correlation(x: FloatArray, parts: Sequence[IntArray]) -> float:
 def _shared(weights: FloatArray, parts: Sequence[IntArray]) -> float:
     """Return the share of pairs with a common factor in the variance of a weighted sum, per unit of correlation."""
     return _pairs(weights, parts) / float(weights @ weights)
-
-
-def _sums(values: FloatArray, parts: Sequence[IntArray]) -> FloatArray:
-    """Return the sum of values of each combination of the partitions' groups."""
-    joint = parts[0]
-    for part in parts[1:]:
-        joint = np.unique(joint * (int(part.max()) + 1) + part, return_inverse=True)[1]
-    return np.asarray(np.bincount(joint, values), dtype=np.float64)
 
 
 def _freedom(part: IntArray, means: int) -> float:

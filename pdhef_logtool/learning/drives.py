@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, logs_of, lost_texts
 from pdhef_logtool.logs.discovery import LogInput, Logs
-from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, UsageError
 from pdhef_logtool.records.printable import listed
-from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
-
-_Read = TypeVar("_Read")
 
 #: Splits of a simulated set for results.
 HELD_OUT = ("test", "extrapolation")
@@ -49,57 +43,29 @@ class LearnSettings:
     split: str | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DriveSet:
-    """Drives of one car, as a command names them.
+def chosen_logs(arguments: Logs, settings: LearnSettings) -> dict[LogInput, str]:
+    """Return the logs with their splits in a simulated set, empty without one.
 
-    Attributes
-    ----------
-    car : car to read them with. logs : of the drives.
-    splits : split of each log in its simulated set, by log name; empty without one.
+    Raises
+    ------
+    UsageError
+        There is no log of the requested split, or results need one of them.
     """
-
-    car: Car
-    settings: LearnSettings
-    logs: tuple[LogInput, ...]
-    mapping: SignalMapping | None
-    splits: Mapping[str, str]
-    reporter: Reporter
-
-    @classmethod
-    def of(cls, arguments: Logs, car: Car, settings: LearnSettings, reporter: Reporter) -> DriveSet:
-        """Return the drives of arguments; raises UsageError without a drive, or for drives that results need."""
-        config, wanted, manifests = settings.config, settings.split, cache(set_manifest)
-        logs = logs_of(arguments, config.read_options)
-        splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in logs}
-        if wanted not in (None, ANY_SPLIT):
-            logs = [i for i in logs if splits[i.stem] == wanted]
-            if not logs:
-                there = ", ".join(sorted({s for s in splits.values() if s}))
-                got = f"drives of {there}" if there else "drives without a set's manifest beside them"
-                raise UsageError(expected=f"drives of split {wanted}", got=got, where="--split")
-        refused = [f"{i.stem} ({splits[i.stem]})" for i in logs if splits[i.stem] in HELD_OUT]
-        if refused and wanted != ANY_SPLIT:
-            expected = "drives that no result is reported on"
-            remedy = "drives that a car learns from are no longer test drives: use --split validation, or --split any"
-            raise UsageError(expected=expected, got=listed(refused, _NAMED), where="learn", remedy=remedy)
-        return cls(car, settings, tuple(logs), mapping_of(config.mapping), splits, reporter)
-
-    def read(
-        self, read: Callable[[LogInput], tuple[DriveRecord, _Read | None]], share: float = 1.0
-    ) -> tuple[tuple[DriveRecord, ...], list[_Read]]:
-        """Read the logs in order; return a record of each, and the contents of usable logs.
-
-        ``share`` : share of the reading in the progress.
-        """
-        records, drives = [], list[_Read]()
-        for number, log in enumerate(self.logs):
-            self.reporter.progress(f"reading {log.stem}", share * number / len(self.logs))
-            record, drive = read(log)
-            records.append(replace(record, split=self.splits[log.stem] or None))
-            if drive is not None:
-                drives.append(drive)
-        return tuple(records), drives
+    wanted, manifests = settings.split, cache(set_manifest)
+    logs = logs_of(arguments, settings.config.read_options)
+    splits = {i: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in logs}
+    if wanted not in (None, ANY_SPLIT):
+        there = ", ".join(sorted({s for s in splits.values() if s}))
+        splits = {i: split for i, split in splits.items() if split == wanted}
+        if not splits:
+            got = f"drives of {there}" if there else "drives without a set's manifest beside them"
+            raise UsageError(expected=f"drives of split {wanted}", got=got, where="--split")
+    refused = [f"{i.stem} ({split})" for i, split in splits.items() if split in HELD_OUT]
+    if refused and wanted != ANY_SPLIT:
+        expected = "drives that no result is reported on"
+        remedy = "drives that a car learns from are no longer test drives: use --split validation, or --split any"
+        raise UsageError(expected=expected, got=listed(refused, _NAMED), where="learn", remedy=remedy)
+    return splits
 
 
 def set_manifest(folder: Path | None) -> Mapping[str, Mapping[str, Any]]:
@@ -140,11 +106,6 @@ class DriveRecord:
         start_s, end_s = self.span_s or (0.0, 0.0)
         return LearntOn(name=self.name, sha256=self.sha256, start_s=round(start_s, 2), end_s=round(end_s, 2))
 
-    @property
-    def lost(self) -> tuple[str, ...]:
-        """Losses of the input as text."""
-        return lost_texts(self.losses)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the record as JSON-able values."""
         span_s = None if self.span_s is None else [round(s, 3) for s in self.span_s]
@@ -171,7 +132,7 @@ def record_of(drive: Drive, *, whole: WholeDrive | None = None, left_out: str = 
 
 def tell_drive(record: DriveRecord, warn: Tell) -> None:
     """Warn of the notes and losses of a drive, and of the reason for its exclusion."""
-    for text in (*record.notes, *record.lost):
+    for text in (*record.notes, *lost_texts(record.losses)):
         warn(f"{record.name}: {text}")
     if record.left_out:
         warn(f"{record.name} is left out: {record.left_out}")
@@ -181,7 +142,7 @@ def exit_code(records: Sequence[DriveRecord]) -> int:
     """Return 0 if all drives were used completely, 3 if not, 1 if none was used."""
     if all(r.left_out for r in records):
         return EXIT_FAILURE
-    return EXIT_PARTIAL if any(r.left_out or r.lost for r in records) else EXIT_OK
+    return EXIT_PARTIAL if any(r.left_out or lost_texts(r.losses) for r in records) else EXIT_OK
 
 
 def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, Any]]]:

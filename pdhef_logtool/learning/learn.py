@@ -7,7 +7,7 @@ give a residual, which is chosen on held-out driving (:mod:`~.learn`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,11 @@ from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import FEATURES, make_estimator
-from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.learning.drives import (
     DriveRecord,
-    DriveSet,
     LearnSettings,
+    chosen_logs,
     drives_document,
     exit_code,
     record_of,
@@ -40,6 +40,7 @@ from pdhef_logtool.learning.drives import (
 )
 from pdhef_logtool.learning.truth import teaching_reference, weight_of, with_truth
 from pdhef_logtool.logs.discovery import LogInput, Logs
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.model.drive_model import DriveModel, for_later_drives, lacking, model_of, read_driving
 from pdhef_logtool.model.driving import STEP_S, Driving
 from pdhef_logtool.model.fit import fit_car
@@ -109,10 +110,10 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
     if config.car is None:
         reporter.warn(f"no --car: mass, geometry and priors come from the default {source.datasheet.name}")
     check_output(source, output)
-    drives = DriveSet.of(arguments, Car.of(source.datasheet), settings, reporter)
-    read = [*(i.local for i in drives.logs), *(path for path in config.files if path != config.car)]
+    splits = chosen_logs(arguments, settings)
+    read = [*(i.local for i in splits), *(path for path in config.files if path != config.car)]
     check_no_input(read, [], [output])
-    records, model, figures = _learnt(drives)
+    records, model, figures = _learnt(splits, Car.of(source.datasheet), config, reporter.progress)
     for record in records:
         tell_drive(record, reporter.warn)
     learnt_on = tuple(r.learnt_on for r in records if not r.left_out)
@@ -122,20 +123,23 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
     return LearnResult(output, records, model.evidence, figures)
 
 
-def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
+def _learnt(
+    splits: Mapping[LogInput, str], car: Car, config: RunConfig, progress: Callable[[str, float], None]
+) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
     """Return the records of drives, their model, and figures."""
-    config, car, progress = drives.settings.config, drives.car, drives.reporter.progress
-
-    def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive]:
-        with read_drive(log, car, drives.mapping, config.read_options) as drive:
-            return open_drive(drive, config)
-
-    records, opened = drives.read(read, 0.3)
+    mapping, opened, records = mapping_of(config.mapping), list[OpenedDrive](), tuple[DriveRecord, ...]()
+    for log, split in splits.items():
+        progress(f"reading {log.stem}", 0.3 * len(records) / len(splits))
+        with read_drive(log, car, mapping, config.read_options) as drive:
+            record, content = open_drive(drive, config)
+        opened.append(content)
+        records += (replace(record, split=split or None),)
     teachers = [d for d in opened if d.whole is not None]
     if not teachers and config.reference != "on":
         return _without_truth(records, opened, car)
     _check("" if teachers else "none", "at least one drive with a true sideslip and the signals of a calibration")
-    seconds, slow = math.fsum(d.seconds for d in teachers), car.vehicle.low_speed_blend_m_s
+    slopes = [d.driving.slopes for d in teachers if d.driving is not None and d.driving.slopes is not None]
+    seconds, slow = STEP_S * sum(np.isfinite(s).sum() for s in slopes), car.vehicle.low_speed_blend_m_s
     few = "" if seconds >= LEAST_S else f"{seconds:.1f} s"
     _check(few, f"at least {LEAST_S:g} s of driving with ground truth above {slow:g} m/s")
     taught = learn_from(teachers, progress)
@@ -190,12 +194,6 @@ class OpenedDrive:
         """The true sideslip."""
         assert self.whole is not None and self.whole.truth is not None
         return self.whole.truth
-
-    @property
-    def seconds(self) -> float:
-        """Duration of driving with a true sideslip."""
-        assert self.driving is not None and self.driving.slopes is not None
-        return float(np.count_nonzero(np.isfinite(self.driving.slopes))) * STEP_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)

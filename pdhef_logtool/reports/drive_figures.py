@@ -11,8 +11,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
-from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.evaluation.statistics import gathered
+from pdhef_logtool.evaluation.track_errors import NORMAL_95, signal_error
 from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, FloatArray, IntArray

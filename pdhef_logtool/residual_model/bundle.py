@@ -17,7 +17,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES
-from pdhef_logtool.residual_model.interface import LIMITS, Residual, ResidualModel
+from pdhef_logtool.residual_model.interface import LIMITS, Residual
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 from pdhef_logtool.storage.documents import one_of, read_json, validated
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
@@ -145,11 +145,6 @@ class ModelBundle(NetworkDesign):
         scaled = (features[:, self.columns] - np.array(n.feature_mean)) / np.array(n.feature_std)
         limited: FloatArray = np.clip(scaled, -8.0, 8.0)
         return limited
-
-    @property
-    def residual_model(self) -> ResidualModel:
-        """The network as a residual model."""
-        return self
 
     @cached_property
     def _network(self) -> ForwardPass:

@@ -36,8 +36,6 @@ FEATURES = (
     "rear_force_per_mass",
 )
 PAPER_FEATURES = FEATURES[:6]
-#: Features of networks for the residual of the nominal model.
-NOMINAL_FEATURES = FEATURES[:10]
 #: Features that change their sign when left and right are exchanged.
 ODD_FEATURES = frozenset(FEATURES) - {"vx_m_s", "friction", "ax_m_s2", "utilisation"}
 

@@ -110,11 +110,6 @@ class PlugInModel:
         """Digest of the model."""
         return self.plug_in.sha256
 
-    @property
-    def residual_model(self) -> ResidualModel:
-        """The model itself, whose package it belongs to."""
-        return self.plug_in
-
 
 @cache
 def plug_in_names() -> tuple[str, ...]:
@@ -135,11 +130,10 @@ def load_plug_in(name: str) -> PlugInModel:
     expected = "a residual model with sha256 and residual(features, dt_s, state)"
     try:
         loaded = entry.load()
-        sha256, has_method = loaded.sha256, callable(loaded.residual)
+        if not (isinstance(loaded.sha256, str) and callable(loaded.residual)):
+            raise TypeError(type(loaded).__name__)
     except (Exception, SystemExit) as error:
         raise ModelError(expected=expected, got=f"{type(error).__name__}: {error}", where=where) from error
-    if not has_method or not isinstance(sha256, str):
-        raise ModelError(expected=expected, got=type(loaded).__name__, where=where)
     return PlugInModel(name, loaded)
 
 

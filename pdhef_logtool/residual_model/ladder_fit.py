@@ -17,14 +17,7 @@ import numpy as np
 from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
-from pdhef_logtool.residual_model.ladder import (
-    LINEAR,
-    NONE,
-    RANDOM,
-    REGION_RIDGE,
-    LadderModel,
-    plain,
-)
+from pdhef_logtool.residual_model.ladder import LINEAR, NONE, RANDOM, REGION_RIDGE, LadderModel, plain
 from pdhef_logtool.residual_model.ladder_kernels import Basis, expand
 
 #: Ridge parameters, in seconds of driving with features of variance 1. Blocks of the same drive favour values down to

@@ -17,7 +17,7 @@ from pdhef_logtool.car.names import SHIPPED_CARS
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import AUTO, OFF, ReadOptions, parse_time
-from pdhef_logtool.estimators.table import check_names, split_names
+from pdhef_logtool.estimators.table import check_names
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
@@ -45,7 +45,9 @@ def _as_text(value: object) -> object:
 Time = Annotated[str, Field(max_length=64), BeforeValidator(_as_text)]
 #: As a list or with commas.
 Names = Annotated[
-    tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: split_names(v) if isinstance(v, str) else v)
+    tuple[str, ...],
+    Field(strict=False),
+    BeforeValidator(lambda v: tuple(filter(None, map(str.strip, v.split(",")))) if isinstance(v, str) else v),
 ]
 #: A file or folder, as a path or a text.
 File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]

@@ -19,8 +19,8 @@ from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, one_log, read_drive
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
 from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
-from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS
 from pdhef_logtool.evaluation.operating_space import operating_space
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput

@@ -50,7 +50,8 @@ def reference_of(drive: Drive, model: DriveModel, config: RunConfig) -> DriveRef
     if missing:
         return DriveReference(None, _document([], f"the log has no {', '.join(missing)}"))
     speed = drive.mapping.signals.get("speed_m_s")
-    prior = replace(prior_of(model), speed_over_ground=speed is not None and speed.combine == "norm")
+    is_length = drive.plan.alignment.speed_from == "GNSS" or (speed is not None and speed.combine == "norm")
+    prior = replace(prior_of(model), speed_over_ground=is_length)
     spans = list(_spans(drive, prior, use_gnss=config.gnss != "off"))
     used = [span for span in spans if not span.refused]
     refused = "" if used else next((span.refused for span in spans), "the log has no samples")

@@ -10,23 +10,24 @@ mean in degrees: every drive counts by its relative error. The floor limits the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.drive.reading import WholeDrive, read_drive
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
-from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.drives import DriveRecord, DriveSet, record_of
+from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.config import RunConfig
 
 #: Seed of the random draws on validation drives.
 SEED = 0
@@ -58,13 +59,16 @@ class Trial:
     objective_deg: float
 
 
-def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
-    """Return the noise of the tuned filter: the best of ``trials``."""
-    options, slow = task.settings.config.read_options, task.car.vehicle.low_speed_blend_m_s
-    _, drives = task.read(partial(load_drive, task))
+def tune(logs: Iterable[LogInput], config: RunConfig, trials: int) -> dict[str, FilterNoise]:
+    """Return the noise of the tuned filter on drives: the best of ``trials``."""
+    options, mapping, identified = config.read_options, mapping_of(config.mapping), Car.load(config.car)
+    slow, drives = identified.vehicle.low_speed_blend_m_s, []
+    for log in logs:
+        with read_drive(log, identified, mapping, options) as drive:
+            drives.append(drive.whole())
 
     def objective(values: Point) -> float:
-        car = task.car.with_noise(TUNED, filter_noise(values))
+        car = identified.with_noise(TUNED, filter_noise(values))
         estimator = spec_of(TUNED).make(car, Options(options.use_speed))
         given = ((DriveSignals.of(d.signals, car).of_estimator(TUNED), d.truth) for d in drives)
         return objective_deg(
@@ -93,13 +97,6 @@ def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
     """Return a mask [N]: sideslip of the ground truth available, speed above the low-speed limit."""
     finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
     return finite
-
-
-def load_drive(task: DriveSet, log: LogInput) -> tuple[DriveRecord, WholeDrive]:
-    """Read a drive into memory, with its record."""
-    with read_drive(log, task.car, task.mapping, task.settings.config.read_options) as drive:
-        whole = drive.whole()
-        return record_of(drive, whole=whole), whole
 
 
 def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> float:

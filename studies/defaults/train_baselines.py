@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.learning.network.dataset import Dataset
-from pdhef_logtool.learning.network.train_command import Recipe, dataset_for, gap_free_runs, train_on, weights_of
+from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
+from pdhef_logtool.learning.network.train_command import Recipe, gap_free_runs, train_on, weights_of
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import (
     LATERAL_VELOCITY,
@@ -25,11 +25,13 @@ from pdhef_logtool.residual_model.bundle import (
     NOMINAL_MODEL,
     PURE_LSTM_FOLDER,
 )
-from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
+from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
 from studies.pages import options
 
+#: Features of the baselines.
+NOMINAL_FEATURES = FEATURES[:10]
 LOW_PASS_HZ = 2.0
 EPOCHS = 40
 #: Relative variation below which a feature is constant, and thus redundant beside the intercept.
@@ -56,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--epochs", type=int, default=EPOCHS)
     given = parser.parse_args(arguments)
-    data = dataset_for(given.dataset, NOMINAL_MODEL)
+    data = read_dataset(given.dataset, NOMINAL_MODEL)
     file: Path = given.output / LINEAR_REGRESSION_FILE
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(fit_dataset(data, NOMINAL_FEATURES).to_json(), encoding="utf-8")

@@ -24,12 +24,12 @@ from typing import Any
 
 import torch
 
-from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, SHIPPED_CARS, VEHICLE_FILE, Car, read_fit
+from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, SHIPPED_CARS, VEHICLE_FILE, read_fit
 from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
-from pdhef_logtool.learning.drives import DriveSet, LearnSettings
-from pdhef_logtool.learning.network.train_command import PAPER_RECIPE, Recipe, dataset_for, train_on
+from pdhef_logtool.learning.drives import LearnSettings, chosen_logs
+from pdhef_logtool.learning.network.dataset import read_dataset
+from pdhef_logtool.learning.network.train_command import PAPER_RECIPE, Recipe, train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
-from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL
 from pdhef_logtool.runs.config import RunConfig
 from studies.defaults import fit_physics, paper_drives
@@ -78,11 +78,10 @@ class Training:
         """Options that name the car and the mapping."""
         return "--car", self.car, "--mapping", self.work / "mapping.toml"
 
-    def validation_task(self) -> DriveSet:
-        """Return the validation drives with car and network."""
-        config = RunConfig(car=self.car, mapping=self.work / "mapping.toml")
-        settings = LearnSettings(config=config, split="validation")
-        return DriveSet.of([str(self.work / "one_car")], Car.load(config.car), settings, Reporter(warn=print))
+    @property
+    def config(self) -> RunConfig:
+        """The car and the mapping."""
+        return RunConfig(car=self.car, mapping=self.work / "mapping.toml")
 
 
 def simulate(t: Training) -> None:
@@ -106,7 +105,8 @@ def fit(t: Training) -> None:
 
 def noise(t: Training) -> None:
     """Tune the noise of all tuned filters alike, on validation drives."""
-    fitted = read_fit(t.car / FIT_FILE).model_copy(update={"filter": tune(t.validation_task(), t.trials)})
+    logs = chosen_logs([str(t.work / "one_car")], LearnSettings(config=t.config, split="validation"))
+    fitted = read_fit(t.car / FIT_FILE).model_copy(update={"filter": tune(logs, t.config, t.trials)})
     (t.car / FIT_FILE).write_text(part_toml(fitted, fit_physics.HEAD), encoding="utf-8")
 
 
@@ -127,7 +127,7 @@ def train(t: Training) -> None:
     torch.set_num_threads(1)  # small networks: a second process is faster than a second thread
     recipe = Recipe(seed=t.seed, epochs=t.epochs)
 
-    train_on(dataset_for(t.work / PHYSICS_MODEL, PHYSICS_MODEL), t.network, recipe, progress=_print_epoch)
+    train_on(read_dataset(t.work / PHYSICS_MODEL, PHYSICS_MODEL), t.network, recipe, progress=_print_epoch)
     _finish(beside)
 
 
@@ -136,7 +136,7 @@ def paper(t: Training) -> None:
     torch.set_num_threads(1)
     recipe = replace(PAPER_RECIPE, seed=t.seed, **PAPER_WINDOWS)
     train_on(
-        dataset_for(t.work / PAPER_RESIDUALS, NOMINAL_MODEL), t.network / PAPER_FOLDER, recipe, progress=_print_epoch
+        read_dataset(t.work / PAPER_RESIDUALS, NOMINAL_MODEL), t.network / PAPER_FOLDER, recipe, progress=_print_epoch
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.runs.config import RunConfig
 
 SAMPLES = Path(__file__).parents[2] / "sample_logs"

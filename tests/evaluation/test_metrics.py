@@ -98,14 +98,6 @@ def test_a_row_names_log_estimator_and_unit_and_what_is_unknown_has_none():
     assert ("yaw_rate_rad_s", "all", "rmse") not in rows  # no yaw rate of the ground truth
 
 
-def test_wrong_shapes_are_refused():
-    truth = track(vx_m_s=[10] * 4)
-    with pytest.raises(ValueError, match="same stamps"):
-        score(track(stamps_ns=stamps_of(4) + 1, vx_m_s=[1] * 4), truth)
-    with pytest.raises(ValueError, match="mask m"):
-        score(track(vx_m_s=[1] * 4), truth, {"m": np.ones(3, bool)})
-
-
 def test_sideslip_errors_wrap():
     truth = track(vx_m_s=[-10] * 4, vy_m_s=[0.1] * 4)
     estimate = track(vx_m_s=[-10] * 4, vy_m_s=[-0.1] * 4)

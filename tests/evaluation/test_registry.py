@@ -39,7 +39,9 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(metrics, "__path__", [*metrics.__path__, str(folder)])
         patch.setattr(registry, "MODULES", (*registry.MODULES, NAME))
+        registered.cache_clear()
         yield NAME
+    registered.cache_clear()
     sys.modules.pop(f"{metrics.__name__}.{NAME}", None)
 
 
@@ -114,5 +116,6 @@ def test_units_of_all_figures_are_those_that_the_metrics_name(result: RunResult)
 
 def test_a_name_is_registered_once(toy: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, toy))
+    registered.cache_clear()
     with pytest.raises(ValueError, match="registered twice"):
         registered()

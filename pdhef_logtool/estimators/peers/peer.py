@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -55,7 +55,6 @@ class Peer:
     """A published estimator. Subclasses fill ``samples.states``."""
 
     version = 1
-    options: ClassVar[tuple[str, ...]] = ()
     memory_size = 0
 
     vehicle: VehicleParameters

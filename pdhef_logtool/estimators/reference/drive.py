@@ -66,14 +66,13 @@ class ReferencePrior:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceParameter:
-    """An estimated parameter, with its prior and the deviation that rejects the drive."""
+    """An estimated parameter, with its prior mean and the deviation that rejects the drive."""
 
     name: str
     unit: str
     value: float
     std: float
     prior: float
-    prior_std: float
     limit: float
 
 
@@ -244,7 +243,7 @@ def _smooth(
 def _parameters(smoothed: _Smoothed, prior: ReferencePrior, *, tilts: bool) -> tuple[ReferenceParameter, ...]:
     value, std = smoothed.states[-1], np.sqrt(np.maximum(smoothed.last_variance, 0.0))
     return tuple(
-        ReferenceParameter(name, unit, float(value[i]), float(std[i]), mean, sigma, FAR_STD_OF.get(i, FAR_STD) * sigma)
+        ReferenceParameter(name, unit, float(value[i]), float(std[i]), mean, FAR_STD_OF.get(i, FAR_STD) * sigma)
         for i, mean, sigma, name, unit in _entries(prior, tilts=tilts)
         if name and i < len(value)
     )

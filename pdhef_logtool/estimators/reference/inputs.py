@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pdhef_logtool.estimators import kinematic_filter as s
+from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 
 #: Knots per second.
@@ -77,7 +78,7 @@ def knots(
 ) -> tuple[IntArray, FloatArray]:
     """Return the stamps of the knots [K] and the filter's inputs [K, INPUTS] there; a_y without its known bias.
 
-    ``speed_over_ground``: the speed is the length of a velocity; this is assumed if it equals the GNSS speed.
+    ``speed_over_ground``: the speed is the length of a velocity.
     """
     t = (signals.stamps_ns - signals.stamps_ns[0]) * S_PER_NS
     h = 1.0 / RATE_HZ
@@ -103,7 +104,7 @@ def knots(
     rows[:, s.GAP] = gap
     rows[:, s.SPEED] = _speed(t, signals.speed_m_s, knot_s)
     rows[:, s.SPEED_STD] = 0.15 + 0.01 * np.abs(np.nan_to_num(rows[:, s.SPEED])) + 0.05 * np.abs(rows[:, s.AX])
-    rows[:, s.LENGTH] = speed_over_ground or is_length(signals)
+    rows[:, s.LENGTH] = speed_over_ground
     rows[:, s.UNSIGNED] = not (signals.speed_m_s < -STANDSTILL_M_S).any()
     if rows[0, s.LENGTH]:  # of the antenna
         rows[:, s.SPEED_STD] = np.hypot(rows[:, s.SPEED_STD], LENGTH_FACTOR * ANTENNA_Y_STD_M * rows[:, s.YAW_RATE])
@@ -130,13 +131,6 @@ def standstill(rows: FloatArray) -> BoolArray:
     return still & ~(np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH]) > STILL_GNSS_M_S)
 
 
-def is_length(signals: Signals) -> bool:
-    """Return whether the speed is the length of the GNSS velocity instead of an independent measurement."""
-    length = np.hypot(*signals.gnss_velocity_m_s.T)
-    both = np.isfinite(length) & np.isfinite(signals.speed_m_s)
-    return bool(both.any()) and bool(np.abs(length - signals.speed_m_s)[both].max() < 1e-6)
-
-
 def _add_tilt(rows: FloatArray, signals: Signals, t: FloatArray, knot_s: FloatArray) -> None:
     """Add roll and pitch rate to the rows, with signs for a body that leans outwards in turns and dives in braking."""
     h = 1.0 / RATE_HZ
@@ -144,27 +138,19 @@ def _add_tilt(rows: FloatArray, signals: Signals, t: FloatArray, knot_s: FloatAr
     rows[:, s.ROLL_RATE] = ROLL_PER_AY_RAD_S2_M * rows[:, s.AY_RATE]
     if not all(np.isfinite(v).sum() > 0.9 * len(t) for v in (signals.roll_rate_rad_s, signals.pitch_rate_rad_s)):
         return
-    means = []
-    for values in (signals.roll_rate_rad_s, signals.pitch_rate_rad_s):
-        integral, _ = _integral(t, values)
-        means.append((integral(knot_s) - integral(knot_s - h)) / h)
-        at_knots = (integral(knot_s + 0.5 * h) - integral(knot_s - 0.5 * h)) / h
-        means.append(at_knots)
-    roll, roll_at, pitch, pitch_at = means
+    angles = [_integral(t, values)[0] for values in (signals.roll_rate_rad_s, signals.pitch_rate_rad_s)]
+    roll, pitch = ((angle(knot_s) - angle(knot_s - h)) / h for angle in angles)
+    roll_at, pitch_at = ((angle(knot_s + 0.5 * h) - angle(knot_s - 0.5 * h)) / h for angle in angles)
     turned = rows[:, s.YAW_RATE] * rows[:, s.SLOW_AY]  # a body that rolls in a turn has a pitch rate
     dives = ROLL_PER_AY_RAD_S2_M * turned - PITCH_PER_AX_RAD_S2_M * np.gradient(rows[:, s.SLOW_AX], h)
-    signs = [correlation(roll_at, rows[:, s.AY_RATE]), correlation(slow(pitch_at), slow(dives))]
+    half = round(SLOW_S * RATE_HZ)
+    of_pitch = correlation(running_mean(pitch_at, half), running_mean(dives, half))
+    signs = [correlation(roll_at, rows[:, s.AY_RATE]), of_pitch]
     if max(np.abs(signs)) < LEAST_SIGN_CORRELATION:
         return
     roll_sign, pitch_sign = (-1.0 if c < -LEAST_SIGN_CORRELATION else 1.0 for c in signs)
     rows[:, s.TILT], rows[:, s.ROLL_RATE] = 1.0, roll_sign * roll_at
     rows[:, s.MEAN_ROLL_RATE], rows[:, s.MEAN_PITCH_RATE] = roll_sign * roll, pitch_sign * pitch
-
-
-def slow(values: FloatArray) -> FloatArray:
-    """Return the moving mean [K] over twice ``SLOW_S``."""
-    n = round(SLOW_S * RATE_HZ)
-    return np.convolve(np.pad(values, n, mode="edge"), np.full(2 * n + 1, 1.0 / (2 * n + 1)), "valid")
 
 
 def correlation(rate: FloatArray, change: FloatArray) -> float:

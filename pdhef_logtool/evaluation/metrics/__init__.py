@@ -22,11 +22,6 @@ To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`
     )
 """
 
-from pdhef_logtool.evaluation.metrics.metric import ALL as ALL
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive as EvaluatedDrive
 from pdhef_logtool.evaluation.metrics.metric import MetricRow as MetricRow
 from pdhef_logtool.evaluation.metrics.metric import evaluate_drive as evaluate_drive
-from pdhef_logtool.evaluation.metrics.metric import score_track as score_track
-from pdhef_logtool.evaluation.track_errors import NORMAL_95 as NORMAL_95
-from pdhef_logtool.evaluation.track_errors import signal_error as signal_error
-from pdhef_logtool.evaluation.units import SCORED_SIGNALS as SCORED_SIGNALS

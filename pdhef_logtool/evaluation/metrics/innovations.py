@@ -64,9 +64,8 @@ def _pairs(drive: EvaluatedDrive) -> Iterator[Columns]:
 def _autocorrelation(before: FloatArray, after: FloatArray) -> float | None:
     if len(before) < LEAST_PAIRS:
         return None
-    x, y = before - before.mean(), after - after.mean()
-    power = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))
-    return float(np.sum(x * y)) / power if power > 0 else float("nan")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return float(np.corrcoef(before, after)[0, 1])
 
 
 METRICS = (

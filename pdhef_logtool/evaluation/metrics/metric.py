@@ -79,18 +79,6 @@ class EvaluatedDrive:
     calibrated: CalibratedSignals | None = None
     dependent: Collection[str] = ()
 
-    def __post_init__(self) -> None:
-        """Add segment ``all``; raises ValueError unless tracks and masks are at the same stamps."""
-        records = [r for r in (self.truth, self.signals, *self.tracks.values()) if r is not None]
-        stamps_ns = records[0].stamps_ns
-        if not all(np.array_equal(record.stamps_ns, stamps_ns) for record in records):
-            raise ValueError(f"estimates {', '.join(self.tracks)} and ground truth must be at the same stamps")
-        for name, mask in self.masks.items():
-            if mask.shape != stamps_ns.shape:
-                raise ValueError(f"mask {name}: expected shape {stamps_ns.shape}, got {mask.shape}")
-        if ALL not in self.masks:
-            object.__setattr__(self, "masks", {ALL: np.ones(stamps_ns.shape, np.bool_), **self.masks})
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Columns:
@@ -186,26 +174,13 @@ def mean(values: NDArray[Any], *_: FloatArray) -> float:
     return float(np.mean(values))
 
 
-def figures(drive: EvaluatedDrive, metrics: Iterable[Metric]) -> list[MetricRow]:
-    """Return the rows of metrics by estimator, in the order of the tracks, then by metric, signal and segment."""
-    everywhere = [(ALL, slice(None))]
-    stamps = _places(drive.masks)
-    steps = _places({name: mask[1:] & mask[:-1] for name, mask in drive.masks.items()})
-    rows: dict[str, list[MetricRow]] = {name: [] for name in drive.tracks}
-    for columns_of, family in gathered((m.columns, m) for m in metrics).items():
-        for columns in columns_of(drive):
-            places = everywhere if columns.whole else steps if columns.of_steps else stamps
-            for segment, place in places:
-                rows.setdefault(columns.estimator, []).extend(_rows(drive, columns, family, segment, place))
-    return [row for of_estimator in rows.values() for row in of_estimator]
-
-
 _Place: TypeAlias = "IntArray | slice"
 
 
 def _places(masks: Mapping[str, BoolArray]) -> list[tuple[str, _Place]]:
-    """Return the indices of each segment that is not empty."""
-    return [(name, slice(None) if mask.all() else np.flatnonzero(mask)) for name, mask in masks.items() if mask.any()]
+    """Return the indices of ``all`` and of each segment that is not empty."""
+    parts = ((name, mask) for name, mask in masks.items() if name != ALL and mask.any())
+    return [(ALL, slice(None)), *((name, slice(None) if mask.all() else np.flatnonzero(mask)) for name, mask in parts)]
 
 
 def _rows(
@@ -245,15 +220,11 @@ MODULES = (
 )
 
 
+@cache
 def registered() -> Mapping[str, Metric]:
     """Return the metrics by name; their files are imported at the first call."""
-    return _metrics_of(MODULES)
-
-
-@cache
-def _metrics_of(modules: Sequence[str]) -> Mapping[str, Metric]:
     metrics: dict[str, Metric] = {}
-    for module in modules:
+    for module in MODULES:
         for metric in import_module(f"{__package__}.{module}").METRICS:
             if metric.name in metrics:
                 raise ValueError(f"METRICS: {metric.name!r} of {module}.py is registered twice")
@@ -262,20 +233,17 @@ def _metrics_of(modules: Sequence[str]) -> Mapping[str, Metric]:
 
 
 def evaluate_drive(drive: EvaluatedDrive, names: Collection[str] | None = None) -> list[MetricRow]:
-    """Return the values of all metrics, or of the metrics with these names."""
-    return figures(drive, [m for m in registered().values() if names is None or m.name in names])
+    """Return the values of all metrics, or of the metrics with these names.
 
-
-def score_track(
-    estimate: StateTrack, truth: StateTrack, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float
-) -> list[MetricRow]:
-    """Return the metrics of one estimate against ground truth at the same stamps [N].
-
-    ``masks``: bool [N] by segment; ``all`` is added when it is absent. ``low_speed_m_s``: sideslip is scored above
-    this ground-truth speed.
-
-    Raises
-    ------
-    ValueError : The tracks or masks are not at the same stamps.
+    By estimator, in the order of the tracks, then by metric, signal and segment.
     """
-    return evaluate_drive(EvaluatedDrive(log, {estimate.name: estimate}, truth, None, masks, low_speed_m_s))
+    metrics = [m for m in registered().values() if names is None or m.name in names]
+    stamps = _places(drive.masks)
+    steps = _places({name: mask[1:] & mask[:-1] for name, mask in drive.masks.items()})
+    rows: dict[str, list[MetricRow]] = {name: [] for name in drive.tracks}
+    for columns_of, family in gathered((m.columns, m) for m in metrics).items():
+        for columns in columns_of(drive):
+            places = stamps[:1] if columns.whole else steps if columns.of_steps else stamps
+            for segment, place in places:
+                rows.setdefault(columns.estimator, []).extend(_rows(drive, columns, family, segment, place))
+    return [row for of_estimator in rows.values() for row in of_estimator]

@@ -84,12 +84,6 @@ def read_entry(path: Path) -> dict[str, Any] | None:
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             entry = json.loads(file.metadata.metadata[_ENTRY])
-            groups = [file.metadata.row_group(g) for g in range(file.num_row_groups)]
-            types = [[g.column(i).physical_type for i in range(g.num_columns)] for g in groups]
-            of_file = [file.schema.column(i).physical_type for i in range(file.metadata.num_columns)]
-            names = arrow_schema(_SCHEMA).names  # no checksum covers these
-            if file.schema_arrow.names != names or any(t != of_file for t in types):
-                return None
             for _ in file.iter_batches():
                 pass
     except (OSError, KeyError, TypeError, ValueError, RecursionError, pa.ArrowException):
@@ -248,13 +242,13 @@ class Dataset:
         return validated(VehicleParameters, parameters, where, OutputError, expected=expected)
 
 
-def read_dataset(folder: Path) -> Dataset:
-    """Open a dataset by its manifest.
+def read_dataset(folder: Path, model: str = "") -> Dataset:
+    """Open a dataset by its manifest, with the residuals of a model, or of any.
 
     Raises
     ------
     OutputError
-        The folder contains no dataset, or one of another format or with other features.
+        The folder contains no dataset, or one of another format or model, or with other features.
     """
     path = folder / MANIFEST
     document = read_sealed(path, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
@@ -265,6 +259,13 @@ def read_dataset(folder: Path) -> Dataset:
             got=f"{kind} {version} with {', '.join(names or ['none'])}",
             where=path,
             remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
+        )
+    if model not in ("", document["model"]):
+        raise OutputError(
+            expected=f"residuals of {model}",
+            got=f"residuals of {document['model']}",
+            where=folder,
+            remedy=f"pdhef extract LOG... -o DATASET --filter {model} writes them, into another folder",
         )
     drives = tuple(DatasetDrive(folder / d["file"], d) for d in document["drives"])
     return Dataset(folder, document["model"], document["sha256"], drives, document)

@@ -23,6 +23,7 @@ from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, friction_of, logs_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.estimators.parallel_physics import filter_of
+from pdhef_logtool.estimators.reference.inputs import white_noise
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.evaluation.statistics import gathered
@@ -50,6 +51,8 @@ from pdhef_logtool.workers.supervisor import supervise
 
 #: Upper bounds of train and validation in [0, 1); the rest is test.
 SPLIT_ENDS = (0.70, 0.85)
+#: Entries of the noise of the ground truth's derivatives.
+_NOISES = ("vy_dot_m_s2", "yaw_acceleration_rad_s2")
 
 Progress = Callable[[str, float], None]
 
@@ -92,15 +95,11 @@ class ExtractSettings:
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """Result of one log: its entry in the manifest, None if excluded. ``kept``: written by an earlier command.
-
-    ``copy_of``: name of a drive in the dataset with equal signals, empty without one.
-    """
+    """Result of one log: its entry in the manifest, None if excluded. ``kept``: written by an earlier command."""
 
     record: DriveRecord
     entry: dict[str, Any] | None
     kept: bool = False
-    copy_of: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,7 +177,7 @@ def extract(
         The only log cannot be used.
     """
     output = local_path(output)
-    _check(jobs, settings)
+    _check(settings)
     inputs = logs_of(arguments, settings.config.read_options)
     work = _plan_jobs(inputs, output, settings, resume, reporter.warn)
     before = _earlier(output, settings)
@@ -190,7 +189,7 @@ def extract(
     for job in work:
         sha, vehicle = job.physics
         vehicles[sha] = {"name": vehicle.name, "sha256": sha, "parameters": vehicle.model_dump(mode="json")}
-    write = partial(_write, output, settings, kept, vehicles)
+    write = partial(_write, output, settings, kept, vehicles, reporter.warn)
     folders = {
         dataset.split_folder(s) for s in (*dataset.SPLITS, settings.split, *(job.listed_split for job in work)) if s
     }
@@ -201,7 +200,7 @@ def extract(
         else:
             with writing(output):
                 (output / dataset.MANIFEST).unlink(missing_ok=True)
-        results = _without_copies(_extract_all(work, jobs, reporter), reporter.warn)
+        results = _extract_all(work, jobs, reporter)
         manifest = write(results)
         with writing(output):
             dataset.remove_unnamed(output, manifest)
@@ -216,35 +215,30 @@ def _write(
     settings: ExtractSettings,
     kept: Sequence[dict[str, Any]],
     vehicles: Mapping[str, Any],
+    warn: Tell,
     results: Sequence[DriveResult],
 ) -> dict[str, Any]:
-    """Write the manifest of the results and of the ``kept`` entries of earlier calls; return it."""
-    entries = [r.entry for r in results if r.entry is not None]
-    signals = {e["signals_sha256"] for e in entries} - {None}
-    entries += [d for d in kept if d["signals_sha256"] not in signals]
+    """Write the manifest of the results and of the ``kept`` entries of earlier calls; return it.
+
+    Of drives with equal signals, it contains the first new one by name: they could be both in training and in test.
+    """
+    made = sorted(((r.entry, r.record) for r in results if r.entry is not None), key=lambda m: str(m[0]["name"]))
+    first: dict[str, dict[str, Any]] = {}
+    for entry in (*(entry for entry, _ in made), *kept):
+        first.setdefault(entry["signals_sha256"], entry)
+    copies = []
+    for entry, record in made:
+        other = first[entry["signals_sha256"]]["name"]
+        if other != entry["name"]:
+            warn(f"{record.name} is left out: it contains the same signals as {other}")
+            copies.append({"log": record.name, "file": record.file, "of": other})
+    entries = [*first.values()]
     _check_apart(entries)
     left_out = [r.record for r in results if r.record.left_out]
     failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
-    copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
     return dataset.write_manifest(
         output, entries, failed, settings=settings.to_dict(), vehicles=vehicles, duplicates=copies
     )
-
-
-def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
-    """Exclude drives with equal signals, except the first by name: they could be both in training and in test."""
-    first: dict[str, str] = {}
-    for entry in sorted((r.entry for r in results if r.entry is not None), key=lambda e: str(e["name"])):
-        first.setdefault(str(entry["signals_sha256"]), entry["name"])
-    kept = []
-    for result in results:
-        entry = result.entry or {"name": "", "signals_sha256": None}
-        other = entry["name"] if entry["signals_sha256"] is None else first[entry["signals_sha256"]]
-        if other != entry["name"]:
-            warn(f"{result.record.name} is left out: it contains the same signals as {other}")
-            result = replace(result, entry=None, copy_of=other)
-        kept.append(result)
-    return tuple(kept)
 
 
 def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
@@ -271,19 +265,15 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
     """
     if not (output / dataset.MANIFEST).exists():
         return {}
-    expected, remedy = f"a new folder, or a residual dataset for {settings.model}", "choose another folder with -o"
     try:
-        data = dataset.read_dataset(output)
+        return dataset.read_dataset(output, settings.model).manifest
     except OutputError as error:
+        expected = f"a new folder, or a residual dataset for {settings.model}"
+        remedy = "choose another folder with -o"
         raise UsageError(expected=expected, got=error.got, where=output, remedy=remedy) from None
-    if data.model != settings.model:
-        raise UsageError(expected=expected, got=f"one for {data.model}", where=output, remedy=remedy)
-    return data.manifest
 
 
-def _check(jobs: int, settings: ExtractSettings) -> None:
-    if jobs < 1:
-        raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
+def _check(settings: ExtractSettings) -> None:
     for option, value, allowed in (("--split", settings.split, dataset.SPLITS), ("--filter", settings.model, MODELS)):
         if value is not None and value not in allowed:
             raise UsageError(expected=f"one of {', '.join(allowed)}", got=repr(value), where=option)
@@ -352,7 +342,10 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
     if job.resume and (kept := _kept(job, target, source, split, fingerprint)) is not None:
         return kept
     with read_drive(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
-        drive.plan = plan = _strict_truth(drive.plan)
+        plan = drive.plan
+        if plan.truth is not None:  # a bridged gap is accurate enough for scoring, but not for derivatives
+            gaps = {n: gap * residuals.GAP_PERIODS / TRUTH_GAP_PERIODS for n, gap in plan.truth.max_gap_s.items()}
+            drive.plan = plan = replace(plan, truth=replace(plan.truth, max_gap_s=gaps))
         reference, _ = teaching_reference(drive, settings.config)
         _check_plan(plan, job, estimated=reference is not None)
         truth = _truth_facts(plan, estimated=reference is not None)
@@ -367,7 +360,8 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
             condition = parse_condition(settings.where, dataset.COLUMNS, of_tracks=False)
             rows = replace(rows, chosen=condition.is_true(columns))
         progress(job.log_input.stem, 1.0)
-        entry = {
+        start_s, end_s = ((int(stamp) - drive.log.start_ns) * S_PER_NS for stamp in rows.stamps_ns[[0, -1]])
+        entry: dict[str, Any] = {
             **identity,
             "log": job.log_input.stem,
             "source": {"file": job.log_input.path.name, "sha256": source},
@@ -377,7 +371,11 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
             "mapping_sha256": drive.mapping.sha256,
             "calibration": calibration,
             "period_s": plan.alignment.grid_period_s,
-            **_counts(rows, drive.log.start_ns),
+            "start_s": start_s,
+            "end_s": end_s,
+            "duration_s": float(rows.stamps_ns[-1] - rows.stamps_ns[0]) * S_PER_NS,
+            "rows": len(rows),
+            "usable_rows": int(np.count_nonzero(rows.weight > 0.0)),
             "truth": truth,
             "friction_from": drive.friction.label,
             "losses": [asdict(x) for x in drive.losses],
@@ -450,14 +448,6 @@ def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> tuple[s
     return split if isinstance(split, str) and split else None, car if exists else None
 
 
-def _strict_truth(plan: DrivePlan) -> DrivePlan:
-    """Disable the interpolation of ground truth gaps: it is accurate enough for scoring, but not for derivatives."""
-    if plan.truth is None:
-        return plan
-    gaps = {name: gap * residuals.GAP_PERIODS / TRUTH_GAP_PERIODS for name, gap in plan.truth.max_gap_s.items()}
-    return replace(plan, truth=replace(plan.truth, max_gap_s=gaps))
-
-
 def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool = False) -> None:
     needed = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
     if not estimated and (plan.truth is None or not needed <= plan.derivation.keys()):
@@ -477,40 +467,16 @@ def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
     truth = derive_truth(plan.survey_truth, plan=plan.truth).track
-    noise = [residuals.difference_noise(truth.stamps_ns, column) for column in (truth.vy_m_s, truth.yaw_rate_rad_s)]
-    said = f"one-step noise of the ground truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
-    limits = f"{residuals.NEGLIGIBLE_NOISE[0]:g} m/s² and {residuals.NEGLIGIBLE_NOISE[1]:g} rad/s²"
+    per_white = math.sqrt(2.0) / (plan.truth.period_s if plan.truth else math.nan) ** 1.5  # of one-step differences
+    noise = [per_white * white_noise(truth.stamps_ns, c, 0.0) for c in (truth.vy_m_s, truth.yaw_rate_rad_s)]
     within = all(n <= limit for n, limit in zip(noise, residuals.NEGLIGIBLE_NOISE, strict=True))  # False for NaN
     return {
         "kind": ESTIMATED if estimated else "perfect" if perfect else "recorded",
         "quantities": dict(plan.derivation),
         "latency_s": plan.truth_latency_s,
         "smoothing_half_s": 0.0 if within else residuals.SMOOTHING_HALF_S,
-        "smoothing_reason": f"{said}: {'' if within else 'not '}within {limits}",
-        "difference_noise": _pair(noise),
+        "difference_noise": {n: x if math.isfinite(x) else None for n, x in zip(_NOISES, noise, strict=True)},
         "not_independent": dict(plan.dependent),
-    }
-
-
-def _pair(values: Sequence[float]) -> dict[str, float | None]:
-    names = ("vy_dot_m_s2", "yaw_acceleration_rad_s2")
-    return {n: float(v) if math.isfinite(v) else None for n, v in zip(names, values, strict=True)}
-
-
-def _counts(rows: residuals.ResidualRows, log_start_ns: int) -> dict[str, Any]:
-    """Return the span of a drive's rows in seconds from the log's start, and counts of rows."""
-    use = rows.weight > 0.0
-    first, last = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
-    squares = np.square(rows.targets[use] / rows.step_s[use, None])
-    mean = np.cumsum(squares, axis=0)[-1] / len(squares) if len(squares) else np.full(2, math.nan)
-    return {
-        "start_s": (first - log_start_ns) * S_PER_NS,
-        "end_s": (last - log_start_ns) * S_PER_NS,
-        "duration_s": (last - first) * S_PER_NS,
-        "rows": len(rows),
-        "usable_rows": len(squares),
-        "segments": len(np.unique(rows.segment[use])),
-        "residual_rms": _pair(np.sqrt(mean).tolist()),
     }
 
 

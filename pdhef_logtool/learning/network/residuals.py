@@ -9,13 +9,13 @@ inputs of the measurement times that the filter uses. Ground truth lacks axle fo
 along the true motion. Bank, biases and force scale are 0: with the estimates of one filter, the residual would be
 specific to this filter. The row of v_x is 0 by definition and not stored.
 
-For the paper's network and the baselines the model is the nominal one, by the trapezoidal rule between two true states.
+For the paper's network and the baselines the model is the nominal one.
 
 Recorded ground truth is noisy, and one-step differences are mostly noise. In this case the *residual* is smoothed, not
 the ground truth: increments are added up to a curve, a cubic is fitted by least squares to ± half a window about each
-step over the true stamps (Savitzky-Golay), and its increment over the step is the target. All steps are linear in the
-increments, so that fast motion explained by the nominal model is not attenuated; only the residual is, by 1 % at 1 Hz
-and ± 0.2 s. There is no target where the window contains a gap.
+stamp (Savitzky-Golay), and the mean of its slopes at both ends of a step gives the target. All steps are linear in the
+increments, so that fast motion explained by the model is not attenuated; only the residual is. There is no target where
+the window contains a gap.
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.drive.truth import cubic_equations
+from pdhef_logtool.drive.truth import differentiate
 from pdhef_logtool.estimators import vehicle_model as ukf_model
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.vehicle_ukf import U_AX, U_FRICTION, U_STEER, HeldInputs, VehicleUkf
@@ -51,11 +50,6 @@ NEGLIGIBLE_NOISE = (0.05, 0.05)
 
 #: Of double precision, or single as in files.
 _Numbers: TypeAlias = NDArray[Any]
-_CHUNK = 16384
-#: Variance of third differences of white noise, as a multiple of its variance.
-_THIRD_DIFFERENCE_GAIN = 20.0
-#: The 80 % point of |N(0, 1)|: robust against manoeuvres, and valid for signals with repeated values.
-_NOISE_QUANTILE, _NOISE_POINT = 0.8, 1.2815515655446004
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,48 +86,10 @@ class ResidualRows:
 
 
 @njit(cache=True)
-def _nominal_rates(state, steer, friction, p, out):  # type: ignore[no-untyped-def]
-    for k in range(state.shape[0]):
-        # v̇_y and ṙ do not depend on a_x.
-        _, vy_dot, r_dot = state_derivative(state[k, 0], state[k, 1], state[k, 2], steer[k], 0.0, friction[k], p)
-        out[k, 0] = vy_dot
-        out[k, 1] = r_dot
-
-
-def residual_increments(
-    stamps_ns: IntArray, state: FloatArray, inputs: FloatArray, parameters: ModelParameters, *, max_step_s: float
-) -> FloatArray:
-    """Return the motion of the ground truth minus the nominal model's between stamps, [N − 1, 2].
-
-    Parameters
-    ----------
-    stamps_ns : int64 [N]. state : true [v_x, v_y, r], [N, 3]; NaN where it must not be used.
-    inputs : of the steps of the parallel filter, [N, 5]. max_step_s : longer steps are gaps.
-
-    Returns
-    -------
-    Increments of v_y in m/s and r in rad/s; NaN across gaps, for missing values, for |β| > 45°, and below the low-speed
-    limit, where the nominal model is not dynamic.
-    """
-    steer_rad, friction = inputs[:, U_STEER], inputs[:, U_FRICTION]
-    good = _dynamic(state, parameters) & np.isfinite(steer_rad) & np.isfinite(friction)
-    rates = np.empty((len(stamps_ns), 2))
-    usable = (np.where(good[:, None], state, 1.0), np.where(good, steer_rad, 0.0), np.where(good, friction, 1.0))
-    _nominal_rates(*usable, parameters, rates)
-    step_s = np.diff(stamps_ns) * S_PER_NS
-    increments: FloatArray = np.diff(state[:, 1:3], axis=0) - 0.5 * step_s[:, None] * (rates[:-1] + rates[1:])
-    increments[~(good[:-1] & good[1:] & (step_s <= max_step_s))] = np.nan
-    return increments
-
-
-#: Number of entries carried along the ground truth between steps: a run flag, forces, roll and roll rate.
-_RUN = 5
-
-
-@njit(cache=True)
-def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  # type: ignore[no-untyped-def]
+def _run_model(stamps_ns, states, inputs, good, max_step_s, model, out):  # type: ignore[no-untyped-def]
     """Write the model's change of v_y and r [N − 1, 2] from each true state; NaN where that state is unknown."""
     layout, places, p, f = model
+    run = np.zeros(5)  # carried along the ground truth: a flag, forces, roll and roll rate
     block = np.zeros((ukf_model.PLACES, ukf_model.WIDTH))
     for k in range(states.shape[0] - 1):
         out[k, 0] = math.nan
@@ -149,9 +105,9 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
             True,
             0.5 * (inputs[k, U_FRICTION] + inputs[k + 1, U_FRICTION]),
         )
-        if run[0] == 0.0:
+        if layout.forces >= 0 and run[0] == 0.0:
             ukf_model.settle_forces(x, over.steer, over.ax, over.friction, layout, p, f)
-        else:
+        elif layout.forces >= 0:
             x[ukf_model.FRONT], x[ukf_model.REAR] = run[1], run[2]
             if layout.roll >= 0:
                 x[layout.roll], x[layout.roll + 1] = run[3], run[4]
@@ -165,84 +121,46 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
             run[3], run[4] = block[ukf_model.ROLL, 0], block[ukf_model.ROLL_RATE, 0]
 
 
-def physics_increments(
-    stamps_ns: IntArray, state: FloatArray, x: FloatArray, inputs: FloatArray, physics: VehicleUkf, *, max_step_s: float
+def residual_increments(
+    stamps_ns: IntArray, state: FloatArray, inputs: FloatArray, physics: VehicleUkf, *, max_step_s: float
 ) -> FloatArray:
-    """Return the motion of the ground truth minus the motion of the ``physics`` model between stamps, [N − 1, 2].
+    """Return the motion of the ground truth minus the motion of the filter's model between stamps, [N − 1, 2].
 
     Parameters
     ----------
     stamps_ns : int64 [N]. state : true [v_x, v_y, r], [N, 3]; NaN where it must not be used.
-    x, inputs : of the steps of the parallel filter, [N, n] and [N, 5]. max_step_s : longer steps are gaps.
+    inputs : of the steps of the parallel filter, [N, 6]. max_step_s : longer steps are gaps.
 
     Returns
     -------
-    Increments of v_y in m/s and r in rad/s; NaN as in :func:`residual_increments`.
+    Increments of v_y in m/s and r in rad/s; NaN across gaps, for missing values, for |β| > 45°, and below the low-speed
+    limit, where the model is not dynamic.
     """
     model = physics.parameters
-    good = _dynamic(state, model.p) & _complete(x) & _complete(inputs)
-    states = np.zeros_like(x)
+    forward = np.abs(np.arctan2(state[:, 1], state[:, 0])) <= MAX_SIDESLIP_RAD
+    dynamic = forward & (state[:, 0] >= model.p.blend_high_m_s)
+    good = dynamic & _complete(state) & _complete(inputs)
+    states = np.zeros((len(state), model.layout.size))
     states[:, :3] = np.where(good[:, None], state, 1.0)
-    states[:, ukf_model.AX_BIAS] = np.where(good, x[:, ukf_model.AX_BIAS], 0.0)
     moved = np.empty((max(len(stamps_ns) - 1, 0), 2))
-    _run_model(stamps_ns, states, inputs, good, max_step_s, model, np.zeros(_RUN), moved)
+    _run_model(stamps_ns, states, inputs, good, max_step_s, model, moved)
     increments: FloatArray = np.diff(state[:, 1:3], axis=0) - moved
     return increments
 
 
-def _dynamic(state: FloatArray, parameters: ModelParameters) -> BoolArray:
-    """Return a mask: true state [N, 3] finite, model in its dynamic range, and the car moves forward."""
-    forward = np.abs(np.arctan2(state[:, 1], state[:, 0])) <= MAX_SIDESLIP_RAD
-    return np.asarray(_complete(state) & forward & (state[:, 0] >= parameters.blend_high_m_s), dtype=np.bool_)
-
-
 def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: int) -> FloatArray:
-    """Smooth increments [N − 1, c] between stamps [N] by local cubics; the same array for a half window of 0.
+    """Smooth increments [N − 1, c] between stamps [N]; the same array for a half window of 0.
 
-    A cubic is fitted to the cumulative increments over 2 · half_window + 1 steps; the result is its increment over the
-    middle step. NaN if the window contains NaN or exceeds the data.
+    The slopes of their sum (:func:`~.truth.differentiate`) at both ends of a step are averaged. NaN if a window
+    contains NaN or exceeds the data.
     """
     if half_window == 0:
         return increments
-    h, n = half_window, int(increments.shape[0])
-    out = np.full_like(increments, np.nan)
-    if n < 2 * h + 1:
-        return out
-    missing = np.concatenate([[0], np.cumsum(~np.isfinite(increments).all(axis=1))])
-    centres = np.flatnonzero(missing[2 * h + 1 :] == missing[: n - 2 * h]) + h
-    steps, points = np.arange(-h, h + 1), np.arange(-h, h + 2)
-    for start in range(0, centres.shape[0], _CHUNK):
-        centre = centres[start : start + _CHUNK]
-        curve = np.cumsum(increments[centre[:, None] + steps], axis=1)
-        curve = np.concatenate([np.zeros_like(curve[:, :1]), curve], axis=1)
-        time_s = (stamps_ns[centre[:, None] + points] - stamps_ns[centre][:, None]) * S_PER_NS
-        span = np.abs(time_s).max(axis=1)
-        u = time_s / span[:, None]
-        powers, normal = cubic_equations(u)
-        right = np.stack([(powers[i][:, :, None] * curve).sum(axis=1) for i in range(4)], axis=1)
-        fit = np.linalg.solve(normal, right)
-        end, begin = u[:, h + 1], u[:, h]
-        out[centre] = sum(((end**i - begin**i)[:, None] * fit[:, i] for i in range(1, 4)), np.zeros_like(fit[:, 0]))
-    return out
-
-
-def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
-    """Return the 1-sigma of white noise in the derivative of ``values`` [N] by one-step differences; NaN if unknown.
-
-    Computed from third differences, which contain hardly any motion at usual rates. Noise that an INS has filtered
-    over several samples is not detected.
-    """
-    if stamps_ns.shape[0] < 8:
-        return math.nan
-    steps = np.diff(stamps_ns)
-    period_ns = float(np.median(steps))
-    even = steps <= GAP_PERIODS * period_ns
-    third = values[3:] - 3.0 * values[2:-1] + 3.0 * values[1:-2] - values[:-3]
-    third = third[even[:-2] & even[1:-1] & even[2:] & np.isfinite(third)]
-    if third.size < 5:
-        return math.nan
-    sigma = float(np.quantile(np.abs(third), _NOISE_QUANTILE)) / (_NOISE_POINT * math.sqrt(_THIRD_DIFFERENCE_GAIN))
-    return math.sqrt(2.0) * sigma / (period_ns * S_PER_NS)
+    curve = np.concatenate([np.zeros_like(increments[:1]), np.cumsum(np.nan_to_num(increments), axis=0)])
+    curve[:-1][np.isnan(increments)] = np.nan
+    longest_ns = int(stamps_ns[-1] - stamps_ns[0])  # longer steps than usual have no increment
+    slopes = np.stack([differentiate(stamps_ns, c, half_window, longest_ns) for c in curve.T], axis=1)
+    return np.asarray(0.5 * (slopes[:-1] + slopes[1:]) * np.diff(stamps_ns)[:, None] * S_PER_NS)
 
 
 def residual_rows(
@@ -274,11 +192,7 @@ def residual_rows(
     # A predicted steering angle must not affect a residual.
     inputs[~np.isfinite(without_impossible(signals).steer_rad), U_STEER] = np.nan
     stamps_ns, gap_s = signals.stamps_ns, GAP_PERIODS * period_s
-    if physics.equations == "forces":
-        increments = physics_increments(stamps_ns, state, filtered.x, inputs, physics, max_step_s=gap_s)
-    else:
-        nominal = model_parameters(physics.vehicle)
-        increments = residual_increments(stamps_ns, state, inputs, nominal, max_step_s=gap_s)
+    increments = residual_increments(stamps_ns, state, inputs, physics, max_step_s=gap_s)
     targets, step_s = np.full((count, 2), np.nan), np.full(count, np.nan)
     targets[:-1] = smooth_increments(signals.stamps_ns, increments, half_window)
     step_s[:-1] = np.diff(signals.stamps_ns) * S_PER_NS

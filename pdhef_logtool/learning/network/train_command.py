@@ -7,9 +7,9 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, read_dataset
 from pdhef_logtool.learning.network.residuals import ResidualRows
-from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
+from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -35,15 +35,16 @@ from pdhef_logtool.residual_model.bundle import (
 )
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import ResidualNetwork, State
-from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
 
 # isort: split
 # After the network, which checks that PyTorch is installed.
 import torch
+from torch.nn.utils.rnn import pad_sequence
 
-CHECKPOINT = "checkpoint.safetensors"
+CHECKPOINT = "checkpoint.pt"
+_DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 #: Maximum number of validation steps at once, with the state carried on; an hour at once would need a gigabyte.
@@ -137,8 +138,6 @@ def normalisation_of(
     parts = [(s.features[s.weight > 0][:, columns], s.target[s.weight > 0]) for s in sequences]
     # Contiguous rows are summed one by one, so that rounding does not depend on the split into sequences.
     features, target = (np.ascontiguousarray(np.concatenate(c)) for c in zip(*parts, strict=True))
-    if not len(features):
-        raise ModelError(expected="training sequences with usable samples", got="none", where="train")
     mean = features.mean(axis=0)
     if odd:
         mean[[n in ODD_FEATURES for n in names]] = 0.0
@@ -152,6 +151,7 @@ def train(
     recipe: Recipe,
     work: Path,
     *,
+    test: Iterable[FeatureSequence] = (),
     init: ModelBundle | None = None,
     device: str = "cpu",
     progress: Progress = lambda _text, _share: None,
@@ -160,7 +160,7 @@ def train(
 
     Parameters
     ----------
-    training, validation : iterated up to three times before the first epoch.
+    training, validation : iterated up to three times before the first epoch. test : scored by the best epoch.
     work : folder of the checkpoint; a checkpoint with the same recipe and data is resumed.
     init : bundle to start from (fine-tuning), with its features, architecture and normalisation.
 
@@ -185,10 +185,10 @@ def train(
         weights={},
     )
     run = _Training.start(recipe, init, empty.signs, device)
-    train_pieces = Pieces(training, lambda s: _pieces(s, recipe.piece_steps, empty))
-    validation_pieces = Pieces(validation, lambda s: [_balanced(_scaled(s, empty))])
+    train_pieces = [piece for s in training for piece in _pieces(s, recipe.piece_steps, empty)]
+    validation_pieces, test_pieces = ([_balanced(_scaled(s, empty)) for s in x] for x in (validation, test))
     identity = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
-    identity |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
+    identity |= {"training": _sha256(train_pieces), "validation": _sha256(validation_pieces)}
     if (work / CHECKPOINT).is_file():
         run.resume(work / CHECKPOINT, identity)
     for epoch in range(len(run.history), recipe.epochs):
@@ -202,14 +202,13 @@ def train(
             run.best = _weights(run.network)
         run.save(work / CHECKPOINT, identity)
         progress(f"epoch {epoch + 1}: train {train_loss:.4f}, validation {loss:.4f}", (epoch + 1) / recipe.epochs)
+    run.network.load_state_dict(run.best)
     provenance = {
         "recipe": asdict(recipe),
         "epochs": len(run.history),
         "best_epoch": run.best_epoch + 1,
         "validation_loss": run.history[run.best_epoch].validation_loss,
-        "training_sequences": train_pieces.sequences,
-        "validation_sequences": validation_pieces.sequences,
-        "training_hours": round(train_pieces.steps * recipe.period_s / 3600.0, 3),
+        "test_loss": run.validate(test_pieces) if test_pieces else None,
     }
     return replace(empty, weights={k: v.numpy() for k, v in run.best.items()}, provenance=provenance), run.history
 
@@ -223,28 +222,11 @@ class _Piece(NamedTuple):
     weight: torch.Tensor
 
 
-class Pieces(list[_Piece]):
-    """Pieces of sequences, single precision.
-
-    Attributes
-    ----------
-    sequences, steps : number of sequences and steps. sha256 : hash of the pieces.
-    """
-
-    def __init__(
-        self, sequences: Iterable[FeatureSequence], cut: Callable[[FeatureSequence], Iterable[_Piece]]
-    ) -> None:
-        super().__init__()
-        self.sequences = self.steps = 0
-        content = hashlib.sha256()
-        for s in sequences:
-            self.sequences += 1
-            self.steps += len(s.weight)
-            for piece in cut(s):
-                self.append(piece)
-                for column in piece:
-                    content.update(column.numpy().tobytes())
-        self.sha256 = content.hexdigest()
+def _sha256(pieces: Iterable[_Piece]) -> str:
+    total = hashlib.sha256()
+    for column in chain.from_iterable(pieces):
+        total.update(column.numpy().tobytes())
+    return total.hexdigest()
 
 
 def _scaled(s: FeatureSequence, bundle: ModelBundle) -> _Piece:
@@ -266,11 +248,6 @@ def _balanced(piece: _Piece) -> _Piece:
     square = (piece.target**2).mean(dim=1)
     mean = float((square * piece.weight).sum() / piece.weight.sum())
     return piece._replace(weight=piece.weight / (mean + WEIGHT_FLOOR))
-
-
-def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
-    pad = torch.nn.utils.rnn.pad_sequence
-    return _Piece(*(pad(list(columns), batch_first=True).to(device) for columns in zip(*pieces, strict=True)))
 
 
 # ---- one epoch ----
@@ -326,7 +303,8 @@ class _Training:
             if self.signs is not None:  # pieces are as often mirrored as not
                 mirrored = [p._replace(features=p.features * self.signs, target=-p.target) for p in chosen]
                 chosen = [m if torch.rand(()) < 0.5 else p for m, p in zip(mirrored, chosen, strict=True)]
-            losses.append(self._batch(_padded(chosen, self.device)))
+            padded = (pad_sequence(list(columns), batch_first=True) for columns in zip(*chosen, strict=True))
+            losses.append(self._batch(_Piece(*(column.to(self.device) for column in padded))))
         return float(np.mean(losses)), rate
 
     def _batch(self, batch: _Piece) -> float:
@@ -366,56 +344,28 @@ class _Training:
         return total / weight if weight else math.inf
 
     def save(self, path: Path, identity: dict[str, Any]) -> None:
-        """Write a checkpoint: tensors and document in one file, so that no write can leave an inconsistent pair.
-
-        ``identity`` of the training: its recipe and data.
-        """
-        from safetensors.torch import save
-
-        states = self.optimiser.state_dict()["state"]
-        optimiser = {f"{i}.{key}": value for i, of in states.items() for key, value in of.items()}
-        groups = {"network": self.network.state_dict(), "best": self.best, "optimiser": optimiser}
-        tensors = {f"{g}.{name}": value.cpu().contiguous() for g, of in groups.items() for name, value in of.items()}
-        document = seal(
-            {"identity": identity, "history": [asdict(e) for e in self.history], "sha256": _sha256(tensors)}
-        )
-        write_bytes(path, save(tensors, metadata={"document": json.dumps(document)}))
+        """Write a checkpoint, with its hash in front; ``identity`` of the training: its recipe and data."""
+        file = io.BytesIO()
+        states = {"network": self.network.state_dict(), "optimiser": self.optimiser.state_dict(), "best": self.best}
+        torch.save({"identity": json.dumps(identity), "history": [asdict(e) for e in self.history], **states}, file)
+        data = file.getvalue()
+        write_bytes(path, hashlib.sha256(data).digest() + data)
 
     def resume(self, path: Path, identity: dict[str, Any]) -> None:
         """Continue after a checkpoint; raises ModelError if it is damaged, or of another recipe or other data."""
-        from safetensors import SafetensorError, safe_open
-
-        try:
-            with safe_open(path, framework="pt") as stored:
-                document = json.loads(stored.metadata()["document"])
-                tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
-            if not is_sealed(document) or document["sha256"] != _sha256(tensors):
-                raise ValueError("content that is not as it was written")
-        except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
-            expected = "a checkpoint of a training"
-            raise ModelError(expected=expected, got=str(error), where=path, remedy="remove it to train again") from None
-        if document["identity"] != json.loads(json.dumps(identity)):
+        content = path.read_bytes()
+        data = content[_DIGEST_BYTES:]
+        if content[:_DIGEST_BYTES] != hashlib.sha256(data).digest():
+            expected, got = "a checkpoint of a training", "content that is not as it was written"
+            raise ModelError(expected=expected, got=got, where=path, remedy="remove it to train again")
+        stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        if stored["identity"] != json.dumps(identity):
             expected, got = "a checkpoint of this recipe and data", "one of another"
             remedy = "train into another folder, or remove the checkpoint"
             raise ModelError(expected=expected, got=got, where=path, remedy=remedy)
-        groups: dict[str, dict[str, Any]] = {"network": {}, "best": {}, "optimiser": {}}
-        for name, value in tensors.items():
-            group, _, key = name.partition(".")
-            groups[group][key] = value
-        states: dict[int, dict[str, torch.Tensor]] = {}
-        for name, value in groups["optimiser"].items():
-            index, _, key = name.partition(".")
-            states.setdefault(int(index), {})[key] = value
-        self.network.load_state_dict(groups["network"])
-        self.optimiser.load_state_dict({"state": states, "param_groups": self.optimiser.state_dict()["param_groups"]})
-        self.history, self.best = [Epoch(**e) for e in document["history"]], groups["best"]
-
-
-def _sha256(tensors: Mapping[str, torch.Tensor]) -> str:
-    total = hashlib.sha256()
-    for name in sorted(tensors):
-        total.update(name.encode() + tensors[name].numpy().tobytes())
-    return total.hexdigest()
+        self.network.load_state_dict(stored["network"])
+        self.optimiser.load_state_dict(stored["optimiser"])
+        self.history, self.best = [Epoch(**e) for e in stored["history"]], stored["best"]
 
 
 def _weights(network: ResidualNetwork) -> dict[str, torch.Tensor]:
@@ -491,7 +441,7 @@ def run_training(
     """
     dataset, output = Path(dataset), local_path(output)
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
-    data = dataset_for(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
+    data = read_dataset(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
     start = network_folder(NO_MODEL if init is None else init)
     bundle = None if start is None else load_bundle(start)
     if bundle is not None and bundle.model != data.model:
@@ -499,25 +449,6 @@ def run_training(
     check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
     with OutputFolder(output):
         return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
-
-
-def dataset_for(folder: Path, model: str) -> Dataset:
-    """Open a dataset with the residuals of a model.
-
-    Raises
-    ------
-    OutputError
-        It is no dataset, or one of another model.
-    """
-    data = read_dataset(folder)
-    if data.model != model:
-        raise OutputError(
-            expected=f"residuals of {model}",
-            got=f"residuals of {data.model}",
-            where=folder,
-            remedy=f"pdhef extract LOG... -o DATASET --filter {model} writes them, into another folder",
-        )
-    return data
 
 
 def make_recipe(*, paper: bool, seed: int, epochs: int | None, device: str) -> Recipe:
@@ -542,18 +473,16 @@ def train_on(
     """Train one network by a recipe, which contains the target; otherwise as :func:`run_training`."""
     import polars as pl
 
-    splits = {name: SplitSequences(data, name, recipe.target, recipe.odd) for name in SPLITS}
-
-    settings: dict[str, Any] = {"init": init, "device": device, "progress": progress}
-    bundle, history = train(splits["train"], splits["validation"], recipe, output, **settings)
-    test_loss = None if next(iter(splits["test"]), None) is None else mean_square(bundle, splits["test"])
+    training, validation, test = (SplitSequences(data, split, recipe.target, recipe.odd) for split in SPLITS)
+    bundle, history = train(
+        training, validation, recipe, output, test=test, init=init, device=device, progress=progress
+    )
     provenance = {
         **bundle.provenance,
         "dataset_sha256": data.sha256,
         "vehicle": data.vehicle_name,
         "fine_tuned_from": None if init is None else init.sha256,
         "fine_tuned_on": None if init is None else data.vehicle_name,
-        "test_loss": test_loss,
     }
     bundle = replace(bundle, provenance=provenance, model=data.model, physics_sha256=data.physics_sha256)
     table = io.BytesIO()  # polars raises errors of other types for a full disk
@@ -561,20 +490,7 @@ def train_on(
     write_bytes(output / HISTORY_FILE, table.getvalue())
     bundle.save(output)
     (output / CHECKPOINT).unlink(missing_ok=True)
-    return TrainResult(output, bundle, tuple(history), test_loss)
-
-
-def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> float:
-    """Return the weighted mean square error of the normalised targets, computed as in operation."""
-    total, weight = 0.0, 0.0
-    for s in sequences:
-        rates, _ = bundle.run(s.features, np.zeros(len(s.weight), dtype=np.bool_), None)
-        error = (rates - s.target) / np.array(bundle.normalisation.target_std)
-        total += float((np.mean(error**2, axis=1) * s.weight).sum())
-        weight += float(s.weight.sum())
-    if weight == 0.0:
-        raise ModelError(expected="usable samples to test on", got="none", where="train")
-    return total / weight
+    return TrainResult(output, bundle, tuple(history), bundle.provenance["test_loss"])
 
 
 def gap_free_runs(drive: ResidualRows) -> Iterable[slice]:
