@@ -91,8 +91,7 @@ class Survey:
         """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
         if not self.channels.truth:
             return self.checks
-        measured = measure(self.channels.signals, {}, None, self.vehicle, self.mapping)
-        return (*self.mounted, *self._of(replace(measured, is_mounted=self.measured.is_mounted), None))
+        return (*self.mounted, *self._of(self.measured.without_truth(), None))
 
     def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
         """Return the channels that must not be used, with the reason. Ground truth does not decide about sensors.
@@ -174,7 +173,7 @@ def survey_log(
         corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
         mapping = mapping.with_sources(signals, [note])
         channels = read_signals(log, mapping, clocks, *span_ns)
-        mounting = replace(mounting, named=mounting.rows)
+        mounting = replace(mounting, named=mounting.rotation)
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     is_mounted = mounting is not None and mounting.confident and mounting.is_as_named
     measured, latency = replace(measured, is_mounted=is_mounted), truth_latency(channels.signals, channels.truth, truth)
