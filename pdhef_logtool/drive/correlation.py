@@ -125,15 +125,6 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
     return math.hypot(chance, later - (shift_s - steps * grid.step_s), _RESAMPLING_S)
 
 
-def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float) -> bool:
-    """Return whether the correlation has a peak of ``least`` or more inside a range."""
-    first, last = round(low_s / grid.step_s) - 1, round(high_s / grid.step_s) + 1
-    reach = max(-first, last)
-    correlations = _correlations(grid, reach)[reach + first : reach + last + 1]
-    inner = correlations[1:-1]
-    return bool(((inner > correlations[:-2]) & (inner >= correlations[2:]) & (inner >= least)).any())
-
-
 def parabolic_peak(before: float, middle: float, after: float) -> float:
     """Return the position of the vertex of the parabola through values at −1, 0, 1; 0 if it has no maximum."""
     curvature = before - 2.0 * middle + after

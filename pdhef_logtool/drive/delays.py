@@ -15,7 +15,6 @@ from pdhef_logtool.drive.columns import GRID_S
 from pdhef_logtool.drive.correlation import (
     CommonGrid,
     find_shift,
-    has_peak_within,
     on_common_grid,
     shift_error,
     without_trend,
@@ -34,8 +33,6 @@ LATE_GYRO_S = 0.005
 MAX_SHIFT_ERROR_S, SURE = 0.015, 4.0
 #: Least correlation at the shift: of ground truth; of sensors, which differ where the car slides; of exact pairs.
 LEAST_CORRELATION = (0.8, 0.9, 0.95)
-#: A peak in the plausible range with this share of the highest correlation may be the right one.
-AS_HIGH = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,9 +155,7 @@ def late_sensors(measured: Measured) -> tuple[LateSensor, ...]:
         lag = lag_of(grid, LEAST_CORRELATION[1 + law.exact], MAX_SHIFT_ERROR_S)
         shift_s, error_s = lag.latency_s, lag.std_error_s
         beyond_s = max(low - shift_s, shift_s - high)
-        # A sine also correlates with itself a period later.
-        is_late = lag.reliable and error_s <= beyond_s / SURE
-        if not is_late or has_peak_within(grid, low, high, AS_HIGH * lag.correlation):
+        if not lag.reliable or error_s > beyond_s / SURE:
             continue
         name = law.late[shift_s >= low]
         late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift_s, error_s, low, high))

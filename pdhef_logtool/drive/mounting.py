@@ -54,9 +54,6 @@ RATES = tuple(f"triad.rate.{axis}" for axis in "xyz")
 MOUNTED = ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: A mean acceleration in this range is gravity.
 IS_GRAVITY_M_S2 = (0.75 * GRAVITY_M_S2, 1.25 * GRAVITY_M_S2)
-#: Largest angle between the mean gravity of a drive and the car's vertical.
-TILT_DEG = 15.0
-
 
 # ------------------------------------------------------------------------------------------------ fields of an IMU
 
@@ -155,23 +152,6 @@ def nearest_step(rotation: FloatArray) -> FloatArray:
     steps = np.concatenate([rows * np.array(signs)[:, None] for signs in product((1.0, -1.0), repeat=3)]) + 0.0
     steps = steps[np.linalg.det(steps) > 0.0]
     return np.asarray(steps[np.argmax(np.sum(steps * rotation, axis=(1, 2)))])
-
-
-def upright_check(named: FloatArray, force: FloatArray) -> Check | None:
-    """Report that gravity, the mean acceleration [3], is not upward in the axes that a mapping names.
-
-    ``named``: rows [3, 3] of forward, left and the yaw axis in the sensor's axes. The result is None without forward or
-    left, and if the sensor subtracts gravity.
-    """
-    up, size = np.cross(named[0], named[1]), float(np.linalg.norm(force))
-    least = math.cos(math.radians(2.0 * TILT_DEG)) * size
-    if not up.any() or not IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1] or up @ force > least:
-        return None
-    along = int(np.argmax(np.abs(force)))
-    axis = f"{'-' if force[along] < 0.0 else '+'}{'xyz'[along]}"
-    evidence = f"gravity is along {axis} of the accelerometer, not along its vertical: its axes are not the car's"
-    remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
-    return Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -374,7 +354,9 @@ def turned_signals(
     return signals
 
 
-def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]) -> list[Check]:
+def mounting_checks(
+    mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]
+) -> tuple[Check, ...]:
     """Return for each of the IMU's signals whether it is read from the axis that the drive shows."""
     turned = turned_signals(mapping, mounting, triads)
     checks = []
@@ -389,4 +371,4 @@ def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | 
         entries = entries_of(turned[name], "field", "scale")
         check = result("SIGNAL.mounting", "failed", name, evidence=evidence, entries=entries)
         checks.append(check if mounting.confident else replace(check, verdict="undecided"))
-    return checks
+    return tuple(checks)
