@@ -13,12 +13,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from pdhef_logtool.car.vehicle import (
     NonNegative,
-    PhysicsParts,
-    Position,
     Positive,
     Record,
     Sensors,
-    Tyres,
     VehicleParameters,
 )
 from pdhef_logtool.storage.documents import digest, one_of
@@ -59,48 +56,6 @@ class LearntOn(Record):
     sha256: str = ""
     start_s: float = 0.0
     end_s: float = 0.0
-
-
-class FittedSensors(Record):
-    """Identified constant errors of sensors."""
-
-    ay_bias_m_s2: float
-    yaw_rate_bias_rad_s: float
-    yaw_rate_gain: Positive = 1.0
-    yaw_rate_delay_s: NonNegative = 0.0
-
-
-class FittedValues(Record):
-    """Identified values of vehicle file entries; for absent ones the file applies."""
-
-    yaw_inertia_kg_m2: Positive | None = None
-    steer_offset_rad: float | None = None
-    steering_ratio: Positive | None = None
-    roll_gradient_rad_per_m_s2: float | None = None
-    friction: Positive | None = None
-    sensors: FittedSensors | None = None
-    tyres: Tyres | None = None
-    relaxation_length_m: NonNegative | None = None
-    load_sensitivity: NonNegative | None = None
-    roll_frequency_rad_s: Positive | None = None
-    roll_damping: Positive | None = None
-    cg_over_roll_axis_m: NonNegative | None = None
-    imu_position_m: Position | None = None
-    physics: PhysicsParts | None = None
-
-    @classmethod
-    def of(cls, fitted: VehicleParameters) -> FittedValues:
-        """Return all entries of a vehicle."""
-        values = {k: getattr(fitted, k) for k in cls.model_fields}
-        values["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
-        return cls(**values)
-
-    def applied_to(self, vehicle: VehicleParameters) -> VehicleParameters:
-        """Return the vehicle with these values."""
-        update: dict[str, Any] = {k: v for k in type(self).model_fields if (v := getattr(self, k)) is not None}
-        if self.sensors is not None:
-            update["sensors"] = vehicle.sensors.model_copy(update=self.sensors.model_dump())
-        return vehicle.model_copy(update=update)
 
 
 #: ``limit_gain`` of cars without validation by ground truth (docs/method.md#limit). A higher gain reduces the error of
@@ -163,12 +118,12 @@ class TriedParts(Record):
 
 
 class FittedPhysics(Record):
-    """Values and noise that were identified with the filter ``physics``, and the evidence for its model parts.
+    """Vehicle and noise that were identified with the filter ``physics``, and the evidence for its model parts.
 
     ``smoothing``: as :data:`SMOOTHING`, found with the smoother.
     """
 
-    values: FittedValues
+    values: VehicleParameters
     noise: FilterNoise
     smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = SMOOTHING
     tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
@@ -177,14 +132,13 @@ class FittedPhysics(Record):
 class Fit(Record):
     """``fit.toml``: identified physics of the car.
 
-    ``filter`` : noise of the filters with ``values`` (docs/method.md#noise). ``physics`` : values and noise of the
-    filter ``physics``, which has other model parts and is identified separately.
+    ``filter`` : noise of the filters on the vehicle file (docs/method.md#noise). ``physics`` : vehicle and noise of the
+    filter ``physics``, which has other model parts.
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"
     version: Literal[1] = 1
     physics_sha256: Sha256
-    values: FittedValues = FittedValues()
     filter: FilterTables = Field(default_factory=dict)
     physics: FittedPhysics | None = None
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()

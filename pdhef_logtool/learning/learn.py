@@ -107,9 +107,9 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
         )
     source = Car.load(config.car, network=NO_MODEL)
     if config.car is None:
-        reporter.warn(f"no --car: mass, geometry and priors come from the default {source.datasheet.name}")
+        reporter.warn(f"no --car: mass, geometry and priors come from the default {source.vehicle.name}")
     check_output(source, output)
-    drives = DriveSet.of(arguments, Car.of(source.datasheet), settings, reporter)
+    drives = DriveSet.of(arguments, Car.of(source.vehicle), settings, reporter)
     read = [*(i.local for i in drives.logs), *(path for path in config.files if path != config.car)]
     check_no_input(read, [], [output])
     records, model, figures = _learnt(drives)

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, TriedParts
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, PosteriorSteps, physics_filter
 from pdhef_logtool.records.signals import FloatArray
@@ -400,5 +400,4 @@ def find_physics(
     parts, tried = choose_parts([halves, halves[::-1]], start, progress=lambda text, x: progress(text, 0.7 * x))
     progress("fitting the physics filter's sideslip to the ground truth", 0.7)
     result = fit_physics(drives, start, parts)
-    values = FittedValues.of(result.vehicle)
-    return result, FittedPhysics(values=values, noise=result.noise, tried=tried)
+    return result, FittedPhysics(values=result.vehicle, noise=result.noise, tried=tried)
