@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field
 
 from pdhef_logtool.car.vehicle import (
     NonNegative,
@@ -72,7 +72,6 @@ class FilterNoise(Record):
         the two axle forces. Empty for the filter's default.
     r_std : by measurement; the filter's default for missing ones.
     limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0 without.
-    score_deg : objective of the noise search, lower is better; None without a search. trial : number of its trial.
     """
 
     q_std: Annotated[tuple[NonNegative, ...], Field(strict=False)] = ()
@@ -80,45 +79,21 @@ class FilterNoise(Record):
         Field(default_factory=dict)
     )
     limit_gain: NonNegative = 0.0
-    score_deg: Positive | None = None
-    trial: int | None = None
 
     def measurement_std(self, sensors: Sensors) -> tuple[float, float, float]:
         """Return the 1-sigma of a_y, yaw rate and speed, from the sensors for missing ones."""
         ay, rate, speed = (self.r_std.get(m, std) for m, std in zip(MEASUREMENTS, sensors.measurement_std, strict=True))
         return ay, rate, speed
 
-    @model_validator(mode="after")
-    def _one_entry_a_state(self) -> FilterNoise:
-        if len(self.q_std) not in (0, 3, 4, 6):
-            raise ValueError(f"q_std needs 3 or 4 entries (v_x, v_y, yaw rate, a_x bias), got {len(self.q_std)}")
-        return self
-
-
-def _axle_forces_belong_to_physics(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
-    for name, table in tables.items():
-        if len(table.q_std) == 6 and name != PHYSICS:
-            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics's")
-    return tables
-
 
 #: Noise by filter.
-FilterTables = Annotated[
-    dict[Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise],
-    AfterValidator(_axle_forces_belong_to_physics),
+FilterTables = dict[
+    Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise
 ]
 
 
-class TriedParts(Record):
-    """A tested set of model parts of ``physics``: its error on held-out folds, and the verdict."""
-
-    parts: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    held_out_deg: Annotated[tuple[float, ...], Field(strict=False)]
-    taken: bool
-
-
 class FittedPhysics(Record):
-    """Vehicle and noise that were identified with the filter ``physics``, and the evidence for its model parts.
+    """Vehicle and noise that were identified with the filter ``physics``.
 
     ``smoothing``: as :data:`SMOOTHING`, found with the smoother.
     """
@@ -126,7 +101,6 @@ class FittedPhysics(Record):
     values: VehicleParameters
     noise: FilterNoise
     smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = SMOOTHING
-    tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
 
 
 class Fit(Record):

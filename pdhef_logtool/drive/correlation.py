@@ -32,11 +32,6 @@ class CommonGrid:
     a: FloatArray
     b: FloatArray
 
-    @property
-    def both(self) -> int:
-        """Number of grid points where both are known."""
-        return int(np.count_nonzero(np.isfinite(self.a) & np.isfinite(self.b)))
-
 
 @dataclass(frozen=True, slots=True)
 class Shift:

@@ -11,6 +11,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from pdhef_logtool.drive.columns import GRID_S
 from pdhef_logtool.drive.correlation import (
     CommonGrid,
@@ -83,9 +85,7 @@ def lag_of(
     return LatencyEstimate(0.0 if lacks else shift.shift_s, shift.correlation, error_s, not lacks, False, lacks)
 
 
-def estimate_truth_latency(
-    sensor_yaw_rate: Channel, truth_yaw_rate: Channel, *, max_error_s: float = MAX_LATENCY_ERROR_S
-) -> LatencyEstimate:
+def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) -> LatencyEstimate:
     """Estimate the ground-truth latency against the gyro by cross-correlation of detrended yaw rates.
 
     Parameters
@@ -98,9 +98,9 @@ def estimate_truth_latency(
     a, b, grid = sensor_yaw_rate, truth_yaw_rate, None
     if min(len(a), len(b)) > 1:
         grid = on_common_grid(a.stamps_ns, a.values, b.stamps_ns, b.values)
-    if grid is None or grid.both * grid.step_s < 4.0 * MAX_LATENCY_S:
+    if grid is None or float(np.isfinite(grid.a + grid.b).sum()) * grid.step_s < 4.0 * MAX_LATENCY_S:
         return LatencyEstimate(0.0, 0.0, math.inf, False, False, "less than two seconds in common")
-    lag = lag_of(grid, max_error_s=max_error_s)
+    lag = lag_of(grid)
     return replace(lag, reason="gyro against ground-truth yaw rate") if lag.reliable else lag
 
 

@@ -70,12 +70,11 @@ def main(arguments: list[str] | None = None) -> int:
     def say(text: str, share: float) -> None:
         print(f"{100 * share:3.0f} % {text}", flush=True)
 
-    result, physics = find_physics(drives, car.vehicle, progress=say)
+    result, physics, tried = find_physics(drives, car.vehicle, progress=say)
     # The smoother uses the filter's noise: the network predicts most of the model residual.
     physics = physics.model_copy(update={"smoothing": (1.0, 1.0)})
     print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
-    for tried in physics.tried:
-        print(f"{', '.join(tried.parts) or 'static'}: {tried.held_out_deg} {'taken' if tried.taken else ''}")
+    print(*tried, sep="\n")
     part = Fit(physics_sha256=physics_sha256(car.vehicle), physics=physics, drives=tuple(learnt_on))
     (given.output / FIT_FILE).write_text(part_toml(part, HEAD), encoding="utf-8")
     return 0

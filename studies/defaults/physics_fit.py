@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, TriedParts
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, PosteriorSteps, physics_filter
 from pdhef_logtool.records.signals import FloatArray
@@ -341,14 +341,14 @@ def choose_parts(
     start: VehicleParameters,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
-) -> tuple[PhysicsParts, tuple[TriedParts, ...]]:
+) -> tuple[PhysicsParts, list[str]]:
     """Choose the parts by driving that their fits have not seen: each stays only with evidence.
 
     Parts are removed one after the other, starting from all parts: some are useful only together, such as the roll
     and the load transfer that it delays. The remaining parts must score better than the model without parts.
     """
     theta: list[Sequence[Theta]] = [STARTS for _ in folds]
-    tried: list[TriedParts] = []
+    tried: list[str] = []
 
     def scored(parts: PhysicsParts, iterations: int) -> tuple[FloatArray, list[Sequence[Theta]]]:
         """Return the logarithm of the RMS on the held-out half of each fold, and θ there."""
@@ -364,7 +364,7 @@ def choose_parts(
 
     def tell(parts: PhysicsParts, scores: FloatArray, taken: bool) -> None:
         held_out = tuple(round(float(x), 4) for x in np.degrees(np.exp(scores)))
-        tried.append(TriedParts(parts=parts.names, held_out_deg=held_out, taken=taken))
+        tried.append(f"{', '.join(parts.names) or 'static'}: {held_out} {'taken' if taken else ''}")
 
     none = PhysicsParts()
     static, _ = scored(none, MAX_ITERATIONS)
@@ -382,7 +382,7 @@ def choose_parts(
             parts, best, theta = fewer, scores, ends
     if (static - best).mean() <= LEAST_GAIN:
         parts = none
-    return parts, tuple(tried)
+    return parts, tried
 
 
 def find_physics(
@@ -390,8 +390,8 @@ def find_physics(
     start: VehicleParameters,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
-) -> tuple[PhysicsFit, FittedPhysics]:
-    """Identify ``physics`` of a car on drives with ground truth; also return it in the format of a car.
+) -> tuple[PhysicsFit, FittedPhysics, list[str]]:
+    """Identify ``physics`` of a car on drives with ground truth; also return it in the format of a car, and the trials.
 
     The parts of the model are chosen by cross-validation between two halves of the drives.
     """
@@ -400,4 +400,4 @@ def find_physics(
     parts, tried = choose_parts([halves, halves[::-1]], start, progress=lambda text, x: progress(text, 0.7 * x))
     progress("fitting the physics filter's sideslip to the ground truth", 0.7)
     result = fit_physics(drives, start, parts)
-    return result, FittedPhysics(values=result.vehicle, noise=result.noise, tried=tried)
+    return result, FittedPhysics(values=result.vehicle, noise=result.noise), tried
