@@ -52,8 +52,9 @@ CORRELATION_S = 1.0
 KEPT_STEPS = 4
 #: Length of the blocks for the spread of gradients: longer than a bend, so that blocks are nearly independent.
 BLOCK_S = 3.0
-#: Largest number of iterations, smallest relative decrease of the cost, and step of θ for derivatives.
-ITERATIONS, LEAST_GAIN, DERIVATIVE_STEP = 40, 1e-5, 0.02
+ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
+#: Number of attempts per step, factor on the damping after a failed attempt, and divisor after a successful one.
+TRIES, MORE, LESS = 6, 6.0, 5.0
 #: Lower limit of the peak force, as a share of this quantile of a_y, which includes bank and body roll.
 REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
 #: Model error common to a whole drive, as a share of each prior's standard deviation: with it at least 95 % of the
@@ -150,7 +151,7 @@ class CarFit:
         self._error_std = self._least_std
         slippery = [p.theta(p.low) if p.name == priors.PEAK else 0.0 for p in self.parameters]
         descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
-        theta = min(descents, key=self._cost)
+        theta = min(descents, key=lambda end: self._cost(self.errors_of(end), end))
         for _ in range(SCALES):
             error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
             self._error_std = error_std
@@ -160,10 +161,32 @@ class CarFit:
         return theta
 
     def _descend(self, theta: FloatArray) -> FloatArray:
-        from scipy.optimize import least_squares  # its import takes time
+        """Minimize the cost by Levenberg and Marquardt."""
+        errors, damping = self.errors_of(theta), 1e-2
+        value = self._cost(errors, theta)
+        for _ in range(ITERATIONS):
+            residuals, jacobian = self._linearised(theta, errors)
+            normal, gradient, gain = jacobian.T @ jacobian + np.eye(theta.size), jacobian.T @ residuals + theta, 0.0
+            if not gradient.any():
+                break
+            for _ in range(TRIES):
+                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+                step *= min(1.0, MAX_STEP / float(np.max(np.abs(step))))
+                there = self.errors_of(theta + step)
+                if (new := self._cost(there, theta + step)) < value:
+                    theta, errors, value, gain = theta + step, there, new, value - new
+                    damping = max(damping / LESS, 1e-5)
+                    break
+                damping *= MORE
+            if gain < LEAST_GAIN:
+                break
+        return theta
 
-        end = least_squares(self._residuals, theta, max_nfev=ITERATIONS, ftol=LEAST_GAIN)
-        return np.asarray(end.x, dtype=np.float64)
+    def _linearised(self, theta: FloatArray, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the residuals [R] at θ [n], with the ``errors`` there, and their derivatives [R, n] by differences."""
+        residuals = self._residuals(errors, errors)
+        moved = [self._residuals(self.errors_of(theta + t), errors) for t in DERIVATIVE_STEP * np.eye(theta.size)]
+        return residuals, (np.stack(moved, axis=1) - residuals[:, None]) / DERIVATIVE_STEP
 
     def rms(self, theta: FloatArray) -> FloatArray:
         """Return the RMS error of yaw rate and a_y, [2]."""
@@ -227,26 +250,21 @@ class CarFit:
         """Return the RMS of each channel of errors over ``_error_std``."""
         return np.asarray(np.sqrt(np.mean(scaled**2, axis=1)) * self._error_std, dtype=np.float64)
 
-    def _residuals(self, theta: FloatArray) -> FloatArray:
-        """Return residuals [R + n] whose squares are the terms of the cost."""
-        errors = self.errors_of(theta).ravel()
-        robust = errors * np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + errors**2)))
-        return np.append(self._weight * robust, theta)
+    def _cost(self, scaled: FloatArray, theta: FloatArray) -> float:
+        robust = 2.0 * (np.sqrt(1.0 + scaled**2) - 1.0)
+        return float(self._weight**2 * np.sum(robust) + theta @ theta)
 
-    def _cost(self, theta: FloatArray) -> float:
-        return float(np.sum(self._residuals(theta) ** 2))
+    def _residuals(self, scaled: FloatArray, centre: FloatArray) -> FloatArray:
+        """Return residuals [2 K] with the soft L1 weights of the errors ``centre``."""
+        return np.asarray(self._weight * scaled / (1.0 + centre**2) ** 0.25, dtype=np.float64).ravel()
 
     def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the inverse curvature of the cost [n, n], and its gradient by block [blocks, n]."""
-        errors = self.errors_of(theta)
-        moved = [self.errors_of(theta + step) - errors for step in DERIVATIVE_STEP * np.eye(theta.size)]
-        jacobian = np.stack([m.ravel() for m in moved], axis=1) / DERIVATIVE_STEP
-        # Weights of the soft L1 cost.
-        weights = self._weight / (1.0 + errors.ravel() ** 2) ** 0.25
-        residuals, jacobian = weights * errors.ravel(), weights[:, None] * jacobian
+        centre = self.errors_of(theta)
+        residuals, jacobian = self._linearised(theta, centre)
         inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
         gradients = np.zeros((int(self._block.max()) + 1, theta.size))
-        np.add.at(gradients, np.tile(self._block, len(errors)), jacobian * residuals[:, None])
+        np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         return inverse, gradients
 
     def posterior(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -277,7 +295,7 @@ class CarFit:
     def _laplace(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Return log evidence and covariance of the parameters at the lowest cost."""
         inverse, gradients = self._curvature(theta)
-        evidence = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - self._cost(theta))
+        evidence = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - self._cost(self.errors_of(theta), theta))
         count = len(gradients)
         spread = gradients.T @ gradients * (count / (count - 1) if count > 1 else 0.0)
         shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
