@@ -52,9 +52,8 @@ CORRELATION_S = 1.0
 KEPT_STEPS = 4
 #: Length of the blocks for the spread of gradients: longer than a bend, so that blocks are nearly independent.
 BLOCK_S = 3.0
-ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
-#: Number of attempts per step, factor on the damping after a failed attempt, and divisor after a successful one.
-TRIES, MORE, LESS = 6, 6.0, 5.0
+#: Of the descent; ``MORE`` and ``LESS``: factor on the damping after a failed attempt, divisor after a successful one.
+ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN, TRIES, MORE, LESS = 40, 0.02, 1.0, 1e-3, 6, 6.0, 5.0
 #: Lower limit of the peak force, as a share of this quantile of a_y, which includes bank and body roll.
 REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
 #: Model error common to a whole drive, as a share of each prior's standard deviation: with it at least 95 % of the
@@ -95,14 +94,13 @@ def fit_car(driving: Driving, vehicle_file: VehicleParameters, earlier: Sequence
         vehicle = vehicle_file if reached is None else vehicle_file.model_copy(update={"friction": reached})
     root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     varied = () if refused else varied_parameters(theta, root, fit.sideslip, VARIED)
-    rms = fit.rms(theta)
     return Posterior(
         vehicle,
         fit.fitted(theta, covariance),
         refused,
         tuple(fit.vehicle(to) for to in varied),
         # A good fit is no proof of a better model.
-        error_scale=max(1.0, float(np.sqrt(np.mean((rms / ERROR_STD[:2]) ** 2)))),
+        error_scale=max(1.0, float(np.sqrt(np.mean((fit.rms(theta) / ERROR_STD[:2]) ** 2)))),
         reached_friction=reached,
         seconds=driving.seconds,
         level_m_s2=level_of(driving),
@@ -167,11 +165,9 @@ class CarFit:
         for _ in range(ITERATIONS):
             residuals, jacobian = self._linearised(theta, errors)
             normal, gradient, gain = jacobian.T @ jacobian + np.eye(theta.size), jacobian.T @ residuals + theta, 0.0
-            if not gradient.any():
-                break
             for _ in range(TRIES):
                 step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-                step *= min(1.0, MAX_STEP / float(np.max(np.abs(step))))
+                step /= max(1.0, float(np.max(np.abs(step))) / MAX_STEP)
                 there = self.errors_of(theta + step)
                 if (new := self._cost(there, theta + step)) < value:
                     theta, errors, value, gain = theta + step, there, new, value - new
