@@ -16,7 +16,7 @@ from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
 from pdhef_logtool.car.model import GROUND_TRUTH, CarModel, TaughtParameter, read_model
 from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.names import SHIPPED_CARS as SHIPPED_CARS
-from pdhef_logtool.car.parts import PHYSICS, FilterNoise, Fit, FittedPhysics, FittedValues, LearntOn, physics_sha256
+from pdhef_logtool.car.parts import PHYSICS, FilterNoise, Fit, FittedPhysics, LearntOn, physics_sha256
 from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, VehicleParameters, default_vehicle
@@ -48,21 +48,19 @@ class Car:
 
     Attributes
     ----------
-    vehicle : physics and sensors, including identified values.
-    datasheet : physics and sensors from the user's file.
+    vehicle : physics and sensors of the user's file, or as calibrated on the drive.
     noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`.
     fitted_physics : values and noise identified with the filter ``physics``, None without.
     model : prior of the calibration, and residual, from earlier drives; None without.
     network, network_name : the residual network, None without.
     network_gain : residual gain of ``pd-hef``; None: 1 with a network that was trained with these physics, otherwise 0.
-    learnt_on : drives on which ``vehicle`` was identified.
+    learnt_on : drives on which ``fitted_physics`` was identified.
     self_calibrated : the posterior of the current drive, for the estimators that use it; None without.
     assumed : missing entries of the file. source : folder or file, None for the default car.
     notes : stale parts, with the reason.
     """
 
     vehicle: VehicleParameters
-    datasheet: VehicleParameters
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
     network: ModelBundle | PlugInModel | None = None
     network_name: str = NO_MODEL
@@ -80,8 +78,8 @@ class Car:
 
     @classmethod
     def of(cls, vehicle: VehicleParameters, **parts: Any) -> Car:
-        """Return the car of a vehicle, which is also its datasheet; ``parts`` are further attributes."""
-        return cls(vehicle, vehicle, **parts)
+        """Return the car of a vehicle; ``parts`` are further attributes."""
+        return cls(vehicle, **parts)
 
     @classmethod
     def load(cls, path: Place = None, *, network: Place = None, sensors: Place = None) -> Car:
@@ -106,7 +104,7 @@ class Car:
         folder = source if source is not None and source.is_dir() else None
         file = _file_of(source, folder)
         vehicle = file.vehicle if sensors is None else with_sensors(file.vehicle, sensors)
-        car = cls(vehicle, vehicle, network_gain=file.network_gain, assumed=file.assumed, source=source)
+        car = cls(vehicle, network_gain=file.network_gain, assumed=file.assumed, source=source)
         if folder is not None:
             car = _with_parts(car, folder)
         name, used = _network_of(folder, network)
@@ -125,9 +123,8 @@ class Car:
 
     @property
     def physics_vehicle(self) -> VehicleParameters:
-        """The vehicle for the filter ``physics``: with the values identified with it, otherwise as for all filters."""
-        fitted = self.fitted_physics
-        return self.vehicle if fitted is None else fitted.values.applied_to(self.datasheet)
+        """The vehicle for the filter ``physics``: the one identified with it, otherwise as for all filters."""
+        return self.vehicle if self.fitted_physics is None else self.fitted_physics.values
 
     @property
     def residual_network(self) -> ModelBundle | PlugInModel | None:
@@ -155,9 +152,9 @@ class Car:
     def cg_std_m(self) -> float:
         """1-sigma of the distance from the rear axle to the centre of gravity; 0 if the file gives this distance."""
         share = next((a.spread for a in self.assumed if a.entry == "front_weight_share"), 0.0)
-        if self.source is None and self.datasheet.name == DEFAULT_VEHICLE_NAME:
+        if self.source is None and self.vehicle.name == DEFAULT_VEHICLE_NAME:
             share = DEFAULT_CG_SPREAD
-        return share * self.datasheet.cg_to_rear_axle_m
+        return share * self.vehicle.cg_to_rear_axle_m
 
     @property
     def calibrated_car(self) -> Car:
@@ -165,26 +162,13 @@ class Car:
         calibrated = self.self_calibrated
         if calibrated is None:
             return self
-        vehicle, noise = calibrated.vehicle, calibrated.noise
-        changed = {name: value for name, value in vehicle if value != getattr(self.vehicle, name)}
+        physics = FittedPhysics(values=calibrated.vehicle, noise=calibrated.noise)
         return replace(
-            self.with_noise(PHYSICS, noise),
-            vehicle=vehicle,
-            datasheet=self.datasheet.model_copy(update=changed),
+            self.with_noise(PHYSICS, physics.noise),
+            vehicle=calibrated.vehicle,
             network_gain=self.residual_gain,
-            fitted_physics=FittedPhysics(values=FittedValues.of(vehicle), noise=noise),
+            fitted_physics=physics,
             self_calibrated=None,
-        )
-
-    def with_fit(self, fit: Fit) -> Car:
-        """Return the car with identified parameters; a residual gain of other parameters is dropped."""
-        vehicle = fit.values.applied_to(self.datasheet)
-        if vehicle != self.datasheet and not vehicle.name.endswith("(identified)"):
-            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
-        noise = dict(fit.filter) if fit.physics is None else fit.filter | {PHYSICS: fit.physics.noise}
-        gain = self.network_gain if vehicle == self.datasheet else None
-        return replace(
-            self, vehicle=vehicle, noise=noise, network_gain=gain, fitted_physics=fit.physics, learnt_on=fit.drives
         )
 
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
@@ -208,7 +192,7 @@ def _with_parts(car: Car, folder: Path) -> Car:
     notes: list[str] = []
     if (folder / MODEL_FILE).exists():
         model = read_model(folder / MODEL_FILE)
-        if model.belongs_to(car.datasheet):
+        if model.belongs_to(car.vehicle):
             if (folder / FIT_FILE).exists():
                 notes.append(f"{FIT_FILE}: not used, {MODEL_FILE} takes its place")
             if model.truth not in ("", GROUND_TRUTH):
@@ -217,8 +201,9 @@ def _with_parts(car: Car, folder: Path) -> Car:
         notes.append(f"{MODEL_FILE} is not used: {VEHICLE_FILE} has changed since; pdhef learn creates it again")
     if (folder / FIT_FILE).exists():
         fit = read_fit(folder / FIT_FILE)
-        if fit.physics_sha256 == physics_sha256(car.datasheet):
-            car = car.with_fit(fit)
+        if fit.physics_sha256 == physics_sha256(car.vehicle):
+            noise = fit.filter if fit.physics is None else fit.filter | {PHYSICS: fit.physics.noise}
+            car = replace(car, noise=noise, fitted_physics=fit.physics, learnt_on=fit.drives)
         else:
             notes.append(f"{FIT_FILE} is not used: {VEHICLE_FILE} has changed since")
     return replace(car, notes=tuple(notes))

@@ -9,16 +9,13 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field
 
 from pdhef_logtool.car.vehicle import (
     NonNegative,
-    PhysicsParts,
-    Position,
     Positive,
     Record,
     Sensors,
-    Tyres,
     VehicleParameters,
 )
 from pdhef_logtool.storage.documents import digest, one_of
@@ -61,48 +58,6 @@ class LearntOn(Record):
     end_s: float = 0.0
 
 
-class FittedSensors(Record):
-    """Identified constant errors of sensors."""
-
-    ay_bias_m_s2: float
-    yaw_rate_bias_rad_s: float
-    yaw_rate_gain: Positive = 1.0
-    yaw_rate_delay_s: NonNegative = 0.0
-
-
-class FittedValues(Record):
-    """Identified values of vehicle file entries; for absent ones the file applies."""
-
-    yaw_inertia_kg_m2: Positive | None = None
-    steer_offset_rad: float | None = None
-    steering_ratio: Positive | None = None
-    roll_gradient_rad_per_m_s2: float | None = None
-    friction: Positive | None = None
-    sensors: FittedSensors | None = None
-    tyres: Tyres | None = None
-    relaxation_length_m: NonNegative | None = None
-    load_sensitivity: NonNegative | None = None
-    roll_frequency_rad_s: Positive | None = None
-    roll_damping: Positive | None = None
-    cg_over_roll_axis_m: NonNegative | None = None
-    imu_position_m: Position | None = None
-    physics: PhysicsParts | None = None
-
-    @classmethod
-    def of(cls, fitted: VehicleParameters) -> FittedValues:
-        """Return all entries of a vehicle."""
-        values = {k: getattr(fitted, k) for k in cls.model_fields}
-        values["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
-        return cls(**values)
-
-    def applied_to(self, vehicle: VehicleParameters) -> VehicleParameters:
-        """Return the vehicle with these values."""
-        update: dict[str, Any] = {k: v for k in type(self).model_fields if (v := getattr(self, k)) is not None}
-        if self.sensors is not None:
-            update["sensors"] = vehicle.sensors.model_copy(update=self.sensors.model_dump())
-        return vehicle.model_copy(update=update)
-
-
 #: ``limit_gain`` of cars without validation by ground truth (docs/method.md#limit). A higher gain reduces the error of
 #: single manoeuvres further, but on laps with a wrong file the estimate then drifts with bias and tilt.
 LIMIT_GAIN = 1.5
@@ -118,7 +73,6 @@ class FilterNoise(Record):
     r_std : by measurement; the filter's default for missing ones.
     limit_gain : growth of the process noise of axle forces and yaw rate of ``physics`` beyond the linear range; 0
         without.
-    score_deg : objective of the noise search, lower is better; None without a search. trial : number of its trial.
     """
 
     q_std: Annotated[tuple[NonNegative, ...], Field(strict=False)] = ()
@@ -126,69 +80,43 @@ class FilterNoise(Record):
         Field(default_factory=dict)
     )
     limit_gain: NonNegative = 0.0
-    score_deg: Positive | None = None
-    trial: int | None = None
 
     def measurement_std(self, sensors: Sensors) -> tuple[float, float, float]:
         """Return the 1-sigma of a_y, yaw rate and speed, from the sensors for missing ones."""
         ay, rate, speed = (self.r_std.get(m, std) for m, std in zip(MEASUREMENTS, sensors.measurement_std, strict=True))
         return ay, rate, speed
 
-    @model_validator(mode="after")
-    def _one_entry_a_state(self) -> FilterNoise:
-        if len(self.q_std) not in (0, 3, 4, 6):
-            raise ValueError(f"q_std needs 3 or 4 entries (v_x, v_y, yaw rate, a_x bias), got {len(self.q_std)}")
-        return self
-
-
-def _axle_forces_belong_to_physics(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
-    for name, table in tables.items():
-        if len(table.q_std) == 6 and name != PHYSICS:
-            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics's")
-    return tables
-
 
 #: Noise by filter.
-FilterTables = Annotated[
-    dict[Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise],
-    AfterValidator(_axle_forces_belong_to_physics),
+FilterTables = dict[
+    Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise
 ]
 
 
-class TriedParts(Record):
-    """A tested set of model parts of ``physics``: its error on held-out folds, and the verdict."""
-
-    parts: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    held_out_deg: Annotated[tuple[float, ...], Field(strict=False)]
-    taken: bool
-
-
 class FittedPhysics(Record):
-    """Values and noise that were identified with the filter ``physics``, and the evidence for its model parts.
+    """Vehicle and noise that were identified with the filter ``physics``.
 
     ``smoothing``: as :data:`SMOOTHING`, found with the smoother. ``beside_residual``: noise of the filters that have the
     network's residual, as a factor on the process noise of v_y, yaw rate and axle forces, and its growth
     ``limit_gain``.
     """
 
-    values: FittedValues
+    values: VehicleParameters
     noise: FilterNoise
     smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = SMOOTHING
     beside_residual: Annotated[tuple[Positive, NonNegative], Field(strict=False)] = (1.0, 0.0)
-    tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
 
 
 class Fit(Record):
     """``fit.toml``: identified physics of the car.
 
-    ``filter`` : noise of the filters with ``values`` (docs/method.md#noise). ``physics`` : values and noise of the
-    filter ``physics``, which has other model parts and is identified separately.
+    ``filter`` : noise of the filters on the vehicle file (docs/method.md#noise). ``physics`` : vehicle and noise of the
+    filter ``physics``, which has other model parts.
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"
     version: Literal[1] = 1
     physics_sha256: Sha256
-    values: FittedValues = FittedValues()
     filter: FilterTables = Field(default_factory=dict)
     physics: FittedPhysics | None = None
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()

@@ -45,7 +45,7 @@ def check_output(source: Car, output: Path) -> None:
 def vehicle_file(car: Car) -> bytes:
     """Return the bytes of a car's vehicle.toml, generated for the default car."""
     if car.source is None:
-        return part_toml(car.datasheet, "The default car of pdhef.").encode()
+        return part_toml(car.vehicle, "The default car of pdhef.").encode()
     return (car.source / VEHICLE_FILE if car.source.is_dir() else car.source).read_bytes()
 
 

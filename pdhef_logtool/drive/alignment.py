@@ -57,7 +57,7 @@ MIN_GAP_S = 0.1
 LONGEST_GAP_S = 10.0
 #: Assumed for a channel that shows fewer than two samples in the survey.
 UNKNOWN_PERIOD_S = 0.1
-#: Lateness is judged against the fastest sample this close in time, so that a slow drift of clocks is not lateness.
+#: Lateness is judged against the fastest sample of a few such intervals: a slow drift of clocks is not lateness.
 LATE_NEIGHBOURHOOD_S = 1.0
 #: Jitter below this is never lateness.
 MIN_LATE_S = 0.05
@@ -130,11 +130,6 @@ class AlignmentPlan:
         """Aligned columns that the mapping provides, regardless of their source (``speed_m_s`` also from wheels)."""
         names = {c.target for c in self.channels}
         return frozenset(names | ({"speed_m_s"} if self.speed_from != "none" else set()))
-
-    @property
-    def has_gnss(self) -> bool:
-        """Whether the mapping provides GNSS velocity."""
-        return has_gnss({c.target for c in self.channels})
 
     def without(self, refused: Mapping[str, str]) -> AlignmentPlan:
         """Return the plan without the channels in ``refused`` (name: reason). The grid keeps its stamps."""
@@ -230,7 +225,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan) -> tuple[Signals
     if plan.speed_from == "wheel speeds":
         columns["speed_m_s"] = combine_wheel_speeds(wheels)
     gnss: dict[str, Any] = {}
-    if plan.has_gnss:
+    if has_gnss(columns):
         velocity = gnss["gnss_velocity_m_s"] = gnss_velocity(columns)
         gnss["gnss_late_s"] = np.where(np.isfinite(velocity[:, 0]), (gnss_ready - stamps) * 1e-9, np.nan)
         if plan.speed_from == "GNSS":
@@ -400,20 +395,11 @@ def _survey_delay(channel: Channel) -> tuple[float, float]:
 
 
 def _fastest_nearby(stamps_ns: IntArray, delay_ns: IntArray) -> IntArray:
-    """Return the smallest delay within ±``LATE_NEIGHBOURHOOD_S`` of each sample, [N] (a sparse table of minima)."""
-    half = _ns(LATE_NEIGHBOURHOOD_S)
-    lo = np.searchsorted(stamps_ns, stamps_ns - half, side="left")
-    hi = np.searchsorted(stamps_ns, stamps_ns + half, side="right")
-    level = np.frexp((hi - lo).astype(np.float64))[1] - 1  # floor(log2), exact for integers
-    smallest = np.empty_like(delay_ns)
-    table = delay_ns
-    for k in range(int(level.max(initial=0)) + 1):
-        if k:
-            step = 1 << (k - 1)
-            table = np.minimum(table[:-step], table[step:])
-        here = level == k
-        smallest[here] = np.minimum(table[lo[here]], table[hi[here] - (1 << k)])
-    return smallest
+    """Return the smallest delay in the interval of ``LATE_NEIGHBOURHOOD_S`` of each sample and those beside it, [N]."""
+    starts = np.flatnonzero(np.diff((stamps_ns - stamps_ns[0]) // _ns(LATE_NEIGHBOURHOOD_S), prepend=-1))
+    fastest = np.pad(np.minimum.reduceat(delay_ns, starts), 1, mode="edge")
+    nearby = np.minimum(np.minimum(fastest[:-2], fastest[2:]), fastest[1:-1])
+    return np.repeat(nearby, np.diff(starts, append=len(stamps_ns)))
 
 
 def _is_late(channel: Channel, p: ChannelPlan) -> BoolArray:

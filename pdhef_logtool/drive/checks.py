@@ -81,7 +81,7 @@ class CheckedDrive:
     ----------
     measured : columns [N] on one grid, SI, by signal; names of ground truth begin with ``truth.``.
     vehicle : from the file, or the default vehicle (``has_file`` False).
-    latency : of ground truth against the gyro, or of the gyro. late : late sensors, detected without ground truth.
+    latency : of ground truth against the gyro, or of the gyro.
     related : checks of signals by their relations.
     """
 
@@ -89,7 +89,6 @@ class CheckedDrive:
     vehicle: VehicleParameters
     has_file: bool
     latency: LatencyEstimate | None
-    late: Sequence[LateSensor]
     related: tuple[Check, ...]
 
     @property
@@ -449,13 +448,13 @@ def check_drive(
     """
     related = relation_checks(measured)
     file, has_file = vehicle or default_vehicle(), vehicle not in (None, default_vehicle())
-    drive = CheckedDrive(measured, file, has_file, latency, late, related)
+    drive = CheckedDrive(measured, file, has_file, latency, related)
     unique: dict[str, Check] = {}
     for check in (check for function in FUNCTIONS for check in function(drive)):
         if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:
             unique[check.name] = check  # the worse of two checks with one name counts
     # Ground truth decides about delays before the signals do.
-    return tuple(({c.name: c for c in delay_checks(drive.late)} | unique).values())
+    return tuple(({c.name: c for c in delay_checks(late)} | unique).values())
 
 
 def misread_channels(checks: Sequence[Check], waived: Sequence[str] = ()) -> dict[str, str]:

@@ -32,11 +32,6 @@ class CommonGrid:
     a: FloatArray
     b: FloatArray
 
-    @property
-    def both(self) -> int:
-        """Number of grid points where both are known."""
-        return int(np.count_nonzero(np.isfinite(self.a) & np.isfinite(self.b)))
-
 
 @dataclass(frozen=True, slots=True)
 class Shift:
@@ -123,15 +118,6 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
     ]
     chance = student(len(blocks)) * float(np.std(blocks, ddof=1)) / math.sqrt(len(blocks))
     return math.hypot(chance, later - (shift_s - steps * grid.step_s), _RESAMPLING_S)
-
-
-def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float) -> bool:
-    """Return whether the correlation has a peak of ``least`` or more inside a range."""
-    first, last = round(low_s / grid.step_s) - 1, round(high_s / grid.step_s) + 1
-    reach = max(-first, last)
-    correlations = _correlations(grid, reach)[reach + first : reach + last + 1]
-    inner = correlations[1:-1]
-    return bool(((inner > correlations[:-2]) & (inner >= correlations[2:]) & (inner >= least)).any())
 
 
 def parabolic_peak(before: float, middle: float, after: float) -> float:

@@ -11,11 +11,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from pdhef_logtool.drive.columns import GRID_S
 from pdhef_logtool.drive.correlation import (
     CommonGrid,
     find_shift,
-    has_peak_within,
     on_common_grid,
     shift_error,
     without_trend,
@@ -34,8 +35,6 @@ LATE_GYRO_S = 0.005
 MAX_SHIFT_ERROR_S, SURE = 0.015, 4.0
 #: Least correlation at the shift: of ground truth; of sensors, which differ where the car slides; of exact pairs.
 LEAST_CORRELATION = (0.8, 0.9, 0.95)
-#: A peak in the plausible range with this share of the highest correlation may be the right one.
-AS_HIGH = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +85,7 @@ def lag_of(
     return LatencyEstimate(0.0 if lacks else shift.shift_s, shift.correlation, error_s, not lacks, False, lacks)
 
 
-def estimate_truth_latency(
-    sensor_yaw_rate: Channel, truth_yaw_rate: Channel, *, max_error_s: float = MAX_LATENCY_ERROR_S
-) -> LatencyEstimate:
+def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) -> LatencyEstimate:
     """Estimate the ground-truth latency against the gyro by cross-correlation of detrended yaw rates.
 
     Parameters
@@ -101,9 +98,9 @@ def estimate_truth_latency(
     a, b, grid = sensor_yaw_rate, truth_yaw_rate, None
     if min(len(a), len(b)) > 1:
         grid = on_common_grid(a.stamps_ns, a.values, b.stamps_ns, b.values)
-    if grid is None or grid.both * grid.step_s < 4.0 * MAX_LATENCY_S:
+    if grid is None or float(np.isfinite(grid.a + grid.b).sum()) * grid.step_s < 4.0 * MAX_LATENCY_S:
         return LatencyEstimate(0.0, 0.0, math.inf, False, False, "less than two seconds in common")
-    lag = lag_of(grid, max_error_s=max_error_s)
+    lag = lag_of(grid)
     return replace(lag, reason="gyro against ground-truth yaw rate") if lag.reliable else lag
 
 
@@ -158,9 +155,7 @@ def late_sensors(measured: Measured) -> tuple[LateSensor, ...]:
         lag = lag_of(grid, LEAST_CORRELATION[1 + law.exact], MAX_SHIFT_ERROR_S)
         shift_s, error_s = lag.latency_s, lag.std_error_s
         beyond_s = max(low - shift_s, shift_s - high)
-        # A sine also correlates with itself a period later.
-        is_late = lag.reliable and error_s <= beyond_s / SURE
-        if not is_late or has_peak_within(grid, low, high, AS_HIGH * lag.correlation):
+        if not lag.reliable or error_s > beyond_s / SURE:
             continue
         name = law.late[shift_s >= low]
         late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift_s, error_s, low, high))

@@ -23,26 +23,15 @@ class Bracket:
     """
 
     def __init__(self, stamps_ns: IntArray, at_ns: IntArray, max_gap_ns: int) -> None:
-        self._left: IntArray | slice
-        self._right: IntArray | slice
-        n = int(stamps_ns.shape[0])
-        if n == 0:
-            self.inside: BoolArray = np.zeros(at_ns.shape[0], dtype=np.bool_)
-            self._left = self._right = np.empty(0, dtype=np.int64)
-            self._share = np.empty(0)
-            return
-        if np.array_equal(stamps_ns, at_ns) and (stamps_ns[1:] > stamps_ns[:-1]).all():
-            self.inside = np.ones(n, dtype=np.bool_)
-            self._left = self._right = slice(None)
-            self._share = np.zeros(1)
-            return
+        n = len(stamps_ns)
+        stamps_ns = stamps_ns if n else np.zeros(1, np.int64)  # nothing is inside
         right = np.searchsorted(stamps_ns, at_ns, side="left")
         hit = stamps_ns[np.minimum(right, n - 1)] == at_ns
         left = np.where(hit, right, right - 1)
         bracketed = (left >= 0) & (right < n)
         left, right = np.clip(left, 0, n - 1), np.minimum(right, n - 1)
         step = stamps_ns[right] - stamps_ns[left]
-        self.inside = bracketed & (step <= max_gap_ns)
+        self.inside: BoolArray = bracketed & (step <= max_gap_ns)
         if not self.inside.all():
             at_ns, left, right, step = (c[self.inside] for c in (at_ns, left, right, step))
         self._left, self._right = left, right

@@ -67,7 +67,7 @@ class Measured:
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
         kept = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
         speed = None if (self.speed_name or "").startswith("truth.") else self.speed_name
-        return replace(self, columns=columns, speed_name=speed, relations=kept)
+        return replace(self, columns=columns, speed_name=speed, relations=kept, has_truth=False)
 
     def without(self, names: Iterable[str]) -> Measured:
         """Return the measurements without these columns, which have no relations."""

@@ -45,8 +45,6 @@ ASKEW_SAMPLES, SURE_STD = 40.0, 3.0
 ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
 #: Least correlation of the yaw rate with another measurement that decides its sign, and its independent samples (5 s).
 SIGN_CORRELATION, MIN_SAMPLES = 0.5, 10.0
-#: The same for a left-handed sensor: the wheels' difference changes its sign when a car understeers strongly.
-HAND_CORRELATION = 0.8
 #: Words for the axes of a rate, x first.
 _RATE_WORDS = ("roll", "pitch", "yaw")
 #: Temporary names of the components; they differ from all signal names.
@@ -56,9 +54,6 @@ RATES = tuple(f"triad.rate.{axis}" for axis in "xyz")
 MOUNTED = ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: A mean acceleration in this range is gravity.
 IS_GRAVITY_M_S2 = (0.75 * GRAVITY_M_S2, 1.25 * GRAVITY_M_S2)
-#: Largest angle between the mean gravity of a drive and the car's vertical.
-TILT_DEG = 15.0
-
 
 # ------------------------------------------------------------------------------------------------ fields of an IMU
 
@@ -151,12 +146,6 @@ def angles_deg(rotation: FloatArray) -> tuple[float, float, float]:
     return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
 
 
-def rotation_text(rotation: FloatArray) -> str:
-    """Return a sensor's rotation as text."""
-    roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in angles_deg(rotation))
-    return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg"
-
-
 def nearest_step(rotation: FloatArray) -> FloatArray:
     """Return the nearest rotation [3, 3] by multiples of 90 degrees."""
     rows = np.eye(3)[list(permutations(range(3)))]
@@ -165,57 +154,31 @@ def nearest_step(rotation: FloatArray) -> FloatArray:
     return np.asarray(steps[np.argmax(np.sum(steps * rotation, axis=(1, 2)))])
 
 
-def upright_check(named: FloatArray, force: FloatArray) -> Check | None:
-    """Report that gravity, the mean acceleration [3], is not upward in the axes that a mapping names.
-
-    ``named``: rows [3, 3] of forward, left and the yaw axis in the sensor's axes. The result is None without forward or
-    left, and if the sensor subtracts gravity.
-    """
-    up, size = np.cross(named[0], named[1]), float(np.linalg.norm(force))
-    least = math.cos(math.radians(2.0 * TILT_DEG)) * size
-    if not up.any() or not IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1] or up @ force > least:
-        return None
-    along = int(np.argmax(np.abs(force)))
-    axis = f"{'-' if force[along] < 0.0 else '+'}{'xyz'[along]}"
-    evidence = f"gravity is along {axis} of the accelerometer, not along its vertical: its axes are not the car's"
-    remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
-    return Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy)
-
-
-def angle_deg(cosine: float) -> float:
-    """Return the angle of a cosine, deg; rounding may exceed 1."""
-    return math.degrees(math.acos(float(np.clip(cosine, -1.0, 1.0))))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
     """Rotation [3, 3] from the sensor's axes to forward, left, up, with its evidence.
 
     ``named``: the rows [3, 3] that the mapping reads now, 0 where it lacks a signal. ``confident``: the rotation may be
-    applied. ``hand``: -1 if the sensor's rates are left-handed.
+    applied. The sign of a left-handed sensor's rate is that of the signal (:mod:`~.hypotheses`).
     """
 
     rotation: FloatArray
     named: FloatArray
     evidence: str
     confident: bool
-    hand: float = 1.0
-
-    @property
-    def rows(self) -> FloatArray:
-        """Rows [3, 3] that a mapping should read: forward and left of the accelerometer, up of the gyro."""
-        return np.concatenate([self.rotation[:2], self.hand * self.rotation[2:]])
 
     @property
     def is_as_named(self) -> bool:
         """Whether the mapping reads the axes that it should."""
-        return all(np.allclose(r, n, atol=1e-3) for r, n in zip(self.rows, self.named, strict=True) if n.any())
+        return all(np.allclose(r, n, atol=1e-3) for r, n in zip(self.rotation, self.named, strict=True) if n.any())
 
     @property
     def text(self) -> str:
         """The rotation as text."""
-        mirrored = "" if self.hand > 0.0 else ", its angular rates with the opposite sign"
-        return f"{rotation_text(self.rotation)}{mirrored}"
+        roll, pitch, yaw = (
+            round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in angles_deg(self.rotation)
+        )
+        return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg"
 
 
 def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
@@ -235,25 +198,21 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     ups = _ups(f, w, named)
     if len(ups) > 1 and not references:  # gravity does not show which way is up
         references = steering_references(columns, speed_name)
-    # A sensor is left-handed only if another measurement of the yaw rate confirms it.
-    fitting = [
-        (turn, h) for h in (1.0, -1.0) for up in ups
-        if (turn := _turned(f, h * w, speed, up, references)) and turn.fits and h * HAND_CORRELATION > -turn.sign
-    ]  # fmt: skip
+    fitting = [turn for up in ups if (turn := _turned(f, w, speed, up, references)) and turn.fits]
     if not fitting:
         return None
-    best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
-    mounting = Mounting(_snapped(best), named, best.evidence, _is_shown(best, hand, measured), hand)
+    best = max(fitting, key=lambda x: x.correlation + np.sign(x.sign))
+    mounting = Mounting(_snapped(best), named, best.evidence, _is_shown(best, measured))
     is_sure = best.correlation >= ASKEW_CORRELATION or best.errors_deg[0] <= MAX_ERROR_DEG or mounting.is_as_named
     return replace(mounting, confident=mounting.confident and is_sure)
 
 
-def _is_shown(turn: _Turn, hand: float, measured: Measured) -> bool:
+def _is_shown(turn: _Turn, measured: Measured) -> bool:
     """Return whether another measurement of the yaw rate, the speed or the steering confirms a rotation.
 
     Steering that counts to the left confirms gravity, and is no evidence against it: its sign is no standard.
     """
-    if turn.sign != 0.0 or turn.along or hand < 0.0:
+    if turn.sign != 0.0 or turn.along:
         return turn.sign > 0.0 or turn.along
     return _sign_of(turn.rate, steering_references(measured.columns, measured.speed_name))[0] > 0.0
 
@@ -368,20 +327,12 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
 
 
 def _snapped(turn: _Turn) -> FloatArray:
-    """Return the nearest multiple of 90 degrees, with the remaining tilt and yaw if the drive shows them."""
+    """Return the nearest multiple of 90 degrees, or the rotation itself if the drive shows that it differs."""
     step = nearest_step(turn.rotation)
-    if turn.correlation < ASKEW_CORRELATION or turn.error_deg > ASKEW_ERROR_DEG:
-        return step
-    rest = turn.rotation @ step.T
-    yaw = math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1])
-    is_turned = abs(math.degrees(yaw)) > max(TURNED_DEG, SURE_STD * turn.errors_deg[0])
-    if angle_deg(float(rest[2, 2])) > max(TURNED_DEG, SURE_STD * turn.errors_deg[1]):
-        from scipy.spatial.transform import Rotation
-
-        level_only = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest[2]])[0].as_matrix()
-        return turn.rotation if is_turned else np.asarray(level_only @ step)
-    c, s = (math.cos(yaw), math.sin(yaw)) if is_turned else (1.0, 0.0)
-    return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ step)
+    cosine = float(np.clip(0.5 * (np.trace(turn.rotation @ step.T) - 1.0), -1.0, 1.0))
+    is_certain = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
+    is_askew = math.degrees(math.acos(cosine)) > max(TURNED_DEG, SURE_STD * math.hypot(*turn.errors_deg))
+    return turn.rotation if is_certain and is_askew else step
 
 
 # ------------------------------------------------------------------------------------- into the mapping
@@ -396,22 +347,23 @@ def turned_signals(
     signals = dict(mapping.signals)
     for i, name in enumerate(MOUNTED):
         if name in signals:
-            signals[name] = (rates if i == 2 else accelerations).turned(signals[name], mounting.rows[i])
+            signals[name] = (rates if i == 2 else accelerations).turned(signals[name], mounting.rotation[i])
     for i, name in enumerate(("roll_rate_rad_s", "pitch_rate_rad_s")):
         if name in signals:
-            signals[name] = rates.turned(signals[name], mounting.hand * mounting.rotation[i])
+            signals[name] = rates.turned(signals[name], mounting.rotation[i])
     return signals
 
 
-def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]) -> list[Check]:
+def mounting_checks(
+    mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]
+) -> tuple[Check, ...]:
     """Return for each of the IMU's signals whether it is read from the axis that the drive shows."""
     turned = turned_signals(mapping, mounting, triads)
     checks = []
     for i, name in enumerate(MOUNTED):
         if name not in mapping.signals:
             continue
-        right = np.allclose(mounting.rows[i], mounting.named[i], atol=1e-3)
-        if right:
+        if np.allclose(mounting.rotation[i], mounting.named[i], atol=1e-3):
             if mounting.confident:
                 checks.append(result("SIGNAL.mounting", "passed", name, evidence=mounting.evidence))
             continue
@@ -419,4 +371,4 @@ def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | 
         entries = entries_of(turned[name], "field", "scale")
         check = result("SIGNAL.mounting", "failed", name, evidence=evidence, entries=entries)
         checks.append(check if mounting.confident else replace(check, verdict="undecided"))
-    return checks
+    return tuple(checks)

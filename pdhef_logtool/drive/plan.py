@@ -197,9 +197,9 @@ def with_earlier_drive(car: Car, path: Path) -> tuple[Car, Sensors]:
     VehicleError : The file is missing, wrong, of another vehicle file, or without sensors.
     """
     model = read_model(path, "auto, off or a model.toml", _REMEDY)
-    if not model.belongs_to(car.datasheet):
+    if not model.belongs_to(car.vehicle):
         raise VehicleError(
-            expected=f"a model of the car {car.datasheet.name}",
+            expected=f"a model of the car {car.vehicle.name}",
             got=f"one of the vehicle file of {model.vehicle}, which differs",
             where=str(path),
             remedy="give the --car of that run, or a model of this car",

@@ -89,11 +89,6 @@ class Drive:
         return self.path.name
 
     @property
-    def missing(self) -> tuple[str, ...]:
-        """Signals that the mapping lacks."""
-        return self.chosen.missing
-
-    @property
     def available(self) -> frozenset[str]:
         """Aligned signals that the log provides."""
         return self.plan.alignment.available

@@ -104,8 +104,8 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
         truth = truth_at(derived, signals.stamps_ns, plan.truth_latency_s, standstill_m_s=standstill)
         del derived
     del part  # the channels take as much memory as all that follows
-    signals, changes = find_changes(without_impossible(signals), unchanged)
-    signals = without_faults(signals, plan.vehicle)
+    # The end of a stuck value would be taken for a jump.
+    signals, changes = find_changes(without_faults(without_impossible(signals), plan.vehicle), unchanged)
     truth = None if truth is None else replace(truth, measured_speed_m_s=_measured_speed(signals))
     from_truth = () if truth is None else steps_from_truth(signals, truth)
     return WholeDrive(name, plan, signals, truth, log.start_ns, changes, from_truth, losses, ledger, *hashes)

@@ -123,31 +123,18 @@ def measured_relations(
             relations += compare(law(key, other=other, name=name), columns[name], columns[other])
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
     agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
-    axle = _axle_sideslips(columns, vehicle, speed_name, agree)
-    return relations + axle + _sideslips(columns, is_known=bool(axle))
+    return relations + _axle_sideslips(columns, vehicle, speed_name, agree) + _sideslips(columns)
 
 
 # ------------------------------------------------------------------------------------------- relations
 
 
-def compare(
-    law: Law,
-    predicted: FloatArray,
-    measured: FloatArray,
-    use: BoolArray | None = None,
-    gentle: BoolArray | None = None,
-) -> list[Relation]:
+def compare(law: Law, predicted: FloatArray, measured: FloatArray, use: BoolArray | None = None) -> list[Relation]:
     """Return the relation between two columns where ``use`` and both are finite; an empty list without driving.
 
-    ``gentle``: samples of gentle driving. The relation of these is returned if only it is plausible: a wrong sign, unit
-    or axis is wrong everywhere, sliding is not. The means of the sides count as far as they exceed the ``bias`` of the
-    law: on a circle the mean is the signal. Sides that move by less count as fewer samples: the crossfall of a straight
-    road moves them, too.
+    The means of the sides count as far as they exceed the ``bias`` of the law: on a circle the mean is the signal.
+    Sides that move by less count as fewer samples: the crossfall of a straight road moves them, too.
     """
-    if gentle is not None:
-        relations, at_ease = (compare(law, predicted, measured, where) for where in (use, gentle))
-        is_right = all(r.accepts() and not r.unrelated for r in relations)
-        return at_ease if not is_right and at_ease and all(r.tells and r.accepts() for r in at_ease) else relations
     sides, finite = (predicted, measured), np.isfinite(predicted) & np.isfinite(measured)
     use = finite if use is None else use & finite
     samples = independent_samples(int(np.count_nonzero(use)))
@@ -194,7 +181,7 @@ def _motion(columns: Mapping[str, FloatArray], of: str, pace_name: str) -> Itera
     yaw, left, forward = (columns.get(f"{of}{n}") for n in ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"))
     turns = None if yaw is None else yaw * pace
     if turns is not None and left is not None:
-        yield from compare(law("lateral", of=of, pace=pace_name), turns, left, moving, gentle_at(turns, moving))
+        yield from compare(law("lateral", of=of, pace=pace_name), turns, left, moving)
     if forward is not None:
         along = law("longitudinal", of=of, pace=pace_name)
         straight = moving if turns is None else moving & (np.abs(turns) < STRAIGHT_M_S2)
@@ -327,15 +314,13 @@ def _axle_differences(pace: _Pace) -> list[tuple[str, FloatArray]]:
 
 
 def _wheel_differences(pace: _Pace) -> Iterator[Relation]:
-    """Relate yaw rate and a_y to the speed differences of the axles, which have no mounting error."""
-    pairs = _axle_differences(pace)
-    for name, factor in (("yaw_rate_rad_s", 1.0), ("ay_m_s2", pace.speed)):
-        laws = [law(f"axle_{name}", axle=text, pace=pace.name) for text, _ in pairs if name in pace.columns]
-        sides = [(pace.columns[name], factor * difference) for _, difference in pairs if name in pace.columns]
-        both = zip(laws, sides, strict=True)
-        related = [r for a, b in both for r in compare(a, *b, pace.moving, pace.gentle)]
-        # The rear axle shows a delay: the front wheels also move with the steering.
-        yield from (replace(r, sides=related[0].sides) for r in _best(related))
+    """Relate the yaw rate to the speed differences of the axles, which have no mounting error."""
+    if (yaw := pace.columns.get("yaw_rate_rad_s")) is None:
+        return
+    laws = [(law("axle", axle=text, pace=pace.name), difference) for text, difference in _axle_differences(pace)]
+    related = [r for its, difference in laws for r in compare(its, yaw, difference, pace.moving)]
+    # The rear axle shows a delay: the front wheels also move with the steering.
+    yield from (replace(r, sides=related[0].sides) for r in _best(related))
 
 
 def _scaled_to(wheel: FloatArray, pace: _Pace) -> FloatArray:
@@ -358,8 +343,7 @@ def _courses(columns: Mapping[str, FloatArray], pace: _Pace) -> Iterator[Relatio
         line, mapped = ("course", "") if path == GNSS_COURSE_RATE else ("path", COURSE_RATE)
         for name in (n for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns):
             its = law(key, name=name, line=line, mapped=mapped)
-            gentle = gentle_at(columns[name] * pace.speed, pace.moving)
-            yield from _best([r for t in turnings for r in compare(its, t, columns[name], pace.moving, gentle)])
+            yield from _best([r for t in turnings for r in compare(its, t, columns[name], pace.moving)])
 
 
 def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
@@ -415,13 +399,11 @@ def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
         return np.where(moving_at(speed) & (speed > 1.0), (vx * ay - vy * ax) / speed**2, np.nan)
 
 
-def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Relation]:
-    """Relate the ground-truth sideslip to a_y, by kinematics and by the rear axle.
+def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
+    """Relate the ground-truth sideslip to a_y by kinematics.
 
     a_y - v_x r is the derivative of v_y, plus terms of the accelerometer's lever arm, of body roll and of a bias, which
-    are in proportion to the yaw acceleration, to v_x r and to 1. In gentle driving, sideslip is the curvature times a
-    lever arm minus a_y times the compliance of the rear tyres; this relation is used unless both are known
-    (``is_known``) from a file.
+    are in proportion to the yaw acceleration, to v_x r and to 1.
     """
     turning = next((n for n in ("truth.yaw_rate_rad_s", "yaw_rate_rad_s") if n in columns), "")
     names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", turning)
@@ -432,13 +414,7 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     moving, ones = _moving(columns, vx), np.ones_like(ay)
     of_vx = subject != "truth.sideslip_rad"  # sideslip from v_y and v_x, otherwise v_y from sideslip and v_x
     by_rate = law("sideslip_rate", subject=subject, scaled="" if of_vx else "truth.vx_m_s")
-    relations = _partial(by_rate, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
-    if is_known:
-        return relations
-    curvature, ratio = rate / vx, vy / vx  # linear in a wrong v_y, unlike the angle
-    by_ay = law("compliance", subject=subject, scaled="truth.vx_m_s" if of_vx else "")
-    sides = (-ay, columns.get("truth.sideslip_rad", ratio))
-    return relations + _partial(by_ay, *sides, [curvature, ones], gentle_at(vx * rate, moving))
+    return _partial(by_rate, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
 
 
 def _axle_sideslips(
@@ -456,7 +432,7 @@ def _axle_sideslips(
     lever = vehicle.cg_to_rear_axle_m + (0.0 if is_moved else vehicle.truth_position_m[0])
     stiffness = vehicle.cornering_stiffness_n_per_rad(False, vehicle.assumed_friction)
     compliance = vehicle.mass_kg * vehicle.cg_to_front_axle_m / (vehicle.wheelbase_m * stiffness)
-    speed, its = columns[speed_name], law("axle", subject=subject)
+    speed, its = columns[speed_name], law("rear_axle", subject=subject)
     slip, gentle = compliance * ay * speed, gentle_at(speed * rate, _moving(columns, speed))
     expected, used = lever * rate - slip, gentle & np.isfinite(slip) & np.isfinite(rate)
     # Where the two terms cancel, the file's compliance, known to a quarter, decides the sign.

@@ -66,8 +66,6 @@ CHANCE, LEAST_STUCK_S = 1e-6, 0.3
 LEAST_STEER_CHANGE_RAD, MISSED, LEAST_SPEED_CHANGE_M_S, GRADE_S = 0.006, 5.0, 1.5, 5.0
 #: Samples of a coarse signal, half of them repetitions, that are assumed before a drive.
 FEW_SAMPLES = 10.0
-#: Share of the usual step of a value below which an accelerometer or a gyro repeats it.
-LEAKED = 0.1
 #: A value is stuck without a change that it misses if it repeats this many times as long as any value before, in a
 #: drive of at least this time.
 LONGER, SEEN_S = 4, 20.0
@@ -159,7 +157,7 @@ def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signa
         return signals, ()
     cells = cells_of(signals)
     sound, changes = _without_stuck(signals, cells, [n for n in ("steer_rad", "speed_m_s") if n not in ignored])
-    fitted, after_ns = _without_repeats(sound, cells), 0
+    fitted, after_ns = sound, 0
     while len(changes) < MOST_CHANGES and (step := _first_step(fitted, after_ns, ignored)) is not None:
         changes.append(step)
         after_ns = step.start_ns
@@ -405,18 +403,6 @@ def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tupl
     return (replace(signals, **columns) if changes else signals), changes
 
 
-def _without_repeats(signals: Signals, cells: Cells) -> Signals:
-    """Return signals without stuck values of accelerometer and gyro: their end would be taken for a jump.
-
-    A stuck axis of a sensor that is mounted askew has a small part of the other axes' noise.
-    """
-    columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in ("ay_m_s2", "yaw_rate_rad_s")}
-    for column in columns.values():
-        for run in long_runs(column, cells, cells.speed > LEAST_SPEED_M_S, LEAKED):
-            column[run.start : run.end] = np.nan
-    return replace(signals, **columns)
-
-
 class Run(NamedTuple):
     """A repetition of one value beyond chance.
 
@@ -435,16 +421,13 @@ class Run(NamedTuple):
     repeats: float
 
 
-def long_runs(column: FloatArray, cells: Cells, moving: BoolArray, share: float = 0.0, least: int = 0) -> list[Run]:
+def long_runs(column: FloatArray, cells: Cells, moving: BoolArray, least: int = 0) -> list[Run]:
     """Return the repetitions of a column [N] beyond chance in the cells [n] in which the car moves.
 
-    A value repeats if its step is at most a share of the RMS of the steps so far. With ``least``, a repetition has as
-    many samples, and twice as many as any before.
+    With ``least``, a repetition has as many samples, and twice as many as any before.
     """
     rows = np.flatnonzero(np.isfinite(column) & moving[cells.of_stamp])
-    cell, step = cells.of_stamp[rows], np.abs(np.diff(column[rows], prepend=math.nan))
-    usual = np.sqrt(np.cumsum(np.nan_to_num(step) ** 2) / np.maximum(np.arange(len(rows)), 1))
-    same = step <= share * usual
+    cell, same = cells.of_stamp[rows], np.diff(column[rows], prepend=math.nan) == 0.0
     starts = np.flatnonzero(~same)
     lengths = np.append(starts[1:], len(rows))[: len(starts)] - starts
     repeats = (np.cumsum(same)[starts] + 0.5 * FEW_SAMPLES) / (starts + FEW_SAMPLES)

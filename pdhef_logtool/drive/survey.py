@@ -10,10 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from collections.abc import Mapping as Mapped
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-
-import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.check_table import result
@@ -36,9 +34,7 @@ from pdhef_logtool.drive.mounting import (
     find_mounting,
     find_triads,
     mounting_checks,
-    named_rows,
     turned_signals,
-    upright_check,
 )
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.truth import TruthPlan, TruthTrack, derive_truth, plan_truth
@@ -46,7 +42,6 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.signals import FloatArray
 
 #: Smaller delays of a_y may be due to body roll.
 LEAST_AY_DELAY_S = 0.015
@@ -69,16 +64,12 @@ class Survey:
     latency: LatencyEstimate | None
     triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
-    force: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     corrected: tuple[Check, ...] = ()
 
     @property
     def mounted(self) -> tuple[Check, ...]:
         """Checks of the axes that the IMU's signals are read from."""
-        by_drive = [] if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
-        is_open = self.mapping.origin == "auto" and not (self.mounting is not None and self.mounting.confident)
-        upright = upright_check(named_rows(self.mapping, *self.triads), self.force) if is_open else None
-        return (*by_drive, *([] if upright is None else [upright]))
+        return () if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:
@@ -91,8 +82,7 @@ class Survey:
         """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
         if not self.channels.truth:
             return self.checks
-        measured = measure(self.channels.signals, {}, None, self.vehicle, self.mapping)
-        return (*self.mounted, *self._of(replace(measured, is_mounted=self.measured.is_mounted), None))
+        return (*self.mounted, *self._of(self.measured.without_truth(), None))
 
     def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
         """Return the channels that must not be used, with the reason. Ground truth does not decide about sensors.
@@ -164,7 +154,6 @@ def survey_log(
     blind = mounting is not None and mounting.confident
     if not blind and truth is not None:
         mounting = find_mounting(measured, triads, mapping)
-    force = _mean_force(channels)
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
     corrected: list[Check] = []
@@ -174,20 +163,14 @@ def survey_log(
         corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
         mapping = mapping.with_sources(signals, [note])
         channels = read_signals(log, mapping, clocks, *span_ns)
-        mounting = replace(mounting, named=mounting.rows)
+        mounting = replace(mounting, named=mounting.rotation)
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     is_mounted = mounting is not None and mounting.confident and mounting.is_as_named
     measured, latency = replace(measured, is_mounted=is_mounted), truth_latency(channels.signals, channels.truth, truth)
     survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, force, tuple(corrected)
+        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, tuple(corrected)
     )
     return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
-
-
-def _mean_force(channels: MappedChannels) -> FloatArray:
-    """Return the mean acceleration [3] in the sensor's axes; NaN without a component."""
-    components = [channels.signals.get(n) for n in ACCELERATIONS]
-    return np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
 
 
 def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:

@@ -78,16 +78,14 @@ class TruthPlan:
 
     Attributes
     ----------
-    base : channel that provides the stamps of the ground truth. period_s : its median period.
+    base : channel that provides the stamps of the ground truth.
     velocity : derivation of the body velocity. origin : of the local ENU frame, ECEF in m.
-    max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
+    max_gap_s : longest step that is bridged, by used channel. half_window : samples on each side of a derivative.
     position_m : measurement point of the ground truth from the CG, ISO 8855. roll_gradient_rad_per_m_s2 : of the car.
     """
 
     base: str
     velocity: str
-    used: frozenset[str]
-    period_s: float
     max_gap_s: Mapping[str, float]
     half_window: int
     origin: tuple[float, float, float] | None
@@ -129,17 +127,14 @@ def plan_truth(
     survey = {name: c for name, c in channels.items() if len(c) > 1}
     if not survey.keys() - {_FRICTION}:
         return None
-    has = frozenset(survey)
     origin = _find_origin(survey)
-    source, base = _velocity_source(has, survey, origin)
+    source, base = _velocity_source(survey, origin)
     periods = {name: float(np.median(np.diff(c.stamps_ns))) * 1e-9 for name, c in survey.items()}
     gaps = {name: GAP_PERIODS * p for name, p in periods.items()}
     half_window = max(2, round(DIFFERENTIATION_HALF_S / periods[base]))
     place, gradient = truth_position_m, roll_gradient_rad_per_m_s2
-    plan = TruthPlan(base, source, has, periods[base], gaps, half_window, origin, None, place, gradient)
-    if "quat_wxyz" not in has:
-        return plan
-    return replace(plan, attitude=_find_attitude(_Source(survey, plan)))
+    plan = TruthPlan(base, source, gaps, half_window, origin, None, place, gradient)
+    return replace(plan, attitude=_find_attitude(_Source(survey, plan))) if "quat_wxyz" in survey else plan
 
 
 def derive_truth(
@@ -265,16 +260,16 @@ def dependent_signals(
 # ---- planning ----
 
 
-def _first(has: frozenset[str], *names: str) -> str | None:
-    return next((n for n in names if n in has), None)
+def _velocity_source(survey: Mapping[str, Channel], origin: object) -> tuple[str, str]:
+    has = survey.keys()
 
+    def first(*names: str) -> str | None:
+        return next((n for n in names if n in has), None)
 
-def _velocity_source(has: frozenset[str], survey: Mapping[str, Channel], origin: object) -> tuple[str, str]:
-    velocity = _first(has, "enu_velocity_m_s", "ecef_velocity_m_s")
-    # Without a position on Earth, east and north of an ECEF velocity are unknown, and a yaw cannot be applied.
-    placeless = velocity == "ecef_velocity_m_s" and origin is None
-    heading = _first(has - {"yaw_rad"} if placeless else has, "yaw_rad", "quat_wxyz")
-    position = _first(has & (frozenset({"ecef_position_m"}) | _pairs(has)), "x_m", "ecef_position_m", "lat_deg")
+    # Without a position on Earth, east and north of an ECEF velocity are unknown.
+    velocity = first("enu_velocity_m_s", *(["ecef_velocity_m_s"] if origin is not None else []))
+    heading = first("yaw_rad", "quat_wxyz")
+    position = "x_m" if {"x_m", "y_m"} <= has else first("ecef_position_m", *(["lat_deg"] if "lon_deg" in has else []))
     ground = velocity or position
     choices: tuple[tuple[object, str, str | None], ...] = (
         ({"vx_m_s", "vy_m_s"} <= has, "body velocity", "vx_m_s"),
@@ -286,13 +281,8 @@ def _velocity_source(has: frozenset[str], survey: Mapping[str, Channel], origin:
         ("sideslip_rad" in has, "ground speed and sideslip", ground),
         (True, "ground speed alone", ground),
     )
-    longest = max(sorted(survey.keys() - {_FRICTION}), key=lambda n: len(survey[n]))
+    longest = max(sorted(has - {_FRICTION}), key=lambda n: len(survey[n]))
     return next(((source, base) for applies, source, base in choices if applies and base), ("none", longest))
-
-
-def _pairs(has: frozenset[str]) -> frozenset[str]:
-    pairs = [frozenset({"x_m", "y_m"}), frozenset({"lat_deg", "lon_deg"})]
-    return frozenset().union(*(p for p in pairs if p <= has))
 
 
 def _find_origin(survey: Mapping[str, Channel]) -> tuple[float, float, float] | None:
@@ -310,23 +300,19 @@ def _find_origin(survey: Mapping[str, Channel]) -> tuple[float, float, float] | 
 
 def _find_attitude(source: _Source) -> Attitude:
     """Choose frame and body axes such that z points up and the car moves along x; ENU and FLU when in doubt."""
-    velocity = source.reference_velocity()
+    velocity = source.velocity()
     frames: tuple[Literal["ENU", "ECEF", "NED"], ...]
-    if source.reference == "ECEF":
-        frames = ("ECEF",)
-    else:
-        frames = ("ENU", "NED") if source.plan.origin is None else ("ENU", "ECEF", "NED")
+    frames = ("ENU", "NED") if source.plan.origin is None else ("ENU", "ECEF", "NED")
     bodies: tuple[Literal["FLU", "FRD"], ...] = ("FLU", "FRD")
     best, best_score = Attitude(frames[0], "FLU"), -np.inf
     for frame, body in [(f, b) for f in frames for b in bodies]:
         rotation = source.rotation(Attitude(frame, body))
-        up = median_known(rotation[:, 2, 2]) if source.reference == "ENU" else 1.0
-        score = (1.0 if up > 0.5 else -1.0) + _forward_share(rotation, velocity)
+        score = (1.0 if median_known(rotation[:, 2, 2]) > 0.5 else -1.0) + _forward_share(rotation, velocity)
         if score > best_score + 0.05:
             best, best_score = Attitude(frame, body), score
     left_up = source.rotation(best)[:, 2, 1]
     rolls = np.abs(left_up - median_known(left_up)) > 1e-6  # otherwise only a heading; NaN compares False
-    return replace(best, has_roll=source.reference == "ENU" and bool(rolls.any()))
+    return replace(best, has_roll=bool(rolls.any()))
 
 
 def _forward_share(rotation: FloatArray, velocity: FloatArray) -> float:
@@ -350,7 +336,7 @@ class _Source:
         self.stamps_ns: IntArray = np.empty(0, dtype=np.int64) if base is None else base.stamps_ns
 
     def __contains__(self, name: str) -> bool:
-        return name in self.plan.used
+        return name in self.plan.max_gap_s
 
     def name(self, channel: str) -> str:
         """Topic and field of a channel, for the report."""
@@ -364,7 +350,7 @@ class _Source:
     def column(self, name: str) -> FloatArray:
         """Return a channel at the base stamps, [N] or [N, k]; NaN in gaps."""
         channel = self._channels.get(name)
-        if channel is None or name not in self.plan.max_gap_s:
+        if channel is None or name not in self:
             n, k = self.stamps_ns.shape[0], VECTOR_COLUMNS.get(name, 1)
             return np.full((n, k) if k > 1 else n, np.nan)
         bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * 1e9))
@@ -374,21 +360,14 @@ class _Source:
             return bracket.quaternion(channel.values)
         return bracket.linear(channel.values)
 
-    @property
-    def reference(self) -> Literal["ENU", "ECEF"]:
-        """Frame of three-dimensional vectors: ENU, or ECEF if the position on Earth is unknown."""
-        only_ecef = "ecef_velocity_m_s" in self and "enu_velocity_m_s" not in self and self.plan.origin is None
-        return "ECEF" if only_ecef else "ENU"
-
     def _from_ecef(self) -> FloatArray:
-        if self.plan.origin is None:
-            return np.eye(3)
+        assert self.plan.origin is not None
         lat_rad, lon_rad, _ = map(float, geodetic_from_ecef(np.array([self.plan.origin]))[0])
         return enu_from_ecef_rotation(lat_rad, lon_rad)
 
     def position(self) -> FloatArray:
         """Return [N, 3] in the local ENU frame; an unknown height is 0."""
-        if {"x_m", "y_m"} <= self.plan.used:
+        if "x_m" in self and "y_m" in self:
             x, y = self.column("x_m"), self.column("y_m")
             return np.stack([x, y, np.zeros_like(x)], axis=1)
         if self.plan.origin is None:
@@ -400,17 +379,17 @@ class _Source:
             ecef = ecef_from_geodetic(lat, lon, self.column("alt_m") if "alt_m" in self else np.zeros_like(lat))
         return _turn(self._from_ecef(), ecef - np.array(self.plan.origin))
 
-    def reference_velocity(self) -> FloatArray:
-        """Return [N, 3] in the reference frame, differentiated from the position if there is no velocity."""
+    def velocity(self) -> FloatArray:
+        """Return [N, 3] in the local ENU frame, differentiated from the position if there is no velocity."""
         if "enu_velocity_m_s" in self:
             return self.column("enu_velocity_m_s")
-        if "ecef_velocity_m_s" in self:
+        if "ecef_velocity_m_s" in self and self.plan.origin is not None:
             return _turn(self._from_ecef(), self.column("ecef_velocity_m_s"))
         position = self.position()
         return np.stack([self.derivative(position[:, i]) for i in range(3)], axis=1)
 
     def rotation(self, attitude: Attitude) -> FloatArray:
-        """Return matrices [N, 3, 3] that turn forward-left-up body vectors into the reference frame."""
+        """Return matrices [N, 3, 3] that turn forward-left-up body vectors into the local ENU frame."""
         quat = self.column("quat_wxyz")
         quat = np.where(np.linalg.norm(quat, axis=1, keepdims=True) > 1e-6, quat, np.nan)
         matrix = rotation_from_quat(quat)
@@ -483,7 +462,7 @@ def differentiate(
 def _pose(source: _Source) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return x, y and yaw at the CG; without yaw, at the measurement point."""
     position, plan, says = source.position(), source.plan, source.says
-    if {"x_m", "y_m"} <= plan.used:
+    if "x_m" in source and "y_m" in source:
         says["position_m"] = f"{source.name('x_m')} and {source.name('y_m')}"
     elif plan.origin is not None:
         name = "ecef_position_m" if "ecef_position_m" in source else "lat_deg"
@@ -492,7 +471,7 @@ def _pose(source: _Source) -> tuple[FloatArray, FloatArray, FloatArray]:
     if "yaw_rad" in source:
         yaw = source.column("yaw_rad")
         says["yaw_rad"] = source.name("yaw_rad")
-    elif plan.attitude is not None and source.reference == "ENU":
+    elif plan.attitude is not None:
         rotation = source.rotation(plan.attitude)
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         says["yaw_rad"] = source.attitude_text
@@ -519,10 +498,8 @@ def _body_velocity(source: _Source) -> tuple[FloatArray, FloatArray]:
     if kind in ("velocity and heading", "position and heading"):
         return _velocity_by_heading(source)
     if kind in ("ground speed and sideslip", "ground speed alone"):
-        velocity, ground = source.reference_velocity(), f"ground speed of {name(source.plan.base)}"
+        velocity, ground = source.velocity(), f"ground speed of {name(source.plan.base)}"
         speed = np.hypot(velocity[:, 0], velocity[:, 1])
-        if source.reference == "ECEF":
-            speed = np.sqrt((velocity * velocity).sum(axis=1))
         if kind == "ground speed alone":
             says["vx_m_s"] = f"{ground} taken as v_x, no heading known"
             return speed, source.unknown
@@ -544,13 +521,12 @@ def _body_velocity(source: _Source) -> tuple[FloatArray, FloatArray]:
 
 
 def _velocity_by_heading(source: _Source) -> tuple[FloatArray, FloatArray]:
-    velocity, attitude = source.reference_velocity(), source.plan.attitude
-    if source.reference == "ENU" and ("yaw_rad" in source or attitude is None):
+    velocity, attitude = source.velocity(), source.plan.attitude
+    if "yaw_rad" in source or attitude is None:
         yaw, by = source.column("yaw_rad"), source.name("yaw_rad")
         vx = np.cos(yaw) * velocity[:, 0] + np.sin(yaw) * velocity[:, 1]
         vy = -np.sin(yaw) * velocity[:, 0] + np.cos(yaw) * velocity[:, 1]
     else:
-        assert attitude is not None
         rotation, by = source.rotation(attitude), source.attitude_text
         vx, vy = ((rotation[:, :, i] * velocity).sum(axis=1) for i in range(2))
     how = "smoothing derivative of " if source.plan.velocity == "position and heading" else ""

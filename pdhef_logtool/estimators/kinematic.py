@@ -71,4 +71,4 @@ class Kinematic:
 def build(name: str, car: Car, options: Options) -> Kinematic:
     """Return ``kinematic`` with the sensors of a car."""
     del name, options
-    return Kinematic(**{name: getattr(car.datasheet.sensors, name) for name in _PROFILE})
+    return Kinematic(**{name: getattr(car.vehicle.sensors, name) for name in _PROFILE})

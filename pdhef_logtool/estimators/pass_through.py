@@ -40,4 +40,4 @@ class PassThrough:
 def build(name: str, car: Car, options: Options) -> PassThrough:
     """Return ``zero`` or its variant ``no-lateral``."""
     del options
-    return PassThrough(name, "no-lateral" not in options_of(name), car.datasheet.sensors.speed_hold_s)
+    return PassThrough(name, "no-lateral" not in options_of(name), car.vehicle.sensors.speed_hold_s)

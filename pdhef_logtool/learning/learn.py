@@ -108,12 +108,12 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
         )
     source = Car.load(config.car, network=NO_MODEL)
     if config.car is None:
-        reporter.warn(f"no --car: mass, geometry and priors come from the default {source.datasheet.name}")
+        reporter.warn(f"no --car: mass, geometry and priors come from the default {source.vehicle.name}")
     check_output(source, output)
     splits = chosen_logs(arguments, settings)
     read = [*(i.local for i in splits), *(path for path in config.files if path != config.car)]
     check_no_input(read, [], [output])
-    records, model, figures = _learnt(splits, Car.of(source.datasheet), config, reporter.progress)
+    records, model, figures = _learnt(splits, Car.of(source.vehicle), config, reporter.progress)
     for record in records:
         tell_drive(record, reporter.warn)
     learnt_on = tuple(r.learnt_on for r in records if not r.left_out)

@@ -110,7 +110,7 @@ def model_of(car: Car, sensors: Sensors, **entries: Any) -> CarModel:
     from pydantic import TypeAdapter
 
     plain = TypeAdapter(Sensors).dump_python(sensors, mode="json", exclude_none=True)
-    file = car.datasheet
+    file = car.vehicle
     return CarModel(vehicle=file.name, physics_sha256=physics_sha256(file), sensors=plain, **entries)
 
 

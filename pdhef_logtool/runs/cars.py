@@ -167,7 +167,7 @@ def car_record(car: Car) -> dict[str, Any]:
     """
     network = None if car.network is None else [Path(car.network_name).name, car.network.sha256]
     parts = {
-        "the car's physics": [car.vehicle.model_dump(mode="json"), car.datasheet.model_dump(mode="json")],
+        "the car's physics": car.vehicle.model_dump(mode="json"),
         "the car's fit": [_plain(car.fitted_physics), {name: _plain(noise) for name, noise in car.noise.items()}],
         "the car's model": _plain(car.model),
         "the network": network,

@@ -259,7 +259,7 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
             "end_ns": plan.end_ns,
             "duration_s": (plan.end_ns - plan.start_ns) * 1e-9,
         },
-        "mapping": {"missing": drive.missing},
+        "mapping": {"missing": drive.chosen.missing},
         "vehicle": {
             "name": car.vehicle.name,
             "sha256": car.physics_sha256,

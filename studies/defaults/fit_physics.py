@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pdhef_logtool.car.car import FIT_FILE, SHIPPED_CARS, Car
-from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
+from pdhef_logtool.car.parts import Fit, LearntOn, physics_sha256
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     drawn = json.loads((given.work / "manifest.json").read_text(encoding="utf-8"))["drives"]
     drives, learnt_on = [], []
     for entry in drawn:
-        read = read_drive(given.work / entry["file"], Car.of(car.datasheet))
+        read = read_drive(given.work / entry["file"], Car.of(car.vehicle))
         assert read.truth is not None
         drives.append(FitDrive(read.name, read.signals, read.truth))
         learnt_on.append(LearntOn(name=read.name, sha256=entry["sha256"], end_s=entry["duration_s"]))
@@ -70,15 +70,12 @@ def main(arguments: list[str] | None = None) -> int:
     def say(text: str, share: float) -> None:
         print(f"{100 * share:3.0f} % {text}", flush=True)
 
-    result, physics = find_physics(drives, car.datasheet, progress=say)
+    result, physics, tried = find_physics(drives, car.vehicle, progress=say)
     # The smoother uses the filter's noise: the network predicts most of the model residual.
     physics = physics.model_copy(update={"smoothing": (1.0, 1.0)})
     print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
-    for tried in physics.tried:
-        print(f"{', '.join(tried.parts) or 'static'}: {tried.held_out_deg} {'taken' if tried.taken else ''}")
-    part = Fit(
-        physics_sha256=physics_sha256(car.datasheet), values=FittedValues(), physics=physics, drives=tuple(learnt_on)
-    )
+    print(*tried, sep="\n")
+    part = Fit(physics_sha256=physics_sha256(car.vehicle), physics=physics, drives=tuple(learnt_on))
     (given.output / FIT_FILE).write_text(part_toml(part, HEAD), encoding="utf-8")
     return 0
 

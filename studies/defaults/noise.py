@@ -77,8 +77,7 @@ def tune(logs: Iterable[LogInput], config: RunConfig, trials: int) -> dict[str, 
 
     best = min(search(objective, trials, SEED), key=_order)
     print(f"{TUNED}: trial {best.number} of {trials}, {best.objective_deg:.4f}°", flush=True)
-    score = {"score_deg": round(best.objective_deg, 4), "trial": best.number}
-    return {TUNED: filter_noise(best.values).model_copy(update=score)}
+    return {TUNED: filter_noise(best.values)}
 
 
 def _order(trial: Trial) -> tuple[float, int]:

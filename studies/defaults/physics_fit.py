@@ -22,8 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.descent import descend
-from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, PosteriorSteps, physics_filter
 from pdhef_logtool.records.signals import FloatArray
@@ -52,6 +51,8 @@ NIS_LOG_STD = 1.0
 ROBUST = 3.0
 DERIVATIVE_STEP = 0.05
 MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
+#: Number of attempts per step, factor on the damping after a failed attempt, and divisor after a successful one.
+TRIES, MORE, LESS = 6, 6.0, 5.0
 #: Width of the tyres' priors about the axle-force fit, as a share of the widths about a vehicle file.
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
@@ -254,25 +255,39 @@ def fit_physics(
         return drive_errors(drives, start, *build_car(start, parts, priors, theta))
 
     firsts = [np.array([first.get(p.name, 0.0) for p in priors]) for first in starts]
-    ends = [
-        descend(
-            errors,
-            fit_cost,
-            scaled_errors,
-            first,
-            iterations=iterations,
-            least_gain=least_gain,
-            derivative_step=DERIVATIVE_STEP,
-            max_step=MAX_STEP,
-        )
-        for first in firsts
-    ]
-    (theta, normal, value), errors_of_drives = min(ends, key=lambda end: end[0].cost)
+    ends = [_descended(errors, first, iterations) for first in firsts]
+    theta, normal, value, errors_of_drives = min(ends, key=lambda end: end[2])
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     vehicle, noise = build_car(start, parts, priors, theta, digits=6)
     squares = sum(float(np.sum(d.error**2)) for d in errors_of_drives)
     rms = math.degrees(math.sqrt(squares / max(1, sum(d.counted for d in errors_of_drives))))
     return PhysicsFit(vehicle, noise, priors, theta, covariance, value, rms)
+
+
+def _descended(
+    errors: Callable[[FloatArray], list[DriveError]], theta: FloatArray, iterations: int
+) -> tuple[FloatArray, FloatArray, float, list[DriveError]]:
+    """Minimize the cost by Levenberg and Marquardt; return θ, the normal matrix of the last step, cost and errors."""
+    here, damping, normal = errors(theta), 1e-2, np.eye(theta.size)
+    value = fit_cost(here, theta)
+    for _ in range(iterations):
+        residuals = scaled_errors(here, here)
+        moved = [scaled_errors(errors(theta + step), here) for step in DERIVATIVE_STEP * np.eye(theta.size)]
+        jacobian = (np.stack(moved, axis=1) - residuals[:, None]) / DERIVATIVE_STEP
+        normal, gradient = jacobian.T @ jacobian + np.eye(theta.size), jacobian.T @ residuals + theta
+        gain = 0.0
+        for _ in range(TRIES):
+            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            step *= min(1.0, MAX_STEP / float(np.max(np.abs(step))))
+            there = errors(theta + step)
+            if (new := fit_cost(there, theta + step)) < value:
+                theta, here, value, gain = theta + step, there, new, value - new
+                damping = max(damping / LESS, 1e-5)
+                break
+            damping *= MORE
+        if gain <= 0.0 or gain < least_gain(here):
+            break
+    return theta, normal, value, here
 
 
 def fit_cost(errors: Sequence[DriveError], theta: FloatArray) -> float:
@@ -326,14 +341,14 @@ def choose_parts(
     start: VehicleParameters,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
-) -> tuple[PhysicsParts, tuple[TriedParts, ...]]:
+) -> tuple[PhysicsParts, list[str]]:
     """Choose the parts by driving that their fits have not seen: each stays only with evidence.
 
     Parts are removed one after the other, starting from all parts: some are useful only together, such as the roll
     and the load transfer that it delays. The remaining parts must score better than the model without parts.
     """
     theta: list[Sequence[Theta]] = [STARTS for _ in folds]
-    tried: list[TriedParts] = []
+    tried: list[str] = []
 
     def scored(parts: PhysicsParts, iterations: int) -> tuple[FloatArray, list[Sequence[Theta]]]:
         """Return the logarithm of the RMS on the held-out half of each fold, and θ there."""
@@ -349,7 +364,7 @@ def choose_parts(
 
     def tell(parts: PhysicsParts, scores: FloatArray, taken: bool) -> None:
         held_out = tuple(round(float(x), 4) for x in np.degrees(np.exp(scores)))
-        tried.append(TriedParts(parts=parts.names, held_out_deg=held_out, taken=taken))
+        tried.append(f"{', '.join(parts.names) or 'static'}: {held_out} {'taken' if taken else ''}")
 
     none = PhysicsParts()
     static, _ = scored(none, MAX_ITERATIONS)
@@ -367,7 +382,7 @@ def choose_parts(
             parts, best, theta = fewer, scores, ends
     if (static - best).mean() <= LEAST_GAIN:
         parts = none
-    return parts, tuple(tried)
+    return parts, tried
 
 
 def find_physics(
@@ -375,8 +390,8 @@ def find_physics(
     start: VehicleParameters,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
-) -> tuple[PhysicsFit, FittedPhysics]:
-    """Identify ``physics`` of a car on drives with ground truth; also return it in the format of a car.
+) -> tuple[PhysicsFit, FittedPhysics, list[str]]:
+    """Identify ``physics`` of a car on drives with ground truth; also return it in the format of a car, and the trials.
 
     The parts of the model are chosen by cross-validation between two halves of the drives.
     """
@@ -385,5 +400,4 @@ def find_physics(
     parts, tried = choose_parts([halves, halves[::-1]], start, progress=lambda text, x: progress(text, 0.7 * x))
     progress("fitting the physics filter's sideslip to the ground truth", 0.7)
     result = fit_physics(drives, start, parts)
-    values = FittedValues.of(result.vehicle)
-    return result, FittedPhysics(values=values, noise=result.noise, tried=tried)
+    return result, FittedPhysics(values=result.vehicle, noise=result.noise), tried

@@ -120,13 +120,13 @@ def time_s(track: pl.DataFrame) -> FloatArray:
 
 def on_the_road(car: Car, friction: float) -> Car:
     """Return a car with the friction of a drive; all else, including the residual gain, is unchanged."""
-    vehicle, datasheet = (v.model_copy(update={"friction": friction}) for v in (car.vehicle, car.datasheet))
-    physics = car.fitted_physics
+    changed = {"friction": friction}
+    vehicle, physics = car.vehicle.model_copy(update=changed), car.fitted_physics
     if physics is not None:
-        values = physics.values.model_copy(update={"friction": None})
+        values = physics.values.model_copy(update=changed)
         physics = physics.model_copy(update={"values": values})
     gain = car.residual_gain
-    return replace(car, vehicle=vehicle, datasheet=datasheet, network_gain=gain, fitted_physics=physics)
+    return replace(car, vehicle=vehicle, network_gain=gain, fitted_physics=physics)
 
 
 def read_log(log: Path, car: Car) -> WholeDrive:

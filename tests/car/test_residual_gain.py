@@ -10,7 +10,7 @@ import pytest
 from made_models import random_network
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise, Fit, FittedValues
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
@@ -35,8 +35,6 @@ def test_a_network_acts_on_the_physics_that_it_was_trained_with() -> None:
     )
     assert (own.has_evidence, foreign.has_evidence, SEDAN.has_evidence) == (True, False, False)
     assert "no network" in _gain(SEDAN)[1]
-    fit = Fit(physics_sha256=SEDAN.physics_sha256, values=FittedValues(friction=0.5))
-    assert _gain(own.with_fit(fit))[0] == 0.0
     assert _gain(own.with_noise("physics", FilterNoise(q_std=(1.0, 1.0, 1.0))))[0] == 1.0
 
 

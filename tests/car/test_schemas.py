@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 
 from pdhef_logtool.car.car import SHIPPED_CARS
-from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, LearntOn
+from pdhef_logtool.car.parts import FilterNoise, Fit, FittedPhysics, LearntOn
 from pdhef_logtool.car.toml_files import VehicleEntries, part_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation.validation_plan import PlanTable
@@ -23,11 +23,7 @@ FOLDER = Path(__file__).parents[2] / "schemas"
 MODELS: dict[str, Any] = {"car-vehicle": VehicleEntries, "car-fit": Fit, "plan": PlanTable}
 FIT = Fit(
     physics_sha256="ab" * 32,
-    values=FittedValues(
-        friction=0.9,
-        tyres=default_vehicle().tyres,
-        sensors=FittedSensors(ay_bias_m_s2=0.1, yaw_rate_bias_rad_s=0.0),
-    ),
+    physics=FittedPhysics(values=default_vehicle(), noise=FilterNoise()),
     filter={"phy-ukf:tuned": FilterNoise(q_std=(0.1, 0.1, 0.1), r_std={"ay_m_s2": 1.0})},
     drives=(LearntOn(name="lap", sha256="cd", end_s=9.0),),
 )

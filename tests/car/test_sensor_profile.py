@@ -51,7 +51,7 @@ def test_a_profile_replaces_the_sensors_and_makes_what_belongs_to_others_stale(t
     file = tmp_path / "imu.toml"
     file.write_text("[sensors]\nay_std_m_s2 = 0.3\nimu_rate_hz = 200.0\n")
     car = Car.load("saloon", sensors=file)
-    assert car.datasheet.sensors == Sensors(ay_std_m_s2=0.3, imu_rate_hz=200.0)
+    assert car.vehicle.sensors == Sensors(ay_std_m_s2=0.3, imu_rate_hz=200.0)
     assert car.vehicle.mass_kg == Car.load("saloon").vehicle.mass_kg
     assert car.notes and car.physics_sha256 != Car.load("saloon").physics_sha256
     named = Car.load(None, sensors="production")
@@ -96,7 +96,7 @@ def test_speed_and_steering_are_kept_for_the_times_of_the_profile(clean: Signals
 
     def lost_s(**sensors: float) -> float:
         car = Car.of(vehicle(**sensors))
-        passed = PassThrough("zero", claims_zero_sideslip=True, speed_hold_s=car.datasheet.sensors.speed_hold_s)
+        passed = PassThrough("zero", claims_zero_sideslip=True, speed_hold_s=car.vehicle.sensors.speed_hold_s)
         values = passed.run(dark, None)[0].values[:, 0]
         return float(t[np.isfinite(values)].max())
 

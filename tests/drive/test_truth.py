@@ -120,7 +120,6 @@ def sources(stamps, d: Drive) -> dict[str, dict]:
             "ecef_velocity_m_s": v_ecef,
             "quat_wxyz": quat(ECEF * turn * FRD),
         },
-        "ecef velocity without position": {"ecef_velocity_m_s": v_ecef, "quat_wxyz": quat(ECEF * turn)},
         "ecef velocity, lat, yaw": {
             "lat_deg": lat, "lon_deg": lon, "alt_m": alt, "ecef_velocity_m_s": v_ecef, "yaw_rad": wrapped,
         },
@@ -145,10 +144,9 @@ def test_every_source_gives_the_same_body_velocity(kind):
     np.testing.assert_allclose(track.vy_m_s[good], d.vy[good], atol=2e-4)
     np.testing.assert_allclose(track.sideslip_rad[good], d.beta[good], atol=1e-5)
     assert np.isnan(track.ay_m_s2).all()  # a heading has no roll: the specific force is unknown
-    if kind != "ecef velocity without position":
-        inner = np.isfinite(track.yaw_rate_rad_s)
-        assert inner.mean() > 0.95 and truth.derivation["ay_m_s2"].startswith("not scored")
-        np.testing.assert_allclose(track.yaw_rate_rad_s[inner], d.r[inner], atol=2e-5)
+    inner = np.isfinite(track.yaw_rate_rad_s)
+    assert inner.mean() > 0.95 and truth.derivation["ay_m_s2"].startswith("not scored")
+    np.testing.assert_allclose(track.yaw_rate_rad_s[inner], d.r[inner], atol=2e-5)
     assert {"vx_m_s", "vy_m_s", "sideslip_rad"} <= set(truth.derivation)
     if "position_m" in truth.derivation:
         known = np.isfinite(track.x_m)

@@ -10,7 +10,7 @@ from physics_oracle import Oracle, parts, vehicle
 from reference_car import Drive, drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, physics_sha256
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, physics_sha256
 from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, VehicleParameters, correct_signals
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
@@ -67,20 +67,20 @@ def test_a_bias_is_found_and_its_removal_helps(bias):
 
 def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_others():
     own, noisy = vehicle(), with_noise(drive(slalom(0.035, 0.5), 4.0, speed=22.0).signals, 3)
-    sensors = {"ay_bias_m_s2": 0.2, "yaw_rate_bias_rad_s": 0.004}
-    values = FittedValues(
-        steer_offset_rad=0.003,
-        steering_ratio=15.0,
-        sensors=sensors,
-        relaxation_length_m=0.7,
-        physics=PhysicsParts(lag=True, roll=True),
+    fitted = own.model_copy(
+        update={
+            "steer_offset_rad": 0.003,
+            "steering_ratio": 15.0,
+            "sensors": own.sensors.model_copy(update={"ay_bias_m_s2": 0.2, "yaw_rate_bias_rad_s": 0.004}),
+            "relaxation_length_m": 0.7,
+            "physics": PhysicsParts(lag=True, roll=True),
+        }
     )
     car = replace(
-        Car.of(own, noise={"physics": FilterNoise()}), fitted_physics=FittedPhysics(values=values, noise=FilterNoise())
+        Car.of(own, noise={"physics": FilterNoise()}), fitted_physics=FittedPhysics(values=fitted, noise=FilterNoise())
     )
     adaptive = make_estimator("physics", car)
     estimator = adaptive.physics
-    fitted = values.applied_to(own)
     assert estimator.vehicle == fitted
     assert resolve(adaptive).physics_sha256 == physics_sha256(fitted) != physics_sha256(own)
     assert resolve(estimator).identity == resolve(physics_filter(fitted, FilterNoise())).identity

@@ -10,7 +10,7 @@ from reference_car import drive, signals_at, slalom, with_noise
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import PHYSICS, FilterNoise, FittedPhysics, FittedValues
+from pdhef_logtool.car.parts import PHYSICS, FilterNoise, FittedPhysics
 from pdhef_logtool.car.posterior import FittedParameter, Posterior
 from pdhef_logtool.car.toml_files import vehicle_of_entries
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, corrected_anew, default_vehicle
@@ -56,7 +56,8 @@ def calibrated(varied: tuple[VehicleParameters, ...] = (), scale: float = 1.0, *
 
 
 def identified() -> Car:
-    values = FittedValues(yaw_inertia_kg_m2=1700.0, physics=PhysicsParts(lag=True, force_scale=True))
+    parts = PhysicsParts(lag=True, force_scale=True)
+    values = OWN.model_copy(update={"yaw_inertia_kg_m2": 1700.0, "physics": parts})
     found = FittedPhysics(values=values, noise=NOISE)
     return Car.of(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)
 
@@ -146,7 +147,7 @@ def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prio
 def test_the_interval_contains_where_the_centre_of_gravity_is_only_assumed(signals: Signals) -> None:
     """At a yaw rate r the rear axle determines v_y up to the error of its distance times r."""
     car = calibrated(VARIED)
-    guessed = replace(car, datasheet=default_vehicle())
+    guessed = replace(car, vehicle=OWN.model_copy(update={"name": default_vehicle().name}))
     (_, narrow), (_, wide) = (tracks_of("physics", c, signals) for c in (car, guessed))
     assert guessed.cg_std_m > 0.05 > car.cg_std_m == 0.0
     added = wide.sideslip_std_rad**2 - narrow.sideslip_std_rad**2
