@@ -36,7 +36,6 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     FileContainer,
-    RawChunk,
     RecordT,
     Span,
     SpanDamageError,
@@ -80,7 +79,6 @@ class McapContainer(FileContainer):
     magic = MCAP_MAGIC
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
-    whole_chunks = True
     chunks: list[Extent]
 
     def __init__(
@@ -366,7 +364,6 @@ class McapContainer(FileContainer):
                 schema_encoding=schema.encoding if schema else "",
                 schema_data=schema.data if schema else b"",
                 metadata=dict(channel.metadata),
-                schema_id=channel.schema_id if schema else 0,
             )
 
     def _check_data(self) -> None:
@@ -467,42 +464,6 @@ class McapContainer(FileContainer):
         if block is None:
             raise SpanDamageError("its records contradict each other")
         return block
-
-    def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
-        """See :class:`~pdhef_logtool.logs.container.Container`."""
-        extent = self.chunks[span.index]
-        if not extent.is_chunk or not len(block) or not kept.issuperset(np.unique(block.channel).tolist()):
-            return None
-        if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
-            return None  # the time does not fit the index
-        content = bytes(block.buffer)
-        if not all(self._is_known(op, content[start:end], kept) for op, start, end in _other_records(block)):
-            return None
-        record = self.source.read(extent.start, extent.end - extent.start)
-        size, crc, compression, start, length = _chunk_head(record, len(record))
-        return RawChunk(
-            compression=compression,
-            stored=record[start : start + length],
-            size=size,
-            crc=crc or crc32(content),
-            channel=block.channel,
-            log_time_ns=block.log_time_ns,
-            offset=block.offset - MESSAGE_HEAD.itemsize,
-        )
-
-    def _is_known(self, opcode: int, payload: bytes, kept: frozenset[int]) -> bool:
-        """Return whether a record of a chunk declares kept channels only, as this file declares them."""
-        try:
-            if opcode == Opcode.CHANNEL:
-                channel = _parsed(Channel, payload)
-                return channel.id in kept and channel == self._raw_channels[channel.id]
-            if opcode == Opcode.SCHEMA:
-                schema = _parsed(Schema, payload)
-                used = {self._raw_channels[id_].schema_id for id_ in kept}
-                return schema.id in used and schema == self._schemas[schema.id]
-        except (struct.error, UnicodeDecodeError, ValueError, McapError):
-            return False
-        return True
 
     def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
