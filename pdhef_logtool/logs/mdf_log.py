@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import partial
-from io import BytesIO
+from io import BytesIO, StringIO
 from typing import Any
 
 import numpy as np
@@ -59,10 +59,9 @@ def open_mdf(file: TableFile) -> Tables:
     LogError : no group of it can be read. LimitError : it claims more than the limits allow.
     """
     asammdf = required("asammdf", "formats", "reads MDF files", file.name)
-    warnings: list[str] = []
-    logger = logging.getLogger("asammdf")
+    warnings, logger = StringIO(), logging.getLogger("asammdf")
+    logger.handlers, logger.propagate = [logging.StreamHandler(warnings)], False
     logger.setLevel(logging.WARNING)
-    logger.filters = [lambda record: warnings.append(record.getMessage())]  # in place of its output
     losses: list[Loss] = []
     stream: Any = file.stream
     if is_unfinished(file):  # asammdf completes it in place
@@ -79,7 +78,7 @@ def open_mdf(file: TableFile) -> Tables:
         source = _opened(asammdf, repaired)
     if isinstance(source, str):
         raise LogError(expected="an MDF file with readable channels", got=source, where=file.name)
-    if beyond := sum("outside the file size" in text for text in warnings):
+    if beyond := warnings.getvalue().count("outside the file size"):
         losses.append(Loss("truncated", f"{beyond} blocks are beyond the end of the file", file.name))
     groups = Groups(file, source)
     tables: list[Table] = []
