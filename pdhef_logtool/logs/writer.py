@@ -41,7 +41,7 @@ from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.mcap_index import INDEX_RECORD, RECORD
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.wire_layout import CdrEncoder
-from pdhef_logtool.records.errors import MappingError, OutputError
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import LIBRARY
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
@@ -130,20 +130,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
 
         Raises
         ------
-        MappingError : the type is unknown, a constant does not fit it, or the topic was added before.
+        MappingError : the definition does not parse.
         """
-        if topic in self._encoders:
-            raise MappingError(expected="a new topic", got="one that was added before", where=topic)
-        if definition is None:
-            try:
-                definition = message_definition(type_name)
-            except KeyError as error:
-                raise MappingError(
-                    expected="a common ROS 2 type or one of our own",
-                    got=type_name,
-                    where=topic,
-                    remedy="give its definition",
-                ) from error
+        definition = message_definition(type_name) if definition is None else definition
         encoder = CdrEncoder(topic, type_name, definition, constants or {})
         channel = self.add_channel(ChannelRecord(-1, topic, "cdr", type_name, "ros2msg", definition.encode()))
         self._encoders[topic] = (channel, encoder)
@@ -223,10 +212,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
 
     def _encode(self, batch: TopicBatch) -> Block:
         """Return the messages of a batch."""
-        if batch.topic not in self._encoders:
-            raise MappingError(expected="a topic of this file", got="an unknown one", where=batch.topic)
-        if np.any(np.diff(batch.log_time_ns) < 0):
-            raise MappingError(expected="ascending log times", got="a step back", where=batch.topic)
         channel, encoder = self._encoders[batch.topic]
         n = len(batch.log_time_ns)
         rows = encoder.encode(n, batch.fields)
