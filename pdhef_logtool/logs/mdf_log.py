@@ -254,16 +254,14 @@ class Groups:
 
     def _raw(self, number: int, index: int) -> tuple[NDArray[Any], BoolArray | None]:
         """Return raw values [N] or [N, k] of a channel, and which rows are invalid [N]."""
-        channel, rows = self._groups[number].channels[index], np.arange(self._groups[number].channel_group.cycles_nr)
-        is_virtual = self._is(number, index, _VIRTUAL)
-        if not channel.bit_count and self._version == 3:
+        channel = self._groups[number].channels[index]
+        if not channel.bit_count and self._version == 3:  # row numbers
+            rows = np.arange(self._groups[number].channel_group.cycles_nr)
             return rows * (channel.sampling_rate or 1.0), None
-        if is_virtual and not channel.flags & _SOME_INVALID:
-            return rows, None
         values, invalid = self._source.get(
             group=number, index=index, raw=True, samples_only=True, ignore_invalidation_bits=True
         )
-        return rows if is_virtual else np.asarray(values), invalid
+        return np.asarray(values), invalid
 
     def _values(self, number: int, index: int) -> FloatArray:
         """Return physical values [N] of a channel, NaN for invalid samples."""
