@@ -50,7 +50,6 @@ class ChannelRecord:
     schema_encoding: str  # "ros2msg" | "ros2idl" | "ros1msg" | "jsonschema" | "protobuf" | ""
     schema_data: bytes
     metadata: Mapping[str, str] = field(default_factory=dict)
-    schema_id: int = 0  # in an MCAP file; 0: no schema
 
     @property
     def type_name(self) -> str:
@@ -220,38 +219,6 @@ def _copy(block: Block, buffer: NDArray[np.uint8], place: IntArray) -> None:
             items_at_bytes(buffer.data, size)[place[rows]] = items_at_bytes(block.buffer, size)[block.offset[rows]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RawChunk:
-    """A chunk of another file, to be written as it is.
-
-    Its maker has decompressed it, checked its CRC, and made sure that its channels have the same ids and definitions in
-    the file that is written.
-
-    Attributes
-    ----------
-    compression, stored : compression and compressed bytes, as in the other file.
-    size, crc : bytes and CRC-32 of the decompressed records.
-    channel, log_time_ns, offset : int64 [N] of its messages; offset of the record in the decompressed bytes.
-    """
-
-    compression: str
-    stored: bytes
-    size: int
-    crc: int
-    channel: IntArray
-    log_time_ns: IntArray
-    offset: IntArray
-
-    @property
-    def start_ns(self) -> int:
-        """First log time."""
-        return int(self.log_time_ns.min())
-
-    def split(self, before_ns: float) -> tuple[RawChunk | None, RawChunk | None]:
-        """Return the chunk as the first item if it begins before a time, as the second otherwise."""
-        return (self, None) if self.start_ns < before_ns else (None, self)
-
-
 @dataclass(frozen=True, slots=True)
 class Wanted:
     """Topics and log times [start, end) that will be read; None: all.
@@ -311,7 +278,7 @@ class Container(ABC):
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : remedy for a file of another format.
-    zstd_messages : whether each message is a zstd frame. whole_chunks : whether chunks can be copied as they are.
+    zstd_messages : whether each message is a zstd frame.
     is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
     """
 
@@ -323,7 +290,6 @@ class Container(ABC):
     distro = ""
     remedy = ""
     zstd_messages = False
-    whole_chunks = False
 
     def __init__(self, path: LogPlace, size: int, meter: Meter | None = None) -> None:
         self.path = path
@@ -349,22 +315,6 @@ class Container(ABC):
     @abstractmethod
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes [start, end) of a span."""
-
-    def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
-        """Return the chunk that a block was read from, to be written to another file as it is.
-
-        Parameters
-        ----------
-        span, block : the span and the result of :meth:`load`, which shows that the chunk is sound.
-        kept : channels that have the same id and definition in the other file.
-
-        Returns
-        -------
-        The chunk; None if these messages are in none, or if it contains or declares anything that the other file does
-        not.
-        """
-        del span, block, kept
-        return None
 
     def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
         """Read the attachments or metadata records; a damaged one is among the losses and left out."""

@@ -274,9 +274,6 @@ def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
             container.zstd_messages = per_message
             # A topics table may name cdr by default where the recorder used another format: do not decode it as CDR.
             named = {id_: encodings.get(c.topic, c.encoding) for id_, c in container.channels.items()}
-            container.whole_chunks &= not per_message and all(
-                c.encoding == named[c.id] for c in container.channels.values()
-            )
             container.channels |= {id_: replace(c, encoding=named[id_]) for id_, c in container.channels.items()}
     except BaseException:
         for opened in containers:

@@ -5,19 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_cells import read_cells
-from pdhef_logtool.logs.table_clocks import NO_TIME, unwrapped
+from pdhef_logtool.logs.table_clocks import unwrapped
 from pdhef_logtool.logs.table_columns import Sheet, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
-
-#: Units of NumPy's dates, by those types of Arrow that have no unit.
-_DATE_UNITS = {"date32[day]": "D", "date64[ms]": "ms"}
 
 
 def open_parquet(file: TableFile) -> Tables:
@@ -132,25 +128,24 @@ def _column_of_group(source: Any, number: int, path: str, rows: int) -> Any:
 
 def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Loss]) -> Any:
     """Return a column as an array [N] with NaN (NaT) for null, or as texts."""
+    import polars as pl
     import pyarrow as pa
 
     if kind == "text":
         return _texts(column, name, file, losses)
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
-    unit = _DATE_UNITS.get(str(column.type)) or getattr(column.type, "unit", "")
+    series = pl.Series(pl.from_arrow(column))
     if kind == "date":
-        column = column.cast(pa.int32()) if unit == "D" else column
-        return column.cast(pa.int64()).fill_null(NO_TIME).to_numpy().view(f"M8[{unit}]")
+        return series.to_numpy()
     if kind == "duration":
-        is_of_day = pa.types.is_time(column.type)
-        column = column.cast(pa.int32()) if pa.types.is_time32(column.type) else column
-        values = column.cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
-        values = values / np.timedelta64(1, "s").astype(f"m8[{unit}]").astype(np.int64)
+        is_of_day = series.dtype == pl.Time
+        nanoseconds = series if is_of_day else series.cast(pl.Duration("ns"))
+        values = nanoseconds.cast(pl.Int64).cast(pl.Float64).to_numpy() / 1e9
         return unwrapped(values) if is_of_day else values
-    if pa.types.is_floating(column.type) or (pa.types.is_integer(column.type) and not column.null_count):
-        return column.to_numpy()
-    return column.cast(pa.float64(), safe=False).to_numpy()
+    if series.dtype.is_float() or (series.dtype.is_integer() and not series.null_count()):
+        return series.to_numpy()
+    return series.cast(pl.Float64).to_numpy()
 
 
 def _texts(column: Any, name: str, file: TableFile, losses: list[Loss]) -> NDArray[Any] | Any:

@@ -176,6 +176,14 @@ def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> RecordingSpa
     return _survey({(topic, 0): times for topic, times in stamps_ns.items()}, where)[0]
 
 
+def survey_rows(times_ns: IntArray, where: str) -> tuple[BoolArray, tuple[Loss, ...]]:
+    """Return which of the times [N] of rows in file order are used, and losses; ``where`` as for :func:`survey`."""
+    recording_span, repeated = _survey({("", 0): times_ns}, where)
+    return _inside(times_ns, recording_span.intervals) & ~repeated.get(
+        ("", 0), np.zeros(1, np.bool_)
+    ), recording_span.losses
+
+
 def _survey(
     times_ns: Mapping[_Lane, IntArray], where: str, whole: Sequence[tuple[str, int, int, int]] = ()
 ) -> tuple[RecordingSpan, dict[_Lane, BoolArray]]:

@@ -8,11 +8,13 @@ from __future__ import annotations
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from rosbags.rosbag1.reader import Header, ReaderError
 
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
@@ -23,7 +25,6 @@ from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
 _U32 = struct.Struct("<I")
-_TIME = struct.Struct("<II")
 _ZERO_BLOCK_BYTES = 1 << 20
 _LEAST_MESSAGE_BYTES = 8 + 3 * 4 + len(b"op=") + 1 + len(b"conn=") + 4 + len(b"time=") + 8
 
@@ -78,15 +79,15 @@ class Rosbag1Container(FileContainer):
                 self.lose_record(offset, error)
             self.position = end
 
-    def _take(self, fields: Mapping[str, bytes], offset: int, start: int, end: int) -> None:
+    def _take(self, fields: Header, offset: int, start: int, end: int) -> None:
         """Handle one complete record."""
-        op = _op(fields)
+        op = fields.get_uint8("op")
         if op == _OP_CHUNK:
-            compression, (size,) = fields["compression"].decode(), _U32.unpack(fields["size"])
+            compression, size = fields.get_string("compression"), fields.get_uint32("size")
             self._found.append(_Chunk(offset, start, end, compression, size))
             return
         if op == _OP_BAG_HEADER:
-            self._header = (int.from_bytes(fields["index_pos"], "little"), _U32.unpack(fields["chunk_count"])[0])
+            self._header = fields.get_uint64("index_pos"), fields.get_uint32("chunk_count")
             return
         self.meter.limits.check("metadata_bytes", end - start, f"a record of kind {op}")
         if op == _OP_CONNECTION:
@@ -94,7 +95,7 @@ class Rosbag1Container(FileContainer):
         elif op == _OP_CHUNK_INFO:
             pairs = np.frombuffer(self.source.read(start, end - start), dtype="<u4")
             counts = Counter(dict(zip(pairs[::2].tolist(), pairs[1::2].tolist(), strict=True)))
-            self._infos[int.from_bytes(fields["chunk_pos"], "little")] = counts
+            self._infos[fields.get_uint64("chunk_pos")] = counts
         elif op == _OP_INDEX and self._found:
             self._found[-1].indexes.append(_index(fields, self.source.read(start, end - start)))
         else:
@@ -133,9 +134,9 @@ class Rosbag1Container(FileContainer):
             for offset in range(start, end, _ZERO_BLOCK_BYTES)
         )
 
-    def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
-        inner = _header_fields(payload)
-        id_ = _U32.unpack(fields["conn"])[0]
+    def _add_connection(self, fields: Header, payload: bytes) -> None:
+        inner = Header.read(BytesIO(_U32.pack(len(payload)) + payload))
+        id_ = fields.get_uint32("conn")
         if id_ in self.channels:
             return
         self.meter.limits.check("channels", len(self.channels) + 1, f"connection {id_}")
@@ -146,9 +147,9 @@ class Rosbag1Container(FileContainer):
         }
         self.channels[id_] = ChannelRecord(
             id=id_,
-            topic=fields["topic"].decode(),
+            topic=fields.get_string("topic"),
             encoding="ros1",
-            schema_name=inner["type"].decode(),
+            schema_name=inner.get_string("type"),
             schema_encoding="ros1msg",
             schema_data=inner.get("message_definition", b""),
             metadata=metadata,
@@ -165,41 +166,32 @@ class Rosbag1Container(FileContainer):
             if record is None:
                 raise SpanDamageError("its last record is cut")
             fields, begin, offset = record
-            op = _op(fields)
             try:
+                op = fields.get_uint8("op")
                 if op == _OP_MESSAGE:
                     self.meter.check_scan(len(stamps))
-                    channels.append(_U32.unpack(fields["conn"])[0])
-                    seconds, nanoseconds = _TIME.unpack(fields["time"])
-                    stamps.append(seconds * NS_PER_S + nanoseconds)
+                    channels.append(fields.get_uint32("conn"))
+                    stamps.append(fields.get_time("time"))
                     offsets.append(begin)
                     lengths.append(offset - begin)
                 elif op != _OP_CONNECTION:
                     raise SpanDamageError(f"it contains a record of kind {op}, which no chunk may")
                 elif declare:
                     self._add_connection(fields, content[begin:offset])
-            except (KeyError, struct.error, ValueError) as error:
+            except (ReaderError, ValueError) as error:
                 raise SpanDamageError(f"a record is malformed: {error}") from error
         self.meter.limits.check_messages(len(stamps), len(stored))
         return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
 
 
-def _index(fields: Mapping[str, bytes], payload: bytes) -> tuple[int, IntArray]:
+def _index(fields: Header, payload: bytes) -> tuple[int, IntArray]:
     """Return the connection and the log times [N] of an index record."""
-    (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
+    count = fields.get_uint32("count")
     words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
-    return connection, words[:, 0] * NS_PER_S + words[:, 1]
+    return fields.get_uint32("conn"), words[:, 0] * NS_PER_S + words[:, 1]
 
 
-def _op(fields: Mapping[str, bytes]) -> int:
-    """Return the kind of a record; -1 if it names none."""
-    op = fields.get("op", b"")
-    return op[0] if len(op) == 1 else -1
-
-
-def _record_at(
-    read: Callable[[int, int], bytes], offset: int, size: int, most: int
-) -> tuple[dict[str, bytes], int, int] | None:
+def _record_at(read: Callable[[int, int], bytes], offset: int, size: int, most: int) -> tuple[Header, int, int] | None:
     """Return header fields and data extent of the record at a byte; None if it is cut or no record.
 
     Parameters
@@ -211,25 +203,12 @@ def _record_at(
     (header,) = _U32.unpack(read(offset, 4))
     if header == 0 or offset + 8 + header > size or header > most:
         return None
-    text = read(offset + 4, header + 4)
-    start = offset + 8 + header
-    (length,) = _U32.unpack_from(text, header)
-    if start + length > size:
+    text = read(offset, header + 8)
+    start = offset + len(text)
+    end = start + int.from_bytes(text[-4:], "little")
+    if end > size:
         return None
     try:
-        return _header_fields(text[:header]), start, start + length
-    except (struct.error, ValueError):
+        return Header.read(BytesIO(text)), start, end
+    except (ReaderError, ValueError):
         return None
-
-
-def _header_fields(text: bytes) -> dict[str, bytes]:
-    fields: dict[str, bytes] = {}
-    offset = 0
-    while offset < len(text):
-        (length,) = _U32.unpack_from(text, offset)
-        name, sign, value = text[offset + 4 : offset + 4 + length].partition(b"=")
-        if not sign or offset + 4 + length > len(text):
-            raise ValueError("a header field without '='")
-        fields[name.decode("ascii", errors="replace")] = value
-        offset += 4 + length
-    return fields

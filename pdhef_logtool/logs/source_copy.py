@@ -1,7 +1,5 @@
 """Lossless copies of a log's messages into an MCAP, in order of log time; a few spans are in memory at a time.
 
-Chunks of an MCAP are copied unchanged if all their channels are kept: checked, but not compressed again.
-
 Messages of an MCAP keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and
 metadata records are copied too. Bags and rosbag2 databases keep their bytes and definitions.
 """
@@ -10,31 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
-from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk
+from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter
 
 #: Number of a channel in the log: file of the log, and channel id in that file.
 _Key = tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True)
-class SourceChannels:
-    """Channels of a log and of its copy.
-
-    Attributes
-    ----------
-    ids : channel of the copy by file and channel of the source.
-    verbatim : channels of MCAP files that keep their id, their schema's id and their definition.
-    """
-
-    ids: Mapping[_Key, int]
-    verbatim: frozenset[_Key] = frozenset()
 
 
 def source_profile(log: ColumnarLog) -> str:
@@ -52,85 +36,67 @@ def register_channels(
     *,
     leave_out: Callable[[str], bool] = lambda _topic: False,
     whole_metadata: bool = True,
-) -> SourceChannels:
-    """Add all channels of a log to a writer, except channels of topics that are left out.
+) -> dict[_Key, int]:
+    """Add all channels of a log to a writer, except channels of topics that are left out; return their new ids.
 
-    Without ``whole_metadata`` channels keep only the metadata that state how messages are sent.
-
-    Equal channels of split files become one channel. Channels keep their ids; if the ids of split files contradict each
-    other, the ids of the first file are kept.
+    Without ``whole_metadata`` channels keep only the metadata that state how messages are sent. Equal channels of split
+    files become one channel.
     """
     ids: dict[_Key, int] = {}
     ids_by_content: dict[str, int] = {}
-    verbatim: set[_Key] = set()
     for c, container in enumerate(log.containers):
         same_file: set[int] = set()
         for channel in container.channels.values():
             if leave_out(channel.topic):
                 continue
             target = channel
-            if not whole_metadata and not _TRANSPORT.issuperset(channel.metadata):
+            if not whole_metadata:
                 target = replace(channel, metadata={k: v for k, v in channel.metadata.items() if k in _TRANSPORT})
             if channel.encoding == "cdr" and not channel.schema_data:
                 target = _with_definition(target)
-            identity = str(replace(target, id=0, schema_id=0, metadata=dict(sorted(target.metadata.items()))))
+            identity = str(replace(target, id=0, metadata=dict(sorted(target.metadata.items()))))
             id_ = ids_by_content.get(identity)
             if id_ is None or id_ in same_file:  # two publishers of one file stay two channels
-                id_ = writer.add_channel(target)
-                ids_by_content[identity] = id_
+                id_ = ids_by_content[identity] = writer.add_channel(target)
             same_file.add(id_)
-            ids[(c, channel.id)] = id_
-            if target is channel and container.whole_chunks and writer.has_ids_of(id_, channel):
-                verbatim.add((c, channel.id))
-    return SourceChannels(ids, frozenset(verbatim))
+            ids[c, channel.id] = id_
+    return ids
 
 
 def iterate_copy(
-    log: ColumnarLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
-) -> Iterator[Block | RawChunk]:
-    """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
+    log: ColumnarLog, ids: Mapping[_Key, int], start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[Block]:
+    """Yield the messages of a log with log time in [start, end) in log-time order, with the ``ids`` of the copy.
 
     Messages of equal log time are in file order. Spans that overlap in time are merged; only these are in memory.
     Damaged spans are left out and reported by ``log.lost``.
-
-    Chunks that can be copied as they are, are yielded whole: sound chunks of MCAP files that are inside the window and
-    contain and declare only channels with unchanged ids. If all chunks are such, they are in the order of the files, so
-    that readers return messages of equal log times in the same order as from the source.
     """
-    unchanged = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(log.containers))]
     spans = [
         (c, span)
         for c, container in enumerate(log.containers)
         for span in container.spans
-        if span.overlaps(start_ns, end_ns) and (not span.counts or any((c, id_) in channels.ids for id_ in span.counts))
+        if span.overlaps(start_ns, end_ns) and (not span.counts or any((c, id_) in ids for id_ in span.counts))
     ]
-    if not all(unchanged[c].issuperset(span.counts) for c, span in spans):
-        spans.sort(key=lambda item: item[1].start_ns)
+    spans.sort(key=lambda item: item[1].start_ns)
     for c, container in enumerate(log.containers):
         container.prefetch(span for of, span in spans if of == c)
-    pending: dict[tuple[int, int], Block] = {}
+    pending: dict[_Key, Block] = {}
     for c, span in spans:
         yield from _taken(pending, span.start_ns)
         block = log.load(c, span)
-        if block is None:
-            continue
-        inside = in_window(block.log_time_ns, start_ns, end_ns) is None
-        chunk = log.containers[c].raw_chunk(span, block, unchanged[c]) if inside else None
-        if chunk is None:
-            pending[c, span.index] = _copied(block, c, channels, start_ns, end_ns)
-        else:
-            yield chunk
+        if block is not None:
+            pending[c, span.index] = _copied(block, c, ids, start_ns, end_ns)
     yield from _taken(pending, math.inf)
 
 
-def _copied(block: Block, c: int, channels: SourceChannels, start_ns: int | None, end_ns: int | None) -> Block:
+def _copied(block: Block, c: int, ids: Mapping[_Key, int], start_ns: int | None, end_ns: int | None) -> Block:
     """Return the messages to be copied of a span of file ``c``, in order of log time, with the copy's channel ids.
 
     Messages before 1970 are left out: an MCAP file cannot contain their times.
     """
     channel = np.full(len(block), -1)
     for id_, rows in block.rows.items():
-        channel[rows] = channels.ids.get((c, id_), -1)
+        channel[rows] = ids.get((c, id_), -1)
     window = in_window(block.log_time_ns, max(start_ns or 0, 0), end_ns)
     keep = np.flatnonzero((channel >= 0) & (True if window is None else window))
     return replace(block, channel=channel).take(keep[np.argsort(block.log_time_ns[keep], kind="stable")])
@@ -145,7 +111,7 @@ def _taken(pending: dict[tuple[int, int], Block], before_ns: float) -> Iterator[
         if rest is not None:
             pending[place] = rest
     if taken:
-        yield Block.merged(taken)
+        yield Block.merged(taken) if len(taken) > 1 else taken[0]
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:

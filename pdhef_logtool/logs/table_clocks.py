@@ -17,15 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
-from pdhef_logtool.logs.recording_span import (
-    BREAK_NS,
-    NOTED_SHARE,
-    OTHER_EPOCH,
-    OUTLIER,
-    TIME_JUMP,
-    find_epochs,
-    steps_back,
-)
+from pdhef_logtool.logs.recording_span import NOTED_SHARE, survey_rows
 from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
@@ -427,41 +419,28 @@ def whole_days(date: dt.date) -> int:
 def ascending_rows(stamps: IntArray, where: str) -> tuple[IntArray, list[Loss]]:
     """Return the rows that are kept of stamps [N], in file order, and losses.
 
-    As in logs of messages, rows of another time (:mod:`~pdhef_logtool.logs.recording_span`) are left out where they
-    disturb the order. If the clock steps back, the first pass is kept, and rows more than ``BREAK_NS`` after its end.
-    Single rows out of order are left out. No row is moved.
+    As in logs of messages, rows of another time and times that were recorded before are left out
+    (:mod:`~pdhef_logtool.logs.recording_span`), where they disturb the order. Single rows out of order are left out. No
+    row is moved.
     """
     rows: IntArray = np.flatnonzero(stamps != NO_TIME)
     losses: list[Loss] = []
-
-    def leave_out(kept: BoolArray, reason: str, what: str) -> None:
-        nonlocal rows
-        if not kept.all():
-            out, n = stamps[rows[~kept]], int((~kept).sum())
-            severity: Literal["lost", "note"] = "lost" if n > NOTED_SHARE * len(stamps) else "note"
-            first, last = (int(out.min()), int(out.max())) if reason == TIME_JUMP else (None, None)
-            losses.append(Loss(reason, f"{n} rows are left out: {what}", where, first, last, n, severity))
-            rows = rows[kept]
-
     if len(rows) < len(stamps):
         losses.append(Loss("bad-stamp", "row without a time", where, count=len(stamps) - len(rows)))
     if (np.diff(stamps[rows]) >= 0).all():
         return rows, losses
-    _, kept, outlier = find_epochs(stamps[rows], stamps[rows] + 1, np.ones(len(rows), np.int64))
-    reason = OUTLIER if outlier[~kept].all() else OTHER_EPOCH
-    leave_out(kept, reason, "their times are far from all others")
-    kept = np.ones(len(rows), np.bool_)
-    begins = steps_back(stamps[rows]).tolist()
-    end_ns = NO_TIME
-    for begin, end in zip([0, *begins], [*begins, len(rows)], strict=True):
-        times = stamps[rows[begin:end]]
-        kept[begin:end] = times > end_ns
-        end_ns = max(end_ns, int(times.max()) + BREAK_NS)
-    leave_out(kept, TIME_JUMP, f"the clock steps back at row {rows[begins[0]] + 1}" if begins else "")
+    used, left_out = survey_rows(stamps[rows], where)
+    losses += left_out
+    rows = rows[used]
     times = stamps[rows]
     behind, ahead = times >= np.maximum.accumulate(times), times <= np.minimum.accumulate(times[::-1])[::-1]
-    leave_out(max(behind, ahead, key=np.count_nonzero), "out-of-order", "their times are not in order")
-    return rows, losses
+    kept = max(behind, ahead, key=np.count_nonzero)
+    if not kept.all():
+        n = int((~kept).sum())
+        severity: Literal["lost", "note"] = "lost" if n > NOTED_SHARE * len(stamps) else "note"
+        what = f"{n} rows are left out: their times are not in order"
+        losses.append(Loss("out-of-order", what, where, count=n, severity=severity))
+    return rows[kept], losses
 
 
 def unlike_lengths(stamps: Mapping[str, IntArray], where: str) -> list[Loss]:

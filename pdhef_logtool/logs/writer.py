@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 from isal.isal_zlib import crc32
@@ -36,18 +36,15 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.container import MCAP_MAGIC, Block, ChannelRecord, RawChunk, items_at_bytes, rows_by_channel
+from pdhef_logtool.logs.container import MCAP_MAGIC, Block, ChannelRecord, items_at_bytes, rows_by_channel
 from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.mcap_index import INDEX_RECORD, RECORD
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.wire_layout import CdrEncoder
-from pdhef_logtool.records.errors import MappingError, OutputError
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import LIBRARY
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
-
-if TYPE_CHECKING:
-    from zstandard import ZstdCompressor
 
 #: Of message records, as far as they come together; in a chunk.
 CHUNK_BYTES = 1 << 20
@@ -87,7 +84,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
     """
 
     def __init__(self, path: Path, *, profile: str = "ros2", level: int = _LEVEL) -> None:
-        self._path, self._level = path, level
+        import zstandard
+
+        self._path, self._compressor = path, zstandard.ZstdCompressor(level=level)
         self._schemas: dict[int, Schema] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[int, Channel] = {}
@@ -99,7 +98,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._metadata_indexes: list[MetadataIndex] = []
         self._crc = 0
         self._at = 0
-        self._compressor: ZstdCompressor | None = None
         self._pending = PendingFile(path)
         with writing(path):
             self._file: IO[bytes] = open_new(self._pending.path)
@@ -132,20 +130,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
 
         Raises
         ------
-        MappingError : the type is unknown, a constant does not fit it, or the topic was added before.
+        MappingError : the definition does not parse.
         """
-        if topic in self._encoders:
-            raise MappingError(expected="a new topic", got="one that was added before", where=topic)
-        if definition is None:
-            try:
-                definition = message_definition(type_name)
-            except KeyError as error:
-                raise MappingError(
-                    expected="a common ROS 2 type or one of our own",
-                    got=type_name,
-                    where=topic,
-                    remedy="give its definition",
-                ) from error
+        definition = message_definition(type_name) if definition is None else definition
         encoder = CdrEncoder(topic, type_name, definition, constants or {})
         channel = self.add_channel(ChannelRecord(-1, topic, "cdr", type_name, "ros2msg", definition.encode()))
         self._encoders[topic] = (channel, encoder)
@@ -153,17 +140,15 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
     def add_channel(self, record: ChannelRecord) -> int:
         """Add a channel and return its id; without name and encoding of the schema it has none.
 
-        The ids are those of the record if these are free, otherwise others in ascending order.
-
         Raises
         ------
         OutputError : there are too many channels.
         """
         schema = 0
         if record.schema_name or record.schema_encoding:
-            schema = self._add_schema(record.schema_name, record.schema_encoding, record.schema_data, record.schema_id)
+            schema = self._add_schema(record.schema_name, record.schema_encoding, record.schema_data)
         channel = Channel(
-            id=self._free_id(self._channels, record.id),
+            id=self._next_id(self._channels),
             topic=record.topic,
             message_encoding=record.encoding,
             metadata=dict(record.metadata),
@@ -173,53 +158,33 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._emit_record(channel)
         return channel.id
 
-    def has_ids_of(self, channel_id: int, record: ChannelRecord) -> bool:
-        """Return whether a channel has the ids of a record, which a :class:`RawChunk` of its file needs."""
-        return channel_id == record.id and self._channels[channel_id].schema_id == record.schema_id
-
-    def _add_schema(self, name: str, encoding: str, data: bytes, wanted: int) -> int:
+    def _add_schema(self, name: str, encoding: str, data: bytes) -> int:
         key = (name, encoding, data)
-        held = self._schemas.get(wanted)
-        if held is not None and (held.name, held.encoding, held.data) == key:
-            return wanted
-        if key in self._schema_ids and (held is not None or not wanted):
-            return self._schema_ids[key]
-        schema = Schema(id=self._free_id(self._schemas, wanted or -1), data=data, encoding=encoding, name=name)
-        self._schemas[schema.id] = schema
-        self._schema_ids.setdefault(key, schema.id)
-        self._emit_record(schema)
-        return schema.id
+        if key not in self._schema_ids:
+            schema = Schema(id=self._next_id(self._schemas), data=data, encoding=encoding, name=name)
+            self._schemas[schema.id] = schema
+            self._schema_ids[key] = schema.id
+            self._emit_record(schema)
+        return self._schema_ids[key]
 
-    def _free_id(self, taken: Mapping[int, object], wanted: int) -> int:
-        """Return the wanted id if it is free, otherwise the next above all ids, or a gap."""
-        if 0 <= wanted <= _LARGEST_ID and wanted not in taken:
-            return wanted
-        above = max(taken, default=0) + 1
-        if above <= _LARGEST_ID:
-            return above
-        free = next((i for i in range(1, _LARGEST_ID + 1) if i not in taken), None)
-        if free is None:
+    def _next_id(self, taken: Mapping[int, object]) -> int:
+        if len(taken) >= _LARGEST_ID:
             raise OutputError(expected="at most 65535 channels", got="more", where=self._path)
-        return free
+        return len(taken) + 1
 
-    def write(self, batches: Sequence[TopicBatch], raws: Iterable[Block | RawChunk] = ()) -> None:
+    def write(self, batches: Sequence[TopicBatch], raws: Iterable[Block] = ()) -> None:
         """Write batches and raw messages on channels of :meth:`add_channel`, which ascend in log time.
 
-        Both are merged by log time, of equal times raw messages first. Raw messages are consumed as they come. Raw
-        chunks are written as they are, between chunks of the other messages by their first log times.
+        Both are merged by log time, of equal times raw messages first. Raw messages are consumed as they come.
         """
         ours = self._records([self._encode(batch) for batch in batches if len(batch.log_time_ns)])
         group: list[Block] = []
         for raw in raws:
-            if isinstance(raw, Block):
-                group += [raw] if len(raw) else []
-            if group and (isinstance(raw, RawChunk) or sum(map(_record_bytes, group)) >= CHUNK_BYTES):
+            group += [raw] if len(raw) else []
+            if sum(map(_record_bytes, group)) >= CHUNK_BYTES:
                 before = int(np.searchsorted(ours.log_time_ns, group[-1].log_time_ns[-1]))
                 self._emit_messages(self._records([*group, ours.take(slice(before))]))
                 group, ours = [], ours.take(slice(before, None))
-            if isinstance(raw, RawChunk):
-                ours = self._emit_messages(ours, before_ns=raw.start_ns)
-                self._emit_chunk(raw)
         self._emit_messages(self._records([*group, ours]) if group else ours)
 
     @staticmethod
@@ -235,26 +200,18 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             items[block.offset - MESSAGE_HEAD.itemsize] = head.view(items.dtype)
         return block
 
-    def _emit_messages(self, block: Block, before_ns: int | None = None) -> Block:
-        """Write :meth:`_records` in chunks, as long as these begin before a time; return the others."""
+    def _emit_messages(self, block: Block) -> None:
+        """Write :meth:`_records` in chunks."""
         first = 0
-        if not len(block) or (before_ns is not None and block.log_time_ns[0] >= before_ns):
-            return block
         start, end = block.offset - MESSAGE_HEAD.itemsize, block.offset + block.length
-        while first < len(block) and (before_ns is None or block.log_time_ns[first] < before_ns):
+        while first < len(block):
             last = max(int(np.searchsorted(end, start[first] + CHUNK_BYTES, side="right")), first + 1)
             content, rows = block.buffer[start[first] : end[last - 1]], slice(first, last)
-            channel, log_time = block.channel[rows], block.log_time_ns[rows]
-            self._emit_chunk(self._compressed(content, channel, log_time, start[rows] - start[first]))
+            self._emit_chunk(content, block.channel[rows], block.log_time_ns[rows], start[rows] - start[first])
             first = last
-        return block.take(slice(first, None))
 
     def _encode(self, batch: TopicBatch) -> Block:
         """Return the messages of a batch."""
-        if batch.topic not in self._encoders:
-            raise MappingError(expected="a topic of this file", got="an unknown one", where=batch.topic)
-        if np.any(np.diff(batch.log_time_ns) < 0):
-            raise MappingError(expected="ascending log times", got="a step back", where=batch.topic)
         channel, encoder = self._encoders[batch.topic]
         n = len(batch.log_time_ns)
         rows = encoder.encode(n, batch.fields)
@@ -264,27 +221,17 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         times = batch.log_time_ns.astype(np.int64), batch.publish_time_ns.astype(np.int64)
         return Block(rows.data.cast("B"), np.full(n, channel), *times, sequence, number * size, np.full(n, size))
 
-    def _compressed(
-        self, records: bytes | memoryview, channel: IntArray, log_time_ns: IntArray, offset: IntArray
-    ) -> RawChunk:
-        """Return message records as a chunk; channel, log time and offset [N] of each record in it."""
-        if self._compressor is None:
-            import zstandard
-
-            self._compressor = zstandard.ZstdCompressor(level=self._level)
+    def _emit_chunk(self, records: bytes | memoryview, channel: IntArray, log_time: IntArray, offset: IntArray) -> None:
+        """Write message records as a chunk; channel, log time and offset [N] of each record in it."""
         stored = self._compressor.compress(records)
-        return RawChunk("zstd", stored, len(records), crc32(records), channel, log_time_ns, offset)
-
-    def _emit_chunk(self, chunk: RawChunk) -> None:
-        channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
         start_ns, end_ns = int(log_time.min()), int(log_time.max())
         about: dict[str, Any] = {
-            "compression": chunk.compression,
+            "compression": "zstd",
             "message_start_time": start_ns,
             "message_end_time": end_ns,
-            "uncompressed_size": chunk.size,
+            "uncompressed_size": len(records),
         }
-        chunk_start, chunk_length = self._emit_record(Chunk(data=stored, uncompressed_crc=chunk.crc, **about))
+        chunk_start, chunk_length = self._emit_record(Chunk(data=stored, uncompressed_crc=crc32(records), **about))
         index_at = self._at
         offsets: dict[int, int] = {}
         index = bytearray()

@@ -10,14 +10,14 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from mcap.records import Attachment
 from numpy.typing import NDArray
 
 from pdhef_logtool.evaluation.dead_reckoned import pose_known
-from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk, RawMessage, block_of
+from pdhef_logtool.logs.container import Block, ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.definitions import message_definition
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
@@ -29,8 +29,6 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.plotted import LogLine, log_lines, log_message, plotted_fields
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots, rounded
 from pdhef_logtool.storage.documents import jsonable
-
-_Raw: TypeAlias = Block | RawChunk
 
 #: Everything below this name in a source log is ours and is replaced.
 NAMESPACE = "/pdhef/"
@@ -134,11 +132,10 @@ class AnnotatedMcap(AbstractContextManager["AnnotatedMcap"]):
     def write(self, tracks: Sequence[StateTrack]) -> None:
         """Write the tracks, merged with the messages of the source.
 
-        Sound chunks that contain only kept messages are copied whole, others message by
-        message. The losses of the source itself are complete afterwards.
+        The losses of the source itself are complete afterwards.
         """
-        raws: Iterator[_Raw] = iter(())
-        waiting: list[_Raw] = []
+        raws: Iterator[Block] = iter(())
+        waiting: list[Block] = []
         if self._source is not None:
             left_out = self.left_out or ()
             channels = register_channels(
@@ -248,7 +245,7 @@ def _pieces(tracks: Sequence[StateTrack]) -> Iterator[tuple[int, int]]:
             yield start_ns, start_ns + _PIECE_NS
 
 
-def _until(raws: Iterator[_Raw], waiting: list[_Raw], end_ns: float) -> Iterator[_Raw]:
+def _until(raws: Iterator[Block], waiting: list[Block], end_ns: float) -> Iterator[Block]:
     """Yield the messages up to the first one at or after a time, which waits for the next call."""
     while (raw := waiting.pop() if waiting else next(raws, None)) is not None:
         ready, rest = raw.split(end_ns)

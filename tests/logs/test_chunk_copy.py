@@ -1,4 +1,4 @@
-"""Full copies: every message, attachment and metadata record of the source; chunks that stay unchanged, and others."""
+"""Full copies: every message, attachment and metadata record of the source."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.records import Chunk
-from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 from recorded import messages_of, raw_channel, summary_of
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.container import Block, RawChunk, RawMessage, block_of
+from pdhef_logtool.logs.container import RawMessage, block_of
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
@@ -54,34 +52,12 @@ def _annotate(source: Path | ColumnarLog, target: Path, leave_out=lambda _: Fals
             writer.add_topic("/ours", "std_msgs/msg/Float64")
             stamps = T0 - 50_000_000 + np.arange(7000) * 100_000
             ours = [TopicBatch("/ours", stamps, stamps, {"data": np.arange(7000.0)})] if batches else []
-            items = list(iterate_copy(log, channels, *window))
-            writer.write(ours, items)
-        lost = log.lost
-    return items, lost
-
-
-def _chunks(path: Path) -> list[Chunk]:
-    with path.open("rb") as stream:
-        return [r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)]
+            writer.write(ours, iterate_copy(log, channels, *window))
+        return log.lost
 
 
 def _messages(path: Path) -> list[tuple[object, ...]]:
     return messages_of(path, without="/ours")
-
-
-@pytest.mark.parametrize("compression", list(CompressionType))
-def test_chunks_are_taken_over_bit_for_bit(tmp_path: Path, compression: CompressionType) -> None:
-    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    _write(source, compression=compression)
-    items, lost = _annotate(source, target)
-    assert lost == ()
-    assert len(items) == len(_chunks(source)) > 5
-    assert all(isinstance(item, RawChunk) for item in items)
-    copied = [c for c in _chunks(target) if c in _chunks(source)]  # data, size, CRC, compression and both times
-    assert copied == _chunks(source)
-    assert _messages(target) == _messages(source)
-    starts = [c.message_start_time for c in summary_of(target).chunk_indexes]
-    assert starts == sorted(starts)
 
 
 def _damage_chunk(path: Path, number: int) -> tuple[int, int]:
@@ -99,30 +75,25 @@ def test_a_damaged_chunk_is_dropped_and_said(tmp_path: Path, compression: Compre
     _write(source, compression=compression)
     intact = _messages(source)
     start, end = _damage_chunk(source, 2)
-    items, lost = _annotate(source, target)
+    lost = _annotate(source, target)
     assert [(x.kind, x.start_ns, x.end_ns) for x in lost] == [("bad-chunk", start, end)]
-    assert all(isinstance(item, RawChunk) for item in items)
     assert _messages(target) == [m for m in intact if not start <= m[0] < end]  # type: ignore[operator]
     assert _messages(target) != intact
 
 
-def test_chunks_that_hold_what_is_left_out_are_taken_apart(tmp_path: Path) -> None:
+def test_a_copy_has_no_topic_that_is_left_out(tmp_path: Path) -> None:
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     _write(source, extra=("/old",))
-    items, lost = _annotate(source, target, leave_out=lambda topic: topic == "/old")
+    lost = _annotate(source, target, leave_out=lambda topic: topic == "/old")
     assert lost == ()
-    assert all(isinstance(item, Block) for item in items)
     assert _messages(target) == [m for m in _messages(source) if m[1] != "/old"]
 
 
-def test_a_window_takes_apart_only_the_chunks_at_its_ends(tmp_path: Path) -> None:
+def test_a_copy_of_a_window(tmp_path: Path) -> None:
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     _write(source)
     window = (T0 + 100_500_000, T0 + 400_500_000)
-    items, _ = _annotate(source, target, window=window)
-    kinds = ["chunk" if isinstance(item, RawChunk) else "message" for item in items]
-    inside = [c for c in _chunks(source) if c.message_start_time >= window[0] and c.message_end_time < window[1]]
-    assert kinds.count("chunk") == len(inside) >= 2
+    _annotate(source, target, window=window)
     assert _messages(target) == [m for m in _messages(source) if window[0] <= m[0] < window[1]]  # type: ignore[operator]
 
 
@@ -142,11 +113,9 @@ def _split(tmp_path: Path, swap: bool) -> ColumnarLog:
 
 
 @pytest.mark.parametrize("swap", [False, True])
-def test_split_files_keep_their_chunks_while_their_ids_agree(tmp_path: Path, swap: bool) -> None:
+def test_split_files_become_one_whatever_their_ids(tmp_path: Path, swap: bool) -> None:
     target = tmp_path / "copy.mcap"
-    items, _ = _annotate(_split(tmp_path, swap), target)
-    assert isinstance(items[0], RawChunk)
-    assert [type(item) for item in items[1:]] == [Block if swap else RawChunk]
+    _annotate(_split(tmp_path, swap), target)
     expected = _messages(tmp_path / "0.mcap") + _messages(tmp_path / "1.mcap")
     assert _messages(target) == expected
     assert len(summary_of(target).channels) == 3
