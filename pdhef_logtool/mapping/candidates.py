@@ -30,7 +30,7 @@ from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signa
 from pdhef_logtool.records.signals import FloatArray
 
 #: Kind of data in a field, according to the names around it.
-Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command", "device"]
+Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command"]
 #: A field with a meaning from its name or documented type. The last entry is True for a documented type.
 Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
@@ -176,7 +176,7 @@ class Field:
         score += 0.15 if self.meaning.unit else 0.0
         score -= 0.0 if self.seen.changes else 0.1
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
-        score -= {"device": 0.1, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
+        score -= 0.1 if self.role == "navigation" and self.meaning.quantity == "speed" else 0.0
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
     def use(self, unit: str) -> None:
@@ -405,8 +405,6 @@ def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tup
         seen = read.get((source.topic, source.paths[0]))
         if seen is None or isinstance(source.scale, tuple) or not isinstance(source.offset, float):
             continue
-        if not isinstance(source.field, str):
-            continue
         meaning = meaning_of_signal(source.name)
         item = Field(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))
         item.factors, item.sign = (("", abs(source.scale)),), math.copysign(1.0, source.scale)
@@ -434,15 +432,11 @@ def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
 
 
 def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
-    """Return the stamp of the innermost message around a field that has a stamp."""
-    times = {f.path for f in fields if f.kind == "time"}
-    parts = path.split(".")[:-1]
-    while parts:
-        for stamp in STAMP_PATHS:
-            if ".".join([*parts, stamp]) in times:
-                return ".".join([*parts, stamp])
-        parts.pop()
-    return stamp_path_of(fields)
+    """Return the stamp of a topic, or else of the innermost message around a field that has a stamp."""
+    parts, times = path.split("."), {f.path for f in fields if f.kind == "time"}
+    inner = (".".join([*parts[:depth], stamp]) for depth in range(len(parts) - 1, 0, -1) for stamp in STAMP_PATHS)
+    outer = stamp_path_of(fields)
+    return next((stamp for stamp in inner if outer == "log_time" and stamp in times), outer)
 
 
 def triad_of(item: Field) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Number and length of the pieces of the log to read; a shorter log is read whole.
 PIECES = 8
@@ -207,11 +207,9 @@ def _filled(rows: FloatArray) -> FloatArray:
     return rows
 
 
-def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | None:
+def fit(y: FloatArray, x: FloatArray) -> Fit | None:
     """Fit a line through the finite cells [M]; None if there are too few or one of the two is constant."""
     use = np.isfinite(y) & np.isfinite(x)
-    if where is not None:
-        use &= where
     if np.count_nonzero(use) < FEWEST_CELLS:
         return None
     # Exclude a few outliers, such as a sensor's "invalid".

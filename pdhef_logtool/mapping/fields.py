@@ -30,8 +30,8 @@ _HALF = 5
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
-#: grade and slip, and of the usual lengths and tracks among cars; usual track.
-SAME, BY_DRIVING, USUAL_LENGTHS, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.4, 0.2, 1.55
+#: grade and slip, and of the usual tracks among cars; usual track.
+SAME, BY_DRIVING, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.2, 1.55
 #: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
@@ -208,7 +208,6 @@ def decide_units(fields: Fields) -> None:
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
-    _by_steering(fields)
     _by_track(fields)
     _by_siblings(fields)
 
@@ -286,23 +285,6 @@ def _by_turning(fields: Fields) -> None:
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
         if relation is not None and abs(relation.correlation) > CLEAR:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
-
-
-def _by_steering(fields: Fields) -> None:
-    """Determine the unit of the speed by the length that converts the path's curvature to a steering angle."""
-    speed, rate, steering = fields.best("speed"), fields.best("rate"), fields.best("steering")
-    if speed is None or rate is None or steering is None or speed.unit_known or speed.fixed:
-        return
-    curve = fields.curvature(speed.seen.cells, rate.seen.cells)
-    relation = None if curve is None else fit(fields.pieces.smooth(steering.seen.cells), curve)
-    if relation is None or abs(relation.correlation) < CLEAR:
-        return
-    ways = [Unit(u, f / m, k, USUAL_LENGTHS) for k, m in USUAL_LENGTH_M.items() for u, f in steering.units]
-    others = [[Unit(*u, energy=RARE.get(u[0], 0.0)) for u in f.units] for f in (rate, speed)]
-    share = posterior([ways, *others], [Gain((1, -1, 1), relation.slope, BY_DRIVING)]).sum(axis=(0, 1))
-    if share.max() > CERTAIN * share.sum():
-        speed.use(speed.units[int(share.argmax())][0])
-        speed.doubts.append(f"unit not given; taken as {speed.factors[0][0]}, with a usual ratio of the steering")
 
 
 def _by_track(fields: Fields) -> None:

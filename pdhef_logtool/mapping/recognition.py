@@ -14,7 +14,6 @@ from pdhef_logtool.mapping import navigation
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
-from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.evidence import Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
@@ -193,7 +192,6 @@ def auto_map(
     if decoded is not None:
         mapping = decoded.as_mapped(mapping)
         candidates = tuple(replace(c, source=decoded.as_source(c.source)) for c in candidates)
-    mapping = with_usable_stamps(log, mapping)
     return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), candidates)
 
 
@@ -355,7 +353,7 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
             signals = navigation.receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
             signals |= _in_degrees(draft.log, {n: s for n, s in signals.items() if n in GNSS_POSITION})
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
-            signals = navigation.named_gnss(draft.log, topic, draft.signals) if by_name else signals
+            signals = navigation.named_gnss(draft.log, topic) if by_name else signals
             if signals:
                 yield signals
 
@@ -425,8 +423,6 @@ def _role(topic: TopicInfo) -> Role:
     navigates = {*words, *words_of(topic.type_name)} & _TOPICS["navigation"]
     if words & _TOPICS["estimate"] and not navigates:
         return "estimate"
-    if words & _TOPICS["device"]:
-        return "device"
     return "navigation" if navigates else "sensor"
 
 
