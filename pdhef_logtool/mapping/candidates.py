@@ -51,8 +51,6 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
 }
 #: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
 MOST: dict[str, float] = VOCABULARY["largest"]
-#: The same where no other unit is possible: five turns of a truck's steering wheel, in degrees.
-MOST_OTHERWISE = {**MOST, "steering": 32.0}
 CONSTANT = "constant in the parts of the log that were read"
 #: Strength of the meaning of a field that only the drive gives, and least strength of a name.
 PROPOSED, LEAST_NAMED = 0.55, 0.6
@@ -189,7 +187,7 @@ class Field:
         source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
         if self.sign_path:
             source = replace(source, field=(self.path, self.sign_path), scale=(self.scale, 1.0), combine="signed")
-        most = MOST_OTHERWISE.get(self.meaning.quantity)
+        most = MOST.get(self.meaning.quantity)
         finite = self.seen.values[np.isfinite(self.seen.values)] * self.scale + self.offset
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
             source = replace(source, valid_min=-most, valid_max=most)
@@ -423,12 +421,9 @@ def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
     """Return the units that are possible by a field's range; a unit in its name excludes all others."""
     largest = seen.largest
     named = () if meaning.scale is None else ((meaning.unit, meaning.scale),)
-    for limits in (MOST_OTHERWISE,) if named else (MOST, MOST_OTHERWISE):
-        most = limits.get(meaning.quantity, math.inf)
-        # Beyond a car's range, the unit in the name is wrong.
-        if within := tuple(u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most):
-            return within
-    return ()
+    most = MOST.get(meaning.quantity, math.inf)
+    # Beyond a car's range, the unit in the name is wrong.
+    return tuple(u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most)
 
 
 def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:

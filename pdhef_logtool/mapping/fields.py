@@ -217,8 +217,6 @@ def _by_gravity(fields: Fields) -> None:
     for item in fields.candidates:
         if item.meaning.quantity == "acceleration" and item.is_axis:
             groups.setdefault(triad_of(item), {})[item.meaning.part] = item
-        elif item.meaning.quantity == "acceleration" and item.meaning.part == "z":  # named vertical, without a triad
-            groups[f"{triad_of(item)}.{item.path}"] = {"z": item}
     for axes in groups.values():
         if set(axes) in ({"z"}, set("xyz")):
             means = {axis: float(np.nanmean(f.seen.values)) for axis, f in axes.items()}
@@ -268,9 +266,6 @@ def _speeds(fields: Fields) -> None:
 def _by_speeding_up(fields: Fields) -> None:
     """Determine the units of speeds and of a_x by a_x ≈ v̇."""
     for speed, ax in itertools.product(fields.open("speed"), fields.open("acceleration", "x")):
-        # With two unknown units, x of a vector is ambiguous: it may be in the world frame.
-        if len(ax.units) > 1 < len(speed.units) and speed.is_axis and speed.meaning.part == "x":
-            continue
         relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
         if relation is not None and relation.correlation >= CLEAR:
             settle((ax, speed), [Gain((1, -1), relation.slope, BY_DRIVING)], "a_x ≈ v̇", bonus=0.3)

@@ -51,7 +51,6 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
-    name = _PATTERNS["no_words"].sub("", name)
     name = _PATTERNS["sides"].sub(lambda m: "_" + "".join(g[0] for g in m.groups() if g), name.translate(LATIN))
     name = _PATTERNS["corner_at_end"].sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
@@ -164,7 +163,7 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     ``unit_text`` is the unit stored in the log (``km/h``, ``°/s``), empty without one.
     """
     *parents, leaf = path.split(".")
-    leaf_words = words_of(f"r_{unit_text.replace('°', 'deg')}" if leaf == "r" else re.sub(r"\[\d*\]", "", leaf))
+    leaf_words = words_of(re.sub(r"\[\d*\]", "", leaf))
     inner = tuple(w for p in parents for w in words_of(p))
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _WORDS["other_devices"] & set(outer):
@@ -192,13 +191,9 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
 
 def _described(leaf_words: tuple[str, ...]) -> set[str]:
     """Return the words of a leaf that describe its quantity."""
-    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured;
-    # a controller before "vehicle" is the sender.
-    if leaf_words[1:2] == ("vehicle",) and leaf_words[2:]:
-        leaf_words = leaf_words[leaf_words[0] in _WORDS["controllers"] :]
-    kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
-    kept |= {w for w in leaf_words[-1:] if (w not in STATES and leaf_words[-2:-1] != ("per",)) or len(leaf_words) == 1}
-    return kept
+    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
+    last = set(leaf_words[-1:]) - (STATES if leaf_words[1:] else set())
+    return last | {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
 
 
 _TURNING = frozenset({"rate", "velocity", "velocities", "gyro", "gyroscope"})

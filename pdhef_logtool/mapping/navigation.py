@@ -98,9 +98,7 @@ def axes_of(
     if any(SAME_STEPS[0] < slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0))):
         return "east, north"
     enough = np.count_nonzero(moving) >= FEWEST_CELLS
-    # A car may reverse; without a path, a direction that is often opposite shows axes of the earth.
-    ahead = x if steps is None else np.abs(x)
-    is_ahead = not enough or bool(np.mean((ahead > np.abs(y))[moving]) >= AHEAD_SHARE)
+    is_ahead = not enough or bool(np.mean((x > np.abs(y))[moving]) >= AHEAD_SHARE)
     if not is_ahead:
         return "not ahead"
     return "" if relation is None else "body"
@@ -312,7 +310,8 @@ def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
     if not speed:
         return
     for path, meaning in its.angles.items():
-        if (convention := _convention(its.seen.get(path), its.course, meaning.scale)) is not None:
+        convention = _convention(its.seen.get(path), its.course, meaning.scale)
+        if convention is not None and convention[1] < 0.0:  # a course over ground is clockwise from north by definition
             yield its.source("gnss_course_rad", path, *convention[1:])
             yield its.source("gnss_speed_m_s", speed, unit)
             return

@@ -268,12 +268,10 @@ class Weighing:
             self.taken[name] = item
 
     def _motion_along(self, *axes: Field) -> tuple[list[float], list[float]]:
-        """Return the correlations of accelerations with speeding up, and with turning left by the path or the gyro."""
-        speed, rate, pieces = self._speed(), self.taken.get("yaw_rate_rad_s"), self.fields.pieces
+        """Return the correlations of accelerations with speeding up, and with turning left by the path."""
+        speed, pieces = self._speed(), self.fields.pieces
         pace, path = np.ones_like(axes[0].si) if speed is None else speed.si, path_velocity(self.fields)
         turning = np.full_like(pace, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
-        if path is None and rate is not None and rate.is_axis and place_of(rate) == place_of(axes[0]):
-            turning = rate.si
         changes = pieces.rate_of(pace), pieces.smooth(np.where(pace > 0.0, turning, np.nan) * pace)
         ahead, left = ([correlation(pieces.smooth(f.si), change) for f in axes] for change in changes)
         return ahead, left
@@ -504,8 +502,6 @@ def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
             truth.setdefault(name, item)
     if not {*_SLIP, "lat_deg"} & set(truth):
         return {}
-    if not _SLIP & set(truth):
-        truth.pop("vx_m_s", None)
     if {"vx_m_s", "vy_m_s"} <= set(truth):
         truth.pop("sideslip_rad", None)
     return truth
