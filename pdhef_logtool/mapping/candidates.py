@@ -23,7 +23,7 @@ from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, UNITS, VOCABULARY, Meaning, is_command, words_of
+from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
@@ -270,21 +270,11 @@ def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tu
 
 
 def _units_without_name(info: FieldInfo) -> Units:
-    """Return the possible units of a field by quantity, if its name contains no word with another meaning."""
+    """Return the possible units of a field without a unit by quantity, if no word of its name has a meaning."""
     words = set(words_of(info.path)) - STATES
-    unit = naming.plain_unit(info.unit)
-    named = f"{info.path.rpartition('.')[2]}_{unit}"
-    kinds = {"speed": "speed", "acceleration": "acceleration", "rate": "rate", "steering": "angle"}
-    given = {q: ((u, s),) for q, kind in kinds.items() for u, s in [naming.unit_of(named, kind)] if s is not None}
-    if "acceleration" in given:  # m/s is a part of m/s², and deg of deg/s
-        given.pop("speed", None)
-    if naming.OTHER_QUANTITIES & words:
-        given.pop("steering", None)
-    given.pop("steering" if "rate" in given and given["rate"][0][0] not in UNITS["angle"] else "rate", None)
-    if given and not words & NOT_VALUES and not is_command(info.path):
-        return given
     unknown = all(len(w) == 1 or w.isdigit() or w in naming.COUNTING or w not in naming.KNOWN for w in words)
-    return {q: HYPOTHESES[q][:2] for q in kinds} if unknown and not unit and not words & NOT_VALUES else {}
+    quantities = ("speed", "acceleration", "rate", "steering")
+    return {q: HYPOTHESES[q][:2] for q in quantities} if unknown and not info.unit and not words & NOT_VALUES else {}
 
 
 def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:

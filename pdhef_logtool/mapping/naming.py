@@ -36,7 +36,7 @@ _UNIT_PHRASES: tuple[tuple[str, str], ...] = tuple(VOCABULARY["unit_phrases"].it
 _SPELLED_UNITS = tuple((re.compile(pattern), sign) for pattern, sign in VOCABULARY["unit_parts"].items())
 _SYNONYMS: dict[str, str] = VOCABULARY["synonyms"]
 _WORDS = {name: frozenset(words.split()) for name, words in VOCABULARY["words"].items()}
-COUNTING, NOT_VALUES, OTHER_QUANTITIES = (_WORDS[name] for name in ("counting", "not_values", "other_quantities"))
+COUNTING, NOT_VALUES = _WORDS["counting"], _WORDS["not_values"]
 #: Words by which names that are written as one word are cut.
 KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
 _WHOLE, _BARE = KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS

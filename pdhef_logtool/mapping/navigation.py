@@ -41,8 +41,8 @@ _CONVENTIONS = tuple(
     for sense, sign, angle in (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
     for unit, factor in (("degrees", math.radians(1.0)), ("radians", 1.0))
 )
-#: Tolerance of the ratio of a velocity to the speed from positions; speed over ground over that along the path if the
-#: axes are the earth's; share of the time that a body moves ahead.
+#: Tolerance of the ratio of a speed to that from positions; speed over ground over that along the path if the axes are
+#: the earth's; share of the time that a body moves ahead.
 NEAR_PATH, SAME_STEPS, AHEAD_SHARE = 0.08, (0.7, 1.4), 0.6
 #: Least share of its y axis in a path: along the x axis, velocities over ground and of the body are equal.
 ACROSS_SHARE = 0.1
@@ -305,8 +305,8 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
 
 def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
-    units = {p: m.scale or its.unit_on_path(p) for p, m in its.meanings.items() if m.quantity == "speed"}
-    speed, unit = next(((p, u) for p, u in units.items() if u is not None), ("", 0.0))
+    speeds = ((p, m.scale or its.unit_on_path(p)) for p, m in its.meanings.items() if m.quantity == "speed")
+    speed, unit = next(((path, unit) for path, unit in speeds if unit is not None), ("", 0.0))
     if not speed:
         return
     for path, meaning in its.angles.items():

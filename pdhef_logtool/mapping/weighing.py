@@ -56,8 +56,8 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Correlation below which an acceleration is along the other axis; least one of one ahead whose sign is otherwise open.
-FOLLOWS, FAINT = 0.5, 0.25
+#: Correlation with speeding up below which an acceleration is along another axis.
+FOLLOWS = 0.5
 #: Speed over that over ground below which it is vertical.
 VERTICAL = 0.2
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
@@ -245,36 +245,20 @@ class Weighing:
             self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
 
     def _turn_level(self) -> None:
-        """Turn the axes of a level device by quarters of a turn if its names are letters, as the motion shows."""
-        ax = self.taken.get("ax_m_s2")
+        """Turn the axes of a level device by a quarter of a turn if its names are letters, as speeding up shows."""
+        ax, speed, pieces = self.taken.get("ax_m_s2"), self._speed(), self.fields.pieces
         triad = [f for f in self.fields.candidates if ax is not None and triad_of(f) == triad_of(ax)]
-        triad = [f for f in triad if f.meaning.quantity == "acceleration"]
-        across = [f for f in triad if f.meaning.part == "y"]
-        if ax is None or ax.fixed or not ax.is_axis or len(across) != 1:
+        across = [f for f in triad if f.meaning.quantity == "acceleration" and f.meaning.part == "y"]
+        if ax is None or speed is None or ax.fixed or not ax.is_axis or len(across) != 1:
             return
-        ay = across[0]
-        ahead, left = self._motion_along(ax, ay)
-        if abs(ahead[1]) > CLEAR and abs(ahead[0]) < FOLLOWS:
-            ahead_sign = math.copysign(1.0, ahead[1])
-        elif abs(left[0]) > CLEAR and abs(left[1]) < FOLLOWS:
-            ahead_sign = -math.copysign(1.0, left[0])
-        else:
+        ay, change = across[0], pieces.rate_of(speed.si)
+        along, ahead = (correlation(pieces.smooth(f.si), change) for f in (ax, ay))
+        if abs(ahead) <= CLEAR or abs(along) >= FOLLOWS:
             return
-        # Two axes without a third have no handedness.
-        along = math.copysign(1.0, ahead[1]) if len(triad) < len("xyz") and abs(ahead[1]) > FAINT else ahead_sign
-        for name, item, factor in (("ax_m_s2", ay, along), ("ay_m_s2", ax, -ahead_sign)):
-            item.sign, item.is_turned = item.sign * factor, True
+        for name, item, factor in (("ax_m_s2", ay, ahead), ("ay_m_s2", ax, -ahead)):
+            item.sign, item.is_turned = item.sign * math.copysign(1.0, factor), True
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
             self.taken[name] = item
-
-    def _motion_along(self, *axes: Field) -> tuple[list[float], list[float]]:
-        """Return the correlations of accelerations with speeding up, and with turning left by the path."""
-        speed, pieces = self._speed(), self.fields.pieces
-        pace, path = np.ones_like(axes[0].si) if speed is None else speed.si, path_velocity(self.fields)
-        turning = np.full_like(pace, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
-        changes = pieces.rate_of(pace), pieces.smooth(np.where(pace > 0.0, turning, np.nan) * pace)
-        ahead, left = ([correlation(pieces.smooth(f.si), change) for f in axes] for change in changes)
-        return ahead, left
 
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
