@@ -21,7 +21,7 @@ from pdhef_logtool.mapping import naming
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
-from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
+from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
@@ -172,7 +172,6 @@ class Field:
             return 0.95
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
         score += 0.15 if self.meaning.unit else 0.0
-        score -= 0.0 if self.seen.changes else 0.1
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
         score -= 0.1 if self.role == "navigation" and self.meaning.quantity == "speed" else 0.0
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
@@ -211,7 +210,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         there = {f.path for f in fields}
         no_values = _no_values(topic, fields)
         for info in (f for f in fields if f.path not in no_values):
-            if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or _is_setpoint(topic, info):
+            if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or is_command(info.path):
                 continue
             if its := documented.entries(info.path):
                 results += [(topic, role, replace(info, path=p), entry.meaning, True) for p, entry in its.items()]
@@ -277,11 +276,6 @@ def _units_without_name(info: FieldInfo) -> Units:
     return {q: HYPOTHESES[q][:2] for q in quantities} if unknown and not info.unit and not words & NOT_VALUES else {}
 
 
-def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
-    """Return whether a field is a command; ``REF_Speed`` of a topic ``reference`` is measured."""
-    return is_command(info.path.removeprefix("REF_") if "reference" in topic.name.lower() else info.path)
-
-
 def _signs_of(paths: Collection[str]) -> dict[str, str]:
     """Return the paths of signs by the paths of their magnitudes."""
     bases = ((_SIGN.sub("", path), path) for path in paths)
@@ -332,7 +326,7 @@ def _weighable(
         its = meaning if name == path else naming.meaning_among(topic.name, topic.type_name, name, info.unit)
         if its is None and meaning.quantity == "speed":
             its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
-        if seen is None or its is None or not _is_measured(name, seen):
+        if seen is None or its is None or not np.isfinite(seen.values).any():
             continue
         if role == "sensor" and {"gps", "gnss", "ins", "rtk"} & set(words_of(name)):
             role = "navigation"
@@ -355,12 +349,6 @@ def _weighable(
             item.sign = -1.0
             item.reasons.append("positive downward by its name")
         yield item
-
-
-def _is_measured(name: str, seen: Seen) -> bool:
-    """Return whether there are values, other than codes of an enumeration."""
-    is_state = not STATES.isdisjoint(words_of(name)[-1:]) and is_enumeration(seen.values)
-    return bool(np.isfinite(seen.values).any()) and not is_state
 
 
 def _may_be_share(item: Field, info: FieldInfo) -> bool:

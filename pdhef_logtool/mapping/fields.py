@@ -234,21 +234,14 @@ def _by_gravity(fields: Fields) -> None:
 
 
 def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
-    """Turn an inertial sensor's axes to the car's by the usual mounting for this axis upward; the drive checks it.
-
-    Phones that give accelerations in g give gravity, not the force against it.
-    """
+    """Turn an inertial sensor's axes to the car's by the usual mounting for this axis upward; the drive checks it."""
     for item in axes.values():
         item.has_gravity = True
-    device, is_negated = axes["x"], up == "-y" and axes["x"].factors[0][0] == "g"
-    usual = VOCABULARY["mountings"].get("+y" if is_negated else up, {})
-    rates = [
-        f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and place_of(f) == place_of(device)
-    ]
+    usual, place = VOCABULARY["mountings"].get(up, {}), place_of(axes["x"])
+    rates = [f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and place_of(f) == place]
     for item in (f for f in (*axes.values(), *rates) if f.meaning.part in usual and not (f.fixed or f.is_downward)):
         part, sign = usual[item.meaning.part]
-        item.meaning, item.is_turned = replace(item.meaning, part=part), True
-        item.sign = -sign if is_negated and item.meaning.quantity == "acceleration" else sign
+        item.meaning, item.is_turned, item.sign = replace(item.meaning, part=part), True, sign
         item.doubts.append(f"gravity is along {up} of its device, read as that of {usual['text']}")
 
 

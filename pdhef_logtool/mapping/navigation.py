@@ -53,8 +53,6 @@ NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative:
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
 #: Ground truth with one of these contains a heading, or motion that needs one.
 HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
-#: Course of a single antenna in addition to a heading from two antennas: a sensor, even of a ground-truth instrument.
-RAW_COURSE = "heading_raw"
 
 
 #: Ground-truth quantities of one topic, and the note on their source.

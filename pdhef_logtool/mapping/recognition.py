@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
@@ -15,13 +14,13 @@ from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.evidence import Pieces, Seen
-from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
+from pdhef_logtool.mapping.joints import is_joints, joint_names
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command, words_of
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors, plain_type
 from pdhef_logtool.mapping.weighing import Weighing, weigh
-from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray, has_gnss
+from pdhef_logtool.records.signals import FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
 _FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
@@ -268,11 +267,6 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not type_of(t).startswith(NO_SENSORS)]
     weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
     draft.signals.update(weighed.signals)
-    steer = weighed.signals.get("steer_rad")
-    both = None if steer is None else mean_of_sides(draft.log, {t.name: t for t in topics}, steer)
-    if both is not None:
-        draft.signals["steer_rad"] = both
-        draft.notes.append(f"steer_rad is the mean of the two steered wheels in {both.topic}")
     joints = (t for t, role in rest if is_joints(t) and role != "command" and not joint_names(draft.log, t))
     draft.notes += [f"{t.name} is not used: the joints or their order differ between messages" for t in joints]
     if weighed.truth:
@@ -329,9 +323,8 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     instruments = (
         {_device(source.topic) for source in draft.truth.values()} if navigation.has_heading(draft.truth) else set()
     )
-    topics = [t for t in topics if not _named(t, "truth")]
-    others = [t for t in topics if _device(t.name) not in instruments]
-    receivers = list(_receivers(draft, topics, others, vendors))
+    others = [t for t in topics if not _named(t, "truth") and _device(t.name) not in instruments]
+    receivers = list(_receivers(draft, others, vendors))
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
@@ -345,25 +338,16 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
-def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], vendors: Vendors) -> Iterator[_Sources]:
-    """Yield the signals of each receiver among ``others``, and of any topic with the course of a single antenna."""
+def _receivers(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Iterator[_Sources]:
+    """Yield the signals of each receiver."""
     for topic in topics:
         fields = () if type_of(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
-        if fields and (topic in others or has_path(fields, navigation.RAW_COURSE)):
+        if fields:
             signals = navigation.receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
-            signals |= _in_degrees(draft.log, {n: s for n, s in signals.items() if n in GNSS_POSITION})
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
             signals = navigation.named_gnss(draft.log, topic) if by_name else signals
             if signals:
                 yield signals
-
-
-def _in_degrees(log: DriveLog, places: _Sources) -> _Sources:
-    """Return positions with a documented unit in degrees if their values are degrees, as programs convert them."""
-    seen = Pieces(log).read((s.topic, s.paths[0]) for s in places.values() if s.scale != 1.0)
-    largest = {path: values.largest for (_, path), values in seen.items()}
-    is_small = {n: math.pi < largest.get(s.paths[0], 0.0) < 180.0 for n, s in places.items()}
-    return {n: replace(s, scale=1.0) if any(is_small.values()) else s for n, s in places.items()}
 
 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
@@ -439,14 +423,8 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
         if chosen is not None:
             draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, paths[chosen])
             draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
-    if not draft.signals or has_speed(draft.signals):
-        return
-    _speed_of_navigation(draft, topics)
-    bodies = [t for t in twists if not _is_truth(t) and _axes(draft, t, topics) == "body"]
-    if len(bodies) == 1 and not has_speed(draft.signals):
-        draft.take(draft.signals, "speed_m_s", bodies[0].name, _twist(bodies[0], "linear", "x"))
-        draft.notes.append(f"speed_m_s comes from {bodies[0].name}, whose x is ahead, as no other source gives a speed")
-        draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
+    if draft.signals and not has_speed(draft.signals):
+        _speed_of_navigation(draft, topics)
 
 
 def _speed_of_receiver(draft: _Draft) -> None:
