@@ -95,11 +95,10 @@ def weigh(
     named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
     if log.end_ns > log.start_ns and not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
         named += proposed_fields(log, topics, named)
-    wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
-    if not wanted:
+    if not named:
         return Weighing(Fields(Pieces(log), {}, [], []))
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
-    pieces, weighable = look(log, wanted, vendors, [*signals.values(), *true])
+    pieces, weighable = look(log, named, vendors, [*signals.values(), *true])
     anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
@@ -112,26 +111,6 @@ def weigh(
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
     return weighing
-
-
-def _is_wanted(
-    quantity: str, part: str, role: Role, signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]
-) -> bool:
-    """Return whether a field can provide a missing signal, or information on one."""
-    if quantity == "over ground":  # shows which speed is vertical
-        return "speed_m_s" not in signals
-    if quantity == "acceleration" and part == "z":  # shows gravity
-        return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
-    if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
-        return True
-    if quantity == "rate" and part in ("x", "y"):  # the axes of a device may differ from the car's
-        return "yaw_rate_rad_s" not in signals
-    names = names_of(quantity, part)
-    steered = {"steer_rad", "steering_wheel_rad"} & set(signals)
-    open_ = any(n not in signals and not (n.startswith("steer") and steered) for n in names)
-    for_truth = not truth and (role in ("truth", "navigation") or quantity in ("sideslip", "velocity", "heading"))
-    for_truth |= role == "truth" and not has_heading(truth)
-    return open_ or for_truth
 
 
 @dataclass(slots=True)
