@@ -166,7 +166,8 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
         seen, recorded_ns, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
         times = np.concatenate(recorded[key])
         is_asked_for = source.stamp == "log_time" or source.clock == "device"
-        unusable = "" if is_asked_for else why_missing(raw.shape[0], times.shape[0])
+        missing = 1.0 - raw.shape[0] / times.shape[0] if times.shape[0] and not is_asked_for else 0.0
+        unusable = f"{missing:.0%} of its stamps are zero or no time" if missing > UNUSABLE_SHARE else ""
         if unusable:
             raw = log_time = times
         elif source.stamp != "log_time":
@@ -216,12 +217,6 @@ def _offset_changes(parts: Sequence[_Stamps]) -> bool:
     """Return whether the smallest delays of successive parts differ by more than clock drift explains."""
     least = np.array([float((log_time - raw).min()) for raw, log_time, _ in parts if raw.shape[0]])
     return bool((np.abs(np.diff(least)) > STEP_BACK_NS).any())
-
-
-def why_missing(usable: int, messages: int) -> str:
-    """Return why too few messages have a stamp; empty if enough have one."""
-    share = 1.0 - usable / messages if messages else 0.0
-    return f"{share:.0%} of its stamps are zero or no time" if share > UNUSABLE_SHARE else ""
 
 
 def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
