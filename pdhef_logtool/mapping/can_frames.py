@@ -32,6 +32,7 @@ from pdhef_logtool.logs.can_decoding import (
 )
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.mapping.evidence import Pieces
 from pdhef_logtool.mapping.naming import VOCABULARY
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource, near
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
@@ -50,9 +51,6 @@ _KINDS = {"id": ("number",), "data": ("array", "string"), "length": ("number",)}
 EXTENDED_FLAG = 1 << 31
 NO_DATA_FLAGS = (1 << 30) | (1 << 29)
 STANDARD_ID_BITS = (1 << 11) - 1
-
-#: Parts of a log in which identifiers are looked for.
-_PARTS, _PART_NS = 4, 5_000_000_000
 
 
 def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
@@ -126,13 +124,9 @@ def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> CanSignalLog |
 
 
 def _identifiers(log: DriveLog, topic: str, paths: _FramePaths) -> frozenset[int]:
-    """Return the identifiers of a topic's frames in parts of the log."""
-    sent: set[int] = set()
-    for start in np.linspace(log.start_ns, max(log.start_ns, log.end_ns - _PART_NS), _PARTS).astype(np.int64).tolist():
-        columns = log.read({topic: [paths.parts["id"]]}, start, start + _PART_NS, quiet=True)[topic]
-        numbers = np.asarray(columns.fields[paths.parts["id"]], np.float64)
-        sent |= {int(i) & ID_BITS for i in np.unique(numbers[np.isfinite(numbers)])}
-    return frozenset(sent)
+    """Return the identifiers of a topic's frames in pieces of the log."""
+    seen = Pieces(log).read([(topic, paths.parts["id"])]).values()
+    return frozenset(int(i) & ID_BITS for its in seen for i in np.unique(its.values[np.isfinite(its.values)]))
 
 
 def _buses(log: DriveLog, view: _CanView) -> list[int]:

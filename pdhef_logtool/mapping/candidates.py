@@ -21,16 +21,16 @@ from pdhef_logtool.mapping import naming
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
-from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
+from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, UNITS, VOCABULARY, Meaning, is_command, words_of
+from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
 
 #: Kind of data in a field, according to the names around it.
-Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command", "device"]
+Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command"]
 #: A field with a meaning from its name or documented type. The last entry is True for a documented type.
 Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
@@ -51,8 +51,6 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
 }
 #: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
 MOST: dict[str, float] = VOCABULARY["largest"]
-#: The same where no other unit is possible: five turns of a truck's steering wheel, in degrees.
-MOST_OTHERWISE = {**MOST, "steering": 32.0}
 CONSTANT = "constant in the parts of the log that were read"
 #: Strength of the meaning of a field that only the drive gives, and least strength of a name.
 PROPOSED, LEAST_NAMED = 0.55, 0.6
@@ -174,9 +172,8 @@ class Field:
             return 0.95
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
         score += 0.15 if self.meaning.unit else 0.0
-        score -= 0.0 if self.seen.changes else 0.1
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
-        score -= {"device": 0.1, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
+        score -= 0.1 if self.role == "navigation" and self.meaning.quantity == "speed" else 0.0
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
     def use(self, unit: str) -> None:
@@ -189,7 +186,7 @@ class Field:
         source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
         if self.sign_path:
             source = replace(source, field=(self.path, self.sign_path), scale=(self.scale, 1.0), combine="signed")
-        most = MOST_OTHERWISE.get(self.meaning.quantity)
+        most = MOST.get(self.meaning.quantity)
         finite = self.seen.values[np.isfinite(self.seen.values)] * self.scale + self.offset
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
             source = replace(source, valid_min=-most, valid_max=most)
@@ -213,7 +210,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         there = {f.path for f in fields}
         no_values = _no_values(topic, fields)
         for info in (f for f in fields if f.path not in no_values):
-            if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or _is_setpoint(topic, info):
+            if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or is_command(info.path):
                 continue
             if its := documented.entries(info.path):
                 results += [(topic, role, replace(info, path=p), entry.meaning, True) for p, entry in its.items()]
@@ -272,26 +269,11 @@ def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tu
 
 
 def _units_without_name(info: FieldInfo) -> Units:
-    """Return the possible units of a field by quantity, if its name contains no word with another meaning."""
+    """Return the possible units of a field without a unit by quantity, if no word of its name has a meaning."""
     words = set(words_of(info.path)) - STATES
-    unit = naming.plain_unit(info.unit)
-    named = f"{info.path.rpartition('.')[2]}_{unit}"
-    kinds = {"speed": "speed", "acceleration": "acceleration", "rate": "rate", "steering": "angle"}
-    given = {q: ((u, s),) for q, kind in kinds.items() for u, s in [naming.unit_of(named, kind)] if s is not None}
-    if "acceleration" in given:  # m/s is a part of m/s², and deg of deg/s
-        given.pop("speed", None)
-    if naming.OTHER_QUANTITIES & words:
-        given.pop("steering", None)
-    given.pop("steering" if "rate" in given and given["rate"][0][0] not in UNITS["angle"] else "rate", None)
-    if given and not words & NOT_VALUES and not is_command(info.path):
-        return given
     unknown = all(len(w) == 1 or w.isdigit() or w in naming.COUNTING or w not in naming.KNOWN for w in words)
-    return {q: HYPOTHESES[q][:2] for q in kinds} if unknown and not unit and not words & NOT_VALUES else {}
-
-
-def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
-    """Return whether a field is a command; ``REF_Speed`` of a topic ``reference`` is measured."""
-    return is_command(info.path.removeprefix("REF_") if "reference" in topic.name.lower() else info.path)
+    quantities = ("speed", "acceleration", "rate", "steering")
+    return {q: HYPOTHESES[q][:2] for q in quantities} if unknown and not info.unit and not words & NOT_VALUES else {}
 
 
 def _signs_of(paths: Collection[str]) -> dict[str, str]:
@@ -344,7 +326,7 @@ def _weighable(
         its = meaning if name == path else naming.meaning_among(topic.name, topic.type_name, name, info.unit)
         if its is None and meaning.quantity == "speed":
             its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
-        if seen is None or its is None or not _is_measured(name, seen):
+        if seen is None or its is None or not np.isfinite(seen.values).any():
             continue
         if role == "sensor" and {"gps", "gnss", "ins", "rtk"} & set(words_of(name)):
             role = "navigation"
@@ -367,12 +349,6 @@ def _weighable(
             item.sign = -1.0
             item.reasons.append("positive downward by its name")
         yield item
-
-
-def _is_measured(name: str, seen: Seen) -> bool:
-    """Return whether there are values, other than codes of an enumeration."""
-    is_state = not STATES.isdisjoint(words_of(name)[-1:]) and is_enumeration(seen.values)
-    return bool(np.isfinite(seen.values).any()) and not is_state
 
 
 def _may_be_share(item: Field, info: FieldInfo) -> bool:
@@ -405,8 +381,6 @@ def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tup
         seen = read.get((source.topic, source.paths[0]))
         if seen is None or isinstance(source.scale, tuple) or not isinstance(source.offset, float):
             continue
-        if not isinstance(source.field, str):
-            continue
         meaning = meaning_of_signal(source.name)
         item = Field(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))
         item.factors, item.sign = (("", abs(source.scale)),), math.copysign(1.0, source.scale)
@@ -425,24 +399,17 @@ def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
     """Return the units that are possible by a field's range; a unit in its name excludes all others."""
     largest = seen.largest
     named = () if meaning.scale is None else ((meaning.unit, meaning.scale),)
-    for limits in (MOST_OTHERWISE,) if named else (MOST, MOST_OTHERWISE):
-        most = limits.get(meaning.quantity, math.inf)
-        # Beyond a car's range, the unit in the name is wrong.
-        if within := tuple(u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most):
-            return within
-    return ()
+    most = MOST.get(meaning.quantity, math.inf)
+    # Beyond a car's range, the unit in the name is wrong.
+    return tuple(u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most)
 
 
 def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
-    """Return the stamp of the innermost message around a field that has a stamp."""
-    times = {f.path for f in fields if f.kind == "time"}
-    parts = path.split(".")[:-1]
-    while parts:
-        for stamp in STAMP_PATHS:
-            if ".".join([*parts, stamp]) in times:
-                return ".".join([*parts, stamp])
-        parts.pop()
-    return stamp_path_of(fields)
+    """Return the stamp of a topic, or else of the innermost message around a field that has a stamp."""
+    parts, times = path.split("."), {f.path for f in fields if f.kind == "time"}
+    inner = (".".join([*parts[:depth], stamp]) for depth in range(len(parts) - 1, 0, -1) for stamp in STAMP_PATHS)
+    outer = stamp_path_of(fields)
+    return next((stamp for stamp in inner if outer == "log_time" and stamp in times), outer)
 
 
 def triad_of(item: Field) -> str:

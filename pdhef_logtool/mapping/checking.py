@@ -15,7 +15,6 @@ from pdhef_logtool.records.errors import MappingError
 
 #: Paths of the measurement time in messages, best first.
 STAMP_PATHS = ("header.stamp", "stamp", "timestamp")
-STAMP_NAMES = ("stamp", "timestamp")
 
 #: Names of seconds and nanoseconds in encodings without a time type.
 SECONDS_NAMES = ("sec", "secs", "seconds")
@@ -34,15 +33,6 @@ def stamp_path_of(fields: tuple[FieldInfo, ...]) -> str:
         if path in times or split_stamp(path, paths) is not None:
             return path
     return RECORDER_STAMPS[0]
-
-
-def stamp_paths(fields: tuple[FieldInfo, ...]) -> list[str]:
-    """Return the paths of all times of a schema, outermost first, except times in arrays."""
-    paths = {f.path for f in fields}
-    times = {f.path for f in fields if f.kind == "time"}
-    pairs = {path.rpartition(".")[0] for path in paths if path.rpartition(".")[2] in SECONDS_NAMES}
-    times |= {path for path in pairs if path.rpartition(".")[2] in STAMP_NAMES and split_stamp(path, paths)}
-    return sorted((t for t in times if "[" not in t), key=lambda path: (path.count("."), path))
 
 
 def has_path(fields: tuple[FieldInfo, ...], path: str) -> bool:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
 from pdhef_logtool.logs.recording_span import STEP_BACK_NS, steps_back
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp, stamp_paths
-from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, SignalSource
+from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
+from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
@@ -40,11 +40,9 @@ MIN_BIN_SAMPLES = 20
 OUTLIER_STAMP_NS = 60_000_000_000
 #: If at least this share of stamps has the same error, all stamps are replaced by log time.
 UNUSABLE_SHARE = 0.1
-#: If messages with equal stamps were recorded apart by at least COARSE_SPACING of the usual spacing, the clock is too
-#: coarse for them; otherwise they came in one packet, or one message was recorded twice. If the steps vary by more than
-#: IRREGULAR of the period, another stamp replaces them that varies by less than REGULAR_SHARE of that. If a clock is
-#: faster or slower than log time by the factor FASTEST, its unit is wrong.
-COARSE_SPACING, IRREGULAR, REGULAR_SHARE, FASTEST = 1.0 / 3.0, 0.3, 0.3, 5.0
+#: If messages with equal stamps were recorded apart by at least this share of the usual spacing, the clock is too
+#: coarse for them; otherwise they came in one packet, or one message was recorded twice.
+COARSE_SPACING = 1.0 / 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +166,8 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
         seen, recorded_ns, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
         times = np.concatenate(recorded[key])
         is_asked_for = source.stamp == "log_time" or source.clock == "device"
-        unusable = "" if is_asked_for else why_missing(raw.shape[0], times.shape[0])
+        missing = 1.0 - raw.shape[0] / times.shape[0] if times.shape[0] and not is_asked_for else 0.0
+        unusable = f"{missing:.0%} of its stamps are zero or no time" if missing > UNUSABLE_SHARE else ""
         if unusable:
             raw = log_time = times
         elif source.stamp != "log_time":
@@ -218,82 +217,6 @@ def _offset_changes(parts: Sequence[_Stamps]) -> bool:
     """Return whether the smallest delays of successive parts differ by more than clock drift explains."""
     least = np.array([float((log_time - raw).min()) for raw, log_time, _ in parts if raw.shape[0]])
     return bool((np.abs(np.diff(least)) > STEP_BACK_NS).any())
-
-
-def why_missing(usable: int, messages: int) -> str:
-    """Return why too few messages have a stamp; empty if enough have one."""
-    share = 1.0 - usable / messages if messages else 0.0
-    return f"{share:.0%} of its stamps are zero or no time" if share > UNUSABLE_SHARE else ""
-
-
-def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
-    """Return the mapping with bad stamps replaced by another header stamp or by the publication time.
-
-    The first ten seconds are examined for gaps, steps back, rate, and regularity of the steps. If no stamp of a message
-    is usable, the source keeps its stamp; :func:`fit_clocks` then uses log time and reports the reason.
-    """
-    keys = {(s.topic, s.stamp): s for s in reversed([*mapping.sources()]) if s.can_signal is None}
-    better = {key: other for key, source in keys.items() if (other := _better_stamp(log, source)) is not None}
-    if not better:
-        return mapping
-    notes = [f"{topic} is read by {best}, not {stamp}: {why}" for (topic, stamp), (best, why) in better.items()]
-
-    def moved(source: SignalSource) -> SignalSource:
-        return replace(source, stamp=better.get((source.topic, source.stamp), (source.stamp, ""))[0])
-
-    return replace(mapping.changed(moved), notes=(*mapping.notes, *notes))
-
-
-def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None:
-    """Return a better stamp in a source's messages and the reason; None without one."""
-    if source.stamp_unit != "ros" or source.stamp in ("publish_time", AUTO_STAMP):
-        return None
-    headers = [p for p in stamp_paths(log.fields(source.topic)) if source.stamp not in (p, "log_time")]
-    sources = {p: replace(source, stamp=p) for p in (source.stamp, *headers, *RECORDER_STAMPS)}
-    requests = requests_of(log, sources.values(), values=False)
-    columns = log.read(requests, log.start_ns, min(log.end_ns, log.start_ns + SURVEY_WINDOW_NS)).get(source.read_topic)
-    if columns is None or not len(columns):
-        return None
-    judged = {p: _judged_stamps(log, columns, s) for p, s in sources.items()}
-    why, varies = judged[source.stamp]
-    others = [p for p in headers if not judged[p][0]]
-    # Some recorders store the publication time: it is used if it is more regular than log time.
-    if not others and (why or source.stamp == "log_time") and judged["publish_time"][1] < judged["log_time"][1]:
-        others = ["publish_time"]
-    if not others:
-        return None
-    best = min(others, key=lambda p: judged[p][1])
-    if not why and varies > IRREGULAR and judged[best][1] < REGULAR_SHARE * varies:
-        why = f"its steps vary by {varies:.0%} of its period, the steps of {best} by {judged[best][1]:.0%}"
-    return (best, why) if why else None
-
-
-def _judged_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[str, float]:
-    """Judge the stamps of a source in some seconds.
-
-    Returns
-    -------
-    str : why the stamps are unusable; empty if they are usable.
-    float : variation of their steps in periods; infinite for stamps that are not on the log's clock.
-    """
-    raw, usable = raw_stamps(log, columns, source)
-    missing = why_missing(int(np.count_nonzero(usable)), len(columns))
-    if missing:
-        return missing, np.inf
-    if len(columns) < MIN_BIN_SAMPLES:
-        return "", 0.0
-    stamps, log_time = raw[usable], columns.log_time_ns[usable]
-    span_s, log_span_s = float(np.ptp(stamps)) * 1e-9, float(np.ptp(log_time)) * 1e-9
-    if span_s == 0.0:
-        return "its stamps are constant", np.inf
-    if not 1.0 / FASTEST < span_s / max(log_span_s, 1e-9) < FASTEST:
-        return f"its stamps advance by {span_s:.3g} s in {log_span_s:.3g} s", np.inf
-    steps = np.diff(np.sort(stamps))
-    low, middle, high = np.quantile(steps, [0.1, 0.5, 0.9])
-    mean = float(steps.mean())  # far from the middle where messages came in bursts
-    delay_ns = float(np.median(log_time - stamps))
-    varies = max(float(high - low), abs(mean - float(middle))) / mean
-    return why_unusable(stamps, log_time), varies if 0.0 <= delay_ns <= MAX_CREDIBLE_DELAY_NS else np.inf
 
 
 def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:

@@ -11,6 +11,7 @@ from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES
 from pdhef_logtool.mapping.recognition import TWIST_COVARIANCES, TWIST_FIELDS
 from pdhef_logtool.mapping.records import CanSettings, SignalSource, near
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
+from pdhef_logtool.mapping.vendors import plain_type
 from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS
 
@@ -156,7 +157,7 @@ def _recognise(
     topic: TopicInfo, path: str, units: Mapping[str, str], text: str, option: str
 ) -> tuple[dict[str, str], list[CovarianceSource]]:
     """Return the fields by signal that a topic's type provides, all of them or the one with this path."""
-    kind = topic.type_name.replace("/msg/", "/")
+    kind = plain_type(topic.type_name)
     path_of: dict[str, str] = {}
     covariance: list[CovarianceSource] = []
     if kind == STATE_TYPE:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.drive_log import Columns, DriveLog
-from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Number and length of the pieces of the log to read; a shorter log is read whole.
 PIECES = 8
@@ -95,14 +94,14 @@ class Pieces:
     def read(self, fields: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Seen]:
         """Read fields, given by topic and path; an array becomes one entry per column, ``name[i]``.
 
-        At most ``MOST_COLUMNS`` columns of an array are read. Unreadable fields are omitted.
+        At most ``MOST_COLUMNS`` columns of an array are read.
         """
         requests: dict[str, list[str]] = {}
         for topic, path in dict.fromkeys(fields):
             requests.setdefault(topic, []).append(path)
         parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
         for number, start in enumerate(self.starts if requests else ()):
-            for topic, columns in self._columns(requests, start).items():
+            for topic, columns in self.log.read(requests, start, start + PIECE_NS, quiet=True).items():
                 cell = (columns.log_time_ns - start) // CELL_NS
                 for path in requests[topic]:
                     values = np.asarray(columns.fields[path], dtype=np.float64)
@@ -114,15 +113,6 @@ class Pieces:
                         parts.setdefault((topic, f"{path}[{i}]"), []).append((number, cell, column))
         whole = {key: np.concatenate([column for _, _, column in samples]) for key, samples in parts.items()}
         return {key: Seen(values, partial(self._on_grid, values, parts[key])) for key, values in whole.items()}
-
-    def _columns(self, requests: Mapping[str, Sequence[str]], start: int) -> dict[str, Columns]:
-        try:
-            return self.log.read(requests, start, start + PIECE_NS, quiet=True)
-        except PdhefError:
-            if len(requests) == 1:
-                return {}
-            one_by_one = (self._columns({t: p}, start) for t, p in requests.items())
-            return {t: c for samples in one_by_one for t, c in samples.items()}
 
     def _on_grid(self, values: FloatArray, samples: list[tuple[int, IntArray, FloatArray]]) -> tuple[FloatArray, float]:
         """Return the means of the usual values on the grid [M], and the sample rate."""
@@ -171,12 +161,6 @@ def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
     return float(middle) if high - low < 0.1 * abs(middle) else None
 
 
-def is_enumeration(values: FloatArray) -> bool:
-    """Return whether all values are whole numbers, and few."""
-    single = np.unique(values[np.isfinite(values)])
-    return single.shape[0] <= MOST_COLUMNS and bool((single == np.rint(single)).all())
-
-
 def spread(cells: FloatArray) -> float:
     """Return the standard deviation of the finite values; 0 without any."""
     finite_cells = cells[np.isfinite(cells)]
@@ -207,11 +191,9 @@ def _filled(rows: FloatArray) -> FloatArray:
     return rows
 
 
-def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | None:
+def fit(y: FloatArray, x: FloatArray) -> Fit | None:
     """Fit a line through the finite cells [M]; None if there are too few or one of the two is constant."""
     use = np.isfinite(y) & np.isfinite(x)
-    if where is not None:
-        use &= where
     if np.count_nonzero(use) < FEWEST_CELLS:
         return None
     # Exclude a few outliers, such as a sensor's "invalid".

@@ -30,8 +30,8 @@ _HALF = 5
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
 #: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
-#: grade and slip, and of the usual lengths and tracks among cars; usual track.
-SAME, BY_DRIVING, USUAL_LENGTHS, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.4, 0.2, 1.55
+#: grade and slip, and of the usual tracks among cars; usual track.
+SAME, BY_DRIVING, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.2, 1.55
 #: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
@@ -208,7 +208,6 @@ def decide_units(fields: Fields) -> None:
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
-    _by_steering(fields)
     _by_track(fields)
     _by_siblings(fields)
 
@@ -218,8 +217,6 @@ def _by_gravity(fields: Fields) -> None:
     for item in fields.candidates:
         if item.meaning.quantity == "acceleration" and item.is_axis:
             groups.setdefault(triad_of(item), {})[item.meaning.part] = item
-        elif item.meaning.quantity == "acceleration" and item.meaning.part == "z":  # named vertical, without a triad
-            groups[f"{triad_of(item)}.{item.path}"] = {"z": item}
     for axes in groups.values():
         if set(axes) in ({"z"}, set("xyz")):
             means = {axis: float(np.nanmean(f.seen.values)) for axis, f in axes.items()}
@@ -237,21 +234,14 @@ def _by_gravity(fields: Fields) -> None:
 
 
 def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
-    """Turn an inertial sensor's axes to the car's by the usual mounting for this axis upward; the drive checks it.
-
-    Phones that give accelerations in g give gravity, not the force against it.
-    """
+    """Turn an inertial sensor's axes to the car's by the usual mounting for this axis upward; the drive checks it."""
     for item in axes.values():
         item.has_gravity = True
-    device, is_negated = axes["x"], up == "-y" and axes["x"].factors[0][0] == "g"
-    usual = VOCABULARY["mountings"].get("+y" if is_negated else up, {})
-    rates = [
-        f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and place_of(f) == place_of(device)
-    ]
+    usual, place = VOCABULARY["mountings"].get(up, {}), place_of(axes["x"])
+    rates = [f for f in fields.candidates if f.meaning.quantity == "rate" and f.is_axis and place_of(f) == place]
     for item in (f for f in (*axes.values(), *rates) if f.meaning.part in usual and not (f.fixed or f.is_downward)):
         part, sign = usual[item.meaning.part]
-        item.meaning, item.is_turned = replace(item.meaning, part=part), True
-        item.sign = -sign if is_negated and item.meaning.quantity == "acceleration" else sign
+        item.meaning, item.is_turned, item.sign = replace(item.meaning, part=part), True, sign
         item.doubts.append(f"gravity is along {up} of its device, read as that of {usual['text']}")
 
 
@@ -269,9 +259,6 @@ def _speeds(fields: Fields) -> None:
 def _by_speeding_up(fields: Fields) -> None:
     """Determine the units of speeds and of a_x by a_x ≈ v̇."""
     for speed, ax in itertools.product(fields.open("speed"), fields.open("acceleration", "x")):
-        # With two unknown units, x of a vector is ambiguous: it may be in the world frame.
-        if len(ax.units) > 1 < len(speed.units) and speed.is_axis and speed.meaning.part == "x":
-            continue
         relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
         if relation is not None and relation.correlation >= CLEAR:
             settle((ax, speed), [Gain((1, -1), relation.slope, BY_DRIVING)], "a_x ≈ v̇", bonus=0.3)
@@ -286,23 +273,6 @@ def _by_turning(fields: Fields) -> None:
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
         if relation is not None and abs(relation.correlation) > CLEAR:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
-
-
-def _by_steering(fields: Fields) -> None:
-    """Determine the unit of the speed by the length that converts the path's curvature to a steering angle."""
-    speed, rate, steering = fields.best("speed"), fields.best("rate"), fields.best("steering")
-    if speed is None or rate is None or steering is None or speed.unit_known or speed.fixed:
-        return
-    curve = fields.curvature(speed.seen.cells, rate.seen.cells)
-    relation = None if curve is None else fit(fields.pieces.smooth(steering.seen.cells), curve)
-    if relation is None or abs(relation.correlation) < CLEAR:
-        return
-    ways = [Unit(u, f / m, k, USUAL_LENGTHS) for k, m in USUAL_LENGTH_M.items() for u, f in steering.units]
-    others = [[Unit(*u, energy=RARE.get(u[0], 0.0)) for u in f.units] for f in (rate, speed)]
-    share = posterior([ways, *others], [Gain((1, -1, 1), relation.slope, BY_DRIVING)]).sum(axis=(0, 1))
-    if share.max() > CERTAIN * share.sum():
-        speed.use(speed.units[int(share.argmax())][0])
-        speed.doubts.append(f"unit not given; taken as {speed.factors[0][0]}, with a usual ratio of the steering")
 
 
 def _by_track(fields: Fields) -> None:

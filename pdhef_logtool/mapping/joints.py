@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.mapping.naming import Meaning, corner_of, words_of
-from pdhef_logtool.mapping.records import SignalSource
 
 #: Number of messages to read the names from: several nodes may send different joints to one topic.
 MESSAGES = 200
@@ -43,19 +40,3 @@ def joint_meanings(log: DriveLog, topic: TopicInfo) -> Iterator[tuple[str, Meani
             yield f"position[{i}]", Meaning("steering", kind, 1.0, "rad", 1.0, why)
         elif corner and (_WHEELS & set(words) or len(words) < 3):
             yield f"velocity[{i}]", Meaning("wheel rate", corner, 1.0, "radps", 1.0, why)
-
-
-def mean_of_sides(log: DriveLog, topics: Mapping[str, TopicInfo], steering: SignalSource) -> SignalSource | None:
-    """Return the mean of the left and right steered wheel if a steering angle is one of the two."""
-    topic = topics.get(steering.topic)
-    if topic is None or not is_joints(topic) or not isinstance(steering.field, str):
-        return None
-    names = joint_names(log, topic)
-    joint = names[int(steering.field[len("position[") : -1])]
-    for this, other in (("left", "right"), ("right", "left"), ("fl", "fr"), ("fr", "fl"), ("l", "r"), ("r", "l")):
-        there = re.sub(rf"(?<![a-z]){this}(?![a-z])", other, joint)
-        if there != joint and there in names:
-            scale = float(steering.scale if isinstance(steering.scale, float) else steering.scale[0])
-            fields = (steering.field, f"position[{names.index(there)}]")
-            return replace(steering, field=fields, scale=(0.5 * scale, 0.5 * scale))
-    return None

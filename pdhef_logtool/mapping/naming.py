@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +17,6 @@ from typing import TypeAlias
 
 from pdhef_logtool.logs.table_columns import LATIN, LETTERS
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
-from pdhef_logtool.records.signals import WHEELS
 
 #: Size of the cache of meanings: the drives of a fleet have the same names.
 CACHED_NAMES = 8192
@@ -37,14 +36,12 @@ _UNIT_PHRASES: tuple[tuple[str, str], ...] = tuple(VOCABULARY["unit_phrases"].it
 _SPELLED_UNITS = tuple((re.compile(pattern), sign) for pattern, sign in VOCABULARY["unit_parts"].items())
 _SYNONYMS: dict[str, str] = VOCABULARY["synonyms"]
 _WORDS = {name: frozenset(words.split()) for name, words in VOCABULARY["words"].items()}
-COUNTING, NOT_VALUES, OTHER_QUANTITIES = (_WORDS[name] for name in ("counting", "not_values", "other_quantities"))
+COUNTING, NOT_VALUES = _WORDS["counting"], _WORDS["not_values"]
 #: Words by which names that are written as one word are cut.
 KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
 _WHOLE, _BARE = KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS
 _CORNERS: dict[str, str] = VOCABULARY["corners"]
 _GERMAN: dict[str, str] = VOCABULARY["german_corners"]
-#: Names of the wheels in the order of WHEELS.
-_WHEEL_CODES = tuple(tuple(codes.split()) for codes in VOCABULARY["wheel_codes"]["codes"])
 _AXES: dict[str, str] = {word: axis for axis, words in VOCABULARY["axes"].items() for word in words.split()}
 _PATTERNS = {name: re.compile("|".join(either)) for name, either in VOCABULARY["patterns"].items()}
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -54,7 +51,6 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 def words_of(name: str) -> tuple[str, ...]:
     """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
-    name = _PATTERNS["no_words"].sub("", name)
     name = _PATTERNS["sides"].sub(lambda m: "_" + "".join(g[0] for g in m.groups() if g), name.translate(LATIN))
     name = _PATTERNS["corner_at_end"].sub(r"_\g<0>_", name)
     for part in re.split(r"[^A-Za-z0-9]+", name):
@@ -65,8 +61,6 @@ def words_of(name: str) -> tuple[str, ...]:
 
 #: Last words of names of enumerations, and of what is measured.
 STATES = frozenset({"state", "states", "status"})
-#: An element of a vector, and words of vectors.
-_NUMBERED, _VECTORS = re.compile(r"(.*?)_?([0-4])"), _WORDS["vectors"]
 
 
 def _unglued(piece: str) -> list[str]:
@@ -144,15 +138,6 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     return "", None
 
 
-@lru_cache(maxsize=CACHED_NAMES)
-def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Meaning | None:
-    """Return the quantity of a field by its name; words of its parents or topic complete an incomplete leaf.
-
-    ``unit_text`` is the unit stored in the log (``km/h``, ``°/s``), empty without one.
-    """
-    return _meaning_of_topic(topic, path, unit_text) or _meaning_of_path(topic, type_name, path, unit_text)
-
-
 def meaning_among(topic: str, type_name: str, path: str, unit_text: str, there: Collection[str] = ()) -> Meaning | None:
     """Return :func:`meaning_of` a field beside others; an array of unknown length may be a vector of three axes."""
     path = _spelled_out(path, there)
@@ -166,34 +151,19 @@ def _spelled_out(path: str, there: Collection[str]) -> str:
         return f"{gyro[1]}gyro_{gyro[2]}"
     leaf = path.rpartition(".")[2]
     struct = path.removesuffix(leaf)
-    if (numbered := _NUMBERED.fullmatch(leaf)) and _VECTORS & set(words_of(numbered[1])):
-        numbers = {m[2] for p in there if (m := _NUMBERED.fullmatch(p.removeprefix(struct))) and m[1] == numbered[1]}
-        if numbers in ({"0", "1", "2"}, {"1", "2", "3"}):
-            return f"{struct}{numbered[1]}_{'xyz'[sorted(numbers).index(numbered[2])]}"
     beside = {p.removeprefix(struct).lower() for p in there if p.startswith(struct)}
     short = (names[leaf.lower()] for needed, names in _SHORT_NAMES if leaf.lower() in names and needed <= beside)
-    return struct + next(short, _with_wheel(leaf, beside))
+    return struct + next(short, leaf)
 
 
-def _with_wheel(leaf: str, beside: Collection[str]) -> str:
-    """Return a name with the wheel in words if it differs by the side of the wheel only from another one beside it."""
-    for place in _PATTERNS["code"].finditer(leaf):
-        code = place[0].lower()
-        for wheels in _WHEEL_CODES:
-            partner = wheels[wheels.index(code) ^ 1] if code in wheels else ""
-            if (
-                partner
-                and place[0] != leaf
-                and f"{leaf[: place.start()]}{partner}{leaf[place.end() :]}".lower() in beside
-            ):
-                wheel = WHEELS[wheels.index(code)]
-                return f"{leaf[: place.start()]}_wheel_{wheel}_{leaf[place.end() :]}".strip("_")
-    return leaf
+@lru_cache(maxsize=CACHED_NAMES)
+def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Meaning | None:
+    """Return the quantity of a field by its name; words of its parents or topic complete an incomplete leaf.
 
-
-def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> Meaning | None:
+    ``unit_text`` is the unit stored in the log (``km/h``, ``°/s``), empty without one.
+    """
     *parents, leaf = path.split(".")
-    leaf_words = words_of(f"r_{unit_text.replace('°', 'deg')}" if leaf == "r" else re.sub(r"\[\d*\]", "", leaf))
+    leaf_words = words_of(re.sub(r"\[\d*\]", "", leaf))
     inner = tuple(w for p in parents for w in words_of(p))
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _WORDS["other_devices"] & set(outer):
@@ -221,23 +191,9 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
 
 def _described(leaf_words: tuple[str, ...]) -> set[str]:
     """Return the words of a leaf that describe its quantity."""
-    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured;
-    # a controller before "vehicle" is the sender.
-    if leaf_words[1:2] == ("vehicle",) and leaf_words[2:]:
-        leaf_words = leaf_words[leaf_words[0] in _WORDS["controllers"] :]
-    kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
-    kept |= {w for w in leaf_words[-1:] if (w not in STATES and leaf_words[-2:-1] != ("per",)) or len(leaf_words) == 1}
-    return kept
-
-
-def _meaning_of_topic(topic: str, path: str, unit_text: str) -> Meaning | None:
-    """Return the meaning of the only number of a topic by the topic's name; None if the path has a name."""
-    is_bare = path.isalpha() and set(words_of(path)) <= _WORDS["counting"]
-    if not is_bare or _WORDS["other_devices"] & set(words_of(topic)):
-        return None
-    name = "_".join(w for w in topic.rpartition("/")[2].split("_") if w.lower() not in _WORDS["counting"])
-    meaning = meaning_of("", "", name, unit_text) if name else None
-    return meaning and replace(meaning, strength=0.7 * meaning.strength, why=f"named by {topic!r}")
+    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
+    last = set(leaf_words[-1:]) - (STATES if leaf_words[1:] else set())
+    return last | {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
 
 
 _TURNING = frozenset({"rate", "velocity", "velocities", "gyro", "gyroscope"})

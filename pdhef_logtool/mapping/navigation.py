@@ -20,8 +20,8 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import HYPOTHESES, MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
-from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
-from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_speed, path_velocity
+from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen, fit, ratio
+from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_velocity
 from pdhef_logtool.mapping.naming import Meaning, meaning_among, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
@@ -41,8 +41,8 @@ _CONVENTIONS = tuple(
     for sense, sign, angle in (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
     for unit, factor in (("degrees", math.radians(1.0)), ("radians", 1.0))
 )
-#: Tolerance of the ratio of a velocity to the speed from positions; speed over ground over that along the path if the
-#: axes are the earth's; share of the time that a body moves ahead.
+#: Tolerance of the ratio of a speed to that from positions; speed over ground over that along the path if the axes are
+#: the earth's; share of the time that a body moves ahead.
 NEAR_PATH, SAME_STEPS, AHEAD_SHARE = 0.08, (0.7, 1.4), 0.6
 #: Least share of its y axis in a path: along the x axis, velocities over ground and of the body are equal.
 ACROSS_SHARE = 0.1
@@ -51,12 +51,8 @@ Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.
 NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative: in reverse it has the wrong sign"
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
-#: Words of receivers, whose heading without positions is a course.
-_RECEIVERS = frozenset({"gps", "gnss", "vbox"})
 #: Ground truth with one of these contains a heading, or motion that needs one.
 HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
-#: Course of a single antenna in addition to a heading from two antennas: a sensor, even of a ground-truth instrument.
-RAW_COURSE = "heading_raw"
 
 
 #: Ground-truth quantities of one topic, and the note on their source.
@@ -95,47 +91,25 @@ def axes_of(
     moving = length > SLOW_M_S
     turning = pieces.turning(np.where(moving, x + 1j * y, np.nan))
     relation = None if rate is None else fit(pieces.smooth(rate), turning)
-    sense = _sense(relation)
-    if sense > 0.0:
+    # The direction over ground turns as fast as the car, in rad/s or deg/s; a sideslip that follows it turns less.
+    slope = relation.slope if relation is not None and relation.correlation > CLEAR else 0.0
+    if any(SAME_STEPS[0] < slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0))):
         return "east, north"
     enough = np.count_nonzero(moving) >= FEWEST_CELLS
-    # A car may reverse; without a path, a direction that is often opposite shows axes of the earth.
-    ahead = x if steps is None else np.abs(x)
-    is_ahead = not enough or bool(np.mean((ahead > np.abs(y))[moving]) >= AHEAD_SHARE)
-    if sense < 0.0 and steps is None:  # in a slide the direction in the body's axes turns against the car, too
-        return "" if is_ahead else "north, east"
+    is_ahead = not enough or bool(np.mean((x > np.abs(y))[moving]) >= AHEAD_SHARE)
     if not is_ahead:
         return "not ahead"
     return "" if relation is None else "body"
 
 
-def _sense(relation: Fit | None) -> float:
-    """Return the sign with which a direction turns with the yaw rate, rad/s or deg/s; 0 if unclear.
-
-    The direction over ground turns as fast as the car; a sideslip that follows the yaw rate turns less.
-    """
-    if relation is None or abs(relation.correlation) <= CLEAR:
-        return 0.0
-    is_equal = any(SAME_STEPS[0] < relation.slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0)))
-    return math.copysign(float(is_equal or relation.slope < 0.0), relation.slope)
-
-
 def twist_axes(log: DriveLog, velocity: SignalSource, references: Sequence[SignalSource]) -> Axes:
-    """Return the axes of a velocity's first two fields by positions and a yaw rate among ``references``.
-
-    If its magnitude differs from the speed along the path, its unit is unknown, and so are its axes.
-    """
+    """Return the axes of a velocity's first two fields by positions and a yaw rate among ``references``."""
     pieces, read, anchors = _read(log, (velocity, *references))
     x, y = (read.get((velocity.topic, path)) for path in velocity.paths[:2])
     if x is None or y is None:
         return ""
-    fields = _on_path(pieces, anchors)
-    path = path_speed(fields)
-    times = None if path is None else ratio(path, np.hypot(x.cells, y.cells), SLOW_M_S)
-    if times is not None and abs(times - 1.0) > NEAR_PATH:
-        return ""
     rate = next((f.si for f in anchors if f.meaning.quantity == "rate"), None)
-    return axes_of(pieces, x.cells, y.cells, path_velocity(fields), rate)
+    return axes_of(pieces, x.cells, y.cells, path_velocity(_on_path(pieces, anchors)), rate)
 
 
 def _read(log: DriveLog, sources: Sequence[SignalSource]) -> tuple[Pieces, dict[tuple[str, str], Seen], list[Field]]:
@@ -212,22 +186,15 @@ def receiver_signals(
 
 
 class _Instrument:
-    """A topic with the fields of a navigation system or receiver by their names.
+    """A topic with the fields of a navigation system or receiver by their names."""
 
-    ``signals``: mapped already, among them a speed with a unit that the drive shows.
-    """
-
-    def __init__(self, log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource]) -> None:
+    def __init__(self, log: DriveLog, topic: TopicInfo) -> None:
         self.log, self.topic, self.fields = log, topic.name, log.fields(topic.name, quiet=True)
-        self.yaw_rate, mapped = signals.get("yaw_rate_rad_s"), signals.get("speed_m_s")
         self.stamp = stamp_path_of(self.fields)
         numbers = (f for f in self.fields if f.kind == "number")
         there = {f.path for f in self.fields}
         named = ((f.path, meaning_among(topic.name, topic.type_name, f.path, f.unit, there)) for f in numbers)
         self.meanings = {path: meaning for path, meaning in named if meaning is not None}
-        if mapped is not None and mapped.topic == topic.name and isinstance(mapped.scale, float):
-            units = {p: replace(self.meanings[p], scale=mapped.scale) for p in mapped.paths if p in self.meanings}
-            self.meanings |= units
         first = {m.quantity: path for path, m in reversed(self.meanings.items())}
         self.place_paths = {name: first[q] for name, q in _PLACES.items() if q in first}
         self.named_velocities = [*_horizontal(self.meanings)]
@@ -290,22 +257,6 @@ class _Instrument:
         times = ratio(np.hypot(*self.along), seen.cells, SLOW_M_S) if self.along and seen else None
         return next((u for _, u in HYPOTHESES["speed"] if times is not None and abs(times / u - 1.0) < NEAR_PATH), None)
 
-    def follows(self, path: str, speed: str, scale: float, angle: float) -> bool:
-        """Return whether an angle is the direction of the path; without positions, whether a course turns as the car.
-
-        ``speed``: path of the speed.
-        """
-        if self.has_place:
-            return _off(self.seen[path], self.course, scale, angle) < NEAR_RAD
-        is_receiver = bool(_RECEIVERS & {*words_of(path), *words_of(self.topic)})
-        is_course = is_receiver or self.meanings[path].quantity == "course"
-        if self.yaw_rate is None or speed not in self.seen or not is_course:
-            return False
-        pieces, _, (rate, *_) = _read(self.log, [self.yaw_rate])
-        moving = self.seen[speed].cells * (self.meanings[speed].scale or 1.0) > MOVING_M_S
-        sense = turns(pieces, np.where(moving, scale * self.seen[path].cells, np.nan), rate.si)
-        return sense != 0.0 if is_receiver else sense > 0.0
-
     @property
     def over_ground(self) -> list[SignalSource]:
         """Velocity east and north over ground; empty without one."""
@@ -324,20 +275,20 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
     topics : of navigation systems and references with undocumented types.
     whole : whether only a velocity with a heading counts.
     """
-    truths = [truth for t in topics if (truth := _truth_of(_Instrument(log, t, {}))) is not None]
+    truths = [truth for t in topics if (truth := _truth_of(_Instrument(log, t))) is not None]
     truths = [t for t in truths if not whole or {"enu_velocity_m_s", "yaw_rad"} <= set(t[0])]
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
-def named_gnss(log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
+def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    ``signals`` are mapped already. A velocity must agree with the path, if there is one. A heading that is the
+    A velocity must agree with the path, if there is one. A heading that is the
     direction of the path is a course.
     """
-    its = _Instrument(log, topic, signals)
+    its = _Instrument(log, topic)
     if len(its.place_paths) < len(_PLACES):
-        return {s.name: s for s in its.over_ground or _speed_and_course(its)}
+        return {s.name: s for s in its.over_ground}
     if not its.has_place:
         return {}
     sources = [replace(its.places[n], name=name) for n, name in zip(_PLACES, GNSS_POSITION, strict=True)]
@@ -352,16 +303,14 @@ def named_gnss(log: DriveLog, topic: TopicInfo, signals: Mapping[str, SignalSour
 
 def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
-    units = {p: m.scale or its.unit_on_path(p) for p, m in its.meanings.items() if m.quantity == "speed"}
-    speed, unit = next(((p, u) for p, u in units.items() if u is not None), ("", 0.0))
+    speeds = ((p, m.scale or its.unit_on_path(p)) for p, m in its.meanings.items() if m.quantity == "speed")
+    speed, unit = next(((path, unit) for path, unit in speeds if unit is not None), ("", 0.0))
     if not speed:
         return
     for path, meaning in its.angles.items():
-        # A course over ground is clockwise from north by definition; the drive confirms this and determines the unit.
-        fitting = [c[1:] for c in _CONVENTIONS[:2] if meaning.scale is None or math.isclose(-c[1], meaning.scale)]
-        fitting = [c for c in fitting if path in its.seen and its.follows(path, speed, *c)]
-        if fitting:
-            yield its.source("gnss_course_rad", path, *fitting[0])
+        convention = _convention(its.seen.get(path), its.course, meaning.scale)
+        if convention is not None and convention[1] < 0.0:  # a course over ground is clockwise from north by definition
+            yield its.source("gnss_course_rad", path, *convention[1:])
             yield its.source("gnss_speed_m_s", speed, unit)
             return
 

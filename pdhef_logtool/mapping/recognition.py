@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
@@ -15,18 +13,16 @@ from pdhef_logtool.mapping import navigation
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
-from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.evidence import Pieces, Seen
-from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
+from pdhef_logtool.mapping.joints import is_joints, joint_names
 from pdhef_logtool.mapping.mapping_file import missing_signals
-from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
+from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command, words_of
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
-from pdhef_logtool.mapping.vendors import Vendors, load_vendors
+from pdhef_logtool.mapping.vendors import Vendors, load_vendors, plain_type
 from pdhef_logtool.mapping.weighing import Weighing, weigh
-from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray, has_gnss
+from pdhef_logtool.records.signals import FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
-TRUTH_WORDS, NAVIGATION_WORDS = _TOPICS["truth"], _TOPICS["navigation"]
 _FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
 #: Path of the velocity by type, and first covariance entries; −1 there marks a quantity as not provided (REP 145).
 TWIST_FIELDS, TWIST_COVARIANCES = _FIELDS["twist"], _FIELDS["twist_covariance"]
@@ -40,9 +36,9 @@ RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3", "hdf5"})
 NEAR_1_G = 0.08
 
 #: Types with velocities in the body frame by convention.
-BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
+BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove/Odometry"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
-FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
+FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove/LocationFix"})
 _GRAVITY_PATHS = tuple(f"linear_acceleration.{axis}" for axis in "xyz")
 
 
@@ -164,7 +160,7 @@ def auto_map(
     there = [
         t
         for t in log.topics
-        if t.messages > 0 and not (t.name.startswith(OWN_PREFIX) or _type(t).startswith("pdhef_msgs/"))
+        if t.messages > 0 and not (t.name.startswith(OWN_PREFIX) or type_of(t).startswith("pdhef_msgs/"))
     ]
     there = [vendors.typed(t, log.fields(t.name, quiet=True)) for t in there]
     unlike = [t for t in there if not _has_its_fields(log, t)]
@@ -172,9 +168,9 @@ def auto_map(
     draft = _Draft(log=log, samples=_probe(log, topics))
     why = {t.name: log.unreadable(t.name) or f"its fields differ from {t.type_name}" for t in unlike}
     draft.notes += [f"{name} is not used: {reason}" for name, reason in why.items()]
-    draft.notes += _what_cannot_be_read(log, [t for t in topics if not _type(t).startswith(NO_SENSORS)])
+    draft.notes += _what_cannot_be_read(log, [t for t in topics if not type_of(t).startswith(NO_SENSORS)])
     draft.notes += [
-        f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
+        f"{t.name} ({type_of(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
     topics, decoded = _decode(draft, _of_one_run(draft, topics))
     _map_imu(draft, topics)
@@ -195,7 +191,6 @@ def auto_map(
     if decoded is not None:
         mapping = decoded.as_mapped(mapping)
         candidates = tuple(replace(c, source=decoded.as_source(c.source)) for c in candidates)
-    mapping = with_usable_stamps(log, mapping)
     return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), candidates)
 
 
@@ -238,7 +233,7 @@ def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], Ca
         t
         for t in topics
         if not any(o.type_name.startswith("can/msg/") and o.name != t.name for o in topics)
-        if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
+        if "can" in words_of(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
     ]
     decoded = decoded_frames(log, frames)
     names = ", ".join(path.name for path in log.databases) if frames else ""
@@ -269,14 +264,9 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 
 def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighing:
     """Take candidates for signals without a well-known type."""
-    rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
+    rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not type_of(t).startswith(NO_SENSORS)]
     weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
     draft.signals.update(weighed.signals)
-    steer = weighed.signals.get("steer_rad")
-    both = None if steer is None else mean_of_sides(draft.log, {t.name: t for t in topics}, steer)
-    if both is not None:
-        draft.signals["steer_rad"] = both
-        draft.notes.append(f"steer_rad is the mean of the two steered wheels in {both.topic}")
     joints = (t for t, role in rest if is_joints(t) and role != "command" and not joint_names(draft.log, t))
     draft.notes += [f"{t.name} is not used: the joints or their order differ between messages" for t in joints]
     if weighed.truth:
@@ -333,9 +323,8 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     instruments = (
         {_device(source.topic) for source in draft.truth.values()} if navigation.has_heading(draft.truth) else set()
     )
-    topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS]
-    others = [t for t in topics if _device(t.name) not in instruments]
-    receivers = list(_receivers(draft, topics, others, vendors))
+    others = [t for t in topics if not _named(t, "truth") and _device(t.name) not in instruments]
+    receivers = list(_receivers(draft, others, vendors))
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
@@ -349,32 +338,23 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
-def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], vendors: Vendors) -> Iterator[_Sources]:
-    """Yield the signals of each receiver among ``others``, and of any topic with the course of a single antenna."""
+def _receivers(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Iterator[_Sources]:
+    """Yield the signals of each receiver."""
     for topic in topics:
-        fields = () if _type(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
-        if fields and (topic in others or has_path(fields, navigation.RAW_COURSE)):
+        fields = () if type_of(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
+        if fields:
             signals = navigation.receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
-            signals |= _in_degrees(draft.log, {n: s for n, s in signals.items() if n in GNSS_POSITION})
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
-            signals = navigation.named_gnss(draft.log, topic, draft.signals) if by_name else signals
+            signals = navigation.named_gnss(draft.log, topic) if by_name else signals
             if signals:
                 yield signals
 
 
-def _in_degrees(log: DriveLog, places: _Sources) -> _Sources:
-    """Return positions with a documented unit in degrees if their values are degrees, as programs convert them."""
-    seen = Pieces(log).read((s.topic, s.paths[0]) for s in places.values() if s.scale != 1.0)
-    largest = {path: values.largest for (_, path), values in seen.items()}
-    is_small = {n: math.pi < largest.get(s.paths[0], 0.0) < 180.0 for n, s in places.items()}
-    return {n: replace(s, scale=1.0) if any(is_small.values()) else s for n, s in places.items()}
-
-
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Take the GNSS velocity from a twist over ground, of a navigation system first."""
-    twists = [t for t in topics if _type(t) in TWIST_FIELDS and _type(t) not in BODY_TWIST_TYPES]
-    twists = [t for t in twists if not _words(t.name) & _TOPICS["command"]]
-    for topic in sorted(twists, key=lambda t: (bool(_words(t.name) & _TOPICS["estimate"]), not _is_truth(t))):
+    twists = [t for t in topics if type_of(t) in TWIST_FIELDS and type_of(t) not in BODY_TWIST_TYPES]
+    twists = [t for t in twists if not is_command(t.name)]
+    for topic in sorted(twists, key=lambda t: (_named(t, "estimate"), not _is_truth(t))):
         paths = tuple(_twist(topic, "linear", axis) for axis in "xy")
         axes = _axes(draft, topic, topics)
         if axes not in ("", "body"):
@@ -412,47 +392,39 @@ def _device(topic: str) -> str:
 def _is_well_known(topic: TopicInfo) -> bool:
     """Return whether a topic was mapped by its type already."""
     tables = (TWIST_FIELDS, _FIELDS["pose"], _FIELDS["speed"], _FIELDS["several_positions"])
-    kind = _type(topic)
+    kind = type_of(topic)
     return kind in IMU_TYPES | FIX_TYPES or any(kind in table for table in tables)
 
 
 def _role(topic: TopicInfo) -> Role:
     """Return the kind of data in a topic by its name; a device of a navigation system is a sensor, too."""
-    words = _words(topic.name)
-    is_drive = _type(topic).startswith("ackermann_msgs/") and not words & _TOPICS["measured"]
+    words = set(words_of(topic.name))
+    is_drive = type_of(topic).startswith("ackermann_msgs/") and not words & _TOPICS["measured"]
     if is_drive or is_command(topic.name, topic.type_name.rpartition("/")[2]):
         return "command"
-    if words & TRUTH_WORDS:
+    if words & _TOPICS["truth"]:
         return "truth"
-    navigates = (words | _words(topic.type_name)) & NAVIGATION_WORDS
+    navigates = {*words, *words_of(topic.type_name)} & _TOPICS["navigation"]
     if words & _TOPICS["estimate"] and not navigates:
         return "estimate"
-    if words & _TOPICS["device"]:
-        return "device"
     return "navigation" if navigates else "sensor"
 
 
 def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Without a sensor, take the yaw rate from an odometry and the speed from navigation or a twist, with a note."""
-    twists = [t for t in topics if _type(t) in TWIST_FIELDS]
-    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"])]
+    twists = [t for t in topics if type_of(t) in TWIST_FIELDS]
+    twists = [t for t in twists if not (_named(t, "truth") or is_command(t.name))]
     if "yaw_rate_rad_s" not in draft.signals:
-        odometries = [t for t in twists if not _is_truth(t) and _words(t.name) & _TOPICS["vehicle"]]
-        paths = {t: _twist(t, "angular", "z") for t in odometries if not _words(t.name) & _TOPICS["estimate"]}
-        paths |= {t: "heading_rate" for t in topics if _type(t) in _FIELDS["speed"]}
+        odometries = [t for t in twists if not _is_truth(t) and _named(t, "vehicle")]
+        paths = {t: _twist(t, "angular", "z") for t in odometries if not _named(t, "estimate")}
+        paths |= {t: "heading_rate" for t in topics if type_of(t) in _FIELDS["speed"]}
         turning = [t for t, path in paths.items() if _span(draft.values(t.name, path)) > 0.0]
         chosen = draft.choose("yaw rate", turning, lambda _: (), "the first of its kind")
         if chosen is not None:
             draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, paths[chosen])
             draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
-    if not draft.signals or has_speed(draft.signals):
-        return
-    _speed_of_navigation(draft, topics)
-    bodies = [t for t in twists if not _is_truth(t) and _axes(draft, t, topics) == "body"]
-    if len(bodies) == 1 and not has_speed(draft.signals):
-        draft.take(draft.signals, "speed_m_s", bodies[0].name, _twist(bodies[0], "linear", "x"))
-        draft.notes.append(f"speed_m_s comes from {bodies[0].name}, whose x is ahead, as no other source gives a speed")
-        draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
+    if draft.signals and not has_speed(draft.signals):
+        _speed_of_navigation(draft, topics)
 
 
 def _speed_of_receiver(draft: _Draft) -> None:
@@ -490,44 +462,33 @@ def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
     )
 
 
-def _type(topic: TopicInfo) -> str:
-    """Return a topic's type in the spelling of the tables, independent of its encoding.
-
-    JSON and protobuf spell ROS types with dots (``ros.sensor_msgs.Imu``), ROS spells Foxglove's with slashes.
-    """
-    name = topic.type_name.replace("::", "/").replace("/msg/", "/")
-    if name.startswith(("foxglove_msgs/", "foxglove/")):
-        return "foxglove." + name.partition("/")[2]
-    if topic.encoding in ("json", "protobuf") and not name.startswith("foxglove."):
-        name = name.removeprefix("ros.").replace(".msg.", ".").replace(".", "/")
-    return name
+def type_of(topic: TopicInfo) -> str:
+    """Return a topic's type in the spelling of the tables, independent of its encoding."""
+    return plain_type(topic.type_name)
 
 
 def _twist(topic: TopicInfo, part: str, axis: str) -> str:
-    return f"{TWIST_FIELDS[_type(topic)].format(part)}.{axis}"
+    return f"{TWIST_FIELDS[type_of(topic)].format(part)}.{axis}"
 
 
 def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     """Return whether a topic has the fields of its type; the name of the type alone is no proof."""
-    needed, either = (_FIELDS[which].get(_type(topic), "").split() for which in ("needed", "either"))
+    needed, either = (_FIELDS[which].get(type_of(topic), "").split() for which in ("needed", "either"))
     fields = log.fields(topic.name) if needed or either else ()
     return all(has_path(fields, p) for p in needed) and (not either or any(has_path(fields, p) for p in either))
 
 
-def _words(name: str) -> frozenset[str]:
-    parts = re.split(r"[^a-z0-9]+", name.lower())
-    words = {p for p in parts if p} | {p.rstrip("0123456789") for p in parts}
-    if "ground" in words and "truth" in words:
-        words.add("groundtruth")
-    return frozenset(words)
+def _named(topic: TopicInfo, kind: str) -> bool:
+    """Return whether the name of a topic contains a word of a kind."""
+    return not _TOPICS[kind].isdisjoint(words_of(topic.name))
 
 
 def _is_truth(topic: TopicInfo) -> bool:
-    return bool(_words(topic.name) & (TRUTH_WORDS | NAVIGATION_WORDS))
+    return _named(topic, "truth") or _named(topic, "navigation")
 
 
 def _pose(topic: TopicInfo, part: str) -> str:
-    return f"{_FIELDS['pose'][_type(topic)]}.{part}".removeprefix(".")
+    return f"{_FIELDS['pose'][type_of(topic)]}.{part}".removeprefix(".")
 
 
 def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen]:
@@ -538,19 +499,19 @@ def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen
 
 def _probed_paths(topic: TopicInfo) -> list[str]:
     """Return the paths of a well-known type that may contain constant fillers."""
-    return _FIELDS["probed"].get(_type(topic), "").split()
+    return _FIELDS["probed"].get(type_of(topic), "").split()
 
 
 # ------------------------------------------------------------------------------------------------ sensors
 
 
 def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
-    imus = [t for t in topics if _type(t) in IMU_TYPES and not _words(t.name) & TRUTH_WORDS]
+    imus = [t for t in topics if type_of(t) in IMU_TYPES and not _named(t, "truth")]
     in_g = in_deg = False
     why = "an IMU of the vehicle is preferred to one of a camera or lidar"
     # Drivers with a message for each sensor leave the vectors of the other one at zero.
     forces = [t for t in imus if any(_span(draft.values(t.name, path)) > 0.0 for path in _GRAVITY_PATHS)]
-    imu = draft.choose("imu", forces or imus, lambda t: (bool(_words(t.name) & _TOPICS["device"]),), why)
+    imu = draft.choose("imu", forces or imus, lambda t: (_named(t, "device"),), why)
     if imu is None:
         return
     gyros = [t for t in imus if _span(draft.values(t.name, "angular_velocity.z")) > 0.0]
@@ -583,13 +544,13 @@ def _map_rates(draft: _Draft, gyro: TopicInfo, scale: float) -> None:
 
 
 def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
-    reports = [t for t in topics if _type(t) in _FIELDS["speed"] and not is_command(t.name)]
+    reports = [t for t in topics if type_of(t) in _FIELDS["speed"] and not is_command(t.name)]
     twists = []
     for topic in topics:
-        if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & _TOPICS["command"]:
+        if type_of(topic) not in TWIST_FIELDS or _is_truth(topic) or is_command(topic.name):
             continue
-        words = _words(topic.name)
-        is_body = _type(topic) in BODY_TWIST_TYPES or _axes(draft, topic, topics) in ("", "body")
+        words = set(words_of(topic.name))
+        is_body = type_of(topic) in BODY_TWIST_TYPES or _axes(draft, topic, topics) in ("", "body")
         if is_body and words & _TOPICS["vehicle"] and not words & _TOPICS["estimate"]:
             twists.append(topic)
             continue
@@ -597,10 +558,10 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
             continue  # a velocity over ground: _map_twist
         draft.doubt("speed", (topic.name,), None, "its name suggests neither a speed sensor nor ground truth")
     why = "a velocity report is preferred to an odometry or a twist"
-    chosen = draft.choose("speed", [*reports, *twists], lambda t: (_type(t) not in _FIELDS["speed"],), why)
+    chosen = draft.choose("speed", [*reports, *twists], lambda t: (type_of(t) not in _FIELDS["speed"],), why)
     if chosen is None:
         return
-    kind = _type(chosen)
+    kind = type_of(chosen)
     path = _FIELDS["speed"][kind] if kind in _FIELDS["speed"] else _twist(chosen, "linear", "x")
     draft.take(draft.signals, "speed_m_s", chosen.name, path)
     if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
@@ -617,9 +578,9 @@ def _truth_group(topic: TopicInfo) -> str:
 
 def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
     types = set(TWIST_FIELDS) | set(_FIELDS["pose"]) | FIX_TYPES
-    candidates = [t for t in topics if _type(t) in types and (_is_truth(t) or _type(t) in FIX_TYPES)]
-    if not any(_type(t) in TWIST_FIELDS for t in candidates):
-        odometry = [t for t in topics if _type(t) in BODY_TWIST_TYPES and _words(t.name) & _TOPICS["simulators"]]
+    candidates = [t for t in topics if type_of(t) in types and (_is_truth(t) or type_of(t) in FIX_TYPES)]
+    if not any(type_of(t) in TWIST_FIELDS for t in candidates):
+        odometry = [t for t in topics if type_of(t) in BODY_TWIST_TYPES and _named(t, "simulators")]
         # An odometry from wheels has no lateral velocity.
         simulated = [t for t in odometry if _span(draft.values(t.name, _twist(t, "linear", "y"))) > 0.0]
         candidates += [t for t in simulated if t not in candidates]
@@ -631,35 +592,35 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
         draft.notes.append(f"{prefer} ground truth used; {', '.join(left)} not used")
         candidates = kept
     for topic in topics:
-        if _is_truth(topic) and _type(topic) in _FIELDS["several_positions"]:
-            draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][_type(topic)])
+        if _is_truth(topic) and type_of(topic) in _FIELDS["several_positions"]:
+            draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][type_of(topic)])
     velocity = _map_truth_velocity(draft, candidates)
     _map_truth_position(draft, candidates, velocity)
 
 
 def _map_truth_friction(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
     for topic in topics:
-        path = _FIELDS["friction"].get(_type(topic), "")
+        path = _FIELDS["friction"].get(type_of(topic), "")
         if path and _truth_group(topic) == prefer and draft.is_given(topic.name, path):
             draft.take(draft.truth, "friction", topic.name, path)
 
 
 def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:
-    twists = [t for t in candidates if _type(t) in TWIST_FIELDS and _has_twist(draft, t)]
+    twists = [t for t in candidates if type_of(t) in TWIST_FIELDS and _has_twist(draft, t)]
     why = "topics named as ground truth first, then topics with a pose"
     chosen = draft.choose(
-        "ground-truth velocity", twists, lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(draft, t)), why
+        "ground-truth velocity", twists, lambda t: (not _named(t, "truth"), not _has_pose(draft, t)), why
     )
     if chosen is None:
         return None
-    axes, is_body = _axes(draft, chosen, candidates), _type(chosen) in BODY_TWIST_TYPES
-    receives = not is_body and bool(_words(chosen.name) & NAVIGATION_WORDS)
+    axes, is_body = _axes(draft, chosen, candidates), type_of(chosen) in BODY_TWIST_TYPES
+    receives = not is_body and _named(chosen, "navigation")
     if axes in ("east, north", "north, east") or (receives and axes != "body"):
         return _take_earth_velocity(draft, chosen, axes, is_body=is_body)
     if axes == "not ahead":
         why = "the type's convention is the body frame, although x is mostly not the direction of travel"
         draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
-    imus = [t.name for t in draft.log.topics if _type(t) in IMU_TYPES and _device(t.name) == _device(chosen.name)]
+    imus = [t.name for t in draft.log.topics if type_of(t) in IMU_TYPES and _device(t.name) == _device(chosen.name)]
     down = any(_mean(draft.values(imu, _GRAVITY_PATHS[2])) < -0.5 for imu in imus)  # m/s² or g
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
@@ -696,12 +657,12 @@ def _take_earth_velocity(draft: _Draft, chosen: TopicInfo, axes: str, *, is_body
 
 def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:
     forward, left = _twist(topic, "linear", "x"), _twist(topic, "linear", "y")
-    if draft.is_disowned(topic.name, TWIST_COVARIANCES.get(_type(topic), "")):
+    if draft.is_disowned(topic.name, TWIST_COVARIANCES.get(type_of(topic), "")):
         return False
     if not (draft.is_given(topic.name, forward) and draft.is_given(topic.name, left)):
         return False
     v = np.concatenate([draft.values(topic.name, forward), draft.values(topic.name, left)])
-    if v.shape[0] and (v == 0.0).all() and _type(topic) in _FIELDS["pose"]:
+    if v.shape[0] and (v == 0.0).all() and type_of(topic) in _FIELDS["pose"]:
         # Converters from fixes to odometry leave the twist at zero while the pose changes.
         return all(_span(draft.values(topic.name, _pose(topic, f"position.{a}"))) <= 1.0 for a in "xy")
     return True
@@ -718,7 +679,7 @@ def _span(values: FloatArray) -> float:
 
 
 def _has_pose(draft: _Draft, topic: TopicInfo) -> bool:
-    kind = _type(topic)
+    kind = type_of(topic)
     if kind not in _FIELDS["pose"] or draft.is_disowned(topic.name, _FIELDS["pose_covariance"].get(kind, "")):
         return False
     paths = [_pose(topic, f"position.{a}") for a in "xy"]
@@ -728,7 +689,7 @@ def _has_pose(draft: _Draft, topic: TopicInfo) -> bool:
 
 
 def _has_fix(draft: _Draft, topic: TopicInfo) -> bool:
-    return _type(topic) in FIX_TYPES and all(draft.is_given(topic.name, p) for p in ("latitude", "longitude"))
+    return type_of(topic) in FIX_TYPES and all(draft.is_given(topic.name, p) for p in ("latitude", "longitude"))
 
 
 def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: TopicInfo | None) -> None:
@@ -738,11 +699,11 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
         positions = [t for t in candidates if _has_pose(draft, t) or _has_fix(draft, t)]
         why = "topics named as ground truth first, then poses before satellite fixes"
         chosen = draft.choose(
-            "ground-truth position", positions, lambda t: (not _words(t.name) & TRUTH_WORDS, _type(t) in FIX_TYPES), why
+            "ground-truth position", positions, lambda t: (not _named(t, "truth"), type_of(t) in FIX_TYPES), why
         )
     if chosen is None:
         return
-    if _type(chosen) in FIX_TYPES:
+    if type_of(chosen) in FIX_TYPES:
         _map_fix(draft, chosen, alone=velocity is None)
         return
     for name, axis in (("x_m", "x"), ("y_m", "y")):
@@ -776,6 +737,6 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
     if not alone or status.shape[0] == 0:
         return
     # 0 is any fix; 2 is a ground-based augmented fix, which receivers report for RTK.
-    lowest = 2.0 if "rtk" in _words(fix.name) and bool((status == 2.0).any()) else 0.0
+    lowest = 2.0 if "rtk" in words_of(fix.name) and bool((status == 2.0).any()) else 0.0
     draft.quality = QualityGate(fix.name, "status.status", min=lowest, stamp=draft.stamp(fix.name))
     draft.notes.append(f"ground truth is used where {fix.name}.status.status is at least {lowest:g}")

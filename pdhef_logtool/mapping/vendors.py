@@ -144,7 +144,7 @@ class Vendors:
 
     def typed(self, topic: TopicInfo, fields: Iterable[FieldInfo]) -> TopicInfo:
         """Return an untyped topic with the type name of the export that its fields match, if any."""
-        if topic.encoding != "json" or _plain(topic.type_name) in self.types:
+        if topic.encoding != "json" or plain_type(topic.type_name) in self.types:
             return topic
         there = {f.path for f in fields}
         names = (name for name, kind in self.types.items() if kind.has and kind.has <= there)
@@ -152,11 +152,13 @@ class Vendors:
 
     def of(self, type_name: str) -> VendorType:
         """Return a type; an empty one if it is not documented here."""
-        return self.types.get(_plain(type_name), VendorType())
+        return self.types.get(plain_type(type_name), VendorType())
 
 
-def _plain(type_name: str) -> str:
-    return type_name.removeprefix("ros.").replace("::", "/").replace(".", "/").replace("/msg/", "/")
+def plain_type(type_name: str) -> str:
+    """Return the name of a type in the spelling of ROS 2 without ``/msg``, in which all tables are written."""
+    name = type_name.removeprefix("ros.").replace("::", "/").replace(".", "/").replace("/msg/", "/")
+    return name.replace("foxglove_msgs/", "foxglove/")
 
 
 def load_vendors(path: Path | None = None) -> Vendors:
@@ -188,7 +190,7 @@ def _read(path: Path) -> Vendors:
         fields = _single_fields(model.fields, f"{model.page}, read {model.read}")
         several = tuple(_vector(f) for f in model.fields if isinstance(f.field, list))
         kind = VendorType(fields, several, model.leave_out, frozenset(model.has))
-        types |= {_plain(name): kind for name in model.type}
+        types |= {plain_type(name): kind for name in model.type}
     receivers = tuple(
         VendorType(_single_fields(m.fields, m.page), has=frozenset(m.has), without=frozenset(m.without))
         for m in _tables(raw, "receivers", _ReceiverTable, problems)

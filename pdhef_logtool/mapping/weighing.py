@@ -27,7 +27,7 @@ from pdhef_logtool.mapping.candidates import (
     proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio, spread
+from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     CLEAR,
@@ -56,12 +56,10 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Least correlation of a yaw rate about the right axis, and of an acceleration ahead whose sign is otherwise open.
-FOLLOWS, FAINT = 0.5, 0.25
-#: Standard deviation of the yaw rate of a car that turns; share of the time that counts as always; speed over that over
-#: ground below which it is vertical; least ratio of the yaw rate to the rates about other axes of a device with unknown
-#: axes.
-EXCITED_RATE_RAD_S, MOSTLY, VERTICAL, OUTWEIGHS = 0.03, 0.9, 0.2, 3.0
+#: Correlation with speeding up below which an acceleration is along another axis.
+FOLLOWS = 0.5
+#: Speed over that over ground below which it is vertical.
+VERTICAL = 0.2
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -69,14 +67,13 @@ _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
 #: the signal could also be a share of the largest angle.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
 USUAL = 0.6
-#: Units of wheel speeds, which are mostly named as speeds; their energies where the rest is in SI units.
+#: Units of wheel speeds, which are mostly named as speeds.
 #: Usual radius of a wheel, and 1-sigma of the logarithm of a radius that a car assumes for its wheel speeds.
 USUAL_RADIUS_M, WHEEL_RADIUS = 0.3, 0.015
 WHEEL_UNITS = (
     *(Unit(*u, "wheel speed") for u in HYPOTHESES["wheel speed"]),
     *(Unit(n, f * USUAL_RADIUS_M, "wheel rate", 0.4) for n, f in HYPOTHESES["wheel rate"]),
 )
-IN_SI = {"m/s": 0.0, "km/h": 3.0, "mph": 3.0, "rad/s": 0.0, "rpm": 3.0}
 #: Probability of a unit over the highest one from which the unit is a doubt: of wheels, and of a steering angle.
 POSSIBLE, LIKELY = 0.05, 0.25
 
@@ -98,11 +95,10 @@ def weigh(
     named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
     if log.end_ns > log.start_ns and not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
         named += proposed_fields(log, topics, named)
-    wanted = [n for n in named if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)]
-    if not wanted:
+    if not named:
         return Weighing(Fields(Pieces(log), {}, [], []))
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
-    pieces, weighable = look(log, wanted, vendors, [*signals.values(), *true])
+    pieces, weighable = look(log, named, vendors, [*signals.values(), *true])
     anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
@@ -115,28 +111,6 @@ def weigh(
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
     return weighing
-
-
-def _is_wanted(
-    quantity: str, part: str, role: Role, signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]
-) -> bool:
-    """Return whether a field can provide a missing signal, or information on one."""
-    if quantity == "over ground":  # shows which speed is vertical
-        return "speed_m_s" not in signals
-    if quantity == "acceleration" and part == "z":  # shows gravity
-        return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
-    if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
-        return True
-    if quantity == "rate" and part in ("x", "y"):  # the axes of a device may differ from the car's
-        return "yaw_rate_rad_s" not in signals
-    names = names_of(quantity, part)
-    steered = {"steer_rad", "steering_wheel_rad"} & set(signals)
-    open_ = any(n not in signals and not (n.startswith("steer") and steered) for n in names)
-    if open_ and quantity == "speed" and "speed_m_s" not in signals and any(n.startswith("wheel") for n in signals):
-        open_ = role in ("sensor", "truth", "estimate", "command")
-    for_truth = not truth and (role in ("truth", "navigation") or quantity in ("sideslip", "velocity", "heading"))
-    for_truth |= role == "truth" and not has_heading(truth)
-    return open_ or for_truth
 
 
 @dataclass(slots=True)
@@ -168,7 +142,6 @@ class Weighing:
         for name in _SENSORS:
             if name not in have and not (wheels and name == "speed_m_s"):
                 self._take(name, [f for f in usable if name in names_of(f.meaning.quantity, f.meaning.part)])
-        self._turn_about()
         self._turn_level()
         if not wheels:
             self._wheels(usable)
@@ -180,7 +153,7 @@ class Weighing:
 
     def _usable(self) -> list[Field]:
         """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
-        usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
+        usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation")]
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
@@ -195,14 +168,11 @@ class Weighing:
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
-            if axes == "not ahead" and rates and self._turn_right(x, y, rates[0].si):
-                continue
             is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
             if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
                 self._turn_down(y)
                 continue
             self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y)]
-            self._drop_changes_of(x, y)
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
             # Axes by the yaw rate alone cannot show its sign: beside a speed, the vector is left out.
             is_sure = steps is not None or (is_named and not any(f is not x for f in self.fields.open("speed")))
@@ -224,33 +194,12 @@ class Weighing:
         speeds = [f.si for f in self.fields.open("speed") if f is not x]
         return any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
 
-    def _turn_right(self, x: Field, y: Field, rate: FloatArray) -> bool:
-        """Read a velocity as right and ahead if its y is ahead in bends, too; return whether it is."""
-        is_turning = spread(rate) > EXCITED_RATE_RAD_S and not turns(self.fields.pieces, np.arctan2(y.si, x.si), rate)
-        is_ahead = float(np.mean((y.si > 2.0 * np.abs(x.si))[np.hypot(x.si, y.si) > SLOW_M_S])) > MOSTLY
-        if is_turning and is_ahead:
-            x.meaning, y.meaning, x.sign = y.meaning, x.meaning, -x.sign
-            y.doubts.append("x of its vector is to the right and y ahead, as its values show")
-        return is_turning and is_ahead
-
     def _turn_down(self, y: Field) -> None:
         """Turn the y of a body's velocity to the left if the accelerometer beside it has gravity along -z."""
         down = [f for f in self.fields.candidates if f.has_gravity and f.sign < 0.0 and f.path.rstrip("]")[-1] in "zZ2"]
         if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
             y.sign = -1.0
             y.doubts.append("its device has axes forward, right, down, as gravity shows")
-
-    def _drop_changes_of(self, x: Field, y: Field) -> None:
-        """Leave out accelerations that are derivatives of a velocity over ground, not of the speed and its course."""
-        pieces, length = self.fields.pieces, np.hypot(x.si, y.si)
-        ahead, left = pieces.rate_of(length), length * pieces.turning(x.si + 1j * y.si)
-        for item in [f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and f.is_axis]:
-            if (of := {"x": x, "y": y}.get(item.meaning.part)) is not None and not item.fixed:
-                # Axes of a device may be turned by a quarter.
-                over, *body = (correlation(pieces.smooth(item.si), c) for c in (pieces.rate_of(of.si), ahead, left))
-                if over > max(CLEAR, *map(abs, body)):
-                    self.fields.candidates.remove(item)
-                    self.notes.append(f"{item.topic.name}.{item.path} is not used: it is over ground")
 
     def _vectors(self) -> Iterator[tuple[Field, Field]]:
         """Yield the x and y of velocities that change."""
@@ -274,65 +223,21 @@ class Weighing:
         if rivals:
             self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
 
-    def _turn_about(self) -> None:
-        """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's.
-
-        Without a_y, it is the axis about which the car turns most.
-        """
-        rate, ay, speed = self.taken.get("yaw_rate_rad_s"), self._chosen("ay_m_s2"), self._speed()
-        if rate is None or speed is None or rate.fixed or not rate.is_axis:
-            return
-        rates = [f for f in self.fields.candidates if f.meaning.quantity == "rate" and triad_of(f) == triad_of(rate)]
-        if ay is None:
-            *others, most = sorted(rates, key=lambda f: spread(f.seen.cells))
-            if others and spread(most.seen.cells) > OUTWEIGHS * spread(others[-1].seen.cells):
-                self.taken["yaw_rate_rad_s"] = most
-            return
-        if ay.is_axis:
-            return
-        fits = [(abs(r.correlation), r.slope, f) for f in rates if (r := self.fields.turning(ay.si, f.si, speed.si))]
-        surest, slope, best = max(fits, key=lambda f: f[0], default=(0.0, 1.0, rate))
-        if best is not rate and surest > 0.9 and all(c < FOLLOWS for c, _, f in fits if f is rate):
-            best.sign = math.copysign(1.0, slope)
-            self.taken["yaw_rate_rad_s"] = best
-            self.notes.append(f"yaw_rate_rad_s is {best.path} of {best.topic.name}, with its sign: it follows a_y / v")
-
     def _turn_level(self) -> None:
-        """Turn the axes of a level device by quarters of a turn if its names are letters, as the motion shows."""
-        ax = self.taken.get("ax_m_s2")
+        """Turn the axes of a level device by a quarter of a turn if its names are letters, as speeding up shows."""
+        ax, speed, pieces = self.taken.get("ax_m_s2"), self._speed(), self.fields.pieces
         triad = [f for f in self.fields.candidates if ax is not None and triad_of(f) == triad_of(ax)]
-        triad = [f for f in triad if f.meaning.quantity == "acceleration"]
-        across = [f for f in triad if f.meaning.part == "y"]
-        if ax is None or ax.fixed or not ax.is_axis or len(across) != 1:
+        across = [f for f in triad if f.meaning.quantity == "acceleration" and f.meaning.part == "y"]
+        if ax is None or speed is None or ax.fixed or not ax.is_axis or len(across) != 1:
             return
-        ay = across[0]
-        ahead, left = self._motion_along(ax, ay)
-        if abs(ahead[1]) > CLEAR and abs(ahead[0]) < FOLLOWS:
-            ahead_sign = math.copysign(1.0, ahead[1])
-        elif abs(left[0]) > CLEAR and abs(left[1]) < FOLLOWS:
-            ahead_sign = -math.copysign(1.0, left[0])
-        elif ahead[0] < -CLEAR:
-            ahead_sign = 0.0
-        else:
+        ay, change = across[0], pieces.rate_of(speed.si)
+        along, ahead = (correlation(pieces.smooth(f.si), change) for f in (ax, ay))
+        if abs(ahead) <= CLEAR or abs(along) >= FOLLOWS:
             return
-        # Two axes without a third have no handedness.
-        along = math.copysign(1.0, ahead[1]) if len(triad) < len("xyz") and abs(ahead[1]) > FAINT else ahead_sign
-        turned = ((ay, along), (ax, -ahead_sign)) if ahead_sign else ((ax, -1.0), (ay, -1.0))
-        for name, (item, factor) in zip(("ax_m_s2", "ay_m_s2"), turned, strict=True):
-            item.sign, item.is_turned = item.sign * factor, True
+        for name, item, factor in (("ax_m_s2", ay, ahead), ("ay_m_s2", ax, -ahead)):
+            item.sign, item.is_turned = item.sign * math.copysign(1.0, factor), True
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
             self.taken[name] = item
-
-    def _motion_along(self, *axes: Field) -> tuple[list[float], list[float]]:
-        """Return the correlations of accelerations with speeding up, and with turning left by the path or the gyro."""
-        speed, rate, pieces = self._speed(), self.taken.get("yaw_rate_rad_s"), self.fields.pieces
-        pace, path = np.ones_like(axes[0].si) if speed is None else speed.si, path_velocity(self.fields)
-        turning = np.full_like(pace, np.nan) if path is None else pieces.turning(path[1] + 1j * path[0])
-        if path is None and rate is not None and rate.is_axis and place_of(rate) == place_of(axes[0]):
-            turning = rate.si
-        changes = pieces.rate_of(pace), pieces.smooth(np.where(pace > 0.0, turning, np.nan) * pace)
-        ahead, left = ([correlation(pieces.smooth(f.si), change) for f in axes] for change in changes)
-        return ahead, left
 
     def _wheels(self, usable: Sequence[Field]) -> None:
         wheels = _wheel_set(usable)
@@ -351,10 +256,7 @@ class Weighing:
         times, sigma, by = self._per_turning(mean), BY_DRIVING, "a_y ≈ v r"
         if speed is not None:
             times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
-        beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
-        in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
-        units = [u._replace(energy=in_si * IN_SI[u.name]) for u in WHEEL_UNITS]
-        likely = [u for u in units if first.meaning.quantity in ("wheel speed", u.quantity)]
+        likely = [u for u in WHEEL_UNITS if first.meaning.quantity in ("wheel speed", u.quantity)]
         best, reasons, doubt = _unit_of_wheels(likely, times, sigma, by)
         if times is not None and not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
@@ -387,11 +289,8 @@ class Weighing:
                 continue
             relation = None if curvature is None else fit(self.fields.pieces.smooth(item.seen.cells), curvature)
             name, follows = self._steering_kind(item, relation)
-            if follows is False:
-                item.doubts.append("it does not follow the car's turning")
-                continue
-            if item.score + (0.3 if follows else 0.0) >= LEAST_SCORE:
-                judged.append((item.score + (0.3 if follows else 0.0), name, item))
+            if (score := item.score + 0.3 * follows) >= LEAST_SCORE:
+                judged.append((score, name, item))
         if not judged:
             return
         judged.sort(key=lambda j: (-j[0], j[2].is_off_centre, -j[2].topic.messages, j[2].topic.name, j[2].path))
@@ -408,14 +307,12 @@ class Weighing:
         for item in commands:
             item.bonus -= 0.3
         self._steering([f for f in commands if f.seen.changes or f.fixed])
-        for name in [n for n, f in self.taken.items() if f in commands and any("a share" in d for d in f.doubts)]:
-            del self.taken[name]
 
-    def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
-        """Return the signal for a steering angle, and whether it follows the car's turning (None: unknown)."""
+    def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool]:
+        """Return the signal for a steering angle, and whether it follows the car's turning as a usual one."""
         kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
         if relation is None or abs(relation.correlation) < CLEAR:
-            return _steering_by_range(item, kinds, relation)
+            return _steering_by_range(item, kinds, relation), False
         metres = abs(relation.slope)
         ways = [Unit(u, f / USUAL_LENGTH_M[k], k, 0.7) for k in kinds for u, f in item.units]
         likely = _likely(ways, metres, BY_DRIVING, LIKELY, broken=1e-3)
@@ -424,7 +321,7 @@ class Weighing:
         low, high = _STEERING_M[name]
         if not low <= (length := usual * USUAL_LENGTH_M[name]) <= high:
             item.doubts.append(f"its ratio to the path's curvature is {length:.3g} m, which no car has in this unit")
-            return kinds[0], None
+            return kinds[0], False
         item.use(unit)
         item.reasons.append(f"ratio to the path's curvature {length:.3g} m: {name} in {unit}")
         if abs(math.log(usual)) < USUAL:
@@ -470,13 +367,12 @@ class Weighing:
         first = its[0]
         if first.role == "sensor" and self.true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
             self.true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
-        agrees = self._truth_turns()
         # Fields of ground truth are no inputs, except the speed of a navigation system without another speed.
         mine = set(map(id, self.true.values()))
         for signal in [n for n, f in self.taken.items() if id(f) in mine and n != "speed_m_s"]:
             if first.role != "navigation":
                 del self.taken[signal]
-        if first.role == "sensor" and not (agrees and "reference" in first.topic.name.lower()):
+        if first.role == "sensor":
             evidence = f"{first.topic.name} contains a sideslip, measured or estimated: its name does not give which"
             remedy = 'name it under [truth] in a mapping file, or --waive "truth.source"'
             self.checks.append(Check("truth.source", "truth", "undecided", evidence, remedy))
@@ -500,11 +396,6 @@ class Weighing:
                 item.offset = 0.0 if item.sign > 0.0 else math.pi / 2.0
                 self.true["yaw_rad"] = item
                 return
-
-    def _truth_turns(self) -> bool:
-        """Return whether the yaw rates of ground truth and sensor are equal up to the sign."""
-        sensor, true = self._chosen("yaw_rate_rad_s"), self.true.get("yaw_rate_rad_s")
-        return sensor is not None and true is not None and any(agree(sensor.si, s * true.si) for s in (1.0, -1.0))
 
     # ------------------------------------------------------------------------------------------------- reporting
 
@@ -574,8 +465,6 @@ def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
             truth.setdefault(name, item)
     if not {*_SLIP, "lat_deg"} & set(truth):
         return {}
-    if not _SLIP & set(truth):
-        truth.pop("vx_m_s", None)
     if {"vx_m_s", "vy_m_s"} <= set(truth):
         truth.pop("sideslip_rad", None)
     return truth
@@ -596,17 +485,14 @@ def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
     return max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
 
 
-def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit | None) -> tuple[str, bool | None]:
-    """Return :meth:`Weighing._steering_kind` by the range of values, if the curvature is not conclusive."""
+def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit | None) -> str:
+    """Return the signal for a steering angle by the range of values, if the curvature is not conclusive."""
     name = kinds[-1] if item.seen.largest * item.factors[0][1] > 0.9 else kinds[0]
-    if item.fixed:
-        return name, None
-    if len(kinds) == 2:
+    if len(kinds) == 2 and not item.fixed:
         item.doubts.append(f"its name gives neither steering wheel nor road wheels; taken as {name}")
-    if relation is None:
-        return name, None
-    item.doubts.append(f"its correlation with the path's curvature is only {relation.correlation:.2f}")
-    return name, False if abs(relation.correlation) < 0.25 and item.meaning.strength < 0.9 else None
+    if relation is not None and not item.fixed:
+        item.doubts.append(f"its correlation with the path's curvature is only {relation.correlation:.2f}")
+    return name
 
 
 def truth_topic(weighable: Sequence[Field]) -> str:

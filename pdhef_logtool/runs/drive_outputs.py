@@ -129,10 +129,10 @@ class DriveOutputs:
         return {e.name: first_ns for e in self._run.estimators if e.causal and not drive.not_causal}
 
     def _write_layouts(self, colours: dict[str, int]) -> None:
-        from pdhef_logtool.mapping.recognition import FIX_TYPES
+        from pdhef_logtool.mapping.recognition import FIX_TYPES, type_of
         from pdhef_logtool.results.layouts import write_layouts
 
-        fixes = [t.name for t in self._run.drive.log.topics if t.type_name.replace("/msg/", "/") in FIX_TYPES]
+        fixes = [t.name for t in self._run.drive.log.topics if type_of(t) in FIX_TYPES]
         write_layouts(
             self._change.file(_FOXGLOVE),
             self._change.file(_PLOTJUGGLER),

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, clock_key, fit_clocks, read_signals
-from pdhef_logtool.mapping.clocks import apply_clock, fit_clock_line, why_unusable, with_usable_stamps
+from pdhef_logtool.mapping.clocks import apply_clock, fit_clock_line, why_unusable
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.runs.inspection import inspect_drive_log, render_inspection
@@ -92,9 +92,6 @@ START = 1_700_000_000 * S
 N = 1000
 TRUE = START + np.arange(N, dtype=np.int64) * 10 * MS
 LOG = TRUE + 3 * MS + np.random.default_rng(0).integers(0, MS, N)
-
-#: When a driver sent them, not when the sensor measured.
-JITTERY = LOG - MS - np.random.default_rng(1).integers(0, 8, N) * MS // 2
 
 
 def stepped(by_ns: int) -> IntArray:
@@ -183,62 +180,6 @@ def test_zero_stamps_lose_no_topic() -> None:
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     assert clocks["/imu.header.stamp"].unusable == "100% of its stamps are zero or no time"
     assert clocks["/imu.header.stamp"].median_period_s == pytest.approx(0.01, abs=0.001)
-
-
-@pytest.mark.parametrize(
-    ("inner", "outer", "chosen"),
-    [
-        (np.zeros(N, np.int64), TRUE, "header.stamp"),
-        (np.full(N, START), TRUE, "header.stamp"),
-        (TRUE, np.zeros(N, np.int64), "imu.header.stamp"),
-        (TRUE, TRUE + 5, "imu.header.stamp"),
-        (np.zeros(N, np.int64), np.zeros(N, np.int64), "imu.header.stamp"),
-        (JITTERY, TRUE, "header.stamp"),
-        (TRUE, JITTERY, "imu.header.stamp"),
-        (JITTERY, TRUE - 3600 * S, "imu.header.stamp"),  # regular, and of another clock
-        (START + (TRUE - START) // 1000, TRUE, "header.stamp"),  # microseconds taken for nanoseconds
-    ],
-)
-def test_the_stamp_of_a_nested_message_that_is_a_time_is_read(inner: IntArray, outer: IntArray, chosen: str) -> None:
-    fields = {"header.stamp": outer, "imu.header.stamp": inner, "imu.v": np.arange(float(N))}
-    log = FakeLog({"/state": FakeTopic("a/b", LOG, fields)})
-    source = SignalSource("ay_m_s2", "/state", "imu.v", stamp="imu.header.stamp")
-    mapping = with_usable_stamps(log, Mapping(signals={"ay_m_s2": source}))
-    assert mapping.signals["ay_m_s2"].stamp == chosen
-    assert bool(mapping.notes) == (chosen == "header.stamp")
-
-
-#: Written a hundred at a time.
-BURSTS = np.repeat(TRUE[99::100], 100) + 20 * MS + np.tile(np.arange(100) * 1000, N // 100)
-
-
-@pytest.mark.parametrize(
-    ("header", "published", "recorded", "chosen"),
-    [
-        (None, TRUE + MS, BURSTS, "publish_time"),
-        (None, BURSTS, BURSTS, "log_time"),  # a recorder that has no other time
-        (None, TRUE * 0, BURSTS, "log_time"),
-        (None, TRUE - 3600 * S, BURSTS, "log_time"),  # regular, and of another clock
-        (None, TRUE + MS, LOG, "log_time"),
-        (TRUE, TRUE + MS, BURSTS, "header.stamp"),
-        (TRUE * 0, TRUE + MS, BURSTS, "publish_time"),
-        (TRUE * 0, BURSTS, BURSTS, "header.stamp"),  # log time is used, with the reason in the notes
-    ],
-)
-def test_the_time_of_publication_is_read_where_it_is_the_only_regular_one(
-    header: IntArray | None, published: IntArray, recorded: IntArray, chosen: str
-) -> None:
-    fields = {"v": np.arange(float(N))} | ({} if header is None else {"header.stamp": header})
-    log = FakeLog({"/imu": FakeTopic("a/b", recorded, fields, publish_time_ns=published)})
-    own = "log_time" if header is None else "header.stamp"
-    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp=own)})
-    better = with_usable_stamps(log, mapping)
-    assert better.signals["ay_m_s2"].stamp == chosen
-    assert bool(better.notes) == (chosen != own)
-    clocks = fit_clocks(log, better, log.start_ns, log.end_ns)
-    if chosen == "publish_time":
-        read = read_signals(log, better, clocks, log.start_ns, log.end_ns)
-        np.testing.assert_array_equal(read.signals["ay_m_s2"].stamps_ns, published)
 
 
 @given(
