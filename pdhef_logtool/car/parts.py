@@ -96,9 +96,8 @@ FilterTables = dict[
 class FittedPhysics(Record):
     """Vehicle and noise that were identified with the filter ``physics``.
 
-    ``smoothing``: as :data:`SMOOTHING`, found with the smoother. ``beside_residual``: noise of the filters that have the
-    network's residual, as a factor on the process noise of v_y, yaw rate and axle forces, and its growth
-    ``limit_gain``.
+    ``smoothing``: as :data:`SMOOTHING`, found with the smoother. ``beside_residual``: noise of the filters with the
+    network's residual, as a factor on the process noise of v_y, yaw rate and axle forces, and its ``limit_gain``.
     """
 
     values: VehicleParameters

@@ -170,8 +170,8 @@ class AdaptivePhysics:
     physics : the car's filter with its parts and noise.
     network : of the model's residual, None without; trust : residual gain of F1, in [0, 1].
     adaptive : False leaves the mechanism out: no detector, and the car's filter alone, with its cures as states.
-    beside_residual : the filter with the noise that the residual leaves; None is ``physics``. The parallel filter stays
-        as the network knows it.
+    beside_residual : the filter with the noise that the residual leaves; None is ``physics``. The parallel filter keeps
+        that of the network's training.
     notes : texts for the report, such as the reason for its residual gain.
     """
 

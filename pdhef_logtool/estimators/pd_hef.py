@@ -38,19 +38,14 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 
 def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     """Return ``physics`` of a car with its network."""
-    gain, note = _gain(name, car)
-    physics = of_car(car, use_speed=options.use_speed)
+    (gain, note), physics = _gain(name, car), of_car(car, use_speed=options.use_speed)
+    notes = (f"residual gain {gain:g}: {note}",) if note else ()
+    alone = AdaptivePhysics(physics, adaptive="fixed-r" not in options_of(name), name=name, notes=notes)
+    if gain == 0.0:
+        return alone
     network = car.network.plug_in if isinstance(car.network, PlugInModel) else car.network
-    network = network if gain > 0.0 else None
-    return AdaptivePhysics(
-        physics,
-        network,
-        gain,
-        adaptive="fixed-r" not in options_of(name),
-        beside_residual=None if network is None or car.fitted_physics is None else _quieter(physics, car.fitted_physics),
-        name=name,
-        notes=(f"residual gain {gain:g}: {note}",) if note else (),
-    )
+    quieter = None if car.fitted_physics is None else _quieter(physics, car.fitted_physics)
+    return replace(alone, network=network, trust=gain, beside_residual=quieter)
 
 
 def _quieter(physics: VehicleUkf, fitted: FittedPhysics) -> VehicleUkf:

@@ -79,7 +79,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{row}: {math.degrees(of_row[0]):.4f}°, " + " ".join(f"{r:.3f}" for r in ratios[row][1:]), flush=True)
     allowed = np.max(list(ratios.values()), axis=0) <= MOST_WORSE
     best = int(np.argmin(np.where(allowed, np.prod([ratios[row] for row in PAPER_ROWS], axis=0), np.inf)))
-    print(f"factor and growth {PAIRS[best]}: {np.exp(np.mean([np.log(r[best]) for r in ratios.values()])):.3f} of all rows")
+    of_all = np.exp(np.mean([np.log(r[best]) for r in ratios.values()]))
+    print(
+        f"factor and growth {PAIRS[best]}: {of_all:.3f} of the error with the noise of physics, in the geometric mean"
+    )
     fit = read_fit(given.output / FIT_FILE)
     assert fit.physics is not None
     fit = fit.model_copy(update={"physics": fit.physics.model_copy(update={"beside_residual": PAIRS[best]})})

@@ -26,6 +26,7 @@ from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.reference.inputs import white_noise
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
+from pdhef_logtool.evaluation.smoothing import median_step_ns
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, record_of, set_manifest, tell_drive
 from pdhef_logtool.learning.network import dataset, residuals
@@ -467,7 +468,7 @@ def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
     truth = derive_truth(plan.survey_truth, plan=plan.truth).track
-    per_white = math.sqrt(2.0) / (plan.truth.period_s if plan.truth else math.nan) ** 1.5  # of one-step differences
+    per_white = math.sqrt(2.0) / (median_step_ns(truth.stamps_ns) * 1e-9) ** 1.5  # of one-step differences
     noise = [per_white * white_noise(truth.stamps_ns, c, 0.0) for c in (truth.vy_m_s, truth.yaw_rate_rad_s)]
     within = all(n <= limit for n, limit in zip(noise, residuals.NEGLIGIBLE_NOISE, strict=True))  # False for NaN
     return {
