@@ -38,7 +38,8 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 
 def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     """Return ``physics`` of a car with its network."""
-    (gain, note), physics = _gain(name, car), of_car(car, use_speed=options.use_speed)
+    gain, note = _gain(name, car) if options.steers else (0.0, "a network needs the steering")
+    physics = of_car(car, use_speed=options.use_speed)
     notes = (f"residual gain {gain:g}: {note}",) if note else ()
     alone = AdaptivePhysics(physics, adaptive="fixed-r" not in options_of(name), name=name, notes=notes)
     if gain == 0.0:

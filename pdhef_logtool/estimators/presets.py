@@ -36,11 +36,12 @@ class Options:
     Attributes
     ----------
     use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only initializes them.
-    gnss : whether GNSS velocity corrects :data:`AIDED` if the log has it.
+    gnss : whether GNSS velocity corrects :data:`AIDED` if the log has it. steers : whether the log has the steering.
     """
 
     use_speed: bool = True
     gnss: bool = False
+    steers: bool = True
 
 
 def preset_of(name: str) -> str:

@@ -297,7 +297,7 @@ def runnable(
     refused : signals of the log that failed a check and are not used.
     """
     options = options or Options()
-    options = replace(options, gnss=options.gnss and has_gnss(available))
+    options = replace(options, gnss=options.gnss and has_gnss(available), steers="steer_rad" in available)
     estimators: list[Estimator] = []
     skipped: list[Skipped] = []
     named = (all_names(car, name) if name in (ALL_ESTIMATORS, PEERS) else (name,) for name in names)

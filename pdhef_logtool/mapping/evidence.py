@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
+from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Number and length of the pieces of the log to read; a shorter log is read whole.
@@ -94,14 +95,14 @@ class Pieces:
     def read(self, fields: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Seen]:
         """Read fields, given by topic and path; an array becomes one entry per column, ``name[i]``.
 
-        At most ``MOST_COLUMNS`` columns of an array are read.
+        At most ``MOST_COLUMNS`` columns of an array are read. Unreadable fields are omitted.
         """
         requests: dict[str, list[str]] = {}
         for topic, path in dict.fromkeys(fields):
             requests.setdefault(topic, []).append(path)
         parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
         for number, start in enumerate(self.starts if requests else ()):
-            for topic, columns in self.log.read(requests, start, start + PIECE_NS, quiet=True).items():
+            for topic, columns in self._columns(requests, start).items():
                 cell = (columns.log_time_ns - start) // CELL_NS
                 for path in requests[topic]:
                     values = np.asarray(columns.fields[path], dtype=np.float64)
@@ -113,6 +114,13 @@ class Pieces:
                         parts.setdefault((topic, f"{path}[{i}]"), []).append((number, cell, column))
         whole = {key: np.concatenate([column for _, _, column in samples]) for key, samples in parts.items()}
         return {key: Seen(values, partial(self._on_grid, values, parts[key])) for key, values in whole.items()}
+
+    def _columns(self, requests: Mapping[str, Sequence[str]], start: int) -> dict[str, Columns]:
+        try:
+            return self.log.read(requests, start, start + PIECE_NS, quiet=True)
+        except PdhefError:  # each topic alone, without those that cannot be read
+            alone = requests.items() if len(requests) > 1 else ()
+            return {t: c for topic, paths in alone for t, c in self._columns({topic: paths}, start).items()}
 
     def _on_grid(self, values: FloatArray, samples: list[tuple[int, IntArray, FloatArray]]) -> tuple[FloatArray, float]:
         """Return the means of the usual values on the grid [M], and the sample rate."""

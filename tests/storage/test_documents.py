@@ -55,7 +55,6 @@ VALID_FIT = {
     "format": "pdhef-fit",
     "version": 1,
     "physics_sha256": "ab" * 32,
-    "values": {"friction": 0.9, "sensors": {"ay_bias_m_s2": 0.01, "yaw_rate_bias_rad_s": 0.0}},
     "filter": {"phy-ukf:tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}},
     "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
 }
