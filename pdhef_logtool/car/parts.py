@@ -71,8 +71,7 @@ class FilterNoise(Record):
     q_std : per square root of second, of v_x, v_y and yaw rate, and optionally of the a_x bias; for ``physics`` also of
         the two axle forces. Empty for the filter's default.
     r_std : by measurement; the filter's default for missing ones.
-    limit_gain : growth of the process noise of axle forces and yaw rate of ``physics`` beyond the linear range; 0
-        without.
+    limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0 without.
     """
 
     q_std: Annotated[tuple[NonNegative, ...], Field(strict=False)] = ()
@@ -96,14 +95,12 @@ FilterTables = dict[
 class FittedPhysics(Record):
     """Vehicle and noise that were identified with the filter ``physics``.
 
-    ``smoothing``: as :data:`SMOOTHING`, found with the smoother. ``beside_residual``: noise of the filters with the
-    network's residual, as a factor on the process noise of v_y, yaw rate and axle forces, and its ``limit_gain``.
+    ``smoothing``: as :data:`SMOOTHING`, found with the smoother.
     """
 
     values: VehicleParameters
     noise: FilterNoise
     smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = SMOOTHING
-    beside_residual: Annotated[tuple[Positive, NonNegative], Field(strict=False)] = (1.0, 0.0)
 
 
 class Fit(Record):

@@ -170,20 +170,17 @@ class AdaptivePhysics:
     physics : the car's filter with its parts and noise.
     network : of the model's residual, None without; trust : residual gain of F1, in [0, 1].
     adaptive : False leaves the mechanism out: no detector, and the car's filter alone, with its cures as states.
-    beside_residual : the filter with the noise that the residual leaves; None is ``physics``. The parallel filter keeps
-        that of the network's training.
     notes : texts for the report, such as the reason for its residual gain.
     """
 
     algorithm = "adaptive-physics"
     version = 2
-    options = ("physics", "trust", "adaptive", "beside_residual")
+    options = ("physics", "trust", "adaptive")
 
     physics: VehicleUkf
     network: ResidualModel | None = None
     trust: float = 0.0
     adaptive: bool = True
-    beside_residual: VehicleUkf | None = None
     name: str = "pd-hef"
     causal: bool = True
     notes: tuple[str, ...] = ()
@@ -201,10 +198,9 @@ class AdaptivePhysics:
     @property
     def filters(self) -> tuple[VehicleUkf, ...]:
         """F1, and one filter for each cure that the car has."""
-        physics, cures = self.beside_residual or self.physics, self.cures
+        physics, vehicle, cures = self.physics, self.physics.vehicle, self.cures
         if not cures:
             return (physics,)
-        vehicle = physics.vehicle
         parts = [vehicle.physics.model_copy(update={c: c == cure for c in CURES}) for cure in ("", *cures)]
         vehicles = [vehicle.model_copy(update={"physics": p}) for p in parts]
         return tuple(replace(physics, vehicle=v) for v in vehicles)

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import SMOOTHING, FittedPhysics
+from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.presets import Options, options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
-from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car
+from pdhef_logtool.estimators.vehicle_ukf import of_car
 from pdhef_logtool.residual_model.interface import PlugInModel
 
 #: The preset that uses the taught part of a car.
@@ -45,22 +45,14 @@ def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     if gain == 0.0:
         return alone
     network = car.network.plug_in if isinstance(car.network, PlugInModel) else car.network
-    quieter = None if car.fitted_physics is None else _quieter(physics, car.fitted_physics)
-    return replace(alone, network=network, trust=gain, beside_residual=quieter)
-
-
-def _quieter(physics: VehicleUkf, fitted: FittedPhysics) -> VehicleUkf:
-    """Return the filter with the process noise that a network's residual leaves."""
-    (along, vy, rate, ax_bias, *forces), (share, limit_gain) = physics.q_std, fitted.beside_residual
-    q_std = (along, share * vy, share * rate, ax_bias, *(share * force for force in forces))
-    return replace(physics, q_std=q_std, limit_gain=max(limit_gain, physics.limit_gain))
+    return replace(alone, network=network, trust=gain)
 
 
 def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
     """Return the smoothed filter, with the noise for smoothing; ``name`` is the name of the result."""
     filtered = _with_network(name, car, options)
     factors = SMOOTHING if car.fitted_physics is None else car.fitted_physics.smoothing
-    filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors), beside_residual=None)
+    filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors))
     taught = () if car.model is None or car.model.residual is None else (FILTER_ALONE,)
     return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *taught, *filtered.notes))
 

@@ -524,7 +524,7 @@ def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore
     out_linked, out_predicted_P, out_cross = links
     linked, bias = out_linked.shape[0] > 0, layout.steer_bias
     front_std, rear_std = (q_std[FRONT], q_std[REAR]) if layout.forces >= 0 else (0.0, 0.0)
-    steer_std, rate_std = q_std[bias], q_std[YAW_RATE]
+    steer_std = q_std[bias]
     for k in range(window.dt_s.shape[0]):
         m = memory[0]
         was_unknown = bias >= 0 and m.runs > 0.0 and m.steer_age > rules.steer_hold_s
@@ -548,7 +548,6 @@ def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore
             if layout.forces >= 0 and rules.limit_gain > 0.0:
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
-                q_std[YAW_RATE] = factor * rate_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
             predict(x, P, root, over, rate, now.dt, 0.5, q, layout, places, p, f, points, away)
             if linked:
@@ -799,7 +798,7 @@ class VehicleUkf:
     """
 
     algorithm = "vehicle-ukf"
-    version = 2
+    version = 1
     options = ("equations", "limit_gain", "limit_lag_m", "roll_correction")
 
     vehicle: VehicleParameters

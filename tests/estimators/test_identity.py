@@ -14,8 +14,7 @@ from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.errors import UsageError
 
-_QUIETER = "beside_residual=vehicle-ukf, beside_residual.limit_gain=4.0, beside_residual.version=2"
-_PHYSICS = "physics=vehicle-ukf, physics.version=2"
+_HYBRID = "adaptive-physics 2 (physics=vehicle-ukf, trust=0.75)"
 #: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
 SHIPPED = {
     "zero": ("pass-through 1 (claims_zero_sideslip=True)", "138e43c5f7aa"),
@@ -23,16 +22,16 @@ SHIPPED = {
     "kinematic": ("kinematic 1", "6a7d76af0e93"),
     "open-loop": ("open-loop 1", "5afc5962fabb"),
     "linear-regression": ("linear-regression 1", "9de17837d3ad"),
-    "phy-ukf": ("vehicle-ukf 2 (equations=nominal)", "30266b3a19f2"),
-    "physics": (f"adaptive-physics 2 ({_PHYSICS})", "2c866e93a62f"),
-    "phy-ukf:tuned": ("vehicle-ukf 2 (equations=nominal, roll_correction=True)", "f466b685ca7f"),
+    "phy-ukf": ("vehicle-ukf 1 (equations=nominal)", "cead32189ec2"),
+    "physics": ("adaptive-physics 2 (physics=vehicle-ukf)", "8a1f16b11617"),
+    "phy-ukf:tuned": ("vehicle-ukf 1 (equations=nominal, roll_correction=True)", "2e213229f481"),
     "pure-lstm": ("direct-network 1", "4441758f4188"),
-    "pd-hef": (f"adaptive-physics 2 ({_QUIETER}, {_PHYSICS}, trust=0.75)", "67892123c8d3"),
-    "pd-hef:fixed-r": (f"adaptive-physics 2 (adaptive=False, {_QUIETER}, {_PHYSICS}, trust=1.0)", "b50af9cbad7b"),
+    "pd-hef": (_HYBRID, "3b53c8a7ed26"),
+    "pd-hef:fixed-r": ("adaptive-physics 2 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "d45f6422c9c2"),
     "pd-hef-smoothed": (
-        "smoothed-physics 2 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.physics.version=2, "
-        "filtered.trust=0.75, filtered.version=2)",
-        "058787975358",
+        "smoothed-physics 2 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75, "
+        "filtered.version=2)",
+        "222f805255c6",
     ),
     "pd-hef-paper": ("paper-hybrid-ukf 2", "87a835dda35a"),
 }
@@ -58,10 +57,9 @@ def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
     values = {f.name: getattr(estimator.physics, f.name) for f in fields(VehicleUkf)}
     assert resolve(replace(estimator, physics=kind(**values))) == resolve(estimator)
     changed = resolve(replace(estimator, physics=kind(**values, probe=True)))
-    probed = _PHYSICS.replace(", ", ", physics.probe=True, ")
-    assert changed.identity == f"adaptive-physics 2 ({_QUIETER}, {probed}, trust=0.75)"
-    kind.version = 3  # type: ignore[attr-defined]
-    assert "physics.version=3" in resolve(replace(estimator, physics=kind(**values))).identity
+    assert changed.identity == "adaptive-physics 2 (physics=vehicle-ukf, physics.probe=True, trust=0.75)"
+    kind.version = 2  # type: ignore[attr-defined]
+    assert "physics.version=2" in resolve(replace(estimator, physics=kind(**values))).identity
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)

@@ -10,11 +10,9 @@ from made_models import random_network
 from physics_oracle import G, Oracle, parts
 from reference_car import FRICTION, drive, slalom, with_noise
 
-from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -87,17 +85,3 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it(has: tuple[str, ..
     assert errors[2] < 0.05 * errors[0]
     assert errors[2] < errors[1] < errors[0]
     assert track.ay_m_s2[200:] == pytest.approx(made.ay[200:] + 0.8, abs=0.02)
-
-
-def test_the_filters_with_the_shipped_network_have_less_noise_and_its_features_do_not() -> None:
-    car = Car.load("saloon")
-    fitted = car.fitted_physics
-    assert fitted is not None and fitted.beside_residual != (1.0, 0.0)
-    share, growth = fitted.beside_residual
-    hybrid, physics = (make_estimator(name, car) for name in ("pd-hef", "physics"))
-    assert isinstance(hybrid, AdaptivePhysics) and isinstance(physics, AdaptivePhysics)
-    assert hybrid.physics == physics.physics
-    assert {f.limit_gain for f in hybrid.filters} == {growth} and {f.limit_gain for f in physics.filters} == {0.0}
-    for quiet, own in zip(hybrid.filters, physics.filters, strict=True):
-        ratio = np.array(quiet.q_std) / np.array(own.q_std)
-        np.testing.assert_allclose(ratio, [1.0, share, share, 1.0, share, share])
