@@ -198,12 +198,12 @@ class AdaptivePhysics:
     @property
     def filters(self) -> tuple[VehicleUkf, ...]:
         """F1, and one filter for each cure that the car has."""
-        physics, vehicle, cures = self.physics, self.physics.vehicle, self.cures
+        vehicle, cures = self.physics.vehicle, self.cures
         if not cures:
-            return (physics,)
+            return (self.physics,)
         parts = [vehicle.physics.model_copy(update={c: c == cure for c in CURES}) for cure in ("", *cures)]
         vehicles = [vehicle.model_copy(update={"physics": p}) for p in parts]
-        return tuple(replace(physics, vehicle=v) for v in vehicles)
+        return tuple(replace(self.physics, vehicle=v) for v in vehicles)
 
     def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
         """Return faults and the residual at gain 1, and the state."""

@@ -21,7 +21,7 @@ from pdhef_logtool.learning.network.train_command import (
     normalisation_of,
     weights_of,
 )
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
 
 
@@ -55,6 +55,8 @@ def test_normalisation_is_by_weight_and_keeps_the_targets_zero() -> None:
     assert found.target_std == pytest.approx((math.sqrt(28 / 4), math.sqrt(4 * 28 / 4)))
     flat = normalisation_of([sequence(3, 0.0)], FEATURES[1:2])
     assert (flat.feature_std, flat.target_std) == ((1e-6,), (1e-6, 1e-6))
+    with pytest.raises(ModelError, match="none"):
+        normalisation_of([replace(one, weight=np.zeros(4))], FEATURES[:2])
 
 
 def test_runs_end_at_new_segments_and_short_or_worthless_ones_are_left_out() -> None:

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, pairwise
 from pathlib import Path
@@ -43,8 +43,7 @@ from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_pa
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
-CHECKPOINT = "checkpoint.pt"
-_DIGEST_BYTES = hashlib.sha256().digest_size
+CHECKPOINT = "checkpoint.safetensors"
 
 
 #: Maximum number of validation steps at once, with the state carried on; an hour at once would need a gigabyte.
@@ -138,6 +137,8 @@ def normalisation_of(
     parts = [(s.features[s.weight > 0][:, columns], s.target[s.weight > 0]) for s in sequences]
     # Contiguous rows are summed one by one, so that rounding does not depend on the split into sequences.
     features, target = (np.ascontiguousarray(np.concatenate(c)) for c in zip(*parts, strict=True))
+    if not len(features):
+        raise ModelError(expected="training sequences with usable samples", got="none", where="train")
     mean = features.mean(axis=0)
     if odd:
         mean[[n in ODD_FEATURES for n in names]] = 0.0
@@ -344,28 +345,56 @@ class _Training:
         return total / weight if weight else math.inf
 
     def save(self, path: Path, identity: dict[str, Any]) -> None:
-        """Write a checkpoint, with its hash in front; ``identity`` of the training: its recipe and data."""
-        file = io.BytesIO()
-        states = {"network": self.network.state_dict(), "optimiser": self.optimiser.state_dict(), "best": self.best}
-        torch.save({"identity": json.dumps(identity), "history": [asdict(e) for e in self.history], **states}, file)
-        data = file.getvalue()
-        write_bytes(path, hashlib.sha256(data).digest() + data)
+        """Write a checkpoint: tensors and document in one file, with their hash.
+
+        ``identity`` of the training: its recipe and data.
+        """
+        from safetensors.torch import save
+
+        states = self.optimiser.state_dict()["state"]
+        optimiser = {f"{i}.{key}": value for i, of in states.items() for key, value in of.items()}
+        groups = {"network": self.network.state_dict(), "best": self.best, "optimiser": optimiser}
+        tensors = {f"{g}.{name}": value.cpu().contiguous() for g, of in groups.items() for name, value in of.items()}
+        document = json.dumps({"identity": identity, "history": [asdict(e) for e in self.history]})
+        about = {"document": document, "sha256": _checkpoint_sha256(document, tensors)}
+        write_bytes(path, save(tensors, metadata=about))
 
     def resume(self, path: Path, identity: dict[str, Any]) -> None:
         """Continue after a checkpoint; raises ModelError if it is damaged, or of another recipe or other data."""
-        content = path.read_bytes()
-        data = content[_DIGEST_BYTES:]
-        if content[:_DIGEST_BYTES] != hashlib.sha256(data).digest():
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, framework="pt") as stored:
+                about = stored.metadata()
+                tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
+            if about["sha256"] != _checkpoint_sha256(about["document"], tensors):
+                raise ValueError("another hash")
+        except (OSError, ValueError, LookupError, TypeError, SafetensorError):
             expected, got = "a checkpoint of a training", "content that is not as it was written"
-            raise ModelError(expected=expected, got=got, where=path, remedy="remove it to train again")
-        stored = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-        if stored["identity"] != json.dumps(identity):
+            raise ModelError(expected=expected, got=got, where=path, remedy="remove it to train again") from None
+        document = json.loads(about["document"])
+        if document["identity"] != json.loads(json.dumps(identity)):
             expected, got = "a checkpoint of this recipe and data", "one of another"
             remedy = "train into another folder, or remove the checkpoint"
             raise ModelError(expected=expected, got=got, where=path, remedy=remedy)
-        self.network.load_state_dict(stored["network"])
-        self.optimiser.load_state_dict(stored["optimiser"])
-        self.history, self.best = [Epoch(**e) for e in stored["history"]], stored["best"]
+        groups: dict[str, dict[str, torch.Tensor]] = {"network": {}, "best": {}, "optimiser": {}}
+        for name, value in tensors.items():
+            group, _, key = name.partition(".")
+            groups[group][key] = value
+        states: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in groups["optimiser"].items():
+            index, _, key = name.partition(".")
+            states.setdefault(int(index), {})[key] = value
+        self.network.load_state_dict(groups["network"])
+        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": states})
+        self.history, self.best = [Epoch(**e) for e in document["history"]], groups["best"]
+
+
+def _checkpoint_sha256(document: str, tensors: Mapping[str, torch.Tensor]) -> str:
+    total = hashlib.sha256(document.encode())
+    for name in sorted(tensors):
+        total.update(name.encode() + tensors[name].numpy().tobytes())
+    return total.hexdigest()
 
 
 def _weights(network: ResidualNetwork) -> dict[str, torch.Tensor]:
