@@ -32,6 +32,7 @@ from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.posterior import FittedParameter, Posterior
 from pdhef_logtool.car.vehicle import STIFFNESS_TYRE_SHAPE, VehicleParameters
 from pdhef_logtool.model import equations, priors
+from pdhef_logtool.model.descent import descend, linearised
 from pdhef_logtool.model.driving import STEP_S, Driving
 from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import FloatArray
@@ -52,8 +53,7 @@ CORRELATION_S = 1.0
 KEPT_STEPS = 4
 #: Length of the blocks for the spread of gradients: longer than a bend, so that blocks are nearly independent.
 BLOCK_S = 3.0
-#: Of the descent; ``MORE`` and ``LESS``: factor on the damping after a failed attempt, divisor after a successful one.
-ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN, TRIES, MORE, LESS = 40, 0.02, 1.0, 1e-3, 6, 6.0, 5.0
+ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
 #: Lower limit of the peak force, as a share of this quantile of a_y, which includes bank and body roll.
 REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
 #: Model error common to a whole drive, as a share of each prior's standard deviation: with it at least 95 % of the
@@ -159,30 +159,16 @@ class CarFit:
         return theta
 
     def _descend(self, theta: FloatArray) -> FloatArray:
-        """Minimize the cost by Levenberg and Marquardt."""
-        errors, damping = self.errors_of(theta), 1e-2
-        value = self._cost(errors, theta)
-        for _ in range(ITERATIONS):
-            residuals, jacobian = self._linearised(theta, errors)
-            normal, gradient, gain = jacobian.T @ jacobian + np.eye(theta.size), jacobian.T @ residuals + theta, 0.0
-            for _ in range(TRIES):
-                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-                step /= max(1.0, float(np.max(np.abs(step))) / MAX_STEP)
-                there = self.errors_of(theta + step)
-                if (new := self._cost(there, theta + step)) < value:
-                    theta, errors, value, gain = theta + step, there, new, value - new
-                    damping = max(damping / LESS, 1e-5)
-                    break
-                damping *= MORE
-            if gain < LEAST_GAIN:
-                break
-        return theta
-
-    def _linearised(self, theta: FloatArray, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals [R] at θ [n], with the ``errors`` there, and their derivatives [R, n] by differences."""
-        residuals = self._residuals(errors, errors)
-        moved = [self._residuals(self.errors_of(theta + t), errors) for t in DERIVATIVE_STEP * np.eye(theta.size)]
-        return residuals, (np.stack(moved, axis=1) - residuals[:, None]) / DERIVATIVE_STEP
+        return descend(
+            self.errors_of,
+            self._cost,
+            self._residuals,
+            theta,
+            iterations=ITERATIONS,
+            least_gain=lambda _: LEAST_GAIN,
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        ).theta
 
     def rms(self, theta: FloatArray) -> FloatArray:
         """Return the RMS error of yaw rate and a_y, [2]."""
@@ -257,7 +243,7 @@ class CarFit:
     def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the inverse curvature of the cost [n, n], and its gradient by block [blocks, n]."""
         centre = self.errors_of(theta)
-        residuals, jacobian = self._linearised(theta, centre)
+        residuals, jacobian = linearised(self.errors_of, self._residuals, theta, centre, DERIVATIVE_STEP)
         inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
         gradients = np.zeros((int(self._block.max()) + 1, theta.size))
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])

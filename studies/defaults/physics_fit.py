@@ -25,6 +25,7 @@ import numpy as np
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, PosteriorSteps, physics_filter
+from pdhef_logtool.model.descent import descend
 from pdhef_logtool.records.signals import FloatArray
 from studies.defaults.axle_forces import (
     PEAK_LOG_STD,
@@ -51,8 +52,6 @@ NIS_LOG_STD = 1.0
 ROBUST = 3.0
 DERIVATIVE_STEP = 0.05
 MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
-#: Number of attempts per step, factor on the damping after a failed attempt, and divisor after a successful one.
-TRIES, MORE, LESS = 6, 6.0, 5.0
 #: Width of the tyres' priors about the axle-force fit, as a share of the widths about a vehicle file.
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
@@ -255,39 +254,25 @@ def fit_physics(
         return drive_errors(drives, start, *build_car(start, parts, priors, theta))
 
     firsts = [np.array([first.get(p.name, 0.0) for p in priors]) for first in starts]
-    ends = [_descended(errors, first, iterations) for first in firsts]
-    theta, normal, value, errors_of_drives = min(ends, key=lambda end: end[2])
+    ends = [
+        descend(
+            errors,
+            fit_cost,
+            scaled_errors,
+            first,
+            iterations=iterations,
+            least_gain=least_gain,
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        )
+        for first in firsts
+    ]
+    theta, normal, value, errors_of_drives = min(ends, key=lambda end: end.cost)
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     vehicle, noise = build_car(start, parts, priors, theta, digits=6)
     squares = sum(float(np.sum(d.error**2)) for d in errors_of_drives)
     rms = math.degrees(math.sqrt(squares / max(1, sum(d.counted for d in errors_of_drives))))
     return PhysicsFit(vehicle, noise, priors, theta, covariance, value, rms)
-
-
-def _descended(
-    errors: Callable[[FloatArray], list[DriveError]], theta: FloatArray, iterations: int
-) -> tuple[FloatArray, FloatArray, float, list[DriveError]]:
-    """Minimize the cost by Levenberg and Marquardt; return θ, the normal matrix of the last step, cost and errors."""
-    here, damping, normal = errors(theta), 1e-2, np.eye(theta.size)
-    value = fit_cost(here, theta)
-    for _ in range(iterations):
-        residuals = scaled_errors(here, here)
-        moved = [scaled_errors(errors(theta + step), here) for step in DERIVATIVE_STEP * np.eye(theta.size)]
-        jacobian = (np.stack(moved, axis=1) - residuals[:, None]) / DERIVATIVE_STEP
-        normal, gradient = jacobian.T @ jacobian + np.eye(theta.size), jacobian.T @ residuals + theta
-        gain = 0.0
-        for _ in range(TRIES):
-            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-            step *= min(1.0, MAX_STEP / float(np.max(np.abs(step))))
-            there = errors(theta + step)
-            if (new := fit_cost(there, theta + step)) < value:
-                theta, here, value, gain = theta + step, there, new, value - new
-                damping = max(damping / LESS, 1e-5)
-                break
-            damping *= MORE
-        if gain <= 0.0 or gain < least_gain(here):
-            break
-    return theta, normal, value, here
 
 
 def fit_cost(errors: Sequence[DriveError], theta: FloatArray) -> float:
