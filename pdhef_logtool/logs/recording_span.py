@@ -178,10 +178,10 @@ def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> RecordingSpa
 
 def survey_rows(times_ns: IntArray, where: str) -> tuple[BoolArray, tuple[Loss, ...]]:
     """Return which of the times [N] of rows in file order are used, and losses; ``where`` as for :func:`survey`."""
-    recording_span, repeated = _survey({("", 0): times_ns}, where)
-    return _inside(times_ns, recording_span.intervals) & ~repeated.get(
-        ("", 0), np.zeros(1, np.bool_)
-    ), recording_span.losses
+    lane: _Lane = ("", 0)
+    recording_span, repeated = _survey({lane: times_ns}, where)
+    used = _inside(times_ns, recording_span.intervals)
+    return used & ~repeated[lane] if lane in repeated else used, recording_span.losses
 
 
 def _survey(

@@ -155,7 +155,7 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
         for text in contradictions:
             drive.tell(text)
     if against := contradiction(scored.rows):
-        drive.notes.append(f"WARNING: {against[1]}")  # the text of the selected estimate gives the consequence
+        drive.notes.append(f"WARNING: {against.text}")  # the text of the selected estimate gives the consequence
     if not scored.moves:
         drive.tell(_NEVER_MOVES.format(run.car.vehicle.low_speed_blend_m_s))
     return scored

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
@@ -28,11 +29,17 @@ _BEST_FIRST = (PREFERRED, PHYSICS, "phy-ukf:tuned", "phy-ukf", "open-loop:calibr
 _LAST = (NAIVE, "zero:no-lateral", REFERENCE)
 
 
-def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> tuple[str, str] | None:
+class Contradiction(NamedTuple):
+    """An estimate that fails a test: the ``best`` one that passes both, and the warning of the report."""
+
+    best: str
+    text: str
+
+
+def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradiction | None:
     """Return how the tests contradict an estimate; None if they do not, or no other one passes the yaw-rate test.
 
-    The result is the best estimate that passes both, and the warning of the report. A log without steering has no
-    yaw-rate test, and then no estimate to compare with.
+    A log without steering has no yaw-rate test, and then no estimate to compare with.
     """
     d2, yaw = _figures(rows)
     explain = [n for n, value in yaw.items() if n in d2 and value <= YAW_FACTOR * min(yaw.values())]
@@ -41,7 +48,7 @@ def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> tuple[str
         return None
     if d2[name] <= FACTOR * d2[best] and (name in explain or name not in yaw):
         return None
-    return (
+    return Contradiction(
         best,
         f"{name} contradicts the sensors: its lateral consistency is {d2[name]:.3g} m/s and its yaw consistency "
         f"{yaw.get(name, math.nan):.3g} rad/s, those of {best} {d2[best]:.3g} and {yaw[best]:.3g}; "
@@ -86,8 +93,8 @@ def choose_main(names: Sequence[str], rows: Iterable[MetricRow], *, proven: bool
     rows = list(rows)
     against = None if proven else contradiction(rows, name)
     if against is not None:
-        why = f"{name} contradicts the sensors more than {against[0]} does"
-        name = against[0]
+        why = f"{name} contradicts the sensors more than {against.best} does"
+        name = against.best
     elif proven:
         why = "driving with ground truth has validated this car"
     elif name not in _NOT_JUDGED and any(r.metric == "d2" and r.estimator == name for r in rows):
