@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from typing import TypeAlias
@@ -68,6 +69,15 @@ def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> M
         return _index(summary, start, limits) if sound else None
     except _UNREADABLE:
         return None
+
+
+def chunk_places(source: ByteSource, limits: ResourceLimits) -> list[int]:
+    """Return the ascending offsets of chunks according to the summary, as far as it can be read."""
+    places: list[int] = []
+    with suppress(*_UNREADABLE):
+        indexes = (r for r in _records(_summary(source)[0], limits) if isinstance(r, ChunkIndex))
+        places.extend(r.chunk_start_offset for r in indexes if source.read(r.chunk_start_offset, 1)[0] == Opcode.CHUNK)
+    return sorted(places)
 
 
 def _summary(source: ByteSource) -> tuple[bytes, int, bool]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from array import array
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -44,7 +45,7 @@ from pdhef_logtool.logs.container import (
     items_at_bytes,
     rows_by_channel,
 )
-from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_PAIR, INDEX_RECORD, RECORD, Extent, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_PAIR, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -55,6 +56,7 @@ _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, uncompressed 
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _CRC_BLOCK_BYTES = 4 << 20
 _CHUNK_HEAD_BYTES = RECORD.size + _CHUNK.size + _U64.size  # without the name of the compression
+_LONGEST_NAME = 4  # of a compression
 _ATTACHMENT_HEAD_BYTES = 64 << 10  # at most, in front of its data
 #: Plain numbers: comparing with the members of an enumeration takes longer than reading a record.
 _OP_MESSAGE, _OP_CHUNK, _OP_MESSAGE_INDEX = int(Opcode.MESSAGE), int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX)
@@ -92,16 +94,19 @@ class McapContainer(FileContainer):
         self._raw_channels: dict[int, Channel] = {}
         self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
         self._unread: dict[int, int] = {}  # start and end of the parts of a remote file that are not wanted
+        self._indexed: list[int] | None = None  # places of the chunks that a damaged summary names
         self._closed = False
         self._data_end: tuple[int, int] | None = None  # extent of the record
         self._footer: int | None = None  # place of the record
         self._statistics: Statistics | None = None
+        self._has_end = False  # whether the file ends with its magic bytes
         self._opened_chunks = 0  # number of chunks that the summary does not describe
         super().__init__(path, shown_path, meter)
 
     def _walk(self) -> None:
         source, size = self.source, self.source.size
         indexed = self._indexed_places()
+        self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
         places, n = [*sorted(indexed), size], 0
         self.position = self._read_header()
         for offset in self._places():
@@ -115,12 +120,13 @@ class McapContainer(FileContainer):
             while places[n] <= offset:
                 n += 1
             if end > places[n] or opcode == 0:
-                end = places[n]
-                if end == size:
+                resume = places[n] if places[n] < size else self._next_chunk(offset)
+                if resume is None:
                     self.lose_end(offset)
                     return
-                what = f"bytes {offset} to {end} contain no readable record; reading resumes at the next chunk"
+                what = f"bytes {offset} to {resume} contain no readable record; reading resumes at the next chunk"
                 self.lose("bad-record", what, self.last_ns())
+                end = resume
             elif opcode == _OP_MESSAGE:
                 end = self._messages(offset)
             else:
@@ -211,6 +217,13 @@ class McapContainer(FileContainer):
             raise self.no_log("a header record with profile and library", got) from error
         return end
 
+    def _next_chunk(self, after: int) -> int | None:
+        """Return the first chunk behind a damaged place that a damaged summary names, or None."""
+        if self._indexed is None:
+            self._indexed = chunk_places(self.source, self.meter.limits)
+        position = bisect_right(self._indexed, after)
+        return self._indexed[position] if position < len(self._indexed) else None
+
     def _record(self, opcode: int, start: int, end: int) -> int:
         """Handle one complete record that is no message; return the start of the next one."""
         if opcode in _DECLARATIONS:
@@ -233,6 +246,8 @@ class McapContainer(FileContainer):
             opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self._data_end)
         ):
             raise SpanDamageError(f"no record of kind {opcode} is allowed here")
+        elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(start, end):
+            raise SpanDamageError("a chunk with one wrong bit in its opcode, which makes it a private record")
         return end
 
     def _payload(self, start: int, end: int) -> bytes:
@@ -251,6 +266,15 @@ class McapContainer(FileContainer):
         if channel.id not in self._raw_channels:
             self.meter.limits.check("channels", len(self._raw_channels) + 1, f"channel {channel.id}")
             self._raw_channels[channel.id] = channel
+
+    def _is_chunk(self, start: int, end: int) -> bool:
+        """Return whether a record of a private kind is laid out like a chunk."""
+        head = self.source.read(start, min(end - start, _CHUNK_HEAD_BYTES + _LONGEST_NAME))
+        if len(head) < _CHUNK_HEAD_BYTES + _LONGEST_NAME:
+            return False
+        n = _CHUNK.unpack_from(head, RECORD.size)[-1]
+        place = RECORD.size + _CHUNK.size + n
+        return n <= _LONGEST_NAME and bool(place + _U64.size + _U64.unpack_from(head, place)[0] == end - start)
 
     def _messages(self, offset: int) -> int:
         """Add the message records from here on with heads that are read ahead; return the start of the next record."""
@@ -275,12 +299,15 @@ class McapContainer(FileContainer):
         return base + place
 
     def _add_chunk(self, start: int, end: int) -> int:
-        """Add a chunk that no summary describes, by its content; return the end of its message indexes."""
+        """Add a chunk that no summary describes; return the end of its message indexes.
+
+        Its content describes it. In a file without an end, message indexes that agree with the head of the chunk do.
+        """
         index_end, size = end, self.source.size
         while index_end + INDEX_RECORD.size <= size:
             opcode, following = self._record_head(index_end)
-            if opcode != _OP_MESSAGE_INDEX or following > size:
-                break
+            if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or following > size:
+                break  # one wrong bit makes an index a private record
             index_end = following
         extent = Extent(start, end, index_end)
         first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
@@ -290,6 +317,11 @@ class McapContainer(FileContainer):
             self._lose_indexes(extent)
         elif sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked:
             claimed = replace(claimed, counts=named.counts)
+            is_known = bool(named.counts) and named.counts.keys() <= self._raw_channels.keys()
+            fits = _agree(named, claimed) and unpacked <= self.meter.limits.chunk_bytes
+            if not self._has_end and is_known and fits:
+                self.add_span(extent, named)
+                return index_end
         self._opened_chunks += 1
         block = self.add_content(extent, claimed)
         if block is not None:

@@ -147,18 +147,21 @@ def test_a_cut_file_never_gives_more_nor_passes_as_whole(good: dict[str, bytes],
     assert counts[-1] == N
 
 
-def test_a_damaged_record_length_costs_nothing_that_the_summary_describes(
-    good: dict[str, bytes], tmp_path: Path
+@pytest.mark.parametrize("is_summary_sound", [True, False])
+def test_a_damaged_record_length_costs_at_most_what_the_summary_does_not_describe(
+    good: dict[str, bytes], tmp_path: Path, is_summary_sound: bool
 ) -> None:
     (tmp_path / "good").write_bytes(good["mcap"])
     summary = summary_of(tmp_path / "good")
     content = bytearray(good["mcap"])
     content[summary.chunk_indexes[1].chunk_start_offset + 7] = 0xFF  # the length now points past the end
+    content[-9] ^= not is_summary_sound
     (tmp_path / "bad").write_bytes(content)
     with closing(open_log(tmp_path / "bad")) as log:
         values = log.read({"/imu": ["angular_velocity.z"]})["/imu"].fields["angular_velocity.z"]
-        np.testing.assert_array_equal(values, np.arange(N) * 0.5)
-        assert log.lost == ()
+        lost = np.arange(0) if is_summary_sound else np.arange(100, 200)
+        np.testing.assert_array_equal(values, np.setdiff1d(np.arange(N), lost) * 0.5)
+        assert [loss.kind for loss in log.lost] == ["bad-record"] * (not is_summary_sound)
 
 
 def test_a_byte_that_only_the_crc_shows_costs_its_chunk(tmp_path: Path) -> None:
