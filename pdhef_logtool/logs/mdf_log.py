@@ -284,7 +284,7 @@ class Groups:
         return self._last[1][rows]
 
     def _frames(self, number: int, stamps: IntArray, rows: Any) -> Frames:
-        """Return the CAN frames of a group, zero behind their length, without the row numbers of a virtual channel."""
+        """Return the CAN frames of a group, without the row numbers of a virtual channel."""
         names = [channel.name.removeprefix(f"{_FRAMES}.") for channel in self._groups[number].channels]
         parts = {
             name: np.nan_to_num(self._values(number, i), nan=-1.0)[rows].astype(np.int64)
@@ -292,8 +292,7 @@ class Groups:
             if name in ("ID", "IDE", "BusChannel", "DataLength", "DLC")
             and (self._conversions[number, i] or not self._is(number, i, _VIRTUAL))
         }
-        raw, _ = self._raw(number, names.index("DataBytes"))
-        data = np.asarray(raw, np.uint8).reshape(len(raw), -1)[rows, : _LENGTHS[-1]]
+        data = self._bytes(number, names.index("DataBytes"))[rows]
         identifier = parts["ID"] & _CAN["id_bits"]
         length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
         if np.isin(length, _CAN["only_codes"]).any() or ("DLC" in parts and "DataLength" not in parts):
@@ -301,3 +300,21 @@ class Groups:
         extended = (parts["ID"] >> 31 & 1) | (identifier > _CAN["base_id_bits"]) | (parts.get("IDE", np.zeros(1)) > 0)
         frames = {"id": identifier, "length": length.clip(0, data.shape[1]), "is_extended": extended}
         return Frames(stamps, frames | ({"bus": parts["BusChannel"]} if "BusChannel" in parts else {}), data)
+
+    def _bytes(self, number: int, index: int) -> NDArray[np.uint8]:
+        """Return the data of frames [N, k], zero behind the length."""
+        group = self._groups[number]
+        is_variable = self._is(number, index, _VARIABLE[:1])
+        if is_variable:
+            group.channels[index].channel_type = 0  # its raw values are the places of the data
+        raw, _ = self._raw(number, index)
+        if not is_variable:
+            return np.asarray(raw, np.uint8).reshape(len(raw), -1)
+        stored = np.frombuffer(self._source._mdf._load_signal_data(group, index), np.uint8)
+        begins = raw.astype(np.int64)
+        if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - 4:
+            raise SpanDamageError("data of a frame are missing")
+        frames = np.lib.stride_tricks.sliding_window_view(np.pad(stored, (0, _LENGTHS[-1])), 4 + _LENGTHS[-1])[begins]
+        lengths = frames[:, :4].copy().view("<u4")
+        data = frames[:, 4 : 4 + min(lengths.max(initial=0), _LENGTHS[-1])]
+        return np.where(np.arange(data.shape[1]) < lengths, data, np.uint8(0))

@@ -461,7 +461,7 @@ def many_rows() -> bytes:
 HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
     "circle of parts": (partial(circle, b"CN", 0, 1), "RecursionError"),
     "no header": (lambda: imu().replace(b"##HD", b"##XX"), "an MDF file with readable channels"),
-    "data of a frame": (far_data, "Wrong signal data block"),
+    "data of a frame": (far_data, "data of a frame are missing"),
     "packed": (lambda: imu(packed=(2**40,)), "the channel group cannot be read"),
     "rows": (many_rows, "table bytes"),
     "bit of invalid samples": (
