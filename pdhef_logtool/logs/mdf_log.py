@@ -9,10 +9,12 @@ from __future__ import annotations
 import datetime as dt
 import logging
 import re
+import struct
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import partial
-from io import BytesIO, StringIO
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -46,9 +48,18 @@ _LOCAL, _WITH_OFFSETS = 1, 2
 #: Quantities of masters other than time, by type of synchronisation.
 _NO_TIMES = numbered(_MDF["no_times"])
 
+# Blocks that are surveyed before asammdf opens a file.
 _FIRST = 64
-#: A list of data that another one follows.
-_LIST_WITH_NEXT = re.compile(rb"##DL\0{4}.{16}(?!\0{8})", re.DOTALL)
+#: Places of the links that are followed, by kind of block; empty: all links of a list of data.
+_FOLLOWED, _FOLLOWED_3 = (
+    {kind.encode(): places for kind, places in _MDF[name].items()} for name in ("followed", "followed_3")
+)
+#: Links that lead to blocks of one kind only.
+_CHAINS: Mapping[tuple[bytes, int], bytes] = {
+    (b"", 0): b"HD", (b"HD", 0): b"DG", (b"DG", 0): b"DG", (b"DG", 1): b"CG", (b"CG", 0): b"CG", (b"CG", 1): b"CN",
+    (b"CN", 0): b"CN",
+}  # fmt: skip
+_LISTS = frozenset({b"DL", b"LD", b"HL"})
 
 
 def open_mdf(file: TableFile) -> Tables:
@@ -59,27 +70,19 @@ def open_mdf(file: TableFile) -> Tables:
     LogError : no group of it can be read. LimitError : it claims more than the limits allow.
     """
     asammdf = required("asammdf", "formats", "reads MDF files", file.name)
-    warnings, logger = StringIO(), logging.getLogger("asammdf")
-    logger.handlers, logger.propagate = [logging.StreamHandler(warnings)], False
-    logger.setLevel(logging.WARNING)
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)
     losses: list[Loss] = []
+    if missing := survey_blocks(file):
+        losses.append(Loss("truncated", f"{missing} blocks are beyond the end of the file", file.name))
     stream: Any = file.stream
     if is_unfinished(file):  # asammdf completes it in place
         losses.append(Loss("truncated", "the recorder has not finished the file", file.name, severity="note"))
-        data = file.stream.read()
-        if _LIST_WITH_NEXT.search(data):
-            got = "an unfinished one with several lists of data"
-            raise LogError(
-                expected="a finished recording", got=got, where=file.name, remedy="give the recording itself"
-            )
-        stream = BytesIO(data)
+        stream = BytesIO(file.stream.read())
     source = _opened(asammdf, stream)
     if isinstance(source, str) and (repaired := _repaired(file)):
         source = _opened(asammdf, repaired)
     if isinstance(source, str):
         raise LogError(expected="an MDF file with readable channels", got=source, where=file.name)
-    if beyond := warnings.getvalue().count("outside the file size"):
-        losses.append(Loss("truncated", f"{beyond} blocks are beyond the end of the file", file.name))
     groups = Groups(file, source)
     tables: list[Table] = []
     for number, name in enumerate(unique(map(groups.name, range(len(source.groups))))):
@@ -103,6 +106,61 @@ def is_unfinished(file: TableFile) -> bool:
     head = file.stream.read(_FIRST).ljust(_FIRST)
     file.stream.seek(0)
     return head[8:9] == b"4" and (head[:7] == b"UnFinMF" or any(head[60:62]))
+
+
+def survey_blocks(file: TableFile) -> int:
+    """Follow the links of an MDF file and return how many lead beyond its end.
+
+    Raises
+    ------
+    LogError : links form a circle, or lead to a block of another kind; the file is unfinished and has several lists of
+        data, which asammdf does not complete.
+    LimitError : more groups, channels or unpacked data than a file of this size may contain.
+    """
+    stream, limits, unfinished = file.stream, file.limits, is_unfinished(file)
+    stream.seek(_FIRST)
+    is_old = stream.read(2) == b"HD"
+    base, link, followed = (4, struct.Struct("<I"), _FOLLOWED_3) if is_old else (24, struct.Struct("<Q"), _FOLLOWED)
+    kinds: Counter[bytes] = Counter()
+    seen: set[int] = set()
+    unpacked = missing = 0
+    pending: list[tuple[int, bytes, int]] = [(_FIRST, b"", 0)]
+    while pending:
+        address, parent, place = pending.pop()
+        if address > file.size - base:
+            missing += 1
+            continue
+        stream.seek(address)
+        head = stream.read(base)
+        kind = head[:2] if is_old else head[2:4]
+        if _CHAINS.get((parent, place), kind) != kind:
+            raise _damage(f"a block {_CHAINS[parent, place].decode()} at byte {address}", "another one", file)
+        if kind == b"DZ":
+            unpacked += int.from_bytes(stream.read(16)[8:], "little")
+        if kind not in followed or ((parent, place) == (b"CN", 5) and kind not in _LISTS):
+            continue
+        if address in seen:
+            raise _damage("links that lead to other blocks", f"a circle at byte {address}", file)
+        seen.add(address)
+        kinds[kind] += 1
+        count = int.from_bytes(head[16:24], "little") if kind in _LISTS else 1 + max(followed[kind])
+        limits.check("metadata_bytes", 8 * count, file.name)
+        data = stream.read(count * link.size)
+        links = [target for (target,) in link.iter_unpack(data[: len(data) // link.size * link.size])]
+        missing += len(links) < count
+        if kind == b"DL" and links[:1] > [0] and unfinished:
+            raise _damage("a finished recording", "an unfinished one with several lists of data", file)
+        pending += [(links[i], kind, i) for i in followed[kind] or range(len(links)) if i < len(links) and links[i]]
+    limits.check("channels", kinds[b"CG"], file.name)
+    limits.check("schema_leaves", kinds[b"CN"] / max(1, kinds[b"CG"]), f"{file.name}, channels of a group")
+    limits.check_table(unpacked, file.size, file.name)
+    return missing
+
+
+def _damage(expected: str, got: str, file: TableFile) -> LogError:
+    return LogError(
+        expected=expected, got=got, where=file.name, remedy="the file is damaged: give the recording itself"
+    )
 
 
 def _repaired(file: TableFile) -> BytesIO | None:
@@ -254,14 +312,16 @@ class Groups:
 
     def _raw(self, number: int, index: int) -> tuple[NDArray[Any], BoolArray | None]:
         """Return raw values [N] or [N, k] of a channel, and which rows are invalid [N]."""
-        channel = self._groups[number].channels[index]
-        if not channel.bit_count and self._version == 3:  # row numbers
-            rows = np.arange(self._groups[number].channel_group.cycles_nr)
+        channel, rows = self._groups[number].channels[index], np.arange(self._groups[number].channel_group.cycles_nr)
+        is_virtual = self._is(number, index, _VIRTUAL)
+        if not channel.bit_count and self._version == 3:
             return rows * (channel.sampling_rate or 1.0), None
+        if is_virtual and not channel.flags & _SOME_INVALID:
+            return rows, None
         values, invalid = self._source.get(
             group=number, index=index, raw=True, samples_only=True, ignore_invalidation_bits=True
         )
-        return np.asarray(values), invalid
+        return rows if is_virtual else np.asarray(values), invalid
 
     def _values(self, number: int, index: int) -> FloatArray:
         """Return physical values [N] of a channel, NaN for invalid samples."""

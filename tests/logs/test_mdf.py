@@ -458,12 +458,20 @@ def many_rows() -> bytes:
     return mdf4([clock, Ch("n", kind=6, bits=0, data_type=0)], b"", 2**40, 0)
 
 
+def many_channels() -> bytes:
+    return mdf4([TIME, *(Ch(f"c{i}", 8) for i in range(DEFAULT_LIMITS.schema_leaves))], bytes(16), 1, 16)
+
+
 HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
-    "circle of parts": (partial(circle, b"CN", 0, 1), "RecursionError"),
-    "no header": (lambda: imu().replace(b"##HD", b"##XX"), "an MDF file with readable channels"),
+    **{
+        f"circle {of}": (partial(circle, *of), "circle")
+        for of in ((b"CN", 1, 0), (b"CN", 0, 1), (b"DG", 0, 0), (b"CG", 0, 0))
+    },
+    "no header": (lambda: imu().replace(b"##HD", b"##XX"), "a block HD at byte 64"),
     "data of a frame": (far_data, "data of a frame are missing"),
-    "packed": (lambda: imu(packed=(2**40,)), "the channel group cannot be read"),
+    "packed": (lambda: imu(packed=(2**40,)), "table bytes"),
     "rows": (many_rows, "table bytes"),
+    "channels": (many_channels, "schema leaves"),
     "bit of invalid samples": (
         lambda: mdf4([TIME, Ch("AccY", 8, flags=2, invalid_bit=2**20)], bytes(17 * N), N, 16, invalid_bytes=1),
         "AccY is outside of its record",
@@ -479,12 +487,6 @@ HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
 def test_a_file_that_is_made_to_harm_is_one_line(make: Callable[[], bytes], match: str, tmp_path: Path) -> None:
     with pytest.raises(LogError, match=match):
         of_bytes(tmp_path, make())
-
-
-def test_links_in_a_circle_end_the_reader(tmp_path: Path) -> None:
-    (tmp_path / "a.mf4").write_bytes(circle(b"CG", 0, 0))
-    with pytest.raises(LogError, match="processor time"):
-        open_log(tmp_path / "a.mf4", DEFAULT_LIMITS.times(0.2))
 
 
 def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(
