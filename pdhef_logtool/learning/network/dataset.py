@@ -84,6 +84,12 @@ def read_entry(path: Path) -> dict[str, Any] | None:
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             entry = json.loads(file.metadata.metadata[_ENTRY])
+            groups = [file.metadata.row_group(g) for g in range(file.num_row_groups)]
+            types = [[g.column(i).physical_type for i in range(g.num_columns)] for g in groups]
+            of_file = [file.schema.column(i).physical_type for i in range(file.metadata.num_columns)]
+            names = arrow_schema(_SCHEMA).names  # no checksum covers these
+            if file.schema_arrow.names != names or any(t != of_file for t in types):
+                return None
             for _ in file.iter_batches():
                 pass
     except (OSError, KeyError, TypeError, ValueError, RecursionError, pa.ArrowException):
