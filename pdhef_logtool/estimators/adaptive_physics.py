@@ -13,11 +13,12 @@ vehicle and level roads: the filter of another vehicle, with a force scale, uses
 road none. With Λ the sum of a filter's log-likelihood of its measurements, forgotten within seconds, the weight of
 filter i is
 
-    w_i ∝ exp(Λ_i)
+    w_i ∝ p_i exp(Λ_i)
 
-which is multiple-model estimation (Magill 1965) for temporary effects. A state has a filter only if drives of the car
-have shown its benefit, because an additional state always fits something. A car without identified parts
-has F1 alone. The output is the mixture of all, its covariance with their differences.
+which is multiple-model estimation (Magill 1965) for temporary effects; p_i are the odds before any measurement. Where
+the residual acts, the process noise of v_y and yaw rate is smaller, as long as the innovations agree. A state has a
+filter only if drives of the car have shown its benefit, because an additional state always fits something. A car
+without identified parts has F1 alone. The output is the mixture of all, its covariance with their differences.
 """
 
 from __future__ import annotations
@@ -43,8 +44,13 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.presets import Options
 
 #: Possible deficiencies of a model, as parts of ``physics``; each is the state of one filter, which uses this share of
-#: the residual. The shares were chosen on simulated drives that no table contains.
+#: the residual, and has these odds against F1 before any measurement. Shares and odds were chosen on simulated drives
+#: that no table contains; with even odds, tyres near their limit on a level road are taken for a bank.
 CURES = {"force_scale": 0.5, "bank": 0.0}
+ODDS = {"force_scale": 1.0, "bank": math.exp(-2.0)}
+#: Factor on the 1-sigma of the process noise of v_y and yaw rate at gain 1 of a network that was trained with the
+#: filter. Chosen on the same drives: from 0.65 to 0.3 little changes.
+RESIDUAL_NOISE = 0.5
 #: Time constant with which the likelihood is forgotten, s. Chosen on simulated drives that no table contains; from 1 to
 #: 5 s little changes.
 FORGET_S = 2.0
@@ -97,19 +103,22 @@ def gather_evidence(dt_s, likelihood, starts, evidence):  # type: ignore[no-unty
     return out
 
 
-def weigh(evidence: FloatArray, usable: BoolArray) -> FloatArray:
-    """Return weights [K, H] in proportion to exp(evidence), of sum 1; 0 where ``usable`` [K, H] is False."""
+def weigh(evidence: FloatArray, usable: BoolArray, odds: Sequence[float]) -> FloatArray:
+    """Return weights [K, H] in proportion to odds [H] · exp(evidence), of sum 1; 0 where not ``usable`` [K, H]."""
+    evidence = evidence + np.log(odds)
     best = np.max(evidence, axis=1, keepdims=True, initial=-math.inf, where=usable)
     weights = np.exp(np.where(usable, evidence - best, -math.inf))
     weights[weights < LEAST_WEIGHT * weights.sum(axis=1, keepdims=True)] = 0.0
     return _shares(weights)
 
 
-def weights_of(steps: Sequence[PosteriorSteps], dt_s: FloatArray, evidence: FloatArray) -> FloatArray:
+def weights_of(
+    steps: Sequence[PosteriorSteps], dt_s: FloatArray, evidence: FloatArray, odds: Sequence[float]
+) -> FloatArray:
     """Return the weights [K, H] of the steps of all filters [H]; ``evidence`` as in :func:`gather_evidence`."""
     likelihood, starts = np.stack([s.log_likelihood for s in steps], axis=1), ~np.isfinite(steps[0].prior[:, VX])
     gathered = gather_evidence(dt_s, likelihood, starts, evidence)
-    return weigh(gathered, np.stack([s.valid for s in steps], axis=1))
+    return weigh(gathered, np.stack([s.valid for s in steps], axis=1), odds)
 
 
 def _shares(weights: FloatArray) -> FloatArray:
@@ -169,17 +178,19 @@ class AdaptivePhysics:
     ----------
     physics : the car's filter with its parts and noise.
     network : of the model's residual, None without; trust : residual gain of F1, in [0, 1].
+    residual_noise : factor on the process noise of v_y and yaw rate at gain 1.
     adaptive : False leaves the mechanism out: no detector, and the car's filter alone, with its cures as states.
     notes : texts for the report, such as the reason for its residual gain.
     """
 
     algorithm = "adaptive-physics"
-    version = 2
-    options = ("physics", "trust", "adaptive")
+    version = 3
+    options = ("physics", "trust", "residual_noise", "adaptive")
 
     physics: VehicleUkf
     network: ResidualModel | None = None
     trust: float = 0.0
+    residual_noise: float = 1.0
     adaptive: bool = True
     name: str = "pd-hef"
     causal: bool = True
@@ -194,6 +205,11 @@ class AdaptivePhysics:
     def residual_shares(self) -> tuple[float, ...]:
         """Share of the residual in each filter."""
         return 1.0, *(CURES[cure] for cure in self.cures)
+
+    @property
+    def odds(self) -> tuple[float, ...]:
+        """Odds of each filter before any measurement."""
+        return 1.0, *(ODDS[cure] for cure in self.cures)
 
     @property
     def filters(self) -> tuple[VehicleUkf, ...]:
@@ -217,10 +233,11 @@ class AdaptivePhysics:
         rate, filters = self.trust * checked.rate, self.filters
         before: Sequence[FilterState | None] = state.filters if state else [None] * len(filters)
         members = zip(filters, before, self.residual_shares, strict=True)
-        runs = [f.run(signals, b, share * rate, checked.extra_r) for f, b, share in members]
+        noise = 1.0 - (1.0 - self.residual_noise) * self.trust * checked.gain
+        runs = [f.run(signals, b, share * rate, checked.extra_r, noise) for f, b, share in members]
         steps = tuple(filter_steps for filter_steps, _ in runs)
         evidence = state.evidence.copy() if state else np.zeros(len(filters))
-        weights = weights_of(steps, signals.steps_s, evidence)
+        weights = weights_of(steps, signals.steps_s, evidence, self.odds)
         return MixtureSteps(steps, weights, checked), AdaptiveState(inputs, tuple(s for _, s in runs), evidence)
 
     def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import SMOOTHING
-from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.adaptive_physics import RESIDUAL_NOISE, AdaptivePhysics
 from pdhef_logtool.estimators.presets import Options, options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 from pdhef_logtool.estimators.vehicle_ukf import of_car
@@ -45,14 +45,15 @@ def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     if gain == 0.0:
         return alone
     network = car.network.plug_in if isinstance(car.network, PlugInModel) else car.network
-    return replace(alone, network=network, trust=gain)
+    noise = RESIDUAL_NOISE if alone.adaptive and car.fitted_physics is not None else 1.0
+    return replace(alone, network=network, trust=gain, residual_noise=noise)
 
 
 def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
     """Return the smoothed filter, with the noise for smoothing; ``name`` is the name of the result."""
     filtered = _with_network(name, car, options)
     factors = SMOOTHING if car.fitted_physics is None else car.fitted_physics.smoothing
-    filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors))
+    filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors), residual_noise=1.0)
     taught = () if car.model is None or car.model.residual is None else (FILTER_ALONE,)
     return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *taught, *filtered.notes))
 

@@ -45,7 +45,7 @@ def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray)
         runs.append(steps)
         transitions.append(transition)
         drives.append(drive)
-    weights = weights_of(runs, signals.steps_s, np.zeros(len(runs)))
+    weights = weights_of(runs, signals.steps_s, np.zeros(len(runs)), physics.odds)
     sideslip = np.stack([w * _sideslip_per_vy(s) for w, s in zip(weights.T, runs, strict=True)])
 
     def response(rates: FloatArray) -> FloatArray:

@@ -84,7 +84,7 @@ class SmoothedPhysics:
     """
 
     algorithm = "smoothed-physics"
-    version = 2
+    version = 3
     options = ("filtered", "block_s")
 
     filtered: AdaptivePhysics
@@ -126,7 +126,7 @@ class SmoothedPhysics:
         dt_s = signals.steps_s
         evidence = gather_evidence(dt_s, likelihood, starts, np.zeros(len(drives)))
         _add_later(dt_s, likelihood, starts, evidence)
-        return tracks, weigh(evidence, np.stack([t.valid for t in tracks], axis=1))
+        return tracks, weigh(evidence, np.stack([t.valid for t in tracks], axis=1), self.filtered.odds)
 
     def _smoothed(
         self, physics: VehicleUkf, signals: Signals, rate: FloatArray, extra_r: FloatArray

@@ -114,6 +114,9 @@ GATE_INFLATION = 10.0
 STANDSTILL_AFTER_S = 0.3
 #: A standstill is not accepted for longer than this without a speed sample that states so.
 STANDSTILL_SILENCE_S = 1.5
+#: Mean normalised squared innovation up to which the factor on the noise counts fully, and from which it is 1. Sensors
+#: have less noise than R assumes: the usual mean is 0.18; where the network's residual is wrong, it is about 0.5.
+QUIET_NIS, LOUD_NIS = 0.2, 0.4
 #: Divergence: the filter's own normalised squared innovations stay this far above 1, averaged over the time.
 DIVERGED_NIS_RATIO = 25.0
 #: Samples that the gate rejects count as well, or a gated filter could never notice; each up to this square.
@@ -129,12 +132,12 @@ _JUST_REJECTED_S = 1e-9
 U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED, U_STEER_KNOWN = range(6)
 INPUTS = 6
 
-#: Memory of a filter of the steps before: whether it runs; last inputs and residual; ages, s; duration of the
-#: standstill, s; mean normalised square of the innovations; last speed sample; largest recent share of the grip that is
-#: used, decaying; time since the first sample of an unbroken rejection of a_y, yaw rate and speed, s.
+#: Memory of a filter of the steps before: whether it runs; last inputs, residual and factor on the noise; ages, s;
+#: duration of the standstill, s; mean normalised square of the innovations; last speed sample; largest recent share of
+#: the grip that is used, decaying; time since the first sample of an unbroken rejection of a_y, yaw rate and speed, s.
 MEMORY_FIELDS: list[tuple[Any, ...]] = [
     *((name, np.float64) for name in ("runs", "steer", "ax", "ax_known", "friction", "rate_vy", "rate_r", "steer_age")),
-    *((name, np.float64) for name in ("speed_age", "still", "nis", "speed", "grip")),
+    *((name, np.float64) for name in ("noise", "speed_age", "still", "nis", "speed", "grip")),
     ("rejected", np.float64, (READINGS,)),
 ]
 MEMORY = np.dtype(MEMORY_FIELDS)
@@ -149,8 +152,9 @@ _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"}, _nr
 class Window(NamedTuple):
     """Samples of a window, [K], NaN where missing. ``dt_s`` is the duration before each step, NaN at the start.
 
-    ``residual_rate`` [K, 2] is added to v̇_y and ṙ from the step on, m/s² and rad/s²; ``extra_r`` [K, 2] the
-    variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
+    ``residual_rate`` [K, 2] is added to v̇_y and ṙ from the step on, m/s² and rad/s²; ``noise`` [K] is a factor on the
+    1-sigma of their process noise, while the innovations agree; ``extra_r`` [K, 2] the variance that a_y (m²/s⁴) and
+    yaw rate (rad²/s²) have beyond R.
     """
 
     dt_s: FloatArray
@@ -161,6 +165,7 @@ class Window(NamedTuple):
     speed: FloatArray
     friction: FloatArray
     residual_rate: FloatArray
+    noise: FloatArray
     extra_r: FloatArray
 
 
@@ -315,6 +320,15 @@ def process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-de
         q[layout.force_scale] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
     if layout.bank >= 0:
         q[layout.bank] += BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
+
+
+@_inline
+def trust_residual(m, q):  # type: ignore[no-untyped-def]
+    """Reduce the variance [n] of v_y and yaw rate by the residual's factor, unless the innovations contradict it."""
+    agrees = min(1.0, max(0.0, (LOUD_NIS - m.nis) / (LOUD_NIS - QUIET_NIS)))
+    factor = 1.0 - (1.0 - m.noise) * agrees
+    q[VY] *= factor * factor
+    q[YAW_RATE] *= factor * factor
 
 
 @_inline
@@ -475,9 +489,10 @@ def remember(k, now, residual_rate, m):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def finish_step(k, now, residual_rate, rules, m, inputs):  # type: ignore[no-untyped-def]
+def finish_step(k, now, window, rules, m, inputs):  # type: ignore[no-untyped-def]
     """Keep inputs and residual of step k for the next one, and write its row of the inputs [K, 6]."""
-    remember(k, now, residual_rate, m)
+    remember(k, now, window.residual_rate, m)
+    m.noise = window.noise[k]
     inputs[k, U_STEER] = now.steer
     inputs[k, U_AX] = now.ax
     inputs[k, U_FRICTION] = now.friction
@@ -549,6 +564,7 @@ def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
+            trust_residual(m, q)
             predict(x, P, root, over, rate, now.dt, 0.5, q, layout, places, p, f, points, away)
             if linked:
                 cross_covariance(root, changing(layout), away, out_cross, k)
@@ -588,7 +604,7 @@ def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore
                 m.runs = 0.0
             elif linked:
                 out_linked[k] = not stands
-        finish_step(k, now, window.residual_rate, rules, m, out_inputs)
+        finish_step(k, now, window, rules, m, out_inputs)
         keep_state(x, out_x, k)
         keep(P, out_P, k)
 
@@ -693,11 +709,17 @@ class LinkedSteps(StepColumns):
     cross: FloatArray
 
 
-def make_window(signals: Signals, residual_rate: FloatArray | None = None, extra_r: FloatArray | None = None) -> Window:
-    """Return the window that a kernel reads; without ``residual_rate`` or ``extra_r`` they are 0."""
-    s, nothing = signals, np.zeros((len(signals), 2))
+def make_window(
+    signals: Signals,
+    residual_rate: FloatArray | None = None,
+    extra_r: FloatArray | None = None,
+    noise: FloatArray | None = None,
+) -> Window:
+    """Return the window that a kernel reads; by default residual and additional variance are 0, ``noise`` is 1."""
+    s, nothing, unchanged = signals, np.zeros((len(signals), 2)), np.ones(len(signals))
     columns = [s.steps_s, s.steer_rad, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s, s.friction]
-    columns += [nothing if residual_rate is None else residual_rate, nothing if extra_r is None else extra_r]
+    given = ((residual_rate, nothing), (noise, unchanged), (extra_r, nothing))
+    columns += [default if column is None else column for column, default in given]
     # Numba would compile the kernel again for a read-only column, or one number for all steps.
     return Window._make(np.require(column, requirements=["C", "W"]) for column in columns)
 
@@ -860,13 +882,15 @@ class VehicleUkf:
         state: FilterState | None,
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
+        noise: FloatArray | None = None,
     ) -> tuple[PosteriorSteps, FilterState]:
         """Filter one window (see :class:`~.base.Estimator`).
 
         ``residual_rate`` [N, 2] is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
+        ``noise`` [N]: factor on the 1-sigma of the process noise of v_y and yaw rate from each stamp to the next.
         """
-        steps, after = self.linked_steps(signals, state, residual_rate, extra_r, linked=False)
+        steps, after = self.linked_steps(signals, state, residual_rate, extra_r, noise, linked=False)
         return steps.posterior, after
 
     def linked_steps(
@@ -875,12 +899,13 @@ class VehicleUkf:
         state: FilterState | None,
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
+        noise: FloatArray | None = None,
         *,
         linked: bool = True,
     ) -> tuple[LinkedSteps, FilterState]:
         """Return the result of :meth:`run`, bit for bit, with the links between the steps if they are ``linked``."""
         signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None)
-        window, count, n = make_window(signals, residual_rate, extra_r), len(signals), self.layout.size
+        window, count, n = make_window(signals, residual_rate, extra_r, noise), len(signals), self.layout.size
         steps, belief = no_posterior(signals.stamps_ns, n, window.residual_rate), resume(state, n)
         rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))

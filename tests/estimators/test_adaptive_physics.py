@@ -11,7 +11,7 @@ from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.sensor_faults import without_faults
-from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, mix
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import Signals
@@ -123,6 +123,23 @@ def test_forces_that_are_wrong_in_proportion_are_scaled(weak):
     assert np.nan_to_num(run_estimator(adaptive(), signals).mixture_weight)[150:].mean() > 0.8
     late = slice(150, None)
     assert rmse(adaptive(), signals, weak, late) < 0.7 * rmse(fixed(), signals, weak, late)
+
+
+def test_a_residual_lowers_the_noise_until_the_innovations_contradict_it(made, weak):
+    """On ``made`` the model is right, on ``weak`` its forces are too large; R is larger than the noise, as in use."""
+    physics, ratio = replace(PLAIN, r_std=(0.6, 0.006, 0.16)), []
+    for of in (made, weak):
+        signals = noisy(of)
+        quiet, usual = (physics.run(signals, None, None, None, np.full(len(of.vy), f))[0] for f in (0.5, 1.0))
+        ratio.append(np.sqrt(quiet.P[200:, 1, 1] / usual.P[200:, 1, 1]))
+    assert np.median(ratio[0]) < 0.8
+    assert np.median(ratio[1]) > 0.95
+
+
+def test_without_evidence_the_weights_are_the_odds():
+    usable = np.array([[True, True, True], [True, False, True]])
+    weights = weigh(np.array([[3.0, 3.0, 3.0], [0.0, 9.0, np.log(2.0)]]), usable, (1.0, 0.5, 0.25))
+    np.testing.assert_allclose(weights, [[4 / 7, 2 / 7, 1 / 7], [2 / 3, 0.0, 1 / 3]])
 
 
 def test_the_mixture_has_the_moments_of_its_samples():

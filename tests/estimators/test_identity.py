@@ -14,7 +14,7 @@ from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.errors import UsageError
 
-_HYBRID = "adaptive-physics 2 (physics=vehicle-ukf, trust=0.75)"
+_HYBRID = "adaptive-physics 3 (physics=vehicle-ukf, residual_noise=0.5, trust=0.75)"
 #: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
 SHIPPED = {
     "zero": ("pass-through 1 (claims_zero_sideslip=True)", "138e43c5f7aa"),
@@ -23,15 +23,15 @@ SHIPPED = {
     "open-loop": ("open-loop 1", "5afc5962fabb"),
     "linear-regression": ("linear-regression 1", "9de17837d3ad"),
     "phy-ukf": ("vehicle-ukf 1 (equations=nominal)", "cead32189ec2"),
-    "physics": ("adaptive-physics 2 (physics=vehicle-ukf)", "8a1f16b11617"),
+    "physics": ("adaptive-physics 3 (physics=vehicle-ukf)", "2a61d9bedc99"),
     "phy-ukf:tuned": ("vehicle-ukf 1 (equations=nominal, roll_correction=True)", "2e213229f481"),
     "pure-lstm": ("direct-network 1", "4441758f4188"),
-    "pd-hef": (_HYBRID, "3b53c8a7ed26"),
-    "pd-hef:fixed-r": ("adaptive-physics 2 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "d45f6422c9c2"),
+    "pd-hef": (_HYBRID, "32c5f2999d6e"),
+    "pd-hef:fixed-r": ("adaptive-physics 3 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "7db611b8f5e4"),
     "pd-hef-smoothed": (
-        "smoothed-physics 2 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75, "
-        "filtered.version=2)",
-        "222f805255c6",
+        "smoothed-physics 3 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75, "
+        "filtered.version=3)",
+        "69002a15a2ab",
     ),
     "pd-hef-paper": ("paper-hybrid-ukf 2", "87a835dda35a"),
 }
@@ -57,7 +57,7 @@ def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
     values = {f.name: getattr(estimator.physics, f.name) for f in fields(VehicleUkf)}
     assert resolve(replace(estimator, physics=kind(**values))) == resolve(estimator)
     changed = resolve(replace(estimator, physics=kind(**values, probe=True)))
-    assert changed.identity == "adaptive-physics 2 (physics=vehicle-ukf, physics.probe=True, trust=0.75)"
+    assert changed.identity == "adaptive-physics 3 (physics=vehicle-ukf, physics.probe=True, residual_noise=0.5, trust=0.75)"
     kind.version = 2  # type: ignore[attr-defined]
     assert "physics.version=2" in resolve(replace(estimator, physics=kind(**values))).identity
 
