@@ -14,11 +14,13 @@ from pathlib import Path
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from pdhef_logtool.car.assumed_values import assumed_car
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import read_model
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, has_imu, no_alignment, plan_alignment
 from pdhef_logtool.drive.delays import LatencyEstimate
+from pdhef_logtool.drive.relations import effective_wheelbase_m
 from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.drive.truth import TruthPlan, dependent_signals
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -117,6 +119,7 @@ def plan_drive(
     require_imu: bool = True,
     sensors: Sensors | None = None,
     waived: Sequence[str] = (),
+    scales_car: bool = False,
 ) -> DrivePlan:
     """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and ground truth.
 
@@ -125,6 +128,7 @@ def plan_drive(
     require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
     sensors : of an earlier drive; None decides them here.
     waived : names of checks that may fail without excluding a channel.
+    scales_car : whether the sensors decide the size of the default car.
 
     Raises
     ------
@@ -152,6 +156,9 @@ def plan_drive(
         sound = survey_log(log, mapping, clocks, span_ns, vehicle, rescale=False)
     truth, derived = sound.truth_plan, sound.truth
     derivation = {} if derived is None else dict(derived.derivation)
+    if scales_car and vehicle == default_vehicle() and "steer_rad" not in refused:
+        sensed = looked_at.measured.without_truth()
+        vehicle = assumed_car(effective_wheelbase_m(sensed.columns, sensed.speed_name))
     return DrivePlan(
         mapping=mapping,
         vehicle=vehicle,
@@ -197,6 +204,8 @@ def with_earlier_drive(car: Car, path: Path) -> tuple[Car, Sensors]:
     VehicleError : The file is missing, wrong, of another vehicle file, or without sensors.
     """
     model = read_model(path, "auto, off or a model.toml", _REMEDY)
+    if model.assumed_wheelbase_m is not None and car.vehicle == default_vehicle():
+        car = replace(car, vehicle=assumed_car(model.assumed_wheelbase_m))
     if not model.belongs_to(car.vehicle):
         raise VehicleError(
             expected=f"a model of the car {car.vehicle.name}",

@@ -37,6 +37,7 @@ from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.signals import GNSS_POSITION, Loss
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
 
+_MODEL_CAR = "no --car: the default car is scaled to {:.2g} m, the wheelbase that steering, yaw rate and speed show"
 Tell = Callable[[str], None]
 #: Returns the mapping to read with, from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
@@ -260,8 +261,11 @@ def read_drive(
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         plan = plan_drive(
             opened, used, car.vehicle, *slice_ns, require_imu=require_sensors,
-            sensors=earlier, waived=options.waived,
+            sensors=earlier, waived=options.waived, scales_car=options.model == AUTO,
         )  # fmt: skip
+        if plan.vehicle != car.vehicle:
+            car = replace(car, vehicle=plan.vehicle)
+            told(_MODEL_CAR.format(plan.vehicle.wheelbase_m))
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
         _tell_doubts(plan, options, told)
