@@ -24,9 +24,6 @@ FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD = 0.56, 0.08
 #: Relative uncertainty of the distance from the rear axle to the centre of gravity for a car without any file: 1.71 m
 #: for the default sedan, 1.46 ± 0.18 m for wheelbases of 2.4 to 3.0 m with 45 to 62 % on the front axle.
 DEFAULT_CG_SPREAD = 0.18
-#: Wheelbases of models, below those of road cars. Their mass is that of the default sedan times a power of the ratio of
-#: the wheelbases, from 1:10 and 1:5 models; sideslip depends on forces over mass alone.
-MODEL_WHEELBASES_M, MODEL_MASS_POWER = (0.15, 1.2), 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +98,10 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
 def assumed_car(wheelbase_m: float) -> VehicleParameters:
     """Return the car that is assumed without a vehicle file: a model of this size, otherwise the default sedan."""
     sedan = default_vehicle()
-    if not MODEL_WHEELBASES_M[0] <= wheelbase_m < MODEL_WHEELBASES_M[1]:
+    if not 0.15 <= wheelbase_m < 1.2:  # road cars are longer
         return sedan
-    mass_kg = sedan.mass_kg * (wheelbase_m / sedan.wheelbase_m) ** MODEL_MASS_POWER
+    # The power is that of 1:10 and 1:5 models; sideslip depends on forces over mass.
+    mass_kg = sedan.mass_kg * (wheelbase_m / sedan.wheelbase_m) ** 2.5
     axles = dict.fromkeys(("cg_to_front_axle_m", "cg_to_rear_axle_m"), 0.5 * wheelbase_m)
     raw, _ = completed({"name": sedan.name, "mass_kg": mass_kg, "friction": sedan.friction, **axles})
     return VehicleParameters.model_validate(raw)

@@ -46,7 +46,7 @@ class CarModel(Record):
     truth : source, :data:`GROUND_TRUTH`, :data:`ESTIMATED`, or both; empty if the sensors alone were used.
     evidence : in one line. drives : that were used.
     sensors : as :class:`pdhef_logtool.drive.plan.Sensors`; None without.
-    assumed_wheelbase_m : of the model car that is assumed without a vehicle file; None for other cars.
+    wheelbase_m : of the car that was assumed without a vehicle file; None with one.
     """
 
     format: Literal["pdhef-model"] = "pdhef-model"
@@ -60,7 +60,7 @@ class CarModel(Record):
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     residual: LadderModel | None = None
     sensors: Any = None
-    assumed_wheelbase_m: Positive | None = None
+    wheelbase_m: Positive | None = None
 
     def toml(self, head: str) -> str:
         """Return the file, without loss; ``head`` : comment."""

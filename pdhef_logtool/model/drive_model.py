@@ -9,12 +9,10 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.car.assumed_values import assumed_car
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel, TaughtParameter
 from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.posterior import Posterior
-from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.friction import FrictionFrom, FrictionSource
 from pdhef_logtool.drive.options import AUTO
 from pdhef_logtool.drive.plan import Sensors
@@ -104,10 +102,7 @@ class DriveModel:
         posterior, parameters = self.posterior, self.car.taught_prior
         if posterior is not None and posterior.parameters and not posterior.refused:
             parameters = for_later_drives(posterior)
-        vehicle = self.car.vehicle
-        is_model = vehicle != default_vehicle() and vehicle == assumed_car(vehicle.wheelbase_m)
-        assumed = {"assumed_wheelbase_m": vehicle.wheelbase_m} if is_model else {}
-        return model_of(self.car, self.sensors, parameters=parameters, **assumed)
+        return model_of(self.car, self.sensors, parameters=parameters)
 
 
 def model_of(car: Car, sensors: Sensors, **entries: Any) -> CarModel:
@@ -115,8 +110,8 @@ def model_of(car: Car, sensors: Sensors, **entries: Any) -> CarModel:
     from pydantic import TypeAdapter
 
     plain = TypeAdapter(Sensors).dump_python(sensors, mode="json", exclude_none=True)
-    file = car.vehicle
-    return CarModel(vehicle=file.name, physics_sha256=physics_sha256(file), sensors=plain, **entries)
+    file, size = car.vehicle, None if car.source else car.vehicle.wheelbase_m
+    return CarModel(vehicle=file.name, physics_sha256=physics_sha256(file), sensors=plain, wheelbase_m=size, **entries)
 
 
 def for_later_drives(posterior: Posterior, names: Collection[str] = CARRIED) -> tuple[TaughtParameter, ...]:

@@ -149,4 +149,4 @@ def test_sensors_show_a_model_car_without_a_vehicle_file_and_its_model_belongs_t
     taught = TaughtParameter(name="yaw inertia", value=0.3, std=0.02)
     path.write_text(model.model_copy(update={"parameters": (taught,)}).toml("Of a test."))
     later, _ = with_earlier_drive(Car.load(), path)
-    assert later.vehicle.wheelbase_m == model.assumed_wheelbase_m and later.taught_prior == (taught,)
+    assert later.vehicle.wheelbase_m == model.wheelbase_m and later.taught_prior == (taught,)
