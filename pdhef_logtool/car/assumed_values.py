@@ -16,7 +16,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 
 #: Share of the static weight on the front axle of a passenger car, if the file gives none. 0.63 for front-wheel drive,
 #: 0.50 for rear-engined and sports cars.
@@ -93,6 +93,18 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
         table[name] = values[name] = value
         assumed.append(AssumedValue(entry, value, RULES[entry]["spread"], RULES[entry]["text"]))
     return entries, tuple(assumed)
+
+
+def assumed_car(wheelbase_m: float) -> VehicleParameters:
+    """Return the car that is assumed without a vehicle file: a model of this size, otherwise the default sedan."""
+    sedan = default_vehicle()
+    if not 0.15 <= wheelbase_m < 1.2:  # road cars are longer
+        return sedan
+    # The power is that of 1:10 and 1:5 models; sideslip depends on forces over mass.
+    mass_kg = sedan.mass_kg * (wheelbase_m / sedan.wheelbase_m) ** 2.5
+    axles = dict.fromkeys(("cg_to_front_axle_m", "cg_to_rear_axle_m"), 0.5 * wheelbase_m)
+    raw, _ = completed({"name": sedan.name, "mass_kg": mass_kg, "friction": sedan.friction, **axles})
+    return VehicleParameters.model_validate(raw)
 
 
 def _axle_distances(entries: dict[str, Any], assumed: list[AssumedValue]) -> None:

@@ -46,6 +46,7 @@ class CarModel(Record):
     truth : source, :data:`GROUND_TRUTH`, :data:`ESTIMATED`, or both; empty if the sensors alone were used.
     evidence : in one line. drives : that were used.
     sensors : as :class:`pdhef_logtool.drive.plan.Sensors`; None without.
+    wheelbase_m : of the car that was assumed without a vehicle file; None with one.
     """
 
     format: Literal["pdhef-model"] = "pdhef-model"
@@ -59,6 +60,7 @@ class CarModel(Record):
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     residual: LadderModel | None = None
     sensors: Any = None
+    wheelbase_m: Positive | None = None
 
     def toml(self, head: str) -> str:
         """Return the file, without loss; ``head`` : comment."""

@@ -251,7 +251,7 @@ class VehicleParameters(Record):
             # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 2 scales it with friction; the curve
             # must be plausible at friction 1 or at the file's.
             slopes = tuple(self.cornering_stiffness_n_per_rad(front, mu) / load for mu in (1.0, self.assumed_friction))
-            yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, 2.0, 100.0
+            yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, 0.5, 100.0
         # From a kart, with a track as long as the wheelbase, to a coach with a third of it.
         yield "track over wheelbase", "track_m", (self.track_m / length,), 0.15, 1.5
         # A laden truck: 2.2 m over 3.5 m.

@@ -14,9 +14,10 @@ from pathlib import Path
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from pdhef_logtool.car.assumed_values import assumed_car
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import read_model
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, has_imu, no_alignment, plan_alignment
 from pdhef_logtool.drive.delays import LatencyEstimate
 from pdhef_logtool.drive.survey import survey_log
@@ -110,7 +111,7 @@ class DrivePlan:
 def plan_drive(
     log: DriveLog,
     mapping: Mapping,
-    vehicle: VehicleParameters,
+    vehicle: VehicleParameters | None,
     start_ns: int,
     end_ns: int,
     *,
@@ -122,6 +123,7 @@ def plan_drive(
 
     Parameters
     ----------
+    vehicle : None for the default car, whose size the sensors decide.
     require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
     sensors : of an earlier drive; None decides them here.
     waived : names of checks that may fail without excluding a channel.
@@ -130,31 +132,32 @@ def plan_drive(
     ------
     MappingError : The log lacks a mapped topic or field, or an IMU.
     """
-    mapping = with_gyro_delay(mapping, vehicle)
+    given = vehicle or default_vehicle()
+    mapping = with_gyro_delay(mapping, given)
     if sensors is not None:
         mapping = sensors.applied_to(mapping)
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     if sensors is not None:
         clocks |= clocks_of(sensors, log, mapping, start_ns)
     span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
-    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle)
+    looked_at = survey_log(log, mapping, clocks, span_ns, given)
     mapping, survey = looked_at.mapping, looked_at.channels
     if sensors is not None:
         alignment = sensors.alignment
     elif require_imu or has_imu(survey.signals):
-        alignment = plan_alignment(survey.signals, vehicle)
+        alignment = plan_alignment(survey.signals, given)
     else:
         alignment = no_alignment(survey.signals)
     # The signals of earlier sensors must not depend on later samples.
     refused = looked_at.refused(waived, is_causal=sensors is not None)
     mapping, sound = without_refused_truth(mapping, refused), looked_at
     if mapping is not looked_at.mapping:
-        sound = survey_log(log, mapping, clocks, span_ns, vehicle, rescale=False)
+        sound = survey_log(log, mapping, clocks, span_ns, given, rescale=False)
     truth, derived = sound.truth_plan, sound.truth
     derivation = {} if derived is None else dict(derived.derivation)
     return DrivePlan(
         mapping=mapping,
-        vehicle=vehicle,
+        vehicle=vehicle or looked_at.assumed_car,
         clocks=clocks,
         alignment=alignment.without(refused),
         truth=truth,
@@ -197,6 +200,8 @@ def with_earlier_drive(car: Car, path: Path) -> tuple[Car, Sensors]:
     VehicleError : The file is missing, wrong, of another vehicle file, or without sensors.
     """
     model = read_model(path, "auto, off or a model.toml", _REMEDY)
+    if model.wheelbase_m is not None and car.vehicle == default_vehicle():
+        car = replace(car, vehicle=assumed_car(model.wheelbase_m))
     if not model.belongs_to(car.vehicle):
         raise VehicleError(
             expected=f"a model of the car {car.vehicle.name}",

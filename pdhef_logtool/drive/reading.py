@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import CHANGE_SUFFIX, change_checks
 from pdhef_logtool.drive.friction import FrictionFrom, FrictionSource, friction_source
 from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
@@ -37,6 +37,7 @@ from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.signals import GNSS_POSITION, Loss
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
 
+_MODEL_CAR = "no --car: the default car is scaled to {:.2g} m, the wheelbase that steering, yaw rate and speed show"
 Tell = Callable[[str], None]
 #: Returns the mapping to read with, from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
@@ -243,8 +244,7 @@ def read_drive(
         earlier = None
         if options.model not in (AUTO, OFF):
             car, earlier = with_earlier_drive(car, options.model)
-        prefer = options.prefer_truth
-        chosen = choose_mapping(opened, mapping, prefer_truth=prefer, require_signals=require_sensors)
+        chosen = choose_mapping(opened, mapping, prefer_truth=options.prefer_truth, require_signals=require_sensors)
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.mapping.notes
@@ -258,13 +258,14 @@ def read_drive(
         if not isinstance(log_input.path, Path):
             opened = _reopened(opened, used, slice_ns, options)
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
+        given = None if options.model == AUTO and car.vehicle == default_vehicle() else car.vehicle
         plan = plan_drive(
-            opened, used, car.vehicle, *slice_ns, require_imu=require_sensors,
-            sensors=earlier, waived=options.waived,
-        )  # fmt: skip
-        for note in plan.mapping.notes[len(used.notes) :]:
-            told(note)
-        _tell_doubts(plan, options, told)
+            opened, used, given, *slice_ns, require_imu=require_sensors, sensors=earlier, waived=options.waived
+        )
+        if plan.vehicle != car.vehicle:
+            told(_MODEL_CAR.format(plan.vehicle.wheelbase_m))
+        car = replace(car, vehicle=plan.vehicle)
+        _tell_doubts(plan, len(used.notes), options, told)
         friction = friction_of(plan, car.vehicle, options)
         if friction.note:
             remarks.append(friction.note)
@@ -333,7 +334,10 @@ def _failed_text(check: Check) -> str:
     return f"check {check.name} failed{' (waived)' if check.waived else ''}: {check.evidence}; {check.remedy}"
 
 
-def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
+def _tell_doubts(plan: DrivePlan, notes: int, options: ReadOptions, tell: Tell) -> None:
+    """Report the mapping's notes after the first ``notes``, failed checks, and signals that are not used."""
+    for note in plan.mapping.notes[notes:]:
+        tell(note)
     for check in _checks_of(plan, options):
         if check.verdict == "failed":
             tell(_failed_text(check))

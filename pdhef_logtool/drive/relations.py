@@ -237,6 +237,23 @@ def _lengths(pace: _Pace, vehicle: VehicleParameters | None) -> dict[str, tuple[
     }
 
 
+def effective_wheelbase_m(columns: Mapping[str, FloatArray], speed_name: str | None) -> float:
+    """Return the ratio of the sizes of road-wheel angle and curvature in gentle driving; NaN if it is unknown.
+
+    Neither signs nor delays of the sensors change it. Speeds that only full-size vehicles reach have none.
+    """
+    if speed_name is None or not {"steer_rad", "yaw_rate_rad_s"} <= columns.keys():
+        return math.nan
+    pace = _Pace.of(columns, speed_name)
+    use = pace.gentle & np.isfinite(columns["steer_rad"])
+    steer, rate, speed = (values[use] for values in (columns["steer_rad"], columns["yaw_rate_rad_s"], pace.speed))
+    if not steer.size:
+        return math.nan
+    angle, curvature, turning, fast = np.quantile(np.abs([steer, rate / speed, rate, speed]), 0.9, axis=1).tolist()
+    is_known = turning > DRIVEN["yaw_rate_rad_s"] and fast < FULL_SIZE_M_S[0]
+    return float(f"{angle / curvature:.3g}") if is_known else math.nan
+
+
 def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relation]:
     columns, speed, gentle = pace.columns, pace.speed, pace.gentle
     yaw = columns.get("yaw_rate_rad_s")

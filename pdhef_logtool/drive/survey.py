@@ -13,6 +13,7 @@ from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from pdhef_logtool.car.assumed_values import assumed_car
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.check_table import result
 from pdhef_logtool.drive.checks import (
@@ -37,6 +38,7 @@ from pdhef_logtool.drive.mounting import (
     turned_signals,
 )
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
+from pdhef_logtool.drive.relations import effective_wheelbase_m
 from pdhef_logtool.drive.truth import TruthPlan, TruthTrack, derive_truth, plan_truth
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
@@ -83,6 +85,12 @@ class Survey:
         if not self.channels.truth:
             return self.checks
         return (*self.mounted, *self._of(self.measured.without_truth(), None))
+
+    @property
+    def assumed_car(self) -> VehicleParameters:
+        """The car that is assumed without a vehicle file, by the sensors."""
+        sensed = self.measured.without_truth()
+        return assumed_car(effective_wheelbase_m(sensed.columns, sensed.speed_name))
 
     def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
         """Return the channels that must not be used, with the reason. Ground truth does not decide about sensors.

@@ -110,8 +110,8 @@ def model_of(car: Car, sensors: Sensors, **entries: Any) -> CarModel:
     from pydantic import TypeAdapter
 
     plain = TypeAdapter(Sensors).dump_python(sensors, mode="json", exclude_none=True)
-    file = car.vehicle
-    return CarModel(vehicle=file.name, physics_sha256=physics_sha256(file), sensors=plain, **entries)
+    file, size = car.vehicle, None if car.source else car.vehicle.wheelbase_m
+    return CarModel(vehicle=file.name, physics_sha256=physics_sha256(file), sensors=plain, wheelbase_m=size, **entries)
 
 
 def for_later_drives(posterior: Posterior, names: Collection[str] = CARRIED) -> tuple[TaughtParameter, ...]:

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from pdhef_logtool.car.assumed_values import assumed_car
 from pdhef_logtool.car.toml_files import read_vehicle_file
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.model import priors
 from pdhef_logtool.records.errors import VehicleError
 
 #: Mass, wheelbase and front share of a 1:10 car, a 1:5 car, a small car, a saloon, a van, a 40 t truck.
@@ -86,3 +89,19 @@ def test_without_a_weight_split_that_of_a_passenger_car_is_assumed_and_named(tmp
 def test_wrong_entries_are_named(tmp_path: Path, entries: dict[str, float], named: str) -> None:
     with pytest.raises(VehicleError, match=named):
         read_vehicle_file(write(tmp_path, entries))
+
+
+def test_without_a_file_only_a_wheelbase_below_that_of_road_cars_replaces_the_sedan() -> None:
+    model = assumed_car(0.4)
+    assert model.wheelbase_m == pytest.approx(0.4) and 4.0 < model.mass_kg < 20.0
+    assert model.low_speed_blend_m_s == pytest.approx(1.12, abs=0.01)
+    for unknown_or_usual in (float("nan"), 0.05, 1.3, 2.6):
+        assert assumed_car(unknown_or_usual) is default_vehicle()
+
+
+def test_the_softest_tyres_that_a_fit_of_a_model_car_can_have_are_a_vehicle() -> None:
+    car = assumed_car(0.3)
+    values = {
+        p.name: p.low if p.name in (priors.RATIO, priors.REAR_STIFFNESS) else p.mean for p in priors.parameters_of(car)
+    }
+    VehicleParameters.model_validate(priors.vehicle_with(car, values).model_dump())

@@ -13,10 +13,11 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel, TaughtParameter, read_model
 from pdhef_logtool.drive import reading
-from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.options import OFF, ReadOptions
 from pdhef_logtool.drive.plan import with_earlier_drive
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import spec_of
+from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.errors import MappingError, VehicleError
 from pdhef_logtool.records.signals import Signals
@@ -126,3 +127,26 @@ def test_a_model_that_does_not_fit_is_refused_in_one_line(road: Path, file: Path
         signals(road, ReadOptions(model=file))
     with pytest.raises(VehicleError, match=r"auto, off or a model\.toml"):
         signals(road, ReadOptions(model="of"))  # type: ignore[arg-type]
+
+
+def test_sensors_show_a_model_car_without_a_vehicle_file_and_its_model_belongs_to_later_drives(tmp_path: Path) -> None:
+    time = np.arange(0.0, 40.0, 0.01)
+    speed, angle = 2.0 + 0.5 * np.sin(0.3 * time), 0.15 * np.sin(1.5 * time) + 0.05 * np.sin(0.4 * time)
+    rate = speed * np.tan(angle) / 0.4
+    log, mapping = tmp_path / "small.csv", tmp_path / "mapping.toml"
+    columns = {"speed_m_s": speed, "steer_rad": angle, "yaw_rate_rad_s": rate, "ay_m_s2": speed * rate}
+    rows = np.column_stack([time, *columns.values()])
+    np.savetxt(log, rows, delimiter=",", header=",".join(["time", *columns]), comments="")
+    table = '[signals.{0}]\ntopic = "csv"\nfield = "{0}"\nstamp = "log_time"\n'
+    mapping.write_text("".join(map(table.format, columns)))
+    with read_drive(log, Car.load(), load_mapping(mapping)) as drive:
+        assert drive.car.vehicle.wheelbase_m == pytest.approx(0.4, abs=0.01)
+        assert any("the default car is scaled" in note for note in drive.notes)
+        model = DriveModel.of(drive).file
+    with read_drive(log, Car.load(), load_mapping(mapping), ReadOptions(model=OFF)) as drive:
+        assert drive.car.vehicle == Car.load().vehicle
+    path = tmp_path / "model.toml"
+    taught = TaughtParameter(name="yaw inertia", value=0.3, std=0.02)
+    path.write_text(model.model_copy(update={"parameters": (taught,)}).toml("Of a test."))
+    later, _ = with_earlier_drive(Car.load(), path)
+    assert later.vehicle.wheelbase_m == model.wheelbase_m and later.taught_prior == (taught,)
