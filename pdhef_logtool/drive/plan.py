@@ -17,7 +17,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import read_model
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, has_imu, no_alignment, plan_alignment
+from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, plan_alignment
 from pdhef_logtool.drive.delays import LatencyEstimate
 from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.drive.truth import TruthPlan, dependent_signals
@@ -51,10 +51,6 @@ class Sensors:
     alignment: AlignmentPlan
     decided_s: float
     can: CanSettings | None = None
-
-    def applied_to(self, mapping: Mapping) -> Mapping:
-        """Return the mapping with these sensors; its ground truth is unchanged."""
-        return replace(mapping, signals=self.signals, can=self.can, origin="file")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,11 +90,6 @@ class DrivePlan:
         return self.latency.latency_s if is_significant and self.latency is not None else 0.0
 
     @property
-    def has_truth_pose(self) -> bool:
-        """Whether the ground truth has position and heading."""
-        return {"position_m", "yaw_rad"} <= self.derivation.keys()
-
-    @property
     def sensors(self) -> Sensors:
         """Mapping, clocks and alignment of the sensors, for later drives."""
         signals = self.mapping.signals
@@ -132,7 +123,7 @@ def plan_drive(
     """
     mapping = with_gyro_delay(mapping, vehicle)
     if sensors is not None:
-        mapping = sensors.applied_to(mapping)
+        mapping = replace(mapping, signals=sensors.signals, can=sensors.can, origin="file")
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     if sensors is not None:
         clocks |= clocks_of(sensors, log, mapping, start_ns)
@@ -141,10 +132,8 @@ def plan_drive(
     mapping, survey = looked_at.mapping, looked_at.channels
     if sensors is not None:
         alignment = sensors.alignment
-    elif require_imu or has_imu(survey.signals):
-        alignment = plan_alignment(survey.signals, vehicle)
     else:
-        alignment = no_alignment(survey.signals)
+        alignment = plan_alignment(survey.signals, vehicle, require_imu=require_imu)
     # The signals of earlier sensors must not depend on later samples.
     refused = looked_at.refused(waived, is_causal=sensors is not None)
     mapping, sound = without_refused_truth(mapping, refused), looked_at

@@ -72,11 +72,6 @@ class LearnResult:
         """0 if all drives were used completely, 3 otherwise."""
         return exit_code(self.records)
 
-    @property
-    def drives(self) -> tuple[DriveRecord, ...]:
-        """Drives that were used."""
-        return tuple(r for r in self.records if not r.left_out)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         shared = {"car": str(self.car), "exit_code": self.exit_code, **drives_document(self.records)}
@@ -113,7 +108,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
     splits = chosen_logs(arguments, settings)
     read = [*(i.local for i in splits), *(path for path in config.files if path != config.car)]
     check_no_input(read, [], [output])
-    records, model, figures = _learnt(splits, Car.of(source.vehicle), config, reporter.progress)
+    records, model, figures = _learnt(splits, Car(source.vehicle), config, reporter.progress)
     for record in records:
         tell_drive(record, reporter.warn)
     learnt_on = tuple(r.learnt_on for r in records if not r.left_out)

@@ -54,7 +54,7 @@ def test_a_drive_is_read_once_and_says_the_same_again(
 
 def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> None:
     told: list[str] = []
-    without = Car.of(car.vehicle.model_copy(update={"friction": None}))
+    without = Car(car.vehicle.model_copy(update={"friction": None}))
     with read_drive(sample_logs_dir / "dlc.mcap", without, tell=told.append) as drive:
         drive.tell("one more")
         notes, remarks = list(drive.notes), list(drive.remarks)
