@@ -90,6 +90,11 @@ class DrivePlan:
         return self.latency.latency_s if is_significant and self.latency is not None else 0.0
 
     @property
+    def has_truth_pose(self) -> bool:
+        """Whether the ground truth has position and heading."""
+        return {"position_m", "yaw_rad"} <= self.derivation.keys()
+
+    @property
     def sensors(self) -> Sensors:
         """Mapping, clocks and alignment of the sensors, for later drives."""
         signals = self.mapping.signals

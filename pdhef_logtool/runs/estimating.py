@@ -123,8 +123,7 @@ class Estimated:
         """The tracks for outputs, with poses: ground truth, valid where it is complete, then the estimators."""
         plan, drawn = self.drive.plan, [self.posed(track) for track in self.tracks.values()]
         if self.truth is not None:
-            has_pose = {"position_m", "yaw_rad"} <= plan.derivation.keys()
-            truth = self.truth if has_pose else self.posed(self.truth)
+            truth = self.truth if plan.has_truth_pose else self.posed(self.truth)
             drawn.insert(0, valid_as_a_whole(truth, plan.derivation, plan.vehicle.standstill_m_s))
         return drawn
 
