@@ -161,8 +161,8 @@ def plan_alignment(
     MappingError : No IMU channel has two samples in the survey, so that there is no grid.
     """
     if not require_imu and all(len(channels[name]) < 2 for name in _IMU if name in channels):
-        unused = tuple((name, "without an IMU there are no stamps to align it to") for name in sorted(channels))
-        return AlignmentPlan("", (), math.nan, (), unused, "none")
+        idle = tuple((name, "without an IMU there are no stamps to align it to") for name in sorted(channels))
+        return AlignmentPlan("", (), math.nan, (), idle, "none")
     survey = with_gnss_velocity(channels)
     periods = {name: _median_period_s(c) for name, c in survey.items()}
     grid = _grid_channel(periods)

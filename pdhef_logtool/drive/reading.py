@@ -84,11 +84,6 @@ class Drive:
         return self.plan.mapping
 
     @property
-    def file(self) -> str:
-        """Name of the file or folder."""
-        return self.path.name
-
-    @property
     def available(self) -> frozenset[str]:
         """Aligned signals that the log provides."""
         return self.plan.alignment.available

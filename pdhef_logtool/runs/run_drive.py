@@ -252,7 +252,7 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
     return {
         "log": {
             "name": drive.name,
-            "file": PurePath(drive.file).name,
+            "file": PurePath(drive.path.name).name,
             "kind": drive.log.kind,
             "sha256": drive.sha256,
             "start_ns": plan.start_ns,
@@ -308,7 +308,7 @@ def car_entry(car: Car) -> dict[str, Any]:
 def outcome_of(drive: Drive, losses: Sequence[Loss], *, neutral: bool = False, **changes: Any) -> LogOutcome:
     """Return the record of a log in run.json; ``neutral``: without names and metadata of its file."""
     day, route = day_and_route(drive.plan.start_ns, drive.log.metadata())
-    texts: dict[str, Any] = {"file": drive.file, "lost": lost_texts(losses)}
+    texts: dict[str, Any] = {"file": drive.path.name, "lost": lost_texts(losses)}
     if neutral:
         texts, route = without_names(texts, drive.path, drive.name), route and digest(route)[:SHOWN_DIGITS]
     texts |= {key: getattr(drive, key) for key in ("sha256", "signals_sha256", "truth_sha256")}
