@@ -50,8 +50,8 @@ _RATE_WORDS = ("roll", "pitch", "yaw")
 #: Temporary names of the components; they differ from all signal names.
 ACCELERATIONS = tuple(f"triad.acceleration.{axis}" for axis in "xyz")
 RATES = tuple(f"triad.rate.{axis}" for axis in "xyz")
-#: Triad and row of a mounting by signal: forward and left from the accelerometer, up from the gyro.
-MOUNTED = {"ax_m_s2": (0, 0), "ay_m_s2": (0, 1), "yaw_rate_rad_s": (1, 2)}
+#: Rows of a mounting: forward and left from the accelerometer, up from the gyro.
+MOUNTED = ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: A mean acceleration in this range is gravity.
 IS_GRAVITY_M_S2 = (0.75 * GRAVITY_M_S2, 1.25 * GRAVITY_M_S2)
 
@@ -183,10 +183,10 @@ class Mounting:
 
     def turned(self, mapping: Mapping) -> dict[str, SignalSource]:
         """Return the signals of a mapping, rotated by the mounting of the sensor."""
-        signals, places = mapping.signals, MOUNTED | {"roll_rate_rad_s": (1, 0), "pitch_rate_rad_s": (1, 1)}
-        turned = {
-            n: self.triads[t].turned(signals[n], self.rotation[i]) for n, (t, i) in places.items() if n in signals
-        }
+        signals, (accelerations, rates) = mapping.signals, self.triads
+        triads = dict(zip(MOUNTED, zip((accelerations, accelerations, rates), self.rotation, strict=True), strict=True))
+        triads |= {"roll_rate_rad_s": (rates, self.rotation[0]), "pitch_rate_rad_s": (rates, self.rotation[1])}
+        turned = {n: triad.turned(signals[n], row) for n, (triad, row) in triads.items() if n in signals}
         return signals | turned
 
     def checks(self, mapping: Mapping) -> tuple[Check, ...]:
@@ -242,10 +242,10 @@ def _is_shown(turn: _Turn, measured: Measured) -> bool:
 
 def named_rows(mapping: Mapping, triads: tuple[Triad, Triad]) -> FloatArray:
     """Return the rows [3, 3] of the sensor's axes that a mapping reads, 0 where it lacks one."""
-    named = np.zeros((3, 3))
-    for name, (triad, row) in MOUNTED.items():
+    named, (accelerations, rates) = np.zeros((3, 3)), triads
+    for row, name, triad in zip(named, MOUNTED, (accelerations, accelerations, rates), strict=True):
         if name in mapping.signals:
-            named[row] = triads[triad].row(mapping.signals[name])
+            row[:] = triad.row(mapping.signals[name])
     return named
 
 
