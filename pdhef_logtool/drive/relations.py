@@ -385,7 +385,10 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     is_vy = subject == "truth.vy_m_s"
     its = law("pose", subject=subject, scaled="truth.position_speed_m_s" if is_vy else "")
     its = replace(its, signless=len(signs) < 2 or len(set(signs)) > 1)
-    return compare(its, min(signs, default=1.0) * (left if is_vy else left / speed), columns[subject], moving)
+    sides = (min(signs, default=1.0) * (left if is_vy else left / speed), columns[subject])
+    # Velocity and position may refer to different points of the car; yaw adds a velocity between them.
+    apart = _partial(its, *sides, [turning, np.ones_like(turning)], moving)
+    return _best([*compare(its, *sides, moving), *apart])
 
 
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
