@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
 from pdhef_logtool.car.model import GROUND_TRUTH, CarModel, TaughtParameter, read_model
@@ -75,11 +74,6 @@ class Car:
 
     def __repr__(self) -> str:
         return f"<Car {self.vehicle.name}: {self.source or 'default'}, network {self.network_name}>"
-
-    @classmethod
-    def of(cls, vehicle: VehicleParameters, **parts: Any) -> Car:
-        """Return the car of a vehicle; ``parts`` are further attributes."""
-        return cls(vehicle, **parts)
 
     @classmethod
     def load(cls, path: Place = None, *, network: Place = None, sensors: Place = None) -> Car:

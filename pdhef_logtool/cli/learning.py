@@ -74,7 +74,8 @@ def train(
 
 def render_learning(result: LearnResult, console: Console) -> None:
     """Print result, assumptions and next step, and the table of teaching."""
-    used, left_out = len(result.drives), len(result.records) - len(result.drives)
+    left_out = sum(bool(record.left_out) for record in result.records)
+    used = len(result.records) - left_out
     left = f", {left_out} left out" if left_out else ""
     head = three_lines(
         result.text,

@@ -143,7 +143,9 @@ class AlignmentPlan:
         return {**jsonable(self), "unused": dict(self.unused)}
 
 
-def plan_alignment(channels: Mapping[str, Channel], vehicle: VehicleParameters) -> AlignmentPlan:
+def plan_alignment(
+    channels: Mapping[str, Channel], vehicle: VehicleParameters, *, require_imu: bool = True
+) -> AlignmentPlan:
     """Decide clock, method, gaps and lateness of every channel.
 
     The grid channel is the first of yaw rate, a_y, a_x with a rate within a factor 2 of the fastest of them.
@@ -152,11 +154,15 @@ def plan_alignment(channels: Mapping[str, Channel], vehicle: VehicleParameters) 
     ----------
     channels : every mapped signal by name, with its samples in the survey, if any.
     vehicle : its steering ratio and wheel radius are used.
+    require_imu : False returns a plan without grid, which uses no channel, for a log without IMU.
 
     Raises
     ------
     MappingError : No IMU channel has two samples in the survey, so that there is no grid.
     """
+    if not require_imu and all(len(channels[name]) < 2 for name in _IMU if name in channels):
+        idle = tuple((name, "without an IMU there are no stamps to align it to") for name in sorted(channels))
+        return AlignmentPlan("", (), math.nan, (), idle, "none")
     survey = with_gnss_velocity(channels)
     periods = {name: _median_period_s(c) for name, c in survey.items()}
     grid = _grid_channel(periods)
@@ -175,17 +181,6 @@ def plan_alignment(channels: Mapping[str, Channel], vehicle: VehicleParameters) 
         unused=tuple(sorted(unused.items())),
         speed_from=_speed_source({target for target, _ in chosen.values()}),
     )
-
-
-def has_imu(channels: Mapping[str, Channel]) -> bool:
-    """Return whether a channel of the IMU has the two samples that :func:`plan_alignment` needs."""
-    return any(len(channels[name]) >= 2 for name in _IMU if name in channels)
-
-
-def no_alignment(channels: Mapping[str, Channel]) -> AlignmentPlan:
-    """Return the plan of a log without IMU: no grid, and none of the channels is used."""
-    unused = tuple((name, "without an IMU there are no stamps to align it to") for name in sorted(channels))
-    return AlignmentPlan("", (), float("nan"), (), unused, "none")
 
 
 def align(channels: Mapping[str, Channel], plan: AlignmentPlan) -> tuple[Signals, dict[str, int]]:

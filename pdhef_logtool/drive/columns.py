@@ -97,16 +97,13 @@ def student(blocks: int) -> float:
 
 def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:
     """Average a channel into the grid's cells and low-pass it; NaN in gaps."""
-    nothing = np.full(cells, np.nan)
-    if cells < 2:
-        return nothing
     cell_of = np.rint((channel.stamps_ns - start_ns) * (1e-9 / GRID_S)).astype(np.int64)
     inside = (cell_of >= 0) & (cell_of < cells)
     count = np.bincount(cell_of[inside], minlength=cells).astype(np.float64)
     total = np.bincount(cell_of[inside], weights=channel.values[inside], minlength=cells)
     filled_cells = np.flatnonzero(count > 0.0)
     if filled_cells.shape[0] < 2:
-        return nothing
+        return np.full(cells, np.nan)
     period_s = float(np.median(np.diff(channel.stamps_ns))) * 1e-9
     gap_s = min(max(MAX_GAP_S, MAX_GAP_PERIODS * period_s), LONGEST_GAP_S)
     bracket = Bracket(filled_cells, np.arange(cells), int(gap_s / GRID_S + 1e-9))

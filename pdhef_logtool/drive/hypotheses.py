@@ -355,13 +355,9 @@ def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:
 @lru_cache(maxsize=CACHED_NAMES)
 def is_odd(name: str, scale: float) -> bool:
     """Return whether no unit of a signal has this scale."""
-    return not any(abs(abs(scale) - unit) < 0.01 * unit for unit in _unit_scales(name))
-
-
-@cache
-def _unit_scales(name: str) -> tuple[float, ...]:
     of_units = units_of(name.removeprefix("truth."))
-    return (1.0, *(f for f, words in of_units if words.startswith("is in") and f not in _TYPICAL))
+    units = (1.0, *(f for f, words in of_units if words.startswith("is in") and f not in _TYPICAL))
+    return not any(abs(abs(scale) - unit) < 0.01 * unit for unit in units)
 
 
 def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:

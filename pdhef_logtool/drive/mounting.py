@@ -90,10 +90,10 @@ class Triad:
         return replace(source, field=tuple(self.paths[i] for i in used), scale=scales)
 
 
-def find_triads(log: DriveLog, mapping: Mapping) -> tuple[Triad | None, Triad | None]:
-    """Return the triads of accelerations and of rates with an axis in the mapping; None for a missing triad."""
-    triads = [_triad(log, mapping, names) for names in (("ay_m_s2", "ax_m_s2"), ("yaw_rate_rad_s",))]
-    return triads[0], triads[1]
+def find_triads(log: DriveLog, mapping: Mapping) -> tuple[Triad, Triad] | None:
+    """Return the triads of accelerations and of rates with an axis in the mapping; None without one of them."""
+    accelerations, rates = (_triad(log, mapping, names) for names in (("ay_m_s2", "ax_m_s2"), ("yaw_rate_rad_s",)))
+    return None if accelerations is None or rates is None else (accelerations, rates)
 
 
 def _triad(log: DriveLog, mapping: Mapping, names: tuple[str, ...]) -> Triad | None:
@@ -162,6 +162,7 @@ class Mounting:
     applied. The sign of a left-handed sensor's rate is that of the signal (:mod:`~.hypotheses`).
     """
 
+    triads: tuple[Triad, Triad]
     rotation: FloatArray
     named: FloatArray
     evidence: str
@@ -180,29 +181,51 @@ class Mounting:
         )
         return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg"
 
+    def turned(self, mapping: Mapping) -> dict[str, SignalSource]:
+        """Return the signals of a mapping, rotated by the mounting of the sensor."""
+        signals, (accelerations, rates) = mapping.signals, self.triads
+        triads = dict(zip(MOUNTED, zip((accelerations, accelerations, rates), self.rotation, strict=True), strict=True))
+        triads |= {"roll_rate_rad_s": (rates, self.rotation[0]), "pitch_rate_rad_s": (rates, self.rotation[1])}
+        turned = {n: triad.turned(signals[n], row) for n, (triad, row) in triads.items() if n in signals}
+        return signals | turned
 
-def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
+    def checks(self, mapping: Mapping) -> tuple[Check, ...]:
+        """Return for each of the IMU's signals whether it is read from the axis that the drive shows."""
+        turned, checks = self.turned(mapping), []
+        for name, rotation, named in zip(MOUNTED, self.rotation, self.named, strict=True):
+            if name not in mapping.signals:
+                continue
+            if np.allclose(rotation, named, atol=1e-3):
+                if self.confident:
+                    checks.append(result("SIGNAL.mounting", "passed", name, evidence=self.evidence))
+                continue
+            evidence = f"{self.text}: {self.evidence}"
+            entries = entries_of(turned[name], "field", "scale")
+            check = result("SIGNAL.mounting", "failed", name, evidence=evidence, entries=entries)
+            checks.append(check if self.confident else replace(check, verdict="undecided"))
+        return tuple(checks)
+
+
+def find_mounting(measured: Measured, triads: tuple[Triad, Triad] | None, mapping: Mapping) -> Mounting | None:
     """Find the rotation of an IMU from its six components; None without them, or if the drive does not show it.
 
     ``measured`` contains the components of the triads. Ground truth, if any, gives the sign of the yaw rate.
     """
-    accelerations, rates = triads
     columns, speed_name = measured.columns, measured.speed_name
-    if accelerations is None or rates is None or not all(n in columns for n in (*ACCELERATIONS, *RATES)):
+    if triads is None or not all(n in columns for n in (*ACCELERATIONS, *RATES)):
         return None
-    f = np.stack([columns[n] for n in ACCELERATIONS], axis=1)
-    w = np.stack([columns[n] for n in RATES], axis=1)
-    named = named_rows(mapping, accelerations, rates)
+    f, w = (np.stack([columns[n] for n in names], axis=1) for names in (ACCELERATIONS, RATES))
+    named = named_rows(mapping, triads)
     speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
     references = yaw_references(columns, speed_name)
     ups = _ups(f, w, named)
     if len(ups) > 1 and not references:  # gravity does not show which way is up
         references = steering_references(columns, speed_name)
-    fitting = [turn for up in ups if (turn := _turned(f, w, speed, up, references)) and turn.fits]
-    if not fitting:
+    turns = [turn for up in ups if (turn := _turned(f, w, speed, up, references)) is not None]
+    if not turns:
         return None
-    best = max(fitting, key=lambda x: x.correlation + np.sign(x.sign))
-    mounting = Mounting(_snapped(best), named, best.evidence, _is_shown(best, measured))
+    best = max(turns, key=lambda x: x.correlation + np.sign(x.sign))
+    mounting = Mounting(triads, _snapped(best), named, best.evidence, _is_shown(best, measured))
     is_sure = best.correlation >= ASKEW_CORRELATION or best.errors_deg[0] <= MAX_ERROR_DEG or mounting.is_as_named
     return replace(mounting, confident=mounting.confident and is_sure)
 
@@ -217,12 +240,12 @@ def _is_shown(turn: _Turn, measured: Measured) -> bool:
     return _sign_of(turn.rate, steering_references(measured.columns, measured.speed_name))[0] > 0.0
 
 
-def named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | None) -> FloatArray:
+def named_rows(mapping: Mapping, triads: tuple[Triad, Triad]) -> FloatArray:
     """Return the rows [3, 3] of the sensor's axes that a mapping reads, 0 where it lacks one."""
-    named = np.zeros((3, 3))
-    for i, (name, triad) in enumerate(zip(MOUNTED, (accelerations, accelerations, rates), strict=True)):
-        if name in mapping.signals and triad is not None:
-            named[i] = triad.row(mapping.signals[name])
+    named, (accelerations, rates) = np.zeros((3, 3)), triads
+    for row, name, triad in zip(named, MOUNTED, (accelerations, accelerations, rates), strict=True):
+        if name in mapping.signals:
+            row[:] = triad.row(mapping.signals[name])
     return named
 
 
@@ -242,7 +265,6 @@ class _Turn:
     errors_deg: tuple[float, float]
     sign: float
     along: bool
-    fits: bool
     evidence: str
     rate: FloatArray
 
@@ -269,6 +291,7 @@ def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
 def _turned(
     f: FloatArray, w: FloatArray, speed: FloatArray, up: FloatArray, references: list[tuple[str, FloatArray]]
 ) -> _Turn | None:
+    """Return the rotation about a vertical [3]; None if it does not fit the drive."""
     moving, axis, mean = moving_at(speed), up, up
     for _ in range(3):  # iterates, because the accelerations of the drive tilt the mean slightly
         e1 = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
@@ -305,10 +328,11 @@ def _turned(
         f"speed and yaw rate explain the level accelerations with correlation {correlation:.2f} and gain {gain:.2f}, "
         f"yaw known to {error:.1f} deg{said}"
     )
-    fits = correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG
+    if not (correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG):
+        return None
     ahead = compare(law("longitudinal", of="", pace=""), driven[0].real, f @ rotation[0], used)
     along = any(r.correlation > SIGN_CORRELATION for r in ahead)
-    return _Turn(rotation, correlation, error, by_blocks, sign, along, fits, evidence, rate)
+    return _Turn(rotation, correlation, error, by_blocks, sign, along, evidence, rate)
 
 
 def _sides(column: NDArray[Any]) -> FloatArray:
@@ -333,42 +357,3 @@ def _snapped(turn: _Turn) -> FloatArray:
     is_certain = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
     is_askew = math.degrees(math.acos(cosine)) > max(TURNED_DEG, SURE_STD * math.hypot(*turn.errors_deg))
     return turn.rotation if is_certain and is_askew else step
-
-
-# ------------------------------------------------------------------------------------- into the mapping
-
-
-def turned_signals(
-    mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]
-) -> dict[str, SignalSource]:
-    """Return the mapping's signals, rotated by the mounting of the sensor."""
-    accelerations, rates = triads
-    assert accelerations is not None and rates is not None
-    signals = dict(mapping.signals)
-    for i, name in enumerate(MOUNTED):
-        if name in signals:
-            signals[name] = (rates if i == 2 else accelerations).turned(signals[name], mounting.rotation[i])
-    for i, name in enumerate(("roll_rate_rad_s", "pitch_rate_rad_s")):
-        if name in signals:
-            signals[name] = rates.turned(signals[name], mounting.rotation[i])
-    return signals
-
-
-def mounting_checks(
-    mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]
-) -> tuple[Check, ...]:
-    """Return for each of the IMU's signals whether it is read from the axis that the drive shows."""
-    turned = turned_signals(mapping, mounting, triads)
-    checks = []
-    for i, name in enumerate(MOUNTED):
-        if name not in mapping.signals:
-            continue
-        if np.allclose(mounting.rotation[i], mounting.named[i], atol=1e-3):
-            if mounting.confident:
-                checks.append(result("SIGNAL.mounting", "passed", name, evidence=mounting.evidence))
-            continue
-        evidence = f"{mounting.text}: {mounting.evidence}"
-        entries = entries_of(turned[name], "field", "scale")
-        check = result("SIGNAL.mounting", "failed", name, evidence=evidence, entries=entries)
-        checks.append(check if mounting.confident else replace(check, verdict="undecided"))
-    return tuple(checks)

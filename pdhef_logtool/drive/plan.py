@@ -18,7 +18,7 @@ from pdhef_logtool.car.assumed_values import assumed_car
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import read_model
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, has_imu, no_alignment, plan_alignment
+from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, plan_alignment
 from pdhef_logtool.drive.delays import LatencyEstimate
 from pdhef_logtool.drive.survey import survey_log
 from pdhef_logtool.drive.truth import TruthPlan, dependent_signals
@@ -52,10 +52,6 @@ class Sensors:
     alignment: AlignmentPlan
     decided_s: float
     can: CanSettings | None = None
-
-    def applied_to(self, mapping: Mapping) -> Mapping:
-        """Return the mapping with these sensors; its ground truth is unchanged."""
-        return replace(mapping, signals=self.signals, can=self.can, origin="file")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +131,7 @@ def plan_drive(
     given = vehicle or default_vehicle()
     mapping = with_gyro_delay(mapping, given)
     if sensors is not None:
-        mapping = sensors.applied_to(mapping)
+        mapping = replace(mapping, signals=sensors.signals, can=sensors.can, origin="file")
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     if sensors is not None:
         clocks |= clocks_of(sensors, log, mapping, start_ns)
@@ -144,10 +140,8 @@ def plan_drive(
     mapping, survey = looked_at.mapping, looked_at.channels
     if sensors is not None:
         alignment = sensors.alignment
-    elif require_imu or has_imu(survey.signals):
-        alignment = plan_alignment(survey.signals, given)
     else:
-        alignment = no_alignment(survey.signals)
+        alignment = plan_alignment(survey.signals, given, require_imu=require_imu)
     # The signals of earlier sensors must not depend on later samples.
     refused = looked_at.refused(waived, is_causal=sensors is not None)
     mapping, sound = without_refused_truth(mapping, refused), looked_at

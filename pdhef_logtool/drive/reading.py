@@ -33,7 +33,7 @@ from pdhef_logtool.mapping import (
 )
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
-from pdhef_logtool.records.ledger import SampleCount, damage
+from pdhef_logtool.records.ledger import damage
 from pdhef_logtool.records.signals import GNSS_POSITION, Loss
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
 
@@ -85,11 +85,6 @@ class Drive:
         return self.plan.mapping
 
     @property
-    def file(self) -> str:
-        """Name of the file or folder."""
-        return self.path.name
-
-    @property
     def available(self) -> frozenset[str]:
         """Aligned signals that the log provides."""
         return self.plan.alignment.available
@@ -129,27 +124,11 @@ class Drive:
         return self._sha256
 
     @property
-    def signals_sha256(self) -> str | None:
-        """Hash of the mapped signals; None without samples or before reading."""
-        return None if self._recorded is None else self._recorded.signals_sha256
-
-    @property
-    def truth_sha256(self) -> str | None:
-        """Hash of the mapped ground truth, as :attr:`signals_sha256`."""
-        return None if self._recorded is None else self._recorded.truth_sha256
-
-    @property
     def losses(self) -> tuple[Loss, ...]:
         """Data that could not be used; complete after reading. Files are named without their folder."""
-        merged = merge_losses(
-            [self.log.lost, () if self._recorded is None else self._recorded.losses, damage(self.sample_ledger)]
-        )
+        read = self._recorded
+        merged = merge_losses([self.log.lost, *([] if read is None else [read.losses, damage(read.ledger)])])
         return tuple(replace(x, where=x.where.removeprefix(f"{self.path.parent}/")) for x in merged)
-
-    @property
-    def sample_ledger(self) -> tuple[SampleCount, ...]:
-        """Counts of used and dropped samples of each mapped signal; empty before reading."""
-        return () if self._recorded is None else self._recorded.ledger
 
     def tell(self, text: str) -> None:
         """Report a note to the user, and add it to the notes of this drive."""

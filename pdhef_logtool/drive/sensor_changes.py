@@ -217,8 +217,7 @@ def _tables(cells: Cells) -> tuple[FloatArray, ...]:
     constant, turning = np.ones_like(v), v * r
 
     def rate(column: FloatArray) -> FloatArray:
-        before = np.concatenate([np.full(MEAN_CELLS, np.nan), column[:-MEAN_CELLS]])[: len(column)]
-        return np.asarray((column - before) / (MEAN_CELLS * CELL_S))
+        return np.asarray((column - _later(column, -MEAN_CELLS, len(column))) / (MEAN_CELLS * CELL_S))
 
     kinematics = np.stack([ay, constant, turning, rate(r), rate(turning), v * rate(turning)], axis=1)
     steering = np.stack([steer, constant, r / v, turning, rate(r)], axis=1)
@@ -253,12 +252,10 @@ class _Block(NamedTuple):
 
     def information(self) -> FloatArray:
         """Return the inverse of the second moment in the drive so far, [n, p, p]; 0 where it is not known."""
-        n, p = self.step.shape
+        p = self.step.shape[1]
         finite = np.asarray(np.isfinite(self.step).all(axis=1) & np.isfinite(self.effects).all(axis=(1, 2)))
-        rows, late = np.where(finite[:, None], self.step, 0.0), min(WINDOW_CELLS + PEAK_CELLS, n)
-        total = np.cumsum(rows[:, :, None] * rows[:, None, :], axis=0)[: n - late]
-        total = np.concatenate([np.zeros((late, p, p)), total])
-        count = np.concatenate([np.zeros(late), np.cumsum(finite)[: n - late]])
+        rows = np.where(finite[:, None], self.step, 0.0)
+        count, total = _decided_sum(finite), _decided_sum(rows[:, :, None] * rows[:, None, :])
         few = (1.0 + LEAST_CELLS / np.maximum(count, 1.0)) ** 2 / np.maximum(count, 1.0)
         moment, least = total * few[:, None, None], self.least**2
         raised = np.maximum(least - np.einsum("npp->n", moment) / p, 0.01 * least)
@@ -312,13 +309,15 @@ def sample_steps(column: FloatArray, cells: Cells) -> FloatArray:
     return largest
 
 
+def _decided_sum(column: Any) -> FloatArray:
+    """Return the sum of a column [n, ...] over the cells that were decided before each, [n, ...]."""
+    return np.nan_to_num(_later(np.cumsum(column, axis=0), -WINDOW_CELLS - PEAK_CELLS, len(column)))
+
+
 def _std_so_far(column: FloatArray) -> FloatArray:
     """Return the RMS of a column over the cells that were decided before each; inf before ``LEAST_CELLS``."""
-    finite, late = np.isfinite(column), WINDOW_CELLS + PEAK_CELLS
-    count, total = (
-        np.concatenate([np.zeros(late), np.cumsum(x)[:-late]])[: len(column)]
-        for x in (finite.astype(float), np.where(finite, column, 0.0) ** 2)
-    )
+    finite = np.isfinite(column)
+    count, total = _decided_sum(finite), _decided_sum(np.where(finite, column, 0.0) ** 2)
     few = 1.0 + LEAST_CELLS / np.maximum(count, 1.0)
     return np.where(count < 0.5 * LEAST_CELLS, np.inf, few * np.sqrt(total / np.maximum(count, 1.0)))
 

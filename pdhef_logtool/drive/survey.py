@@ -31,11 +31,8 @@ from pdhef_logtool.drive.mounting import (
     MOUNTED,
     RATES,
     Mounting,
-    Triad,
     find_mounting,
     find_triads,
-    mounting_checks,
-    turned_signals,
 )
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.relations import effective_wheelbase_m
@@ -64,14 +61,13 @@ class Survey:
     truth: TruthTrack | None
     truth_plan: TruthPlan | None
     latency: LatencyEstimate | None
-    triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
     corrected: tuple[Check, ...] = ()
 
     @property
     def mounted(self) -> tuple[Check, ...]:
         """Checks of the axes that the IMU's signals are read from."""
-        return () if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
+        return () if self.mounting is None else self.mounting.checks(self.mapping)
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:
@@ -149,9 +145,7 @@ def survey_log(
     """
     vehicle = vehicle or default_vehicle()
     triads = find_triads(log, mapping)
-    extra: dict[str, SignalSource] = {}
-    for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
-        extra |= {} if triad is None else triad.components(names)
+    extra = {} if triads is None else triads[0].components(ACCELERATIONS) | triads[1].components(RATES)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
     place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
     truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
@@ -167,7 +161,7 @@ def survey_log(
     corrected: list[Check] = []
     if mounting is not None and mapping.origin == "auto" and blind and not mounting.is_as_named:
         note = f"{mounting.text}, and is read so: {mounting.evidence}"
-        signals = turned_signals(mapping, mounting, triads)
+        signals = mounting.turned(mapping)
         corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
         mapping = mapping.with_sources(signals, [note])
         channels = read_signals(log, mapping, clocks, *span_ns)
@@ -175,9 +169,7 @@ def survey_log(
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     is_mounted = mounting is not None and mounting.confident and mounting.is_as_named
     measured, latency = replace(measured, is_mounted=is_mounted), truth_latency(channels.signals, channels.truth, truth)
-    survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, tuple(corrected)
-    )
+    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, mounting, tuple(corrected))
     return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
 
 
@@ -257,7 +249,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
     mapping, mounting = survey.mapping, survey.mounting
     proposals: list[Proposal] = []
     if mounting is not None and mounting.confident and not mounting.is_as_named:
-        turned, said = turned_signals(mapping, mounting, survey.triads), f"{mounting.text}: {mounting.evidence}"
+        turned, said = mounting.turned(mapping), f"{mounting.text}: {mounting.evidence}"
         proposals += [Proposal(n, said, s) for n, s in turned.items() if s != mapping.signals[n]]
     else:
         factors = explained_factors(survey.measured)

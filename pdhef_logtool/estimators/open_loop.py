@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.nominal_model import (
     model_parameters,
     planar_lateral_acceleration,
@@ -16,7 +15,6 @@ from pdhef_logtool.car.nominal_model import (
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
-from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.stepwise import StepState, advance_speed, prepared_steps
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S
@@ -78,9 +76,3 @@ class OpenLoop:
         inputs = (dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction)
         _open_loop(inputs, sensors.speed_hold_s, mu, p, after.state, steps.values, steps.rates, steps.valid)
         return steps, after
-
-
-def build(name: str, car: Car, options: Options) -> OpenLoop:
-    """Return ``open-loop`` of a car."""
-    del options
-    return OpenLoop(car.vehicle, name=name)

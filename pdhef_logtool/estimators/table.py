@@ -49,7 +49,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from itertools import chain
-from operator import attrgetter
 from typing import Any, Final, Literal, cast
 
 from pdhef_logtool.car.car import Car
@@ -85,7 +84,7 @@ class Spec:
     Attributes
     ----------
     build : called with the name, the :class:`Car` and :class:`Options`: a function, or ``module:function`` under
-        :mod:`pdhef_logtool.estimators`, imported when it is first needed.
+        :mod:`pdhef_logtool.estimators`, imported when it is first needed. A class is called with vehicle and name.
     needs : required aligned signals. one_of : signals; it requires at least one of them, unless empty.
     colour : 0xRRGGBB in every plot, distinguishable with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
     causal : whether an estimate at t uses only samples available at t.
@@ -140,12 +139,13 @@ class Spec:
         """
         if reason := self.missing(car):
             raise UsageError(expected="a car with all required parts", got=reason, where=self.name)
-        build = self.build
+        build: Any = self.build
         if isinstance(build, str):
             module, _, function = build.partition(":")
-            build = attrgetter(function)(import_module(f"{__package__}.{module}"))
+            build = getattr(import_module(f"{__package__}.{module}"), function)
         calibration = calibration_of(self.name, car)
-        estimator: Any = build(self.name, car if calibration is None else car.calibrated_car, options)
+        car = car if calibration is None else car.calibrated_car
+        estimator = build(car.vehicle, self.name) if isinstance(build, type) else build(self.name, car, options)
         if options.gnss and self.name in AIDED:
             from pdhef_logtool.estimators.gnss_aided import GnssAided
 
@@ -172,9 +172,9 @@ SPECS: tuple[Spec, ...] = (
          "pass_through:build", _PLANAR, 0xCC79A7),
     Spec("kinematic", "leaky integral of a_y - v_x r", "kinematic:build", _PLANAR | {"ay_m_s2"}, 0x009E73),
     Spec("open-loop", "nominal single-track model from steering and speed alone",
-         "open_loop:build", _INPUTS, 0xE69F00),
+         "open_loop:OpenLoop", _INPUTS, 0xE69F00),
     Spec(OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",
-         "open_loop:build", _INPUTS, 0x661100, causal=False),
+         "open_loop:OpenLoop", _INPUTS, 0x661100, causal=False),
     Spec("linear-regression", "sideslip linear in the network's features, low-passed at 2 Hz (needs such a model)",
          "direct_network:build", FEATURES, 0xDDCC77, network="linear_regression"),
     Spec("phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
@@ -196,15 +196,15 @@ SPECS: tuple[Spec, ...] = (
     Spec("pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, unchanged (needs its network)",
          "hybrid_paper:build", FEATURES, 0xCC6677, network="paper"),
     Spec("linear-kf", "peer: Kalman filter on the linear single track (Leanza et al. 2021)",
-         "peers.linear_kf:LinearKalman.build", _INPUTS, 0x7F7F7F, group=PEERS, one_of=_PLANAR_IMU),
+         "peers.linear_kf:LinearKalman", _INPUTS, 0x7F7F7F, group=PEERS, one_of=_PLANAR_IMU),
     Spec("linear-kf:open-loop", "peer: linear single track from steering and speed alone (Riekert and Schunck 1940)",
-         "peers.linear_kf:LinearKalman.build", _INPUTS, 0xBBBBBB, group=PEERS),
+         "peers.linear_kf:LinearKalman", _INPUTS, 0xBBBBBB, group=PEERS),
     Spec("learned-single-track", "peer: single track with parameters learned from the yaw rate (openpilot's paramsd)",
-         "peers.learned_single_track:LearnedSingleTrack.build", _INPUTS | _PLANAR, 0x999933, group=PEERS),
+         "peers.learned_single_track:LearnedSingleTrack", _INPUTS | _PLANAR, 0x999933, group=PEERS),
     Spec("slip-ukf", "peer: unscented Kalman filter over speed and sideslip with axle forces (Goblirsch et al. 2024)",
-         "peers.slip_ukf:SlipUkf.build", FEATURES, 0x6699CC, group=PEERS),
+         "peers.slip_ukf:SlipUkf", FEATURES, 0x6699CC, group=PEERS),
     Spec("washout", "peer: kinematic with a leak to the stationary single track (Piyabongkarn et al. 2009)",
-         "peers.washout:Washout.build", FEATURES, 0x88CCEE, group=PEERS),
+         "peers.washout:Washout", FEATURES, 0x88CCEE, group=PEERS),
 )  # fmt: skip
 
 

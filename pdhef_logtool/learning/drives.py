@@ -118,7 +118,7 @@ def record_of(drive: Drive, *, whole: WholeDrive | None = None, left_out: str = 
     """Return the record of a drive that was read."""
     return DriveRecord(
         name=drive.name,
-        file=drive.file,
+        file=drive.path.name,
         sha256=drive.sha256,
         seconds=0.0 if whole is None else whole.seconds,
         span_s=None if whole is None else whole.span_s,

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.model import ESTIMATED, GROUND_TRUTH, CarModel, TaughtParameter
+from pdhef_logtool.car.model import ESTIMATED, GROUND_TRUTH, CarModel
 from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.store import check_output, update_car
-from pdhef_logtool.drive.plan import Sensors
 from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.checked_inputs import without_bursts
@@ -53,7 +52,7 @@ from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.residual_model.features import slow_features
 from pdhef_logtool.residual_model.ladder import NONE
-from pdhef_logtool.residual_model.ladder_fit import LadderFit, TaughtDrive, fit_ladder
+from pdhef_logtool.residual_model.ladder_fit import TaughtDrive, fit_ladder
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.outputs import check_no_input, local_path
 
@@ -71,11 +70,6 @@ class LearnResult:
     def exit_code(self) -> int:
         """0 if all drives were used completely, 3 otherwise."""
         return exit_code(self.records)
-
-    @property
-    def drives(self) -> tuple[DriveRecord, ...]:
-        """Drives that were used."""
-        return tuple(r for r in self.records if not r.left_out)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
@@ -113,7 +107,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
     splits = chosen_logs(arguments, settings)
     read = [*(i.local for i in splits), *(path for path in config.files if path != config.car)]
     check_no_input(read, [], [output])
-    records, model, figures = _learnt(splits, Car.of(source.vehicle), config, reporter.progress)
+    records, model, figures = _learnt(splits, Car(source.vehicle), config, reporter.progress)
     for record in records:
         tell_drive(record, reporter.warn)
     learnt_on = tuple(r.learnt_on for r in records if not r.left_out)
@@ -142,8 +136,7 @@ def _learnt(
     seconds, slow = STEP_S * sum(np.isfinite(s).sum() for s in slopes), car.vehicle.low_speed_blend_m_s
     few = "" if seconds >= LEAST_S else f"{seconds:.1f} s"
     _check(few, f"at least {LEAST_S:g} s of driving with ground truth above {slow:g} m/s")
-    taught = learn_from(teachers, progress)
-    return records, taught.model(car, teachers[0].drive.plan.sensors), taught.figures
+    return records, *learn_from(teachers, progress)
 
 
 def _without_truth(
@@ -196,44 +189,6 @@ class OpenedDrive:
         return self.whole.truth
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Teaching:
-    """Result of teaching: parameters of each drive, residual, whether the drives calibrated their car."""
-
-    parameters: tuple[TaughtParameter, ...]
-    ladder: LadderFit
-    calibrated: bool
-    truth: str
-
-    @property
-    def evidence(self) -> str:
-        """The evidence in one line."""
-        tried = ", ".join(f"{t.rung} {t.rmse_deg:.3f}°" for t in self.ladder.trials)
-        rung = "no residual" if self.ladder.rung == NONE else f"residual model {self.ladder.rung}"
-        return (
-            f"{rung}, taught by {self.truth}, by held-out blocks of {self.ladder.seconds:.0f} s"
-            f" (RMSE without constants: {tried or 'not tried'})"
-        )
-
-    @property
-    def figures(self) -> dict[str, Any]:
-        """The figures as JSON-able values."""
-        return {
-            "evidence": self.evidence,
-            "rung": self.ladder.rung,
-            "seconds": round(self.ladder.seconds, 1),
-            "blocks": self.ladder.blocks,
-            "rungs": [asdict(t) for t in self.ladder.trials],
-            "calibrated": self.calibrated,
-            "truth": self.truth,
-        }
-
-    def model(self, car: Car, sensors: Sensors) -> CarModel:
-        """Return the model of the car with the sensors of one of its drives."""
-        stated = {name: getattr(self, name) for name in ("parameters", "calibrated", "truth", "evidence")}
-        return model_of(car, sensors, residual=self.ladder.model, **stated)
-
-
 def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive]:
     """Return the record of an open drive and its content; the record has the reason if it does not teach."""
     if missing := sorted({*lacking(drive), *(FEATURES - drive.available)}):
@@ -257,24 +212,36 @@ def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDriv
     return record, OpenedDrive(drive, driving)
 
 
-def learn_from(drives: Sequence[OpenedDrive], progress: Any = lambda _text, _share: None) -> Teaching:
-    """Return prior and residual from drives of one car, read with its vehicle file."""
+def learn_from(
+    drives: Sequence[OpenedDrive], progress: Callable[[str, float], None] = lambda _text, _share: None
+) -> tuple[CarModel, dict[str, Any]]:
+    """Return the model of a car, with prior and residual, and figures, from drives that were read with its file."""
     progress("fitting the prior", 0.3)
-    vehicle = drives[0].drive.car.vehicle
+    car = drives[0].drive.car
     driven = [d.driving for d in drives if d.driving is not None]
-    fits = (fit_car(driving, vehicle) for driving in driven)
+    fits = (fit_car(driving, car.vehicle) for driving in driven)
     parameters = tuple(p for fit in fits if not fit.refused for p in for_later_drives(fit, TYRES))
-    calibrations = [fit_car(replace(driving, slopes=None), vehicle, parameters) for driving in driven]
+    calibrations = [fit_car(replace(driving, slopes=None), car.vehicle, parameters) for driving in driven]
     progress("fitting the residual", 0.8)
     lacks = [lacking_of(d, c) for d, c in zip(drives, calibrations, strict=True)]
     seconds = {False: 0.0, True: 0.0}
     for driving, calibration in zip(driven, calibrations, strict=True):
         seconds[not calibration.refused] += driving.seconds
     calibrated = seconds[True] >= seconds[False]  # calibrated and uncalibrated physics differ
-    fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
-    ladder = fit_ladder(fitted)
+    ladder = fit_ladder(
+        [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
+    )
     truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
-    return Teaching(parameters, ladder, calibrated, truth)
+    tried = ", ".join(f"{t.rung} {t.rmse_deg:.3f}°" for t in ladder.trials)
+    rung = "no residual" if ladder.rung == NONE else f"residual model {ladder.rung}"
+    evidence = (
+        f"{rung}, taught by {truth}, by held-out blocks of {ladder.seconds:.0f} s"
+        f" (RMSE without constants: {tried or 'not tried'})"
+    )
+    stated = {"evidence": evidence, "calibrated": calibrated, "truth": truth}
+    model = model_of(car, drives[0].drive.plan.sensors, parameters=parameters, residual=ladder.model, **stated)
+    tested = {"rung": ladder.rung, "seconds": round(ladder.seconds, 1), "blocks": ladder.blocks}
+    return model, stated | tested | {"rungs": [asdict(t) for t in ladder.trials]}
 
 
 def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:

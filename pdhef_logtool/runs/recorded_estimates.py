@@ -255,7 +255,7 @@ def _reference(drive: Drive, model: DriveModel, config: RunConfig) -> DriveRefer
         drive.tell("estimated sideslip reference: differences from it are no errors (docs/estimators.md#reference)")
     elif reference is not None and not drive.mapping.truth:
         refused = str(reference.document["refused"])
-        raise _nothing_to_score_against(f"none, and no sideslip reference: {refused}", drive.file)
+        raise _nothing_to_score_against(f"none, and no sideslip reference: {refused}", drive.path.name)
     return reference
 
 

@@ -252,7 +252,7 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
     return {
         "log": {
             "name": drive.name,
-            "file": PurePath(drive.file).name,
+            "file": PurePath(drive.path.name).name,
             "kind": drive.log.kind,
             "sha256": drive.sha256,
             "start_ns": plan.start_ns,
@@ -282,7 +282,7 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
             "causal_from_s": drive.causal_from_s,
         },
         "losses": losses,
-        "ledger": {"samples": drive.sample_ledger},
+        "ledger": {"samples": drive.recorded().ledger},
         "warnings": drive.notes,
         "remarks": drive.remarks,
         "checks": [{k: getattr(c, k) for k in _OF_CHECK} for c in drive.checks],
@@ -308,8 +308,10 @@ def car_entry(car: Car) -> dict[str, Any]:
 def outcome_of(drive: Drive, losses: Sequence[Loss], *, neutral: bool = False, **changes: Any) -> LogOutcome:
     """Return the record of a log in run.json; ``neutral``: without names and metadata of its file."""
     day, route = day_and_route(drive.plan.start_ns, drive.log.metadata())
-    texts: dict[str, Any] = {"file": drive.file, "lost": lost_texts(losses)}
+    texts: dict[str, Any] = {"file": drive.path.name, "lost": lost_texts(losses)}
     if neutral:
         texts, route = without_names(texts, drive.path, drive.name), route and digest(route)[:SHOWN_DIGITS]
-    texts |= {key: getattr(drive, key) for key in ("sha256", "signals_sha256", "truth_sha256")}
-    return LogOutcome(drive.name, mapping_sha256=drive.mapping.sha256, day=day, route=route, **texts, **changes)
+    texts |= {key: getattr(drive.recorded(), key) for key in ("signals_sha256", "truth_sha256")}
+    return LogOutcome(
+        drive.name, sha256=drive.sha256, mapping_sha256=drive.mapping.sha256, day=day, route=route, **texts, **changes
+    )

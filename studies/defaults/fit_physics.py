@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     drawn = json.loads((given.work / "manifest.json").read_text(encoding="utf-8"))["drives"]
     drives, learnt_on = [], []
     for entry in drawn:
-        read = read_drive(given.work / entry["file"], Car.of(car.vehicle))
+        read = read_drive(given.work / entry["file"], Car(car.vehicle))
         assert read.truth is not None
         drives.append(FitDrive(read.name, read.signals, read.truth))
         learnt_on.append(LearntOn(name=read.name, sha256=entry["sha256"], end_s=entry["duration_s"]))

@@ -36,7 +36,7 @@ RUN_CAR = REFERENCE / "vehicles" / "f1tenth.toml"
 
 def recorded(d: PeerDrive) -> Entry:
     """Return a recorded drive with its published vehicle file."""
-    car = pdhef.Car.of(vehicle_of(d))
+    car = pdhef.Car(vehicle_of(d))
     return Entry(DRIVES / d.log, d.group, d.drive, d.car, car, mapping_of(d), d.least_speed_m_s, d.group == OFFSET)
 
 

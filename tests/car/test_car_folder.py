@@ -99,7 +99,7 @@ def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> Non
 
 
 def test_a_car_without_network_has_no_residual_network_and_one_for_physics_is_it() -> None:
-    assert Car.of(default_vehicle()).residual_network is None
+    assert Car(default_vehicle()).residual_network is None
     saloon = Car.load("saloon")
     assert saloon.network is not None
     assert saloon.residual_network is saloon.network

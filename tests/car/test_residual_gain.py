@@ -16,7 +16,7 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
 from tests.command_line import called
 
-SEDAN = Car.of(default_vehicle())
+SEDAN = Car(default_vehicle())
 OWN, FOREIGN = replace(random_network(), physics_sha256=SEDAN.physics_sha256), random_network()
 
 
@@ -55,7 +55,7 @@ def test_a_run_says_the_gain_and_uses_it(sample_logs_dir: Path, tmp_path: Path) 
     car = tmp_path / "car"
     car.mkdir()
     (car / "vehicle.toml").write_text(part_toml(vehicle))
-    replace(random_network(), physics_sha256=Car.of(vehicle).physics_sha256).save(car / "network")
+    replace(random_network(), physics_sha256=Car(vehicle).physics_sha256).save(car / "network")
     random_network(1).save(tmp_path / "foreign")
     for out, network, gain, text in (
         ("own", (), 1.0, "residual gain 1 within the region of validity"),

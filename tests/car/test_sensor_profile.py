@@ -95,7 +95,7 @@ def test_speed_and_steering_are_kept_for_the_times_of_the_profile(clean: Signals
     dark = masked(clean, "speed_m_s", t > 4.0)
 
     def lost_s(**sensors: float) -> float:
-        car = Car.of(vehicle(**sensors))
+        car = Car(vehicle(**sensors))
         passed = PassThrough("zero", claims_zero_sideslip=True, speed_hold_s=car.vehicle.sensors.speed_hold_s)
         values = passed.run(dark, None)[0].values[:, 0]
         return float(t[np.isfinite(values)].max())

@@ -60,7 +60,7 @@ def car() -> Car:
 def read(path: Path, car: Car, **options: object) -> tuple[Drive, WholeDrive]:
     with read_drive(path, car, options=ReadOptions(friction=1.0, **options)) as drive:  # type: ignore[arg-type]
         whole = drive.whole()
-        for s in drive.sample_ledger:
+        for s in drive.recorded().ledger:
             assert s.used + sum(s.dropped.values()) == s.total, s
             assert "not-read" not in s.dropped
         return drive, whole
@@ -71,7 +71,7 @@ def kinds(drive: Drive) -> dict[str, str]:
 
 
 def dropped(drive: Drive) -> dict[str, int]:
-    return dict(next(s.dropped for s in drive.sample_ledger if s.name == "yaw_rate_rad_s" and s.role == "signal"))
+    return dict(next(s.dropped for s in drive.recorded().ledger if s.name == "yaw_rate_rad_s" and s.role == "signal"))
 
 
 def same_at_common_stamps(whole: WholeDrive, sound: WholeDrive, least: int) -> None:
@@ -88,10 +88,10 @@ def same_at_common_stamps(whole: WholeDrive, sound: WholeDrive, least: int) -> N
 def test_a_sound_log_uses_every_sample(sample_logs_dir: Path, car: Car) -> None:
     drive, _ = read(sample_logs_dir / "dlc.mcap", car)
     assert drive.losses == ()
-    assert all(s.used == s.total and not s.dropped for s in drive.sample_ledger)
+    assert all(s.used == s.total and not s.dropped for s in drive.recorded().ledger)
     drive, _ = read(sample_logs_dir / "dlc.mcap", car, start="2", end="5")
     assert drive.losses == ()
-    assert {reason for s in drive.sample_ledger for reason in s.dropped} == {"outside-slice"}
+    assert {reason for s in drive.recorded().ledger for reason in s.dropped} == {"outside-slice"}
 
 
 @pytest.mark.slow
@@ -220,5 +220,5 @@ def test_a_pause_of_twenty_minutes_is_no_epoch(sample_logs_dir: Path, tmp_path: 
     rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: 1200 * S if at_s > 4.0 else 0)
     drive, whole = read(log, car)
     assert kinds(drive) == {}
-    assert all(s.used == s.total for s in drive.sample_ledger)
+    assert all(s.used == s.total for s in drive.recorded().ledger)
     assert len(whole.signals) == 951

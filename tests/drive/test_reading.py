@@ -40,12 +40,12 @@ def test_a_drive_is_read_once_and_says_the_same_again(
     monkeypatch.setattr(recorded, "read_signals", lambda *a: reads.append(a) or read_signals(*a))
     with read_drive(sample_logs_dir / "dlc.mcap", car, options=ReadOptions()) as drive:
         first = drive.whole()
-        said = drive.sample_ledger, drive.signals_sha256, drive.truth_sha256, drive.losses
+        said = drive.recorded(), drive.losses
         second = drive.whole()
-        assert said == (drive.sample_ledger, drive.signals_sha256, drive.truth_sha256, drive.losses)
+        assert said[0] is drive.recorded() and said[1] == drive.losses
         assert drive.sha256 == hash_log(drive.path)
         assert drive.losses == ()
-        used = {s.source: s.used for s in drive.sample_ledger}
+        used = {s.source: s.used for s in drive.recorded().ledger}
         assert used["/imu/data.angular_velocity.z"] > len(first.signals) - 3
     assert len(reads) == 1
     _assert_equal(first.signals, second.signals)
@@ -54,7 +54,7 @@ def test_a_drive_is_read_once_and_says_the_same_again(
 
 def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> None:
     told: list[str] = []
-    without = Car.of(car.vehicle.model_copy(update={"friction": None}))
+    without = Car(car.vehicle.model_copy(update={"friction": None}))
     with read_drive(sample_logs_dir / "dlc.mcap", without, tell=told.append) as drive:
         drive.tell("one more")
         notes, remarks = list(drive.notes), list(drive.remarks)

@@ -158,7 +158,7 @@ def test_a_recorded_steering_that_freezes_is_named(shared_dir: Path) -> None:
     """The steering repeats one value for the last 2 s, while the car comes out of a bend at 17 m/s."""
     (drive,) = (d for d in PEER_DRIVES if d.log == "stanford_wet_1.mcap")
     folder = shared_dir / "data" / "drives"
-    car = Car.of(vehicle_of(drive, folder))
+    car = Car(vehicle_of(drive, folder))
     with read_drive(folder / drive.log, car, mapping_of(drive, folder)) as opened:
         (change,) = opened.whole().changes
     assert (change.sensor, change.kind) == ("steer_rad", "stuck")

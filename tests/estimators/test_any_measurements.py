@@ -113,7 +113,7 @@ def test_without_steering_a_y_and_yaw_rate_there_is_no_estimate(road: WholeDrive
 
 
 def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir: Path) -> None:
-    car = Car.of(default_vehicle())
+    car = Car(default_vehicle())
     with read_drive(sample_logs_dir / "dlc.mcap", car, adjust=without(*STEERING)) as drive:  # type: ignore[arg-type]
         model = DriveModel.fit(drive)
         calibration = model.posterior
@@ -126,7 +126,7 @@ def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir: Path
 
 
 def test_without_a_y_the_yaw_rate_calibrates(sample_logs_dir: Path) -> None:
-    car, fits = Car.of(default_vehicle()), []
+    car, fits = Car(default_vehicle()), []
     for missing in ((), ("ay_m_s2",)):
         with read_drive(sample_logs_dir / "sweep.mcap", car, adjust=without(*missing)) as drive:  # type: ignore[arg-type]
             driving = read_driving(drive)

@@ -56,7 +56,7 @@ MIRRORED = ("vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")
 
 def car_of(vehicle: VehicleParameters = VEHICLE) -> Car:
     """Return a car with all that an estimator may need."""
-    return Car.of(vehicle, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, network_gain=1.0)
+    return Car(vehicle, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, network_gain=1.0)
 
 
 def run(name: str, signals: Signals, **options) -> StateTrack:
@@ -98,7 +98,7 @@ def _calibrated() -> Posterior:
 
 
 def _taught() -> Car:
-    car = Car.of(default_vehicle())
+    car = Car(default_vehicle())
     return replace(car, model=CarModel(physics_sha256=car.physics_sha256, residual=linear_residual()))
 
 

@@ -26,7 +26,7 @@ AVAILABLE = frozenset({"steer_rad", "speed_m_s", "ay_m_s2", "yaw_rate_rad_s"})
 
 @pytest.fixture(scope="module")
 def bare() -> Car:
-    return Car.of(Car.load(study.ROOT / "sample_logs" / "vehicle.toml").vehicle)
+    return Car(Car.load(study.ROOT / "sample_logs" / "vehicle.toml").vehicle)
 
 
 @pytest.fixture(scope="module")

@@ -33,12 +33,12 @@ def test_pure_lstm_says_what_its_network_says_and_predicts_it_over_the_delay():
     made = drive(slalom(0.02, 0.5), 4.0)
     gain = 1.0 + 9.80665 * VEHICLE.roll_gradient_rad_per_m_s2
     on_time = replace(made.signals, ay_m_s2=gain * made.ay)
-    track = run_estimator(make_estimator("pure-lstm", Car.of(VEHICLE, network=model)), on_time)
+    track = run_estimator(make_estimator("pure-lstm", Car(VEHICLE, network=model)), on_time)
     np.testing.assert_allclose(track.vy_m_s, 0.25, rtol=1e-6)
     np.testing.assert_array_equal(track.yaw_rate_rad_s, made.r)
     np.testing.assert_allclose(track.ay_m_s2, made.ay, rtol=1e-12, atol=1e-12)
     late = replace(on_time, ready_ns=on_time.stamps_ns + 20_000_000)
-    track = run_estimator(make_estimator("pure-lstm", Car.of(VEHICLE, network=model)), late)
+    track = run_estimator(make_estimator("pure-lstm", Car(VEHICLE, network=model)), late)
     expected = 0.25 + 0.02 * (made.ay - made.vx * made.r)[:-2]
     np.testing.assert_allclose(track.vy_m_s[2:], expected, atol=1e-3)
     assert np.ptp(track.vy_m_s[2:]) > 0.01
@@ -53,9 +53,9 @@ def test_linear_regression_is_its_equation():
         speed_m_s=np.full(n, 20.0),
     )  # fmt: skip
     model = replace(MODEL, linear_regression=LinearModel(("ay_m_s2", "yaw_rate_rad_s"), (-0.01, 0.2), 0.004, 2.0))
-    track = run_estimator(make_estimator("linear-regression", Car.of(VEHICLE, network=model)), signals)
+    track = run_estimator(make_estimator("linear-regression", Car(VEHICLE, network=model)), signals)
     assert track.sideslip_rad[-1] == pytest.approx(0.004 - 0.03 + 0.03, abs=1e-9)
     step = replace(signals, ay_m_s2=np.where(np.arange(n) < 1000, 3.0, 1.0))
-    after = run_estimator(make_estimator("linear-regression", Car.of(VEHICLE, network=model)), step)
+    after = run_estimator(make_estimator("linear-regression", Car(VEHICLE, network=model)), step)
     share = 1.0 - math.exp(-2.0 * math.pi * 2.0 * 0.01 * 8)  # eight steps behind the jump
     assert after.sideslip_rad[1007] == pytest.approx(0.004 + 0.02 * share, abs=1e-9)

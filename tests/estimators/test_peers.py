@@ -61,10 +61,10 @@ def simulated() -> tuple[Signals, np.ndarray]:
     return Signals(stamps, stamps, *inputs, np.full((len(times), 4), np.nan)), np.arctan2(vy, SPEED_M_S)
 
 
-@pytest.mark.parametrize("name", all_names(Car.of(default_vehicle()), PEERS))
+@pytest.mark.parametrize("name", all_names(Car(default_vehicle()), PEERS))
 def test_a_peer_recovers_a_linear_car_within_its_bound(name, simulated):
     signals, sideslip = simulated
-    track = run_estimator(make_estimator(name, Car.of(linear_sedan())), signals)
+    track = run_estimator(make_estimator(name, Car(linear_sedan())), signals)
     error = np.degrees(np.sqrt(np.mean((track.sideslip_rad - sideslip) ** 2)))
     assert error < BOUNDS_DEG[name]
     assert np.degrees(np.sqrt(np.mean(sideslip**2))) == pytest.approx(0.37, abs=0.01)
@@ -74,7 +74,7 @@ def test_the_learner_learns_an_offset_of_steering(simulated):
     signals, sideslip = simulated
     errors = {}
     for name in ("learned-single-track", "linear-kf:open-loop"):
-        estimator = make_estimator(name, Car.of(linear_sedan()))
+        estimator = make_estimator(name, Car(linear_sedan()))
         track = run_estimator(estimator, replace(signals, steer_rad=signals.steer_rad + 0.005))
         errors[name] = abs(np.degrees(np.mean((track.sideslip_rad - sideslip)[-1000:])))  # two periods
     assert errors["learned-single-track"] < 0.8 * errors["linear-kf:open-loop"]

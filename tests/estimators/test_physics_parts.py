@@ -77,7 +77,7 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
         }
     )
     car = replace(
-        Car.of(own, noise={"physics": FilterNoise()}), fitted_physics=FittedPhysics(values=fitted, noise=FilterNoise())
+        Car(own, noise={"physics": FilterNoise()}), fitted_physics=FittedPhysics(values=fitted, noise=FilterNoise())
     )
     adaptive = make_estimator("physics", car)
     estimator = adaptive.physics

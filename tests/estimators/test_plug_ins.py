@@ -103,6 +103,6 @@ def test_a_plug_in_that_cannot_be_built_is_left_out_with_its_error(monkeypatch: 
     unbuilt = Spec("plug", "a plug-in", lambda *_: sys.exit(0), frozenset(), 0x123456)
     monkeypatch.setattr(table, "all_specs", lambda: (*table.SPECS, unbuilt))
     available = frozenset({"speed_m_s", "yaw_rate_rad_s"})
-    ready, (skipped,) = runnable(("zero", "plug"), Car.of(default_vehicle()), available)
+    ready, (skipped,) = runnable(("zero", "plug"), Car(default_vehicle()), available)
     assert [e.name for e in ready] == ["zero"]
     assert skipped.is_error and "plug (plug-in test_plug_ins): expected an estimator that runs" in skipped.reason

@@ -116,7 +116,7 @@ def test_it_is_nearer_to_the_truth_than_its_filter(parts):
 
 
 def test_what_it_says_of_itself(rough):
-    trusted = Car.of(VEHICLE, network=BUNDLE, network_gain=0.6)
+    trusted = Car(VEHICLE, network=BUNDLE, network_gain=0.6)
     estimator = make_estimator("pd-hef-smoothed", trusted)
     assert isinstance(estimator, SmoothedPhysics) and isinstance(estimator, Smoother)
     assert (estimator.name, estimator.causal, estimator.filtered.trust) == ("pd-hef-smoothed", False, 0.6)

@@ -44,7 +44,7 @@ every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 
 MODEL = full_network()
 #: It has all that any estimator needs.
-CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, network_gain=1.0)
+CAR = Car(VEHICLE, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, network_gain=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def test_what_it_needs_is_what_it_needs(spec: Any, signals: Signals) -> None:
 @every_spec
 def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
     everything = frozenset(ALIGNED_SIGNALS)
-    estimators, skipped = runnable((spec.name,), Car.of(VEHICLE), everything)
+    estimators, skipped = runnable((spec.name,), Car(VEHICLE), everything)
     lacks = spec.network not in ("", "optional") or spec.needs_noise
     assert ([e.name for e in estimators], [s.name for s in skipped]) == (
         ([], [spec.name]) if lacks else ([spec.name], [])
@@ -111,8 +111,8 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
     if lacks:
         assert "--network" in skipped[0].reason or "fit.toml" in skipped[0].reason
         with pytest.raises(UsageError, match=spec.name):
-            make_estimator(spec.name, Car.of(VEHICLE))
-    assert (spec.name in all_names(Car.of(VEHICLE))) == (spec.group == ALL_ESTIMATORS and not lacks)
+            make_estimator(spec.name, Car(VEHICLE))
+    assert (spec.name in all_names(Car(VEHICLE))) == (spec.group == ALL_ESTIMATORS and not lacks)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_a_group_names_its_estimators_and_each_runs_once() -> None:
 def test_a_name_states_the_gain() -> None:
     assert ran("pd-hef:gain=0.5").options["trust"] == 0.5
     assert make_estimator("pd-hef:gain=0.5", CAR).name == "pd-hef:gain=0.5"
-    _, skipped = runnable(("pd-hef:gain=0.5",), Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))
+    _, skipped = runnable(("pd-hef:gain=0.5",), Car(VEHICLE), frozenset(ALIGNED_SIGNALS))
     assert [s.name for s in skipped] == ["pd-hef:gain=0.5"]
 
 

@@ -26,8 +26,8 @@ SEDAN = default_vehicle()
 
 
 def taught_car(residual: LadderModel | None, *, calibrated: bool = False) -> Car:
-    model = CarModel(physics_sha256=Car.of(SEDAN).physics_sha256, residual=residual, calibrated=calibrated)
-    return replace(Car.of(SEDAN), model=model)
+    model = CarModel(physics_sha256=Car(SEDAN).physics_sha256, residual=residual, calibrated=calibrated)
+    return replace(Car(SEDAN), model=model)
 
 
 def acts(estimator: Any) -> bool:

@@ -296,7 +296,7 @@ def test_standstill_holds_and_lets_go(bias, estimator):
 
 
 def test_esp_suite_ignores_the_speed_after_the_start(good):
-    esp = make_estimator("phy-ukf", Car.of(VEHICLE), Options(use_speed=False))
+    esp = make_estimator("phy-ukf", Car(VEHICLE), Options(use_speed=False))
     garbled = edited(good.signals, "speed_m_s", slice(1, None), 3.0)
     a, b = run_estimator(esp, good.signals), run_estimator(esp, garbled)
     np.testing.assert_array_equal(a.vx_m_s, b.vx_m_s)
@@ -305,7 +305,7 @@ def test_esp_suite_ignores_the_speed_after_the_start(good):
     other_start = edited(good.signals, "speed_m_s", 0, 20.0)
     assert abs(run_estimator(esp, other_start).vx_m_s[5] - 20.0) < 0.5
     assert np.abs(a.vx_m_s - good.vx).max() < 3.0
-    full = run_estimator(make_estimator("phy-ukf", Car.of(VEHICLE)), good.signals)
+    full = run_estimator(make_estimator("phy-ukf", Car(VEHICLE)), good.signals)
     assert a.vx_std_m_s[-1] > 3 * full.vx_std_m_s[-1]
 
 

@@ -96,9 +96,9 @@ def test_learn_is_taught_by_it_on_request_alone(
     monkeypatch.setattr(learning, "LEAST_S", 3.0)
     log = [str(tmp_path / "drive.mcap")]
     off = learn(log, tmp_path / "off", LearnSettings(config=RunConfig(car=config.car, mapping=config.mapping)))
-    assert off.drives[0].truth == () and read_model(off.car / MODEL_FILE).truth == ""
+    assert off.records[0].truth == () and read_model(off.car / MODEL_FILE).truth == ""
     result = learn(log, tmp_path / "car", LearnSettings(config=config))
-    assert result.drives[0].truth == (ESTIMATED,) and f"taught by {ESTIMATED}" in result.text
+    assert result.records[0].truth == (ESTIMATED,) and f"taught by {ESTIMATED}" in result.text
     assert read_model(tmp_path / "car" / MODEL_FILE).truth == ESTIMATED == result.figures["truth"]
     assert any(f"taught by {ESTIMATED}" in note for note in Car.load(tmp_path / "car").notes)
 

@@ -87,11 +87,11 @@ def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive:
     assert drive.driving.slopes is not None
     driving = replace(drive.driving, slopes=drive.driving.slopes + offset)
     shifted = replace(drive, whole=replace(drive.whole, truth=moved), driving=driving)
-    first, second = (learn_from([d]) for d in (drive, shifted))
+    (first, of_first), (second, of_second) = (learn_from([d]) for d in (drive, shifted))
     assert [p.value for p in second.parameters] == pytest.approx([p.value for p in first.parameters], rel=1e-6)
-    assert second.ladder.rung == first.ladder.rung
-    if first.ladder.model is not None and second.ladder.model is not None:
-        assert np.allclose(second.ladder.model.weights, first.ladder.model.weights, rtol=1e-4, atol=1e-9)
+    assert of_second["rung"] == of_first["rung"]
+    if first.residual is not None and second.residual is not None:
+        assert np.allclose(second.residual.weights, first.residual.weights, rtol=1e-4, atol=1e-9)
 
 
 def test_a_model_takes_the_place_of_a_fit_unless_the_vehicle_file_has_changed(

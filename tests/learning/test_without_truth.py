@@ -48,7 +48,7 @@ def test_a_pool_of_logs_mends_the_file_without_ground_truth(pool: LearnResult, s
     values = {p["name"]: p["value"] for p in tomllib.loads(text)["parameters"]}
     front, rear = (right.cornering_stiffness_n_per_rad(axle, 0.85) for axle in (True, False))
     assert values["rear cornering stiffness"] == pytest.approx(rear, rel=0.3)
-    assert len(pool.figures["self_calibration"]) == len(pool.drives) == 3
+    assert len(pool.figures["self_calibration"]) == len(pool.records) == 3
     options = ReadOptions(model=pool.car / "model.toml")
     with read_drive(sample_logs_dir / "fishhook.mcap", car, options=options) as drive:
         model = DriveModel.fit(drive)

@@ -52,14 +52,14 @@ FITTED = FittedParameter("yaw inertia", "kg m^2", 1700.0, 1500.0, 0.1, 0.2, log=
 
 def calibrated(varied: tuple[VehicleParameters, ...] = (), scale: float = 1.0, *, causal: bool = False) -> Car:
     found = Posterior(FOUND, () if causal else (FITTED,), varied=varied, error_scale=scale)
-    return replace(Car.of(OWN), self_calibrated=found)
+    return replace(Car(OWN), self_calibrated=found)
 
 
 def identified() -> Car:
     parts = PhysicsParts(lag=True, force_scale=True)
     values = OWN.model_copy(update={"yaw_inertia_kg_m2": 1700.0, "physics": parts})
     found = FittedPhysics(values=values, noise=NOISE)
-    return Car.of(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)
+    return Car(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prio
     """Errors of a file with a wrong rear axle are inside; the interval of an identified car is narrower."""
     true = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
     signals = replace(true, friction=np.full(len(true), 0.85))
-    right, wrong = Car.of(OWN), Car.of(OWN.with_stiffness(1.0, 0.6))
+    right, wrong = Car(OWN), Car(OWN.with_stiffness(1.0, 0.6))
     (truth, _), (plain, wide) = (tracks_of("physics", car, signals) for car in (right, wrong))
     error = np.abs(plain.sideslip_rad - truth.sideslip_rad)[50:]
     assert np.mean(error <= 1.96 * plain.sideslip_std_rad[50:]) < 0.5
@@ -204,14 +204,14 @@ def test_a_sensor_that_the_estimator_reports_as_faulty_widens_nothing() -> None:
 
 def test_the_open_loop_model_runs_once_more_only_on_a_calibrated_car() -> None:
     assert OPEN_LOOP in all_names(calibrated())
-    assert OPEN_LOOP not in all_names(Car.of(OWN))
+    assert OPEN_LOOP not in all_names(Car(OWN))
     with pytest.raises(UsageError, match="has not calibrated"):
-        make_estimator(OPEN_LOOP, Car.of(OWN))
+        make_estimator(OPEN_LOOP, Car(OWN))
 
 
 def test_the_centre_of_gravity_is_assumed_without_a_file_or_weight_split() -> None:
-    assert Car.of(default_vehicle()).cg_std_m == pytest.approx(DEFAULT_CG_SPREAD * 1.71)
-    assert Car.of(OWN.model_copy(update={"name": "mine"})).cg_std_m == 0.0
+    assert Car(default_vehicle()).cg_std_m == pytest.approx(DEFAULT_CG_SPREAD * 1.71)
+    assert Car(OWN.model_copy(update={"name": "mine"})).cg_std_m == 0.0
     given = vehicle_of_entries({"name": "mine", "mass_kg": 1500.0, "wheelbase_m": 2.7}, where="test")
-    car = Car.of(given.vehicle, assumed=given.assumed)
+    car = Car(given.vehicle, assumed=given.assumed)
     assert car.cg_std_m == pytest.approx(FRONT_WEIGHT_SHARE_SPREAD * 2.7 * FRONT_WEIGHT_SHARE)

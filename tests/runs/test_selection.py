@@ -48,7 +48,7 @@ def main(names: str, rows: Sequence[MetricRow] = (), *, proven: bool = False, na
 
 def test_a_proven_car_runs_three_and_an_unproven_one_what_guards_it_as_well() -> None:
     assert default_names(Car.load("saloon"), EVERY) == ("zero", "physics", "pd-hef")
-    unproven = default_names(Car.of(default_vehicle()), EVERY)
+    unproven = default_names(Car(default_vehicle()), EVERY)
     assert set(unproven) == {"zero", "open-loop", "phy-ukf", "physics", "pd-hef"}
     assert "linear-regression" not in unproven
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import VX, VY, YAW_RATE, Steps
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S
-from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray, Signals, step_durations_s
@@ -60,12 +58,6 @@ class Peer:
     vehicle: VehicleParameters
     name: str
     causal: bool = True
-
-    @classmethod
-    def build(cls, name: str, car: Car, options: Options) -> Self:
-        """Return the estimator of a car."""
-        del options
-        return cls(car.vehicle, name)
 
     def estimate(self, samples: Samples, first: int, steps_s: FloatArray, memory: FloatArray) -> None:
         """Fill ``samples.states`` from row ``first`` on, NaN without an estimate; update ``memory`` in place.

@@ -20,6 +20,7 @@ from pdhef_logtool.estimators.reference.gnss import (
 )
 from pdhef_logtool.estimators.reference.inputs import ANTENNA_Y_STD_M, LINEAR_FRICTION, RATE_HZ, knots, sensor_noise
 from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
+from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import INDEPENDENT_SHARE, REFERENCE, StateTrack, make_track
 
@@ -180,9 +181,7 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
 
 def _near(sure: BoolArray) -> BoolArray:
     """Return the mask of the knots [K] with a sure one within ``REACH_S``."""
-    counts = np.concatenate([[0], np.cumsum(sure)])
-    k, n = np.arange(len(sure)), round(REACH_S * RATE_HZ)
-    return np.asarray(counts[np.minimum(k + n, len(sure) - 1) + 1] > counts[np.maximum(k - n, 0)])
+    return np.asarray(running_mean(sure.astype(np.float64), round(REACH_S * RATE_HZ)) > 0.0)
 
 
 def corrected_inputs(states: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -366,7 +366,7 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
             **identity,
             "log": job.log_input.stem,
             "source": {"file": job.log_input.path.name, "sha256": source},
-            "signals_sha256": drive.signals_sha256,
+            "signals_sha256": drive.recorded().signals_sha256,
             "split_from": split_from,
             "settings_sha256": fingerprint,
             "mapping_sha256": drive.mapping.sha256,

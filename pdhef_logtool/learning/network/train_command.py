@@ -186,8 +186,10 @@ def train(
         weights={},
     )
     run = _Training.start(recipe, init, empty.signs, device)
-    train_pieces = [piece for s in training for piece in _pieces(s, recipe.piece_steps, empty)]
-    validation_pieces, test_pieces = ([_balanced(_scaled(s, empty)) for s in x] for x in (validation, test))
+    train_pieces = [piece for s in training for piece in _pieces(s, empty, recipe.piece_steps)]
+    validation_pieces, test_pieces = (
+        [p for s in x for p in _pieces(s, empty, len(s.weight))] for x in (validation, test)
+    )
     identity = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
     identity |= {"training": _sha256(train_pieces), "validation": _sha256(validation_pieces)}
     if (work / CHECKPOINT).is_file():
@@ -230,25 +232,17 @@ def _sha256(pieces: Iterable[_Piece]) -> str:
     return total.hexdigest()
 
 
-def _scaled(s: FeatureSequence, bundle: ModelBundle) -> _Piece:
-    """Return a sequence as the network of a bundle receives and predicts it."""
-    target = s.target / np.array(bundle.normalisation.target_std)
-    return _Piece(*(torch.from_numpy(c.astype(np.float32)) for c in (bundle.normalise(s.features), target, s.weight)))
+def _pieces(s: FeatureSequence, bundle: ModelBundle, steps: int) -> Iterator[_Piece]:
+    """Yield the pieces of a sequence as the network of a bundle receives and predicts it.
 
-
-def _pieces(sequence: FeatureSequence, steps: int, bundle: ModelBundle) -> Iterator[_Piece]:
-    whole = _scaled(sequence, bundle)
-    for first in range(0, whole.features.shape[0], steps):
-        part = _Piece(*(column[first : first + steps] for column in whole))
-        if float(part.weight.sum()) > 0.0:
-            yield _balanced(part)
-
-
-def _balanced(piece: _Piece) -> _Piece:
-    """Divide the weights of a piece by the mean square of its target."""
-    square = (piece.target**2).mean(dim=1)
-    mean = float((square * piece.weight).sum() / piece.weight.sum())
-    return piece._replace(weight=piece.weight / (mean + WEIGHT_FLOOR))
+    The weights of a piece are divided by the mean square of its target.
+    """
+    columns = (bundle.normalise(s.features), s.target / np.array(bundle.normalisation.target_std), s.weight)
+    parts = (torch.split(torch.from_numpy(column.astype(np.float32)), steps) for column in columns)
+    for features, target, weight in zip(*parts, strict=True):
+        if float(weight.sum()) > 0.0:
+            mean = float(((target**2).mean(dim=1) * weight).sum() / weight.sum())
+            yield _Piece(features, target, weight / (mean + WEIGHT_FLOOR))
 
 
 # ---- one epoch ----
