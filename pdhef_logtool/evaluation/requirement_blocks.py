@@ -52,25 +52,25 @@ class RequirementBlocks:
 
 
 def requirement_blocks(
-    requirements: Sequence[Requirement], main: str | None, drive: EvaluatedDrive, truth: StateTrack
+    requirements: Sequence[Requirement], main: str | None, drive: EvaluatedDrive
 ) -> list[RequirementBlocks]:
     """Return the blocks of all requirements with a mean over stamps as the metric and with data in this drive.
 
-    ``main`` : the selected estimate, for requirements without an estimator. ``truth`` : ground truth of the drive, or
-    its estimated reference.
+    Errors are relative to ground truth; where it does not score a requirement, to the estimated reference.
+    ``main`` : the selected estimate, for requirements without an estimator.
     """
-    results: list[RequirementBlocks] = []
-    for requirement in requirements:
-        name = requirement.estimator or main
-        if any(b.of == requirement.measured for b in results) or name is None:
-            continue
-        if not _has_blocks(requirement, drive, estimated=truth.name == REFERENCE):
-            continue
-        names = [name, *filter(None, {requirement.baseline} - {requirement.other_run})]
-        if {*names} <= drive.tracks.keys():
-            blocks = _blocks(requirement, [drive.tracks[n] for n in names], truth, drive)
-            results += [] if blocks is None else [blocks]
-    return results
+    results: dict[str, RequirementBlocks] = {}
+    for truth in filter(None, (drive.truth, drive.tracks.get(REFERENCE))):
+        for requirement in requirements:
+            name = requirement.estimator or main
+            names = [name, *filter(None, {requirement.baseline} - {requirement.other_run})]
+            tracks = [track for n in names if (track := drive.tracks.get(n or "")) is not None]
+            if requirement.measured in results or len(tracks) < len(names):
+                continue
+            if _has_blocks(requirement, drive, estimated=truth.name == REFERENCE):
+                blocks = _blocks(requirement, tracks, truth, drive)
+                results |= {} if blocks is None else {requirement.measured: blocks}
+    return list(results.values())
 
 
 def _has_blocks(requirement: Requirement, drive: EvaluatedDrive, *, estimated: bool) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -27,6 +27,23 @@ _MOST_TIMES = 30.0
 
 
 @dataclass(frozen=True, slots=True)
+class JudgedDrive:
+    """A drive of a run: its label, and its selected estimate (None: its only recorded estimate).
+
+    ``read_report`` returns its report.json: its blocks of time are used where too few drives are scored for a bootstrap
+    over drives. ``factors``: its day, car and route, None if unknown. ``space``, ``friction``: seconds by the lower
+    edges of speed and |a_y|, and the median friction, where the plan asks for exposure.
+    """
+
+    log: str
+    main: str | None
+    read_report: Callable[[], Mapping[str, Any] | None] = dict
+    factors: Mapping[str, object] = field(default_factory=dict)
+    space: Mapping[tuple[float, float], float] = field(default_factory=dict)
+    friction: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
 class DriveValue:
     """The metric of one drive.
 
@@ -35,11 +52,10 @@ class DriveValue:
     estimator : the scored one. n : number of stamps of ``value``; ``baseline`` None without one.
     seconds, metres : scored driving, NaN where unknown. std : root mean square of the 1-sigma of the estimated
         reference; NaN for ground truth. blocks : None if the run stored none. same : estimator and baseline are the
-        same algorithm. factors : its day, car and route, None if unknown.
-    space, friction : seconds by the lower edges of speed and |a_y|, and the median friction, if a plan needs them.
+        same algorithm.
     """
 
-    log: str
+    drive: JudgedDrive
     estimator: str
     value: float
     n: int
@@ -49,9 +65,6 @@ class DriveValue:
     std: float = math.nan
     blocks: RequirementBlocks | None = None
     same: bool = False
-    factors: Mapping[str, object] = field(default_factory=dict)
-    space: Mapping[tuple[float, float], float] = field(default_factory=dict)
-    friction: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +184,7 @@ def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> statis
     """Return the statistic of a requirement over drives, with bounds from drives or from blocks within them."""
     if not drives:
         return statistics.Bounded(math.nan, math.nan, math.nan, 0)
-    count, factors = len(drives), {name: [d.factors.get(name) for d in drives] for name in statistics.FACTORS}
+    count, factors = len(drives), {name: [d.drive.factors.get(name) for d in drives] for name in statistics.FACTORS}
     if requirement.statistic != POOLED:
         return _of_drives(requirement, _ratios(drives), factors)
     if count >= statistics.LEAST_DRIVES and requirement.other_run is not None:
@@ -251,7 +264,7 @@ def _worst(requirement: Requirement, drives: Sequence[DriveValue]) -> str | None
     values = np.abs(_ratios(drives))
     if not len(values) or not np.isfinite(values).any():
         return None
-    return drives[int(np.nanargmin(values) if requirement.metric in AT_LEAST else np.nanargmax(values))].log
+    return drives[int(np.nanargmin(values) if requirement.metric in AT_LEAST else np.nanargmax(values))].drive.log
 
 
 def _case(
@@ -309,7 +322,7 @@ def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[Driv
         (exposure.km, requirement.exposure_km, "km"),
     ]
     for need in requirement.exposure:
-        seconds = [need.seconds_of(d.space, d.friction, d.factors.get("car")) for d in drives]
+        seconds = [need.seconds_of(d.space, d.friction, d.factors.get("car")) for d in (v.drive for v in drives)]
         needs.append((float(sum(s > 0.0 for s in seconds)), float(need.drives), f"drives at {need.label}"))
         needs.append((math.fsum(seconds) / 60.0, need.minutes, f"minutes at {need.label}"))
     return [(has, needed, what) for has, needed, what in needs if needed > 0.0 and (has is None or has < needed)]

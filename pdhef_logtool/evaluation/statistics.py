@@ -22,10 +22,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,6 @@ from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.student import student_quantile
 from pdhef_logtool.storage.templates import one_line, template
-
-if TYPE_CHECKING:
-    from jinja2 import Template
 
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
@@ -100,12 +97,8 @@ class Dependence:
 
     def text(self, drives: int) -> str:
         """Return a sentence on the dependence of drives of one day, car or route."""
-        return one_line(_sentence().render(d=self, drives=drives))
-
-
-@cache
-def _sentence() -> Template:
-    return template(Path(__file__).with_name("templates") / "dependence.txt")
+        sentence = template(Path(__file__).with_name("templates") / "dependence.txt")
+        return one_line(sentence.render(d=self, drives=drives))
 
 
 def deviate(share: float, freedom: float) -> float:

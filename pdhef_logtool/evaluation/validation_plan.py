@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from pdhef_logtool.car.vehicle import NonNegative, Positive, Record
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import LABELS, SIGNALS, read_unit
@@ -33,23 +34,18 @@ _QUANTILE = re.compile(r"quantile (0\.\d+)")
 
 
 _Name = Annotated[str, Field(min_length=1, max_length=200)]
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
-_Positive = Annotated[_Finite, Field(gt=0.0)]
-_Least = Annotated[_Finite, Field(ge=0.0)]
 _Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
 
 
-class ExposureNeed(BaseModel):
+class ExposureNeed(Record):
     """A table ``[[requirement.exposure]]``: the least driving in conditions, over the scored drives."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     speed_m_s: Annotated[_Range, Field(description="Speed from, to: multiples of 5; [60, 65] is all above 60.")] = None
     ay_m_s2: Annotated[_Range, Field(description="|a_y| from, to: integers; [12, 13] is all above 12.")] = None
     friction: Annotated[_Range, Field(description="Median friction of the drive from, to.")] = None
     car: Annotated[_Name | None, Field(description="Name of the car.")] = None
     drives: Annotated[int, Field(ge=0, description="Least number of drives.")] = 0
-    minutes: Annotated[_Least, Field(description="Least minutes.")] = 0.0
+    minutes: Annotated[NonNegative, Field(description="Least minutes.")] = 0.0
 
     @model_validator(mode="after")
     def _agrees(self) -> ExposureNeed:
@@ -188,10 +184,8 @@ def shown(value: float, unit: str) -> str:
     return f"{value * factor:.3g}{'' if text.startswith('°') else ' '}{text}"
 
 
-class RequirementTable(BaseModel):
+class RequirementTable(Record):
     """A table ``[[requirement]]`` of plan.toml."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="Unique identifier.")]
     title: Annotated[_Name | None, Field(description="One line for reports. Default: the requirement in words.")] = None
@@ -203,10 +197,10 @@ class RequirementTable(BaseModel):
     segment: Annotated[_Name | None, Field(description="Segment of the drives. Default: all.")] = None
     manoeuvre: Annotated[_Name | None, Field(description="Manoeuvre, in place of segment.")] = None
     limit: Annotated[
-        _Finite | None, Field(description="Limit in the SI unit of the metric; a minimum for coverage95.")
+        float | None, Field(description="Limit in the SI unit of the metric; a minimum for coverage95.")
     ] = None
-    limit_deg: Annotated[_Finite | None, Field(description="Limit in degrees.")] = None
-    limit_deg_s: Annotated[_Finite | None, Field(description="Limit in degrees per second.")] = None
+    limit_deg: Annotated[float | None, Field(description="Limit in degrees.")] = None
+    limit_deg_s: Annotated[float | None, Field(description="Limit in degrees per second.")] = None
     baseline: Annotated[
         _Name | None,
         Field(
@@ -214,7 +208,7 @@ class RequirementTable(BaseModel):
             "the output of another run: a path with a slash, relative to the plan, or a URL."
         ),
     ] = None
-    max_ratio: Annotated[_Positive | None, Field(description="Largest ratio of the metric to the baseline's.")] = None
+    max_ratio: Annotated[Positive | None, Field(description="Largest ratio of the metric to the baseline's.")] = None
     statistic: Annotated[
         str,
         Field(
@@ -226,15 +220,13 @@ class RequirementTable(BaseModel):
         float, Field(ge=0.5, lt=1.0, description="Confidence level of the two-sided interval that decides.")
     ] = 0.95
     exposure_drives: Annotated[int, Field(ge=1, description="Least number of scored drives.")] = 1
-    exposure_minutes: Annotated[_Least, Field(description="Least scored driving in minutes.")] = 0.0
-    exposure_km: Annotated[_Least, Field(description="Least scored driving in kilometres.")] = 0.0
-    exposure: Annotated[list[ExposureNeed], Field(max_length=50, description="Least driving in conditions.")] = []
+    exposure_minutes: Annotated[NonNegative, Field(description="Least scored driving in minutes.")] = 0.0
+    exposure_km: Annotated[NonNegative, Field(description="Least scored driving in kilometres.")] = 0.0
+    exposure: Annotated[list[ExposureNeed], Field(max_length=50, description="Least driving in conditions.")] = []  # noqa: RUF012
 
 
-class PlanTable(BaseModel):
+class PlanTable(Record):
     """The file plan.toml."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     title: Annotated[str, Field(max_length=200, description="Name of the plan, for reports.")] = ""
     requirement: Annotated[list[RequirementTable], Field(min_length=1)]

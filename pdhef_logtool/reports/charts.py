@@ -219,20 +219,16 @@ class Charts:
 
 
 class _Blocks:
-    """The encoded series of a page; equal arrays are stored once."""
+    """The encoded series of a page."""
 
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
-        self._known: dict[tuple[int, float], dict[str, Any]] = {}
 
     def add(self, values: FloatArray, resolution: float = 0.0) -> dict[str, Any]:
         """Add a series and return its reference for the script."""
-        key = (id(values), resolution)
-        if key not in self._known:
-            name = f"b{len(self.texts)}"
-            self.texts[name], scale = encode(values, resolution)
-            self._known[key] = {"block": name, **scale}
-        return self._known[key]
+        name = f"b{len(self.texts)}"
+        self.texts[name], scale = encode(values, resolution)
+        return {"block": name, **scale}
 
     def entries(self, record: Any, resolution: float) -> dict[str, Any]:
         """Return a record by its fields for the page's script."""

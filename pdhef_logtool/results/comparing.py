@@ -311,25 +311,25 @@ def compare_runs(
     OutputError : No drive is in both runs, or the figures of a run are damaged.
     UsageError : No drive has the estimator, or the key.
     """
-    pairing = pair_logs(a.logs, b.logs)
-    if not pairing.pairs:
+    pairs, only_a, only_b = pair_logs(a.logs, b.logs)
+    if not pairs:
         raise OutputError(
             expected="a drive that is in both runs",
             got=f"none of {len(a.logs)} and {len(b.logs)} by signals, content or name",
             where=f"{a.place} and {b.place}",
             remedy="run both on the same drives",
         )
-    tables = _Tables(a, b, pairing.pairs, cluster)
+    tables = _Tables(a, b, pairs, cluster)
     gated, changed = any(f.max_ratio is not None for f in figures), tables.changed()
     compared = tuple(tables.compared(figures)) if changed or gated else ()
     tables.check_estimators(compared)
     return Comparison(
         a=a.place,
         b=b.place,
-        pairs=Counter(pair.by for pair in pairing.pairs),
-        only_a=tuple(log.label for log in pairing.only_a),
-        only_b=tuple(log.label for log in pairing.only_b),
-        differences=run_differences(a, b, pairing.pairs),
+        pairs=Counter(pair.by for pair in pairs),
+        only_a=tuple(log.label for log in only_a),
+        only_b=tuple(log.label for log in only_b),
+        differences=run_differences(a, b, pairs),
         changed=changed,
         figures=compared,
         others=_corrected(tables.compared(_beside(figures))) if changed and not alone else (),

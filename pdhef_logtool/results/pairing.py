@@ -43,18 +43,14 @@ class Pair:
         return None if left is None or other is None else bool(left == other)
 
 
-@dataclass(frozen=True, slots=True)
-class Pairing:
-    """The drives of two runs: pairs in the order of A, and drives without a partner."""
+def pair_logs(
+    a: Sequence[OpenedLog], b: Sequence[OpenedLog]
+) -> tuple[list[Pair], Sequence[OpenedLog], Sequence[OpenedLog]]:
+    """Return the pairs of the logs of two runs in the order of A, and the logs of A and of B without a partner.
 
-    pairs: tuple[Pair, ...]
-    only_a: tuple[OpenedLog, ...]
-    only_b: tuple[OpenedLog, ...]
-
-
-def pair_logs(a: Sequence[OpenedLog], b: Sequence[OpenedLog]) -> Pairing:
-    """Pair the logs of two runs; a key that several logs of a side have pairs none of them."""
-    left, right = list(a), list(b)
+    A key that several logs of a side have pairs none of them.
+    """
+    left, right = a, b
     pairs: dict[str, Pair] = {}
     for by, key in _KEYS:
         left_by_key, other = _once(left, key), _once(right, key)
@@ -62,7 +58,7 @@ def pair_logs(a: Sequence[OpenedLog], b: Sequence[OpenedLog]) -> Pairing:
         paired = {pair.b.label for pair in pairs.values()}
         left = [log for log in left if log.label not in pairs]
         right = [log for log in right if log.label not in paired]
-    return Pairing(tuple(pairs[log.label] for log in a if log.label in pairs), tuple(left), tuple(right))
+    return [pairs[log.label] for log in a if log.label in pairs], left, right
 
 
 def _once(logs: Sequence[OpenedLog], key: Callable[[OpenedLog], object]) -> dict[object, OpenedLog]:

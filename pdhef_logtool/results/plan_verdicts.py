@@ -6,7 +6,7 @@ The baseline of a requirement can be another run: run A of a comparison, or an e
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.sensors import NOT_INDEPENDENT, SENSORS
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
-from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, RequirementVerdict, gates, judge
+from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, JudgedDrive, RequirementVerdict, gates, judge
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
@@ -30,23 +30,6 @@ if TYPE_CHECKING:
 _BESIDE = ("exposure_s", "exposure_m", NOT_INDEPENDENT, "reference_rms", "reference_std")
 #: Log, estimator, signal, segment and metric.
 _Key = tuple[str, str, str, str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class JudgedDrive:
-    """A drive of a run: its label, and its selected estimate (None: its only recorded estimate).
-
-    ``read_report`` returns its report.json: its blocks of time are used where too few drives are scored for a bootstrap
-    over drives. ``factors``: its day, car and route. ``space``, ``friction``: as in
-    :class:`~pdhef_logtool.evaluation.requirement_verdicts.DriveValue`, where the plan asks for exposure.
-    """
-
-    log: str
-    main: str | None
-    read_report: Callable[[], Mapping[str, Any] | None] = dict
-    factors: Mapping[str, object] = field(default_factory=dict)
-    space: Mapping[tuple[float, float], float] = field(default_factory=dict)
-    friction: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,10 +167,8 @@ class _Judged:
             return None
         value, n = figure
         seconds, metres = self._exposure(drive, n)
-        return DriveValue(
-            drive.log, name, value, n, baseline, seconds, metres, std[0],
-            same=needed and value == baseline, factors=drive.factors, space=drive.space, friction=drive.friction,
-        )  # fmt: skip
+        same = needed and value == baseline
+        return DriveValue(drive, name, value, n, baseline, seconds, metres, std[0], same=same)
 
     def _baseline(self, drive: JudgedDrive, metric: str) -> float | None:
         """Return the metric of the baseline: an estimator of the drive, or of the drive in the other run."""
@@ -281,7 +262,7 @@ def other_runs(plan: ValidationPlan, logs: Sequence[OpenedLog]) -> dict[str, Aga
 
 
 def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) -> Against:
-    partners = {pair.b.label: judged_drive(pair.a) for pair in pair_logs(run.logs, logs).pairs}
+    partners = {pair.b.label: judged_drive(pair.a) for pair in pair_logs(run.logs, logs)[0]}
     return figures_of_file(run.table("metrics"), plan, [d.main for d in partners.values()]), partners
 
 

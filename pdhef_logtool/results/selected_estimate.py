@@ -119,21 +119,15 @@ def result_of(report: Report) -> str:
     if report["answer"] is not None:
         return str(report["answer"]["texts"]["result"])
     names, figures = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"], figures_of(report)
-    errors = [(name, figures.get((name, "sideslip_rad", "all", "rmse"))) for name in names]
-    scored = ", ".join(f"{name}: {degrees(error)}" for name, error in errors if error is not None)
-    if scored:
-        return f"sideslip RMSE of {scored} ({truth_of(report, 'sideslip_rad')})"
-    return f"sideslip of {', '.join(names)} is not scored" if names else "no estimate"
+    errors = {name: figures.get((name, "sideslip_rad", "all", "rmse")) for name in names}
+    return one_line(_words().recorded(report, names, {k: v for k, v in errors.items() if v is not None}))
 
 
 def assumptions_of(report: Report) -> list[str]:
     """Return the assumptions of the result of a document, as independent clauses."""
     if report["answer"] is not None:
         return [clause for clause in report["answer"]["texts"]["assumed"].split("; ") if clause]
-    vehicle = report["vehicle"]
-    car = "no car given: the ground truth is assumed to be measured at the centre of gravity"
-    slow = f"sideslip is scored above {vehicle['low_speed_blend_m_s']:g} m/s"
-    return [car if vehicle["file"] is None else f"car {vehicle['file']}", slow]
+    return clauses(_words().assumed_of_recorded(report["vehicle"]))
 
 
 def failed_checks(report: Report) -> list[str]:

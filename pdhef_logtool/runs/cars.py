@@ -20,7 +20,7 @@ from pdhef_logtool.logs.open_log import log_metadata
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.journal import digest_of
-from pdhef_logtool.storage.documents import read_toml, validated
+from pdhef_logtool.storage.documents import jsonable, read_toml, validated
 
 _Name = Annotated[str, Field(min_length=1)]
 
@@ -167,14 +167,11 @@ def car_record(car: Car) -> dict[str, Any]:
     """
     network = None if car.network is None else [Path(car.network_name).name, car.network.sha256]
     parts = {
-        "the car's physics": car.vehicle.model_dump(mode="json"),
-        "the car's fit": [_plain(car.fitted_physics), {name: _plain(noise) for name, noise in car.noise.items()}],
-        "the car's model": _plain(car.model),
+        "the car's physics": car.vehicle,
+        "the car's fit": [car.fitted_physics, car.noise],
+        "the car's model": car.model,
         "the network": network,
         "the residual gain": car.network_gain,
     }
-    return {"name": car.file_name or "", "network": network, "parts": {k: digest_of(v) for k, v in parts.items()}}
-
-
-def _plain(part: Record | None) -> Any:
-    return None if part is None else part.model_dump(mode="json")
+    digests = {what: digest_of(jsonable(part)) for what, part in parts.items()}
+    return {"name": car.file_name or "", "network": network, "parts": digests}

@@ -14,12 +14,11 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from pdhef_logtool.car.names import SHIPPED_CARS
-from pdhef_logtool.car.vehicle import SENSOR_PROFILES
+from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Friction
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import AUTO, OFF, ReadOptions, parse_time
 from pdhef_logtool.estimators.table import check_names
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 from pdhef_logtool.residual_model.interface import plug_in_names
 from pdhef_logtool.storage.documents import read_toml, validated
@@ -52,7 +51,6 @@ Names = Annotated[
 #: A file or folder, as a path or a text.
 File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]
 Keep = Literal["metrics", "estimates", "full"]
-Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True, defer_build=True))

@@ -25,7 +25,7 @@ from pdhef_logtool.results.parquet_sink import write_estimates
 from pdhef_logtool.results.plotted import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
 from pdhef_logtool.results.sink import TRUTH, Event
-from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_metrics, write_tables
+from pdhef_logtool.results.tables import add_verdicts, write_metrics, write_tables
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import file_sha256
@@ -190,11 +190,7 @@ def files_of(folder: Path) -> dict[str, str]:
 
 def write_run_tables(output: Path, results: Sequence[LogResult]) -> None:
     """Write the tables of logs, and metrics.parquet also beside run.json, for readers of earlier versions."""
-    parts = (
-        drive_part(r.outcome, None) if r.part is None else read_part(r.part) if isinstance(r.part, Path) else r.part
-        for r in results
-    )
-    write_tables(output / opened_run.TABLES_FOLDER, parts, [r.outcome.folder for r in results])
+    write_tables(output / opened_run.TABLES_FOLDER, (r.tables for r in results), [r.outcome.folder for r in results])
     with writing(output / opened_run.METRICS_FILE), PendingFile(output / opened_run.METRICS_FILE) as pending:
         copyfile(output / opened_run.table_file("metrics"), pending.path)
 

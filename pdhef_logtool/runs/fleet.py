@@ -405,11 +405,11 @@ def write_run_pages(output: Path, report: bool, labels: Collection[str] | None, 
 
     run = open_run(output)
     if not report:
-        return remove_pages(run)
+        remove_pages(run)
+        return
     logs = None if labels is None else [log for log in run.logs if log.label in labels]
     for line in write_pages(run, lambda text, _: reporter.progress(text, 1.0), logs=logs).wrong:
         reporter.warn(line)
-    return None
 
 
 @dataclass(slots=True)

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
-from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, requirement_blocks
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+from pdhef_logtool.evaluation.requirement_verdicts import JudgedDrive
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
-from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan, default_plan, load_plan
+from pdhef_logtool.evaluation.validation_plan import ValidationPlan, default_plan, load_plan
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results import plan_verdicts
-from pdhef_logtool.results.plan_verdicts import JudgedDrive, PlanVerdicts
-from pdhef_logtool.results.tables import checks_of
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.files import write_bytes
@@ -32,20 +31,6 @@ def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPla
             expected="a validation plan to give verdicts on", got="none", where="--junit", remedy="--plan FILE"
         )
     return default_plan()
-
-
-def drive_blocks(
-    requirements: Sequence[Requirement], main: str | None, drive: EvaluatedDrive
-) -> list[RequirementBlocks]:
-    """Return the blocks of time of requirements, against the reference where ground truth does not score them.
-
-    ``main`` : the selected estimate, for requirements that name no estimator.
-    """
-    blocks: list[RequirementBlocks] = []
-    for base in filter(None, (drive.truth, drive.tracks.get(REFERENCE))):
-        left = [r for r in requirements if all(b.of != r.measured for b in blocks)]
-        blocks += requirement_blocks(left, main, drive, base)
-    return blocks
 
 
 def judge_drive(
@@ -97,4 +82,4 @@ def write_verdicts(junit: Path | None, verdicts: PlanVerdicts | None, results: S
     if junit is not None and verdicts is not None:
         from pdhef_logtool.results.junit import junit_bytes
 
-        write_bytes(junit, junit_bytes(verdicts, {r.outcome.log: checks_of(r.part) for r in results}))
+        write_bytes(junit, junit_bytes(verdicts, {r.outcome.log: r.tables["checks"][0].as_py() for r in results}))

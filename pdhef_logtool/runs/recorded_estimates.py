@@ -20,6 +20,7 @@ from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, one_log, read_d
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
 from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.evaluation.operating_space import operating_space
+from pdhef_logtool.evaluation.requirement_blocks import requirement_blocks
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.container import Wanted
@@ -57,7 +58,7 @@ from pdhef_logtool.results.run_report import estimator_entry
 from pdhef_logtool.results.tables import drive_part
 from pdhef_logtool.runs import drive_outputs, estimating
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.judging import drive_blocks, judge, judge_drive, read_validation_plan, write_verdicts
+from pdhef_logtool.runs.judging import judge, judge_drive, read_validation_plan, write_verdicts
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.run_drive import outcome_of, report_drive
 from pdhef_logtool.runs.run_result import LogResult, RunResult
@@ -199,7 +200,7 @@ def _score_drive(
     blocks = []
     for track, s in zip(tracks, scored, strict=True):
         asked = [q for q in plan.requirements if q.estimator == track.name or (selected and q.estimator is None)]
-        blocks += drive_blocks(asked, selected, s.drive)
+        blocks += requirement_blocks(asked, selected, s.drive)
     space = operating_space(together.signals, together.truth, together.read(selected or ""), drive.car.vehicle)
     stated = judge_drive(plan, drive, None, whole.rows, blocks, space)
     stated["estimators"] = [estimator_entry(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded]

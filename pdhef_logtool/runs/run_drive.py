@@ -20,6 +20,7 @@ from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.reasons import Interval, sensor_fault, sensor_faults
+from pdhef_logtool.evaluation.requirement_blocks import requirement_blocks
 from pdhef_logtool.evaluation.statistics import day_and_route
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP, ValidationPlan
 from pdhef_logtool.logs.discovery import LogInput
@@ -38,7 +39,7 @@ from pdhef_logtool.results.tables import drive_part
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import STALE_FILES, DriveOutputs, files_of, log_place
 from pdhef_logtool.runs.estimating import Estimated, Evaluation, PreparedDrive, estimate_drive, evaluate, prepare
-from pdhef_logtool.runs.judging import drive_blocks, judge_drive
+from pdhef_logtool.runs.judging import judge_drive
 from pdhef_logtool.runs.referencing import audit_truth
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.runs.selection import choose_main, contradiction
@@ -82,7 +83,7 @@ def run_log(
             scored = _score(run, estimated)
             named = run.config.estimators is not None
             main = choose_main(run.names, scored.rows, proven=drive.car.has_evidence, named=named)
-            blocks = drive_blocks([*validation.requirements, SIDESLIP], main.name, scored.drive)
+            blocks = requirement_blocks([*validation.requirements, SIDESLIP], main.name, scored.drive)
             space = operating_space(estimated.signals, estimated.truth, estimated.read(main.name), run.car.vehicle)
             judged = judge_drive(validation, drive, main.name, scored.rows, blocks, space)
             files = DriveOutputs((change, outputs.path), run, estimated, main)

@@ -11,6 +11,7 @@ from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_GATE, EXIT_OK, EXIT_
 from pdhef_logtool.results.opened_run import OpenedLog
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.results.tables import drive_part, read_part
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.object_store import Mirror
 
@@ -39,6 +40,13 @@ class LogResult:
     def report(self) -> dict[str, Any] | None:
         """The document of report.json, None if the log failed; raises OutputError for a damaged file."""
         return self.document if self.document is not None or self.output is None else self.opened.report()
+
+    @property
+    def tables(self) -> Any:
+        """The rows of the log in all tables (:func:`~pdhef_logtool.results.tables.drive_part`)."""
+        if self.part is None:
+            return drive_part(self.outcome, None)
+        return read_part(self.part) if isinstance(self.part, Path) else self.part
 
     @property
     def opened(self) -> OpenedLog:

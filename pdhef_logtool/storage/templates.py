@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,9 @@ if TYPE_CHECKING:
     from jinja2 import Environment, Template
 
 
+@cache
 def environment(folder: Path) -> Environment:
-    """Return the environment of the templates in a folder; fields of XML and HTML are escaped."""
+    """Return the one environment of the templates in a folder; fields of XML and HTML are escaped."""
     from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, StrictUndefined, select_autoescape
 
     class Kept(FileSystemBytecodeCache):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, judge
+from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, JudgedDrive, judge
 from pdhef_logtool.evaluation.statistics import least_drives
 from pdhef_logtool.evaluation.validation_plan import Requirement
 
@@ -25,8 +25,8 @@ def drives(
 ) -> list[DriveValue]:
     return [
         DriveValue(
-            f"d{i}", "pd-hef", float(v), int(n[i]) if len(n) else 1000, None if others is None else float(others[i]),
-            60.0, 1000.0, **more,
+            JudgedDrive(f"d{i}", None), "pd-hef", float(v), int(n[i]) if len(n) else 1000,
+            None if others is None else float(others[i]), 60.0, 1000.0, **more,
         )
         for i, v in enumerate(values)
     ]  # fmt: skip

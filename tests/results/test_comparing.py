@@ -125,6 +125,7 @@ def test_what_else_differs_is_said(tmp_path: Path) -> None:
         "d2": {"mapping_sha256": digest("scaled"), "signals_sha256": digest("scaled signals")},
         "d3": {"main": "physics"},
         "d4": {"outcome": "lost: a chunk"},
+        "d5": {"signals_sha256": digest("other signals"), "sha256": digest("another file")},
     }
     b = [entry(label, **changed.get(label, {})) for label in TEN]
     other = write_run(tmp_path / "b", TEN, entries=b, config={"friction": 0.3}, versions={"numpy": "2.1"})
@@ -134,7 +135,9 @@ def test_what_else_differs_is_said(tmp_path: Path) -> None:
     assert f"network: none → {digest('net')[:8]}, 1 of 10 drives" in text
     assert "truth: another one (what it held), 1 of 10 drives: d1" in text
     assert "mapping: another one" in text
-    assert "signals: they held something else, 1 of 10 drives: d2" in text
+    assert (
+        "signals: they held something else, 2 of 10 drives: d2, d5; 1 of them are one drive by their name alone" in text
+    )
     assert "selected estimate: pd-hef → physics, 1 of 10 drives" in text
     assert "configuration: friction auto → 0.3" in text
     assert "versions: numpy 2.0 → 2.1" in text

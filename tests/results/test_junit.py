@@ -8,7 +8,7 @@ from dataclasses import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, judge
+from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, JudgedDrive, judge
 from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
 from pdhef_logtool.results.junit import junit_bytes
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
@@ -20,7 +20,10 @@ def verdicts(*errors: float | None, strict: bool = False, title: str = "") -> Pl
     """Return one verdict per error of the only drive, in rad; None: the drive has no figure."""
     requirements = tuple(replace(WORST, id=f"R{i}") for i in range(len(errors)))
     judged = [
-        judge(r, [] if e is None else [DriveValue("a.mcap", "pd-hef", e, 100, seconds=60.0, metres=1e3)])
+        judge(
+            r,
+            [] if e is None else [DriveValue(JudgedDrive("a.mcap", None), "pd-hef", e, 100, seconds=60.0, metres=1e3)],
+        )
         for r, e in zip(requirements, errors, strict=True)
     ]
     return PlanVerdicts(ValidationPlan(requirements, title, "plan.toml"), tuple(judged), strict)

@@ -14,11 +14,11 @@ import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
+from pdhef_logtool.evaluation.requirement_verdicts import JudgedDrive, RequirementVerdict
 from pdhef_logtool.evaluation.validation_plan import ExposureNeed, Requirement, ValidationPlan, default_plan
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.comparing import compare
-from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
+from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, plan_verdicts
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.judging import judge, read_validation_plan
 from pdhef_logtool.runs.run_result import LogResult

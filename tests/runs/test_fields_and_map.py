@@ -17,27 +17,28 @@ from pdhef_logtool.runs.inspection import (
     render_inspection,
     write_mapping,
 )
+from pdhef_logtool.storage.documents import jsonable
 from tests.command_line import rendered
 
 
 def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
     found = fields_of_log(sample_logs_dir / "dlc.mcap", "/imu/data")
-    (topic,) = found.topics
+    (topic,) = found["topics"]
     paths = [f["path"] for f in topic["fields"]]
     assert "angular_velocity.z" in paths
     assert sum("covariance" in p for p in paths) == 3
     gravity = next(f for f in topic["fields"] if f["path"] == "linear_acceleration.z")
     assert gravity["type"] == "float64"
     assert gravity["minimum"] <= gravity["mean"] <= gravity["maximum"]
-    assert found.whole
+    assert found["whole"]
     text = rendered(render_fields, found)
     assert max(map(len, text.splitlines()[1:])) <= 80
-    json.dumps(found.to_dict(), allow_nan=False)
+    json.dumps(jsonable(found), allow_nan=False)
 
 
 def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path) -> None:
     found = fields_of_log(sample_logs_dir / "dlc.mcap")
-    assert len(found.topics) > 5
+    assert len(found["topics"]) > 5
     with pytest.raises(UsageError, match="topics: "):
         fields_of_log(sample_logs_dir / "dlc.mcap", "/imu")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,6 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.runs.inspection.rendering import table_of
 from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed, number_text
-from pdhef_logtool.storage.documents import jsonable
 
 #: Arrays inside of arrays, or of structs.
 INNER_ARRAY = re.compile(r"\[\].")
@@ -31,30 +29,15 @@ MOST_FIELDS = 2000
 _STATISTICS = ("minimum", "mean", "maximum")
 
 
-@dataclass(frozen=True, slots=True)
-class FieldsOfLog:
-    """Fields by topic over ``seconds`` of the log; ``whole`` if that is all of it.
-
-    A topic has ``fields``, or the ``reason`` why not; a field has statistics in raw units over the read part, NaN
-    without a finite value.
-    """
-
-    path: str
-    topics: tuple[dict[str, Any], ...]
-    seconds: float
-    whole: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the document of ``pdhef inspect --fields --json``."""
-        return {"path": self.path, "seconds": self.seconds, "whole": self.whole, "topics": jsonable(self.topics)}
-
-
 def fields_of_log(
     path: LogPlace | str,
     topic: str | None = None,
     options: ReadOptions = AS_IT_IS,
-) -> FieldsOfLog:
-    """Return the numeric fields of a topic, or of all, over a few pieces of the log.
+) -> dict[str, Any]:
+    """Return the numeric fields of a topic, or of all, over a few pieces of the log: ``pdhef inspect --fields --json``.
+
+    ``topics`` are over ``seconds`` of the log; ``whole`` if that is all of it. A topic has ``fields``, or the
+    ``reason`` why not; a field has statistics in raw units over the read part, NaN without a finite value.
 
     Raises
     ------
@@ -68,8 +51,9 @@ def fields_of_log(
             raise UsageError(expected="a topic of the log", got=repr(topic), where=str(path), remedy=f"topics: {names}")
         pieces = Pieces(log)
         seconds = min(log.end_ns - log.start_ns, len(pieces.starts) * PIECE_NS) * 1e-9
-        reports = tuple(_topic_fields(log, pieces, t) for t in topics)
-        return FieldsOfLog(str(path), reports, seconds, log.end_ns - log.start_ns <= seconds * 1e9 + 1)
+        whole = log.end_ns - log.start_ns <= seconds * 1e9 + 1
+        reports = [_topic_fields(log, pieces, t) for t in topics]
+        return {"path": str(path), "seconds": seconds, "whole": whole, "topics": reports}
 
 
 def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> dict[str, Any]:
@@ -110,12 +94,12 @@ def _report(path: str, kind: str, values: Sequence[FloatArray]) -> dict[str, Any
         return {"path": path, "type": kind, **dict(zip(_STATISTICS, figures, strict=True))}
 
 
-def render_fields(report: FieldsOfLog, console: Console) -> None:
+def render_fields(report: Mapping[str, Any], console: Console) -> None:
     """Print one table per topic, for a terminal of 80 columns or more."""
-    console.print(Text(report.path, "bold"), soft_wrap=True)
-    part = "all" if report.whole else "pieces"
-    console.print(f"Values over {part} of the log, {report.seconds:.0f} s, in recorded units.")
-    for topic in report.topics:
+    console.print(Text(report["path"], "bold"), soft_wrap=True)
+    part = "all" if report["whole"] else "pieces"
+    console.print(f"Values over {part} of the log, {report['seconds']:.0f} s, in recorded units.")
+    for topic in report["topics"]:
         title, fields = f"{topic['name']} ({topic['type']})", topic["fields"]
         if fields and not topic["reason"]:
             rows = [(Text(f["path"]), f["type"], *(number_text(f[k]) for k in _STATISTICS)) for f in fields]

@@ -47,9 +47,7 @@ def inspection_page(inspection: Inspection, log: DriveLog) -> bytes:
         ],
         findings=findings_of(inspection),
         # As it is, for it is pasted: render() would cut it and join its lines.
-        mapping=Markup().join(
-            Markup("{}\n").format(printable(line, len(line) * 10 + 1)) for line in mapping_text(inspection).splitlines()
-        ),
+        mapping=Markup("\n").join(printable(line, len(line) * 10 + 1) for line in mapping_text(inspection).split("\n")),
         text=number_text,
     )
 
@@ -100,13 +98,12 @@ def sparkline(cells: FloatArray) -> Markup:
     ys = [np.where(use, 2 + (_HEIGHT - 4) * (most - v) / room, 0.0).round().astype(int) for v in (low, high)]
     if most == least:
         ys = [np.full_like(ys[0], _HEIGHT // 2)] * 2
-    path, before = [], False
-    for i, (x, y_low, y_high) in enumerate(zip(range(0, 2 * len(use), 2), *ys, strict=True)):
-        if use[i]:
-            path.append(
-                f"{'L' if before else 'M'}{x} {y_high}" + (f"V{y_low}" if y_low != y_high or not before else "")
-            )
-        before = bool(use[i])
+    goes_on = use & np.append(False, use[:-1])
+    path = [
+        f"{'L' if on else 'M'}{2 * i} {y_high}" + (f"V{y_low}" if y_low != y_high or not on else "")
+        for i, (on, y_low, y_high) in enumerate(zip(goes_on, *ys, strict=True))
+        if use[i]
+    ]
     return Markup('<svg class="spark" viewBox="0 0 {} 60" preserveAspectRatio="none" aria-hidden="true">'
                   '<path d="{}"/></svg>').format(max(2, 2 * len(use) - 2), "".join(path))  # fmt: skip
 
