@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import (
-    FRICTION,
     FRONT_M,
     FRONT_TYRE,
     MASS_KG,
@@ -54,18 +51,6 @@ def test_derivative_is_the_published_model(vx, vy, r, steer, ax, mu):
     np.testing.assert_allclose(got, want, rtol=1e-11, atol=1e-11)
     ay, _ = forces(vx, vy, r, steer, mu)
     assert nominal_model.planar_lateral_acceleration(vx, vy, r, steer, mu, P) == pytest.approx(ay, rel=1e-11, abs=1e-11)
-
-
-@pytest.mark.parametrize("vx", [-5.0, -1.0, 0.0, 0.5, 1.4])
-@pytest.mark.parametrize("steer", [-0.5, 0.0, 0.2])
-def test_wheels_roll_without_slip_below_the_blend(vx, steer):
-    vy, r = 0.3, -0.2
-    for _ in range(300):
-        ax = -vy * r  # hold the speed
-        _, vy, r = nominal_model.rk4_step(vx, vy, r, steer, ax, FRICTION, 0.01, 1, P)
-    assert r == pytest.approx(vx * math.tan(steer) / WHEELBASE_M, abs=1e-9)
-    assert vy == pytest.approx(REAR_M * vx * math.tan(steer) / WHEELBASE_M, abs=1e-9)
-    assert nominal_model.planar_lateral_acceleration(vx, vy, r, steer, FRICTION, P) == pytest.approx(vx * r, abs=1e-12)
 
 
 @exact

@@ -17,7 +17,6 @@ from pdhef_logtool import Car
 from pdhef_logtool.records.tracks import make_track
 from studies import conditions
 from studies.calibration import coverage_table
-from studies.defaults.noise import HIGH, LOW, Point, search
 from studies.drawn_cars import fit_vehicle
 from studies.pages import DOCS, RESULTS, ROOT
 from studies.peers import __main__ as study
@@ -160,25 +159,6 @@ def test_a_calibrated_figure_is_accepted_and_others_are_not() -> None:
     ]
     lines = [line.split("|") for line in coverage_table(pl.DataFrame(scores)).splitlines()[2:]]
     assert {line[1].strip(): line[-2].strip() for line in lines} == {"right": "yes", "narrow": "no", "wide": "too wide"}
-
-
-OPTIMUM = (0.3, 0.05, 1.5, 0.004)
-
-
-def _bowl(values: Point) -> float:
-    """Return an objective that grows with the distance from the optimum in logarithms."""
-    return 0.1 + sum(math.log(v / o) ** 2 for v, o in zip(values, OPTIMUM, strict=True))
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_the_search_finds_the_optimum_inside_its_ranges(seed: int) -> None:
-    trials = search(_bowl, 128, seed)
-    assert trials == search(_bowl, 128, seed) != search(_bowl, 128, seed + 1)
-    best = min(trials, key=lambda t: t.objective_deg)
-    assert best.number >= 64, "the refinement improves on the exploration"
-    assert np.abs(np.log(np.array(best.values) / OPTIMUM)).max() < math.log(1.4)
-    values = np.array([t.values for t in trials])
-    assert ((values >= LOW * 0.999) & (values <= HIGH * 1.001)).all()
 
 
 DOCUMENTS = [*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile", *ROOT.glob("sample_logs/*.toml")]

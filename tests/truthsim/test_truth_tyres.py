@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from truthsim.tyres import Tyre, cornering_stiffness_n_per_rad, forces_n, lateral_relaxation_length_m, slip_rates
+from truthsim.tyres import Tyre, cornering_stiffness_n_per_rad, forces_n
 
 TYRE = Tyre()
 
@@ -40,16 +40,3 @@ def test_resultant_never_exceeds_friction_and_mirrors(load: float, kappa: float,
     assert forces_n(TYRE, kappa, -alpha, load, mu)[:2] == pytest.approx((fx, -fy), abs=1e-9)
     assert forces_n(TYRE, -kappa, alpha, load, mu)[:2] == pytest.approx((-fx, fy), abs=1e-9)
     assert fx * kappa >= 0.0 and fy * alpha >= 0.0
-
-
-def test_relaxation_length_falls_with_slip_within_the_usual_band() -> None:
-    lengths = [lateral_relaxation_length_m(TYRE, s) for s in np.linspace(0.0, 5.0, 20)]
-    assert (np.diff(lengths) < 0.0).all()
-    assert min(lengths) >= 0.3 and max(lengths) <= 0.7
-
-
-def test_a_spinning_wheel_has_bounded_slip() -> None:
-    rate_x, _ = slip_rates(TYRE, 4.0, 0.0, 10.0, 0.0, 0.0, 10.0)
-    assert rate_x < 0.0
-    _, rate_y = slip_rates(TYRE, 0.0, 2.0, 10.0, 0.0, -10.0, 0.0)
-    assert rate_y < 0.0
