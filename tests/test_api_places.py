@@ -72,11 +72,3 @@ def test_what_learns_takes_texts_and_paths(kind: Callable[[object], Any], tmp_pa
         for logs in (kind(log), [kind(log)]):
             assert "no such file" in _ends(lambda: getattr(pdhef, name)(logs, out, _settings(name, config))).lower()  # noqa: B023
     assert "manifest.json" in _ends(lambda: pdhef.train(kind(tmp_path / "set"), out, init=kind(tmp_path / "net")))
-
-
-def test_every_name_of_the_api_is_tested_or_takes_no_file() -> None:
-    tested = {"read_drive", "inspect_log", "load_mapping", "Car", "RunConfig", "ReadOptions", "run", "train"}
-    tested |= {"learn", "extract", "query", "open_run", "compare"}  # docs/api.md and tests/results
-    of_drives = {"choose", "estimate", "score", "Drive"}
-    settings = {name for name in pdhef.__all__ if name.endswith("Settings")}
-    assert set(pdhef.__all__) == tested | of_drives | settings | {"PdhefError", "Reporter", "Schedule", "__version__"}

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import os
 import tomllib
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import pytest
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_of_entries
+from pdhef_logtool.car.assumed_values import assumed_car
+from pdhef_logtool.car.car import SHIPPED_CARS, Car
+from pdhef_logtool.car.parts import FilterNoise, Fit, FittedPhysics, LearntOn
+from pdhef_logtool.car.toml_files import VehicleEntries, part_toml, read_vehicle_file, vehicle_of_entries
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.evaluation.validation_plan import PlanTable
+from pdhef_logtool.model import priors
 from pdhef_logtool.records.errors import VehicleError
+from pdhef_logtool.results.parquet_sink import load_schema
 
 FILES = Path(__file__).parents[1] / "reference" / "vehicles"
 SAMPLES = Path(__file__).parents[2] / "sample_logs"
@@ -79,6 +88,7 @@ def test_every_entry_of_the_example_is_read(tmp_path):
 
 
 def test_defaults_of_what_the_file_leaves_out(tmp_path):
+
     lines = "mass_kg = 1000\nyaw_inertia_kg_m2 = 1200\ncg_to_front_axle_m = 1.2\ncg_to_rear_axle_m = 1.3\n"
     tyres = "".join(f"[tyres.{a}]\ncornering_stiffness_n_per_rad = 8e4\n" for a in ("front", "rear"))
     vehicle = read_vehicle_file(write(tmp_path, lines + tyres)).vehicle
@@ -177,3 +187,147 @@ def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
     assert "mass_kg, yaw_inertia_kg_m2, cg_to_front_axle_m, cg_to_rear_axle_m contradict one another" in said
     assert "I_z / (m l_f l_r) is 533, plausible is 0.15 to 8" in said
     assert "tyres.front.D_n, mass_kg, cg_to_front_axle_m, cg_to_rear_axle_m contradict one another" in said
+
+
+FOLDER = Path(__file__).parents[2] / "schemas"
+#: By the name of the schema.
+MODELS: dict[str, Any] = {"car-vehicle": VehicleEntries, "car-fit": Fit, "plan": PlanTable}
+FIT = Fit(
+    physics_sha256="ab" * 32,
+    physics=FittedPhysics(values=default_vehicle(), noise=FilterNoise()),
+    filter={"phy-ukf:tuned": FilterNoise(q_std=(0.1, 0.1, 0.1), r_std={"ay_m_s2": 1.0})},
+    drives=(LearntOn(name="lap", sha256="cd", end_s=9.0),),
+)
+
+
+def said_by_the_model(name: str) -> str:
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"{name}.schema.json"}
+    return json.dumps({**head, **MODELS[name].model_json_schema()}, indent=2, ensure_ascii=False) + "\n"
+
+
+def document(part: str) -> dict[str, Any]:
+    """Return one that pdhef wrote."""
+    if part == "fit":
+        return tomllib.loads(part_toml(FIT, "Written by a test."))
+    path = next(SHIPPED_CARS["saloon"].glob(f"{part}.[tj]*"))
+    return json.loads(path.read_text()) if path.suffix == ".json" else tomllib.loads(path.read_text())
+
+
+def valid(part: str, value: dict[str, Any]) -> bool:
+    return bool(jsonschema.Draft202012Validator(load_schema(f"car-{part}.schema.json")).is_valid(value))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_schema_is_what_its_model_says(name: str) -> None:
+    path = FOLDER / f"{name}.schema.json"
+    if os.environ.get("PDHEF_UPDATE_SCHEMAS") == "1":
+        path.write_text(said_by_the_model(name), encoding="utf-8")
+    assert path.read_text(encoding="utf-8") == said_by_the_model(name), "PDHEF_UPDATE_SCHEMAS=1 writes it again"
+    jsonschema.Draft202012Validator.check_schema(load_schema(path.name))
+
+
+@pytest.mark.parametrize("part", ["vehicle", "fit"])
+def test_what_pdhef_wrote_is_valid_and_what_it_refuses_is_not(part: str) -> None:
+    written = document(part)
+    assert valid(part, written)
+    assert not valid(part, written | {"no_such_entry": 1})
+    for name in MODELS[f"car-{part}"].model_json_schema().get("required", []):
+        assert not valid(part, {k: v for k, v in written.items() if k != name}), name
+    if part != "vehicle":
+        assert not valid(part, written | {"version": 99})
+        assert not valid(part, written | {"format": "pdhef-else"})
+
+
+#: Mass, wheelbase and front share of a 1:10 car, a 1:5 car, a small car, a saloon, a van, a 40 t truck.
+VEHICLES = [
+    (3.5, 0.32, 0.5),
+    (21.0, 0.57, 0.42),
+    (900.0, 2.3, 0.6),
+    (1440.0, 2.87, 0.6),
+    (3500.0, 4.3, 0.45),
+    (4e4, 6, 0.3),
+]
+
+
+def rough(mass: float, wheelbase: float, share: float) -> dict[str, float]:
+    return {"mass_kg": mass, "wheelbase_m": wheelbase, "front_weight_share": share}
+
+
+def write_entries(folder: Path, entries: dict[str, float]) -> Path:
+    path = folder / "car.toml"
+    path.write_text("".join(f"{name} = {value}\n" for name, value in entries.items()))
+    return path
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_mass_wheelbase_and_weight_split_suffice(tmp_path: Path, vehicle: tuple[float, float, float]) -> None:
+    file = read_vehicle_file(write_entries(tmp_path, rough(*vehicle)))
+    mass, wheelbase, share = vehicle
+    assert file.vehicle.mass_kg == mass and file.vehicle.wheelbase_m == pytest.approx(wheelbase)
+    assert file.vehicle.axle_load_n(True) == pytest.approx(share * mass * 9.80665)
+    assert {a.entry for a in file.assumed} >= {"yaw_inertia_kg_m2", "tyres.rear.cornering_stiffness_n_per_rad"}
+    assert all(a.spread > 0 and a.rule for a in file.assumed)
+    assert file.vehicle.understeer_gradient_rad_per_m_s2() > 0  # the default vehicle understeers
+
+
+def test_what_is_given_is_kept_and_what_builds_on_it_follows(tmp_path: Path) -> None:
+    given_entries = rough(1500.0, 2.6, 0.6) | {"wheel_radius_m": 0.4, "track_m": 1.7, "cg_height_m": 0.7}
+    file = read_vehicle_file(write_entries(tmp_path, given_entries))
+    assert (file.vehicle.wheel_radius_m, file.vehicle.track_m) == (0.4, 1.7)
+    assert file.vehicle.relaxation_length_m == pytest.approx(0.4 / 0.6, abs=1e-4)
+    assert file.vehicle.cg_over_roll_axis_m == pytest.approx(0.4375)
+    assert {"track_m", "wheel_radius_m", "cg_height_m"}.isdisjoint(a.entry for a in file.assumed)
+
+
+def test_one_axle_distance_and_the_wheelbase_give_the_other(tmp_path: Path) -> None:
+    vehicle = read_vehicle_file(
+        write_entries(tmp_path, {"mass_kg": 1500, "wheelbase_m": 2.6, "cg_to_front_axle_m": 1.1})
+    ).vehicle
+    assert vehicle.cg_to_rear_axle_m == pytest.approx(1.5)
+
+
+def test_without_a_weight_split_that_of_a_passenger_car_is_assumed_and_named(tmp_path: Path) -> None:
+    file = read_vehicle_file(write_entries(tmp_path, {"mass_kg": 1500, "wheelbase_m": 2.6}))
+    assert file.vehicle.cg_to_front_axle_m == pytest.approx(2.6 * 0.44)
+    assert "front_weight_share" in {a.entry for a in file.assumed}
+
+
+@pytest.mark.parametrize(
+    ("entries", "named"),
+    [
+        ({"wheelbase_m": 2.6, "front_weight_share": 0.6}, "mass_kg"),
+        (
+            {"mass_kg": 1500, "wheelbase_m": 2.6, "front_weight_share": 60},
+            r"got front_weight_share: should be less than 1, got 60;",
+        ),
+        (
+            {"mass_kg": 1500, "wheelbase_m": 2600, "front_weight_share": 0.6},
+            r"got wheelbase_m: should [^;]*30, got 2600;",
+        ),
+        ({"mass_kg": 1500, "wheelbase_m": 2.6, "cg_height_m": 550}, r"got cg_height_m: should [^;]*, got 550;"),
+        (
+            {"mass_kg": 1500, "cg_to_front_axle_m": 1.1, "cg_to_rear_axle_m": 1500, "mas": 1},
+            r"got cg_to_rear_axle_m: should [^;]*, got 1500; mas: unknown[^;]*;",
+        ),
+        ({"mass_kg": 1500, "wheelbase_m": 2.6, "cg_to_front_axle_m": 1.1, "cg_to_rear_axle_m": 1.5}, "wheelbase_m"),
+    ],
+)
+def test_wrong_entries_are_named(tmp_path: Path, entries: dict[str, float], named: str) -> None:
+    with pytest.raises(VehicleError, match=named):
+        read_vehicle_file(write_entries(tmp_path, entries))
+
+
+def test_without_a_file_only_a_wheelbase_below_that_of_road_cars_replaces_the_sedan() -> None:
+    model = assumed_car(0.4)
+    assert model.wheelbase_m == pytest.approx(0.4) and 4.0 < model.mass_kg < 20.0
+    assert model.low_speed_blend_m_s == pytest.approx(1.12, abs=0.01)
+    for unknown_or_usual in (float("nan"), 0.05, 1.3, 2.6):
+        assert assumed_car(unknown_or_usual) is default_vehicle()
+
+
+def test_the_softest_tyres_that_a_fit_of_a_model_car_can_have_are_a_vehicle() -> None:
+    car = assumed_car(0.3)
+    values = {
+        p.name: p.low if p.name in (priors.RATIO, priors.REAR_STIFFNESS) else p.mean for p in priors.parameters_of(car)
+    }
+    VehicleParameters.model_validate(priors.vehicle_with(car, values).model_dump())

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from run_report import MAIN, SHA, errors_deg, figures, ran, report, truth
 
 from pdhef_logtool.cli.run_tables import render_fleet, render_run
 from pdhef_logtool.estimators.table import SPECS
@@ -15,6 +14,7 @@ from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.run_result import LogResult, RunResult
 from tests.command_line import rendered
+from tests.run_report import MAIN, SHA, errors_deg, figures, ran, report, truth
 
 NAMES = [s.name for s in SPECS]
 GOOD = [

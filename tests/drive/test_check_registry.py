@@ -18,7 +18,6 @@ from pdhef_logtool.records.checks import Check
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.inspection import inspect_log
-from studies.documentation_tables import with_tables
 from tests.command_line import rendered
 
 NAME = "speed_m_s.range"
@@ -29,7 +28,6 @@ ENTRY = {
     "evidence": "the fastest speed is {value:.1f} m/s",
     "remedy": "check the scale of the speed, which should be in {unit}",
 }
-DOCS = Path(__file__).parents[2] / "docs"
 PLAN = '[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit_deg = 90.0\n'
 
 
@@ -81,17 +79,3 @@ def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(
 def test_inspect_shows_it(toy: str, sample_logs_dir: Path) -> None:
     found = inspect_log(sample_logs_dir / "dlc.mcap")
     assert [c.verdict for c in found.checks if c.name == toy] == ["failed"]
-
-
-def test_the_documentation_lists_it(toy: str) -> None:
-    found = with_tables((DOCS / "formats.md").read_text(encoding="utf-8"))
-    for name, entry in TABLE.items():
-        assert f"| `{name}` | {entry['compares']} | {entry['fails']} |" in found
-
-
-def test_names_of_checks_are_in_the_table(sample_logs_dir: Path) -> None:
-    patterns = [re.escape(name).replace("SIGNAL", r"[\w.]+") for name in TABLE]
-    for log in ("dlc", "sweep", "faults"):
-        found = inspect_log(sample_logs_dir / f"{log}.mcap").checks
-        assert found
-        assert all(any(re.fullmatch(p, c.name) for p in patterns) for c in found)

@@ -224,28 +224,6 @@ def test_specific_force_of_the_simulated_road(sample_logs_dir):
     assert known.sum() > 2500 and np.sqrt(np.mean(error**2)) < 0.02 < 0.2 < np.std(force)
 
 
-def test_a_circle_driven_with_constant_slip():
-    """Closed form: on a circle v_x, v_y, r are constant; position alone must tell them."""
-    stamps, _ = drive(30.0, rate=50)
-    t = (stamps - T0) * 1e-9
-    r, beta, speed = 0.5, -0.06, 12.0
-    radius, course = speed / r, r * t
-    channels = {
-        "x_m": channel("x_m", stamps, radius * np.sin(course)),
-        "y_m": channel("y_m", stamps, -radius * np.cos(course)),
-        "yaw_rad": channel("yaw_rad", stamps, np.angle(np.exp(1j * (course - beta)))),
-    }
-    track = derive_truth(channels).track
-    good = np.isfinite(track.sideslip_rad) & np.isfinite(track.yaw_rate_rad_s)
-    np.testing.assert_allclose(track.sideslip_rad[good], beta, atol=1e-6)
-    np.testing.assert_allclose(track.yaw_rate_rad_s[good], r, atol=1e-9)
-    mirrored = {n: channel(n, stamps, c.values * (1 if n == "x_m" else -1)) for n, c in channels.items()}
-    mirror = derive_truth(mirrored).track
-    np.testing.assert_allclose(mirror.vx_m_s, track.vx_m_s, atol=1e-9)
-    np.testing.assert_allclose(mirror.vy_m_s, -track.vy_m_s, atol=1e-9)
-    np.testing.assert_allclose(mirror.yaw_rate_rad_s, -track.yaw_rate_rad_s, atol=1e-9)
-
-
 def test_ground_speed_alone_claims_no_sideslip():
     stamps, d = drive(3.0)
     truth = derive_truth({"enu_velocity_m_s": channel("enu_velocity_m_s", stamps, d.velocity)})

@@ -1,19 +1,24 @@
-"""Frozen accuracy of the baselines: a weakened baseline fails this test, and no flag updates the values."""
+"""Frozen accuracy of the baselines and identities of the shipped presets: no flag updates the values."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.evaluation.track_errors import signal_error
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.runs.config import RunConfig
 
 SAMPLES = Path(__file__).parents[2] / "sample_logs"
@@ -47,3 +52,73 @@ def test_no_baseline_is_weaker_than_it_was(car: Car, drive: tuple[WholeDrive, di
         error = signal_error(track, whole.truth, "sideslip_rad", 3.0)
         found = math.degrees(math.sqrt(float(np.nanmean(error**2))))
         assert found <= 1.005 * rmse_deg, f"{name}: {found:.4f}"
+
+
+_HYBRID = "adaptive-physics 3 (physics=vehicle-ukf, residual_noise=0.5, trust=0.75)"
+#: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
+SHIPPED = {
+    "zero": ("pass-through 1 (claims_zero_sideslip=True)", "138e43c5f7aa"),
+    "zero:no-lateral": ("pass-through 1 (claims_zero_sideslip=False)", "5ba63001dd67"),
+    "kinematic": ("kinematic 1", "6a7d76af0e93"),
+    "open-loop": ("open-loop 1", "5afc5962fabb"),
+    "linear-regression": ("linear-regression 1", "9de17837d3ad"),
+    "phy-ukf": ("vehicle-ukf 1 (equations=nominal)", "cead32189ec2"),
+    "physics": ("adaptive-physics 3 (physics=vehicle-ukf)", "2a61d9bedc99"),
+    "phy-ukf:tuned": ("vehicle-ukf 1 (equations=nominal, roll_correction=True)", "2e213229f481"),
+    "pure-lstm": ("direct-network 1", "4441758f4188"),
+    "pd-hef": (_HYBRID, "32c5f2999d6e"),
+    "pd-hef:fixed-r": ("adaptive-physics 3 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "7db611b8f5e4"),
+    "pd-hef-smoothed": (
+        "smoothed-physics 3 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75, "
+        "filtered.version=3)",
+        "69002a15a2ab",
+    ),
+    "pd-hef-paper": ("paper-hybrid-ukf 2", "87a835dda35a"),
+}
+#: Fields that are no option: names, texts, noise, physics and network.
+ROLES = {"name", "causal", "notes", "vehicle", "network", "model", "q_std", "r_std", "use_speed"}
+
+
+@pytest.fixture(scope="module")
+def saloon() -> Car:
+    return Car.load("saloon")
+
+
+def test_the_identities_of_the_shipped_presets_are_frozen(saloon: Car) -> None:
+    found = {name: resolve(make_estimator(name, saloon)) for name in all_names(saloon)}
+    assert {name: (a.identity, a.sha256[:12]) for name, a in found.items()} == SHIPPED
+
+
+def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
+    estimator = make_estimator("pd-hef", saloon)
+    assert isinstance(estimator, AdaptivePhysics)
+    kind = make_dataclass("VehicleUkf", [("probe", bool, False)], bases=(VehicleUkf,), frozen=True)
+    kind.options = (*VehicleUkf.options, "probe")  # type: ignore[attr-defined]
+    values = {f.name: getattr(estimator.physics, f.name) for f in fields(VehicleUkf)}
+    assert resolve(replace(estimator, physics=kind(**values))) == resolve(estimator)
+    changed = resolve(replace(estimator, physics=kind(**values, probe=True)))
+    assert changed.identity == _HYBRID.replace("vehicle-ukf,", "vehicle-ukf, physics.probe=True,")
+    kind.version = 2  # type: ignore[attr-defined]
+    assert "physics.version=2" in resolve(replace(estimator, physics=kind(**values))).identity
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)
+def test_every_field_of_an_estimator_is_an_option_or_has_a_role(spec: Any, saloon: Car) -> None:
+    if spec.missing(saloon):
+        assert spec.name == "open-loop:calibrated"  # the class of open-loop
+        return
+    parts: list[Any] = [make_estimator(spec.name, saloon)]
+    while parts:
+        part = parts.pop()
+        assert {f.name for f in fields(part)} <= {*getattr(part, "options", ()), *ROLES}, type(part).__name__
+        parts += [p for name in getattr(part, "options", ()) if is_dataclass(p := getattr(part, name))]
+
+
+def test_a_class_without_an_identity_is_refused() -> None:
+    @dataclass(frozen=True)
+    class Nameless:
+        name: str = "nameless"
+        causal: bool = True
+
+    with pytest.raises(UsageError, match="version = 1 in class Nameless"):
+        resolve(Nameless())  # type: ignore[arg-type]

@@ -88,11 +88,3 @@ def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> Non
     assert make_estimator("pd-hef", taught_car(linear_residual())).causal
     with_network = replace(taught_car(linear_residual()), network=random_network())
     assert not acts(make_estimator("pd-hef:gain=1", with_network)) and acts(make_estimator("pd-hef", with_network))
-
-
-def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
-    physics, hybrid = (track_of(name, taught_car(linear_residual(0.0)), signals) for name in ("physics", "pd-hef"))
-    assert np.array_equal(hybrid.vx_m_s, physics.vx_m_s, equal_nan=True)
-    assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
-    assert np.allclose(hybrid.vy_m_s, physics.vy_m_s, atol=1e-12, equal_nan=True)
-    assert np.nanmax(hybrid.network_trust) == 1.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from physics_oracle import ALL_PARTS, CG_HEIGHT_M, TRACK_M, G, Oracle, names_of, parts, vehicle
+from physics_oracle import ALL_PARTS, Oracle, names_of, parts, vehicle
 from reference_car import FRICTION
 
 from pdhef_logtool.car import nominal_model
@@ -179,25 +179,6 @@ def test_at_low_speed_it_rolls_without_slip(names, speed):
     for _ in range(80):
         end = moved(v, end, HeldInputs(steer, 0.0, True, FRICTION), 0.0025)
     np.testing.assert_allclose(end[[0, 1, 2]], want[[0, 1, 2]], atol=2e-3)
-
-
-@pytest.mark.parametrize("ay", [0.0, 3.0, -6.0, 30.0])
-@pytest.mark.parametrize("sensitivity", [0.0, 0.2])
-def test_load_transfer_takes_a_share_of_its_square(ay, sensitivity):
-    """Two wheels in closed form, of which a stiffness takes the full loss; the oracle has the tyre formula."""
-    x = min(1.0, 2.0 * CG_HEIGHT_M * abs(ay) / (G * TRACK_M))
-    two_wheels = 0.5 * ((1 + x) * (1 - sensitivity * x) + (1 - x) * (1 + sensitivity * x))
-    stiff = AxleTyre(cornering_stiffness_n_per_rad=105_000.0)
-    lean = {"roll_gradient_rad_per_m_s2": 0.0105, "load_sensitivity": sensitivity}
-    plain = np.array([25.0, 0.3, -0.1, 0.0, 0.0, 0.0, 0.0105 * ay, 0.0])
-
-    def asked(v: VehicleParameters) -> np.ndarray:
-        """Return the axle forces at the roll angle for ``ay``, after a step too short to change other states."""
-        return moved(v, plain, HeldInputs(0.02, 0.0, True, FRICTION), 1e-9)[4:6]
-
-    tyres = Tyres(front=stiff, rear=stiff)
-    with_it = asked(vehicle("roll", "load_transfer", tyres=tyres, **lean))
-    np.testing.assert_allclose(with_it, two_wheels * asked(vehicle("roll", tyres=tyres, **lean)), rtol=1e-6)
 
 
 @pytest.mark.parametrize("speed", [25.0, 2.2])

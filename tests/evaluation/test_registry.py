@@ -24,7 +24,6 @@ from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
-from studies.documentation_tables import with_tables
 from tests.command_line import rendered
 
 NAME, LABEL = "interval_width", "interval width"
@@ -96,15 +95,6 @@ def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
     changed = replace(found, changed=1, figures=(replace(compared, verdict="worse"),))
     assert f"sideslip {LABEL}" in rendered(render_comparison, changed, 120)
     assert LABEL.encode() in comparison_page(changed)
-
-
-def test_the_documentation_defines_it(toy: str) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text(encoding="utf-8")
-    found = with_tables(text)
-    for metric in registered().values():
-        assert f"| `{metric.name}` |" in found
-        assert metric.definition in found
-    assert f"| `{toy}` | {LABEL} | that of the signal | lower |" in found
 
 
 def test_units_of_all_figures_are_those_that_the_metrics_name(result: RunResult) -> None:

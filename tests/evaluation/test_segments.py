@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from reference_car import signals_at
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import make_signals, signals_at
 
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, operating_space
+from pdhef_logtool.evaluation.reasons import LISTED_INTERVALS, Interval, reason_intervals, sensor_faults
 from pdhef_logtool.evaluation.segments import driven_speed, find_intervals, moving_mask, segment_masks
-from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, smooth
+from pdhef_logtool.records.reasons import REASONS, SPIKE_AY, STUCK_YAW_RATE
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack, make_track
 
 T0 = 1_700_000_000_000_000_000
 VEHICLE = default_vehicle()  # friction 0.85, blend 3 m/s
@@ -131,3 +139,106 @@ def test_an_interval_ends_behind_its_last_stamp_and_a_car_at_rest_does_not_brake
     (whole,) = find_intervals(s, {"all": masks["all"]})
     assert whole.end_ns == s.stamps_ns[-1] + 1
     assert not masks["braking"][t < 8].any()
+
+
+STEP_NS = 10_000_000
+START_NS = 1_700_000_000_000_000_123
+
+
+def track_of(stamps_ns: np.ndarray, reason: np.ndarray) -> StateTrack:
+    return make_track("pd-hef", stamps_ns, reason=reason)
+
+
+def stamps(count: int) -> np.ndarray:
+    return START_NS + STEP_NS * np.arange(count, dtype=np.int64)
+
+
+def by_hand(stamps_ns: np.ndarray, reason: np.ndarray, bit: int) -> list[Interval]:
+    """One stamp after the other."""
+    spans: list[list[int]] = []
+    for t, mask in zip(stamps_ns.tolist(), reason.tolist(), strict=True):
+        if mask & bit:
+            if spans and t - spans[-1][1] <= RUN_GAP_S * 1e9:
+                spans[-1][1] = t
+            else:
+                spans.append([t, t])
+    return [Interval(a, b + 1) for a, b in spans]
+
+
+@pytest.mark.slow
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 40), st.integers(0, 15)), min_size=1, max_size=60))
+def test_intervals_are_those_found_by_hand(samples: list[tuple[int, int]]) -> None:
+    # Steps of 20 to 800 ms, masks of the first four bits.
+    steps, masks = zip(*samples, strict=True)
+    stamps_ns = START_NS + np.cumsum(np.array(steps, dtype=np.int64)) * 20_000_000
+    reason = np.array(masks, dtype=np.int64)
+    track = track_of(stamps_ns, reason)
+    expected = {r.name: by_hand(stamps_ns, reason, r.bit) for r in REASONS}
+    assert reason_intervals(track) == {name: spans for name, spans in expected.items() if spans}
+
+
+def test_faults_are_told_by_sensor_and_kind_with_the_longest_intervals() -> None:
+    n = 40_000
+    reason = np.zeros(n, dtype=np.int64)
+    reason[np.arange(0, 35_000, 500)] |= SPIKE_AY  # 70 single ones
+    reason[1_000:1_400] |= STUCK_YAW_RATE
+    spike, stuck = sensor_faults(make_track("x", stamps(n), reason=reason)) or ()
+    assert (spike["sensor"], spike["kind"], spike["count"]) == ("ay_m_s2", "spike", 70)
+    assert len(spike["intervals"]) == LISTED_INTERVALS
+    assert [i.start_ns for i in spike["intervals"]] == sorted(i.start_ns for i in spike["intervals"])
+    assert (stuck["sensor"], stuck["kind"], stuck["count"]) == ("yaw_rate_rad_s", "stuck", 1)
+    assert stuck["seconds"] == pytest.approx(3.99)
+    assert sensor_faults(make_track("x", stamps(3))) is None
+    assert sensor_faults(make_track("x", stamps(3), reason=np.zeros(3, dtype=np.int64))) == []
+
+
+def steady_signals(speed: float, ay: float, seconds: float = 20.0) -> Signals:
+    n = round(seconds * 100)
+    columns = {"speed_m_s": np.full(n, speed), "ay_m_s2": np.full(n, ay)}
+    return make_signals(np.full(n - 1, 0.01), **columns)
+
+
+@pytest.mark.parametrize(("speed", "ay", "cell"), [(0.0, 0.5, (0, 0)), (27.0, -4.5, (5, 4)), (90.0, 30.0, (12, 12))])
+def test_a_steady_drive_is_in_one_cell_for_as_long_as_it_lasts(speed: float, ay: float, cell: tuple[int, int]) -> None:
+    made = steady_signals(speed, ay)
+    (found,) = operating_space(made, None, None, VEHICLE)["cells"]
+    assert (found["speed"], found["ay"]) == cell
+    assert found["seconds"] == pytest.approx(20.0)
+    friction = np.repeat([0.3, 0.4, 0.9], [900, 200, 900])
+    assert operating_space(replace(made, friction=friction), None, None, VEHICLE)["friction_median"] == 0.4
+    assert found["scored"] == 0 and np.isnan(found["sideslip_mse_rad2"])
+
+
+def test_cells_have_the_error_of_their_stamps() -> None:
+    made = steady_signals(20.0, 0.2)
+    n, at = len(made), np.arange(len(made))
+    vx, ay = np.where(at < n // 2, 12.0, 33.0), np.where(at < n // 4, 0.5, 3.5)
+    truth = make_track("truth", made.stamps_ns, vx_m_s=vx, vy_m_s=np.zeros(n), ay_m_s2=ay)
+    off = np.where(at < n // 2, 0.01, 0.03)
+    own = make_track("own", made.stamps_ns, vx_m_s=vx, vy_m_s=np.zeros(n), sideslip_rad=off)
+    whole = operating_space(made, truth, own, VEHICLE)["cells"]
+    error = {SPEED_EDGES_M_S[c["speed"]]: c["sideslip_mse_rad2"] for c in whole}
+    assert error == {10.0: pytest.approx(1e-4), 30.0: pytest.approx(9e-4)}
+    assert {AY_EDGES_M_S2[c["ay"]] for c in whole} >= {0.0, 3.0}
+    assert sum(c["scored"] for c in whole) == n
+    assert sum(c["seconds"] for c in whole) == pytest.approx(20.0)
+
+
+def test_the_top_speed_is_that_of_the_drive_also_where_other_signals_are_unknown() -> None:
+    made = steady_signals(20.0, 2.0)
+    n, at = len(made), np.arange(len(made))
+    columns = {"speed_m_s": np.where(at == n // 2, 41.0, 20.0), "ay_m_s2": np.where(at > n // 4, np.nan, 2.0)}
+    some = Signals(**{**{f: getattr(made, f) for f in made.__slots__}, **columns})
+    part = np.where(at < n // 4, 19.0, np.nan)  # ground truth of a part
+    truth = make_track("truth", made.stamps_ns, vx_m_s=part, vy_m_s=0.0 * part, ay_m_s2=part / 10.0)
+    for of in (None, truth):
+        space = operating_space(some, of, None, VEHICLE)
+        assert (space["speed_max_m_s"], space["ay_max_m_s2"]) == (41.0, pytest.approx(2.0, abs=0.11))
+
+
+def test_a_gap_is_no_driving() -> None:
+    made = steady_signals(10.0, 1.5, 4.0)
+    stamps = made.stamps_ns + np.where(np.arange(len(made)) < 200, 0, 60_000_000_000)
+    late = Signals(**{**{f: getattr(made, f) for f in made.__slots__}, "stamps_ns": stamps})
+    assert sum(c["seconds"] for c in operating_space(late, None, None, VEHICLE)["cells"]) == pytest.approx(4.2, abs=0.1)

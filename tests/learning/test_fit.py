@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import json
+import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
+from made_models import full_network
 
+from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.learning.network.train_command import (
     CHECKPOINT,
     PAPER_RECIPE,
     FeatureSequence,
     Recipe,
+    run_training,
     train,
 )
-from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
+from pdhef_logtool.residual_model.bundle import LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER, load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.linear_model import LinearModel
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.storage.documents import seal
+from studies.defaults.train_baselines import SideslipSequence, fit_linear
+from tests.command_line import called, pdhef
 
 pytestmark = pytest.mark.slow
 
@@ -97,3 +111,163 @@ def test_paper_recipe_is_table_1() -> None:
     r = PAPER_RECIPE
     assert (r.batch, r.epochs, r.learning_rate, r.dropout) == (64, 200, 1e-3, 0.2)
     assert (r.hidden, r.layers, r.head, len(r.feature_names)) == (128, 2, (64, 32), 6)
+
+
+@pytest.fixture(scope="module")
+def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return extracted(sample_logs_dir, tmp_path_factory.mktemp("sets") / "physics")
+
+
+def extracted(sample_logs_dir: Path, folder: Path, *options: str) -> Path:
+    """Three slices of one drive, for there are no other sample drives of this length; calls add up."""
+    vehicle = sample_logs_dir / "vehicle.toml"
+    for split, start, end in (("train", "30", "62"), ("validation", "115", "130"), ("test", "155", "170")):
+        pdhef(
+            "extract", sample_logs_dir / "road.mcap", "-o", folder, "--car", vehicle, "--split", split,
+            "--set", f"start={start}", "--set", f"end={end}", *options,
+        )  # fmt: skip
+    return folder
+
+
+def test_train_writes_a_model_that_runs(
+    sample_logs_dir: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joined = dataset
+    done = called("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    bundle = load_bundle(tmp_path / "model")
+    assert document["sha256"] == bundle.sha256
+    assert len(document["history"]) == 2
+    assert {p.name for p in (tmp_path / "model").iterdir()} == {
+        "history.parquet", "model.json", "weights.safetensors",
+    }  # fmt: skip
+    assert pl.read_parquet(tmp_path / "model" / "history.parquet").height == 2
+    assert bundle.provenance["dataset_sha256"]
+    car, network = sample_logs_dir / "vehicle.toml", tmp_path / "model"
+    config = RunConfig(car=car, network=network, estimators=("all",), annotate="none", end="5")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
+    assert {r.estimator for r in result.results[0].rows} >= {"pd-hef:fixed-r", "pd-hef"}
+    rows = pl.read_parquet(tmp_path / "out/logs/dlc/estimates.parquet")
+    physics, pd_hef = (rows.filter(estimator=e)["sideslip_rad"].to_numpy() for e in ("physics", "pd-hef"))
+    assert np.nanmax(np.abs(physics - pd_hef)) > 1e-4, "the network is in use"
+    again = run_training(joined, tmp_path / "again", epochs=2)
+    assert again.bundle.sha256 == bundle.sha256
+    assert again.bundle.provenance["fine_tuned_on"] is None
+    with pytest.raises(UsageError, match="would replace the input"):
+        run_training(joined, tmp_path / "model", init=tmp_path / "model", epochs=1)
+    tuned = run_training(joined, tmp_path / "tuned", init=tmp_path / "model", epochs=1)
+    assert tuned.bundle.provenance["fine_tuned_from"] == bundle.sha256
+    assert tuned.bundle.provenance["fine_tuned_on"] == read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle.name
+    with pytest.raises(OutputError, match="--filter phy-ukf"):
+        run_training(joined, tmp_path / "paper", paper=True, epochs=1)
+
+
+def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="epoch"):
+        run_training(dataset, tmp_path / "m", epochs=0)
+    with pytest.raises(OutputError, match="extract"):
+        run_training(tmp_path, tmp_path / "m")
+    alone = tmp_path / "alone"
+    shutil.copytree(dataset, alone)
+    document = json.loads((alone / "manifest.json").read_text())
+    del document["digest"]
+    document["drives"] = [d for d in document["drives"] if d["split"] == "train"]
+    (alone / "manifest.json").write_text(json.dumps(seal(document)))
+    done = called("train", str(alone), "-o", str(tmp_path / "m"), "--epochs", "1")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "validation" in done.stderr
+
+
+NAMES = ("vx_m_s", "ay_m_s2", "steer_rad", "friction")
+
+
+def smoothed(values: np.ndarray, dt: float, corner_hz: float) -> np.ndarray:
+    """The textbook recursion in plain Python."""
+    share = 1.0 - math.exp(-2.0 * math.pi * corner_hz * dt)
+    out = [values[0]]
+    for v in values[1:]:
+        out.append(out[-1] + share * (v - out[-1]))
+    return np.array(out)
+
+
+def make_features(seed: int, steps: int = 600) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    walks = rng.normal(size=(steps, 28))  # more than features: another number of them draws the same
+    features = np.cumsum(walks[:, : len(FEATURES)], axis=0) * 0.1
+    features[:, FEATURES.index("friction")] = 0.85  # one road: no information
+    return features
+
+
+def make_sequence(seed: int, noise: float = 0.0) -> SideslipSequence:
+    features = make_features(seed)
+    n = len(features)
+    raw = 0.01 + 0.002 * features[:, 0] - 0.03 * features[:, 1] + 0.5 * features[:, 2]
+    beta = smoothed(raw, 0.01, 2.0) + noise * np.random.default_rng(seed).standard_normal(n)
+    beta[100:120] = np.nan  # no truth there
+    return SideslipSequence(features, np.array([np.nan, *[0.01] * (n - 1)]), beta)
+
+
+def test_regression_recovers_known_coefficients():
+    model = fit_linear([make_sequence(s) for s in range(4)], NAMES)
+    assert model.coefficients == pytest.approx((0.002, -0.03, 0.5, 0.0), abs=1e-10)
+    assert model.intercept_rad == pytest.approx(0.01, abs=1e-10)
+    noisy = fit_linear([make_sequence(s, 0.01) for s in range(8)], NAMES)
+    assert noisy.coefficients[:3] == pytest.approx((0.002, -0.03, 0.5), abs=0.004)
+    assert noisy.coefficients[3] == 0.0  # a constant feature gets no weight
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network with its baselines."""
+    folder, network = tmp_path_factory.mktemp("model"), full_network()
+    assert network.pure_lstm is not None
+    network.save(folder)
+    network.pure_lstm.save(folder / PURE_LSTM_FOLDER)
+    model = LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
+    (folder / LINEAR_REGRESSION_FILE).write_text(model.to_json())
+    return folder
+
+
+@pytest.fixture
+def saved(tmp_path: Path, whole: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(whole, tmp_path / "model"))
+
+
+def test_baselines_come_with_the_model(whole):
+    bundle = load_bundle(whole)
+    assert bundle.pure_lstm.sha256 == full_network().pure_lstm.sha256
+    assert bundle.linear_regression == LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0)
+    assert bundle.linear_regression.provenance == {"dataset_sha256": "a"}
+    alone = replace(bundle, pure_lstm=None, linear_regression=None)
+    assert alone.sha256 == bundle.sha256  # the network's own
+
+
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        (LINEAR_REGRESSION_FILE, {"version": 99}),
+        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1, 0.2, 0.3, 0.5]}),
+        (LINEAR_REGRESSION_FILE, {"features": ["truth", *NAMES[1:]]}),
+        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1]}),
+        (f"{PURE_LSTM_FOLDER}/model.json", {"target": None}),
+        (f"{PURE_LSTM_FOLDER}/model.json", {"normalisation": {"target_std": []}}),
+        (f"{PURE_LSTM_FOLDER}/weights.safetensors", "missing"),
+        (f"{PURE_LSTM_FOLDER}/weights.safetensors", "the network's"),
+    ],
+)
+def test_a_damaged_baseline_is_one_clear_error(saved, file, damage):
+    path = saved / file
+    if damage == "missing":
+        path.unlink()
+    elif damage == "the network's":
+        shutil.copy(saved / path.name, path)
+    else:
+        document = json.loads(path.read_text())
+        changed = {k: {**document[k], **v} if isinstance(v, dict) else v for k, v in damage.items()}
+        path.write_text(json.dumps({k: v for k, v in (document | changed).items() if v is not None}))
+    with pytest.raises(ModelError, match=file.partition("/")[0]) as caught:
+        load_bundle(saved)
+    assert len(str(caught.value).splitlines()) == 1

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType
 from recorded import counts_of, numeric_paths, summary_of, write_vectors
 
-from pdhef_logtool.cli.app import app
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, PdhefError
+from tests.command_line import called
 from tests.mcap_files import mcap_writer
 
 T0 = 1_700_000_000_000_000_000
@@ -218,12 +218,6 @@ def _first_numbers(path: Path) -> list[int]:
     return found
 
 
-def _exit_code(path: Path) -> int:
-    with pytest.raises(SystemExit) as ended:
-        app(["inspect", str(path)], prog_name="pdhef")
-    return int(ended.value.code or 0)
-
-
 @pytest.mark.parametrize("message", range(0, N, N // 12))
 def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: Path, message: int) -> None:
     path = _plain_numbers(tmp_path / "log.mcap", chunk_crcs=False, data_crc=True)
@@ -235,7 +229,7 @@ def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: P
         assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-data-crc", "lost")]
         assert "it is unknown which" in log.lost[0].what
         np.testing.assert_array_equal(values["b"], 0.5 * np.arange(N))  # readable values are returned
-    assert _exit_code(path) == EXIT_PARTIAL
+    assert called("inspect", path).returncode == EXIT_PARTIAL
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -243,7 +237,7 @@ def test_a_sound_log_whose_data_has_a_crc_is_covered_by_it(tmp_path: Path, chunk
     path = _plain_numbers(tmp_path / "log.mcap", chunk_crcs=False, data_crc=True, chunked=chunked)
     with closing(open_log(path)) as log:
         assert log.lost == ()
-    assert _exit_code(path) == EXIT_OK
+    assert called("inspect", path).returncode == EXIT_OK
 
 
 def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp_path: Path) -> None:
@@ -278,4 +272,4 @@ def test_damage_of_a_summary_is_a_note(tmp_path: Path) -> None:
     with closing(open_log(path)) as log:
         assert len(log.read({"/t": ["a"]})["/t"]) == N
         assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-summary-crc", "note")]
-    assert _exit_code(path) == EXIT_OK
+    assert called("inspect", path).returncode == EXIT_OK

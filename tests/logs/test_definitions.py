@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from recorded import fields_of
 
+from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
+from pdhef_logtool.logs.decoding import NO_TIME_NS
 from pdhef_logtool.logs.definitions import message_definition, read_definitions
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import MappingError, UsageError
@@ -104,3 +112,108 @@ def test_an_installed_ros_is_looked_in_and_named(
     (note,) = log.lost
     assert (note.severity, note.where) == ("note", "/steer")
     assert f"read by {folder / 'DriverInput.msg'} of this machine, as the log does not define its type" in note.what
+
+
+T0 = 1_700_000_000_000_000_000
+
+
+def _write_raw(path: Path, payloads: Sequence[bytes], encoding: str, name: str, schema: str, text: str) -> None:
+    with McapLogWriter(path, profile="") as writer:
+        channel = writer.add_channel(ChannelRecord(-1, "/t", encoding, name, schema, text.encode()))
+        writer.write([], [block_of(RawMessage(channel, T0 + i, T0 + i, i, p) for i, p in enumerate(payloads))])
+
+
+def _read_json(path: Path, messages: Sequence[object], schema: object, fields: Sequence[str]) -> dict[str, Any]:
+    text = "" if schema is None else json.dumps(schema)
+    encoding = "" if schema is None else "jsonschema"
+    _write_raw(path, [json.dumps(m).encode() for m in messages], "json", "T", encoding, text)
+    return fields_of(path, "/t", *fields)
+
+
+def _rosbags_store() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def test_missing_json_fields_and_short_arrays_are_nan(tmp_path: Path) -> None:
+    messages = [{"a": 1, "b": {"c": [1.5, 2.5]}, "d": True}, {"b": {"c": [3.5]}}, {"a": None, "b": {}, "d": False}]
+    number = {"type": "number"}
+    inner = {"type": "object", "properties": {"c": {"type": "array", "items": number}}}
+    schema = {"type": "object", "properties": {"a": number, "b": inner, "d": {"type": "boolean"}}}
+    read = _read_json(tmp_path / "x.mcap", messages, schema, ["a", "b.c[1]", "b.c", "d"])
+    np.testing.assert_array_equal(read["a"], [1, np.nan, np.nan])
+    np.testing.assert_array_equal(read["b.c[1]"], [2.5, np.nan, np.nan])
+    np.testing.assert_array_equal(read["b.c"], [[1.5, 2.5], [3.5, np.nan], [np.nan, np.nan]])
+    np.testing.assert_array_equal(read["d"], [1, np.nan, 0])
+
+
+def test_json_times_are_nanoseconds_and_missing_ones_are_marked(tmp_path: Path) -> None:
+    messages = [{"stamp": {"sec": 5, "nsec": 7}}, {}]
+    read = _read_json(tmp_path / "x.mcap", messages, None, ["stamp"])
+    assert read["stamp"].dtype == np.int64
+    assert read["stamp"].tolist() == [5_000_000_007, NO_TIME_NS]
+
+
+def test_places_that_a_json_schema_leaves_open_are_found_in_the_messages(tmp_path: Path) -> None:
+    messages = [{"m": {"v": [1, 2]}}, {"m": {"v": [3, 4]}}]
+    read = _read_json(tmp_path / "x.mcap", messages, {"type": "object"}, ["m.v", "m.v[1]"])
+    np.testing.assert_array_equal(read["m.v"], [[1, 2], [3, 4]])
+    np.testing.assert_array_equal(read["m.v[1]"], [2, 4])
+
+
+def test_a_json_message_that_is_no_json_is_counted(tmp_path: Path) -> None:
+    _write_raw(tmp_path / "x.mcap", [b'{"a": 1}', b"{", b'{"a": 3}'], "json", "T", "", "")
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        for start in (None, T0 + 1):  # a second read must not count it twice
+            read = log.read({"/t": ["a"]}, start)["/t"].fields["a"]
+            np.testing.assert_array_equal(read, [1, np.nan, 3] if start is None else [np.nan, 3])
+            (loss,) = log.lost
+            assert (loss.kind, loss.count, loss.severity) == ("undecodable", 1, "lost")
+
+
+def test_a_cut_payload_costs_only_its_own_message(tmp_path: Path) -> None:
+    store = _rosbags_store()
+    name = "geometry_msgs/msg/Vector3"
+    full = [bytes(store.serialize_cdr(store.types[name](x=float(i), y=0.0, z=0.0), name)) for i in range(5)]
+    payloads = [*full[:2], full[2][:11], *full[3:]]
+    _write_raw(tmp_path / "x.mcap", payloads, "cdr", name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0])
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        np.testing.assert_array_equal(log.read({"/t": ["x"]})["/t"].fields["x"], [0, 1, np.nan, 3, 4])
+        assert [(loss.kind, loss.count) for loss in log.lost] == [("undecodable", 1)]
+
+
+@pytest.mark.parametrize(
+    ("path", "problem"),
+    [
+        ("angular_velocity.zz", "angular_velocity.z"),
+        ("yaw.z", "angular_velocity.z"),
+        ("header.frame_id", "text"),
+        ("header", "struct"),
+        ("orientation_covariance[9]", "nearest"),
+        ("angular_velocity..z", "dotted path"),
+        ("", "dotted path"),
+    ],
+)
+def test_a_wrong_path_names_the_nearest(tmp_path: Path, path: str, problem: str) -> None:
+    with McapLogWriter(tmp_path / "x.mcap") as writer:
+        writer.add_topic("/imu", "sensor_msgs/msg/Imu")
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        with pytest.raises(MappingError, match=problem):
+            log.read({"/imu": [path]})
+        with pytest.raises(MappingError, match="nearest: /imu"):
+            log.read({"/imv": ["x"]})
+
+
+def test_an_empty_window_has_columns_of_the_right_shape(tmp_path: Path) -> None:
+    with McapLogWriter(tmp_path / "x.mcap") as writer:
+        writer.add_topic("/imu", "sensor_msgs/msg/Imu")
+    with closing(open_log(tmp_path / "x.mcap")) as log:
+        columns = log.read({"/imu": ["header.stamp", "orientation", "orientation_covariance", "angular_velocity.z"]})[
+            "/imu"
+        ]
+        assert (log.start_ns, log.end_ns, len(columns)) == (0, 0, 0)
+        assert columns.fields["header.stamp"].dtype == np.int64
+        assert columns.fields["orientation"].shape == (0, 4)
+        assert columns.fields["orientation_covariance"].shape == (0, 9)
+        assert columns.fields["angular_velocity.z"].shape == (0,)

@@ -19,7 +19,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool import Car, ReadOptions, read_drive
-from pdhef_logtool.cli.app import app
 from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import Wanted
@@ -29,8 +28,9 @@ from pdhef_logtool.logs.open_log import log_metadata, open_log
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, RedirectGuard, is_public
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource
-from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, LogError, PdhefError, UsageError
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, LogError, UsageError
 from tests.camera_log import with_camera, write_apart
+from tests.command_line import called
 from tests.counting_server import CountingServer, Fault, cutting, serving, stalling, status
 
 aiohttp = pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
@@ -386,14 +386,7 @@ def test_a_redirect_on_the_same_host_is_followed(served: CountingServer) -> None
                 assert log.lost == ()
 
 
-def _exit_code(*arguments: object) -> int:
-    try:
-        return app([str(a) for a in arguments], prog_name="pdhef", standalone_mode=False) or EXIT_OK
-    except PdhefError as error:
-        return error.exit_code
-
-
-def test_an_option_allows_it(served: CountingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_option_allows_it(served: CountingServer, tmp_path: Path) -> None:
     served.fault = _redirecting(served.place("dlc.mcap").replace("127.0.0.1", "localhost"))
     url = served.place("away.mcap")
     with (
@@ -403,11 +396,10 @@ def test_an_option_allows_it(served: CountingServer, tmp_path: Path, monkeypatch
         pass
     with read_drive(url, "saloon", options=ReadOptions(allow_private_redirects=True)) as drive:
         assert drive.losses == ()
-    assert _exit_code("inspect", url, "--fields") == EXIT_FAILURE
-    assert _exit_code("inspect", url, "--fields", "--set", "allow_private_redirects=true") == EXIT_OK
+    assert called("inspect", url, "--fields").returncode == EXIT_FAILURE
+    assert called("inspect", url, "--fields", "--set", "allow_private_redirects=true").returncode == EXIT_OK
     (tmp_path / "pdhef.toml").write_text("allow_private_redirects = true\n")
-    monkeypatch.chdir(tmp_path)
-    assert _exit_code("inspect", url, "--fields") == EXIT_OK
+    assert called("inspect", url, "--fields", cwd=tmp_path).returncode == EXIT_OK
 
 
 def test_a_public_host_may_redirect_to_public_ones_alone(

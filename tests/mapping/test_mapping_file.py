@@ -4,16 +4,30 @@ from __future__ import annotations
 
 import math
 import string
+from itertools import permutations
 from pathlib import Path
 
+import numpy as np
 import pytest
+from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.mapping import Mapping, QualityGate, SignalSource, load_mapping, mapping_to_toml
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import (
+    Mapping,
+    QualityGate,
+    SignalSource,
+    check_mapping,
+    load_mapping,
+    mapping_to_toml,
+    merge_losses,
+    resolve_mapping,
+)
+from pdhef_logtool.mapping.estimates import choose_estimates, sources_of
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
+from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, Loss
 
 DESIGN_EXAMPLE = """
 [signals.steer_rad]
@@ -227,3 +241,189 @@ def test_missing_signals_stand_ready_as_comments(tmp_path: Path) -> None:
     at = next(i for i, line in enumerate(lines) if line.startswith("# [signals.yaw_rate_rad_s]"))
     edited = "\n".join(line[2:] for line in lines[at : at + 4])
     assert set(load_text(tmp_path, edited).signals) == {"yaw_rate_rad_s"}
+
+
+T = np.arange(5, dtype=np.int64) + 1_000_000_000
+
+
+def log() -> FakeLog:
+    zeros = np.zeros(5)
+    return FakeLog(
+        {
+            "/imu/data": FakeTopic(
+                "sensor_msgs/msg/Imu",
+                T,
+                {
+                    "header.stamp": T,
+                    "header.frame_id": np.array(["a"] * 5, dtype=object),
+                    "linear_acceleration.x": zeros,
+                    "linear_acceleration.y": zeros,
+                    "angular_velocity.z": zeros,
+                    "seconds": zeros,
+                },
+            ),
+            "/steer": FakeTopic("x/Steer", T, {"stamp": T, "angle": zeros, "gyro": np.zeros((5, 3)), "data[]": zeros}),
+            "/bare": FakeTopic("std_msgs/msg/Float32", T, {"data": zeros}),
+        }
+    )
+
+
+def mapping(**sources: SignalSource) -> Mapping:
+    return Mapping(signals=sources)
+
+
+def test_what_is_there_passes() -> None:
+    sources = (
+        SignalSource("ax_m_s2", "/imu/data", "linear_acceleration.x"),
+        SignalSource("ay_m_s2", "/steer", "gyro[1]", stamp="stamp"),
+        SignalSource("speed_m_s", "/steer", "data[4]"),
+        SignalSource("steer_rad", "/imu/data", "seconds", stamp="seconds", stamp_unit="s"),
+    )
+    vectors = (
+        SignalSource("enu_velocity_m_s", "/steer", "gyro"),
+        SignalSource("ecef_position_m", "/steer", ("angle", "gyro[0]", "gyro[1]")),
+    )
+    gate = QualityGate("/steer", "angle", min=0.0)
+    check_mapping(Mapping({s.name: s for s in sources}, {s.name: s for s in vectors}, quality=gate), log())
+
+
+def test_everything_that_lacks_is_named_with_the_nearest() -> None:
+    bad = Mapping(
+        signals={
+            "ax_m_s2": SignalSource("ax_m_s2", "/imu/dat", "linear_acceleration.x"),
+            "ay_m_s2": SignalSource("ay_m_s2", "/imu/data", "linear_accel.y"),
+            "yaw_rate_rad_s": SignalSource("yaw_rate_rad_s", "/imu/data", "angular_velocity"),
+            "steer_rad": SignalSource("steer_rad", "/steer", "angle", stamp="header.stamp"),
+            "friction": SignalSource("friction", "/imu/data", "header.frame_id"),
+            "speed_m_s": SignalSource("speed_m_s", "/steer", "gyro[3]"),
+        },
+        truth={"quat_wxyz": SignalSource("quat_wxyz", "/steer", "angle")},
+        quality=QualityGate("/state", "mode", values=(1.0,)),
+    )
+    with pytest.raises(MappingError) as caught:
+        check_mapping(bad, log())
+    line = str(caught.value)
+    for part in (
+        "ax_m_s2: no topic /imu/dat (did you mean /imu/data?)",
+        "ay_m_s2: /imu/data has no field linear_accel.y (did you mean linear_acceleration.y?)",
+        "yaw_rate_rad_s: /imu/data.angular_velocity contains several numbers: name one, such as angular_velocity.z",
+        "steer_rad: /steer has no stamp header.stamp (did you mean stamp?)",
+        "friction: /imu/data.header.frame_id is a string, not a number",
+        "speed_m_s: /steer has no field gyro[3]",
+        "quat_wxyz: /steer.angle is one number, quat_wxyz needs 4",
+        "truth_quality: no topic /state",
+    ):
+        assert part in line, part
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("stamp", "unit", "said"),
+    [("seconds", "ros", "give stamp_unit"), ("header.stamp", "s", "stamp_unit = "), ("header", "ros", "is no time")],
+)
+def test_the_kind_of_the_stamp_is_checked(stamp: str, unit: str, said: str) -> None:
+    source = SignalSource("ax_m_s2", "/imu/data", "linear_acceleration.x", stamp=stamp, stamp_unit=unit)  # type: ignore[arg-type]
+    with pytest.raises(MappingError, match=said):
+        check_mapping(mapping(ax_m_s2=source), log())
+
+
+def test_stamps_that_the_file_leaves_open_come_from_the_schema() -> None:
+    open_ = (("ax_m_s2", "/imu/data", "linear_acceleration.x"), ("steer_rad", "/steer", "angle"))
+    sources = {n: SignalSource(n, *where) for n, *where in (*open_, ("speed_m_s", "/bare", "data"))}
+    stated = SignalSource("ay_m_s2", "/imu/data", "linear_acceleration.y", stamp="publish_time")
+    gate = QualityGate("/steer", "angle", min=0.0)
+    got = resolve_mapping(log(), Mapping({**sources, "ay_m_s2": stated}, quality=gate))
+    assert {n: s.stamp for n, s in got.signals.items()} == {
+        "ax_m_s2": "header.stamp",
+        "steer_rad": "stamp",
+        "speed_m_s": "log_time",
+        "ay_m_s2": "publish_time",
+    }
+    assert got.quality is not None
+    assert got.quality.stamp == "stamp"
+
+
+TABLES = """
+[signals.yaw_rate_rad_s]
+topic = "/imu"
+field = "gyro.z"
+[estimates.esc.sideslip_rad]
+topic = "/esc"
+field = "beta"
+scale = 0.017453292519943295
+latency_s = 0.02
+[estimates.esc.vx_m_s]
+topic = "/esc"
+field = "speed"
+[estimates."my ekf 2.1".vy_m_s]
+topic = "/ekf"
+field = "vy"
+"""
+
+
+BETA = {"beta": np.zeros(10)}
+
+
+def _log(**topics: dict[str, np.ndarray]) -> FakeLog:  # type: ignore[type-arg]
+    times = np.arange(10, dtype=np.int64) * 10_000_000 + 1_700_000_000_000_000_000
+    return FakeLog({name: FakeTopic("custom/Type", times, fields) for name, fields in topics.items()})
+
+
+def test_tables_are_read_and_written_back(tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text(TABLES)
+    mapping = load_mapping(tmp_path / "m.toml")
+    assert list(mapping.estimates) == ["esc", "my ekf 2.1"]
+    assert mapping.estimates["esc"]["sideslip_rad"].latency_s == 0.02
+    assert "/esc" not in mapping.topics  # a run reads no estimates
+    (tmp_path / "again.toml").write_text(mapping_to_toml(mapping))
+    assert load_mapping(tmp_path / "again.toml").estimates == mapping.estimates
+
+
+def test_topics_with_dots_are_found_by_the_longest_that_fits() -> None:
+    values = {"c": np.zeros(10), "b.c": np.zeros(10)}
+    log = _log(**{"a": values, "a.b": values})
+    sources, _ = sources_of(log, ["vx_m_s=a.b.c", "vy_m_s=a.c"], ESTIMATE_UNITS, "--estimate")  # type: ignore[arg-type]
+    assert {n: (s.topic, s.field) for n, s in sources.items()} == {"vx_m_s": ("a.b", "c"), "vy_m_s": ("a", "c")}
+
+
+def test_flags_win_over_tables(tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text(TABLES)
+    mapping = load_mapping(tmp_path / "m.toml")
+    log = _log(**{"/esc": BETA})
+    (flag,) = choose_estimates(log, ["sideslip_rad=/esc.beta"], mapping, None)  # type: ignore[arg-type]
+    assert flag.name == "esc"
+    assert flag.signals["sideslip_rad"].scale == 1.0
+    tables = choose_estimates(log, [], mapping, None)  # type: ignore[arg-type]
+    assert [e.name for e in tables] == ["esc", "my ekf 2.1"]
+
+
+def test_a_topic_named_as_a_whole_brings_its_covariance_and_a_field_does_not(sample_logs_dir: Path) -> None:
+    log = open_log(sample_logs_dir / "step.mcap")
+    sources, covariance = sources_of(log, ["/rtk/odometry"], ESTIMATE_UNITS, "--estimate")
+    assert {"vx_m_s", "vy_m_s"} <= sources.keys()
+    assert covariance is not None
+    assert covariance.topic == "/rtk/odometry"
+    _, none = sources_of(log, ["vx_m_s=/rtk/odometry.twist.twist.linear.x"], ESTIMATE_UNITS, "--estimate")
+    assert none is None
+    log.close()
+
+
+def test_losses_of_one_kind_at_one_place_become_one_that_spans_and_counts_all() -> None:
+    first, second = Loss("nan", "w", "/a.x", 40, 50, 3), Loss("nan", "w", "/a.x", 10, 20, 4)
+    whole = Loss("nan", "w", "/a.x")  # uncounted: adds no bound and no count
+    for order in permutations((first, second, whole)):
+        assert merge_losses([order[:1], order[1:]]) == (Loss("nan", "w", "/a.x", 10, 50, 7),)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        Loss("gap", "w", "/a", 1, 2, 1),
+        Loss("nan", "v", "/a", 1, 2, 1),
+        Loss("nan", "w", "/b", 1, 2, 1),
+        Loss("nan", "w", "/a", 1, 2, 1, "note"),
+    ],
+)
+def test_losses_that_differ_in_kind_words_place_or_weight_stay_apart(other: Loss) -> None:
+    loss = Loss("nan", "w", "/a", 1, 2, 1)
+    assert merge_losses([[loss, other], [loss]]) == (Loss("nan", "w", "/a", 1, 2, 2), other)

@@ -148,11 +148,6 @@ def test_commands_are_no_sensors() -> None:
     assert any("command" in n for n in auto.mapping.notes)
 
 
-def test_an_unstamped_twist_is_taken_at_log_time() -> None:
-    auto = found({"/vehicle/twist": twist("geometry_msgs/msg/Twist", "", 5 + S, 0 * S, stamp="")})
-    assert fields_of(auto)["speed_m_s"] == ("/vehicle/twist", "linear.x", "log_time")
-
-
 def test_what_a_message_disowns_is_not_mapped() -> None:
     minus = np.full((N, 9), -1.0)
     auto = found({"/imu": imu(angular_velocity_covariance=minus)})

@@ -10,11 +10,14 @@ from typing import Any
 import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.reports.fleet import fleet_page
 from pdhef_logtool.reports.pages import remove_pages, write_pages
+from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import seal
-from tests.results.made_run import write_tables
+from tests.results.made_run import entry, write_run, write_tables
+from tests.run_report import text_of
 
 HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u202egnp"
 
@@ -101,3 +104,33 @@ def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path: Path) -> None
     assert written.fleet.file is None and written.exit_code == 3
     assert any("no page of the run" in line for line in written.wrong)
     assert written.pages[1].file is not None
+
+
+TEN = {f"d{i}": 0.001 * (1 + i) for i in range(10)}
+MARKUP = "<img src=x onerror=alert(1)>"
+
+
+def _page(a: Path, b: Path, limit: float | None = 0.05) -> str:
+    return comparison_page(compare_runs(open_run(a), open_run(b), (figure(limit=limit),))).decode()
+
+
+def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    worse = {label: value * (1.1 + 0.01 * i) for i, (label, value) in enumerate(TEN.items())}
+    page = _page(a, write_run(tmp_path / "b", {**worse, "new": 0.1}, config={"friction": 0.3}))
+    text = text_of(page)
+    assert "Verdict B is worse" in text
+    assert "Gate closed drives in B only: new" in text
+    assert "configuration: friction auto → 0.3" in text
+    assert "d9 0.573 0.682 +19.0 %" in text
+    assert page.count('data-figure="') == 2
+
+
+def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", {MARKUP: float("nan"), "d": 0.1}, config={MARKUP: 1})
+    entries = [entry(MARKUP), entry("d", main=MARKUP)]
+    b = write_run(tmp_path / "b", {MARKUP: 0.1, "d": float("nan")}, entries=entries)
+    page = _page(a, b)
+    assert "<img" not in page
+    assert "no drive has the figure on both sides (is there ground truth?): sideslip RMSE" in text_of(page)
+    assert "No drive has the figure on both sides." in text_of(page)

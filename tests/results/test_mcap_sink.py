@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -108,7 +109,7 @@ def decoded(path: Path, topic: str) -> list:
         return [(t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages(connections)]
 
 
-def test_every_topic_is_there_with_all_messages(annotated):
+def test_every_topic_is_there_with_all_messages_in_indexed_chunks(annotated):
     with annotated.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     counts = {
@@ -120,16 +121,7 @@ def test_every_topic_is_there_with_all_messages(annotated):
         for c in summary.channels.values()
     }
     assert counts == TOPICS and len(summary.channels) == len(TOPICS)
-    read: dict[str, int] = {}
-    for topic, *_ in messages(annotated):
-        read[topic] = read.get(topic, 0) + 1
-    assert read == {topic: n for topic, (_, _, n) in TOPICS.items()}
-
-
-def test_chunks_are_indexed(annotated):
-    with annotated.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary.statistics.message_count == sum(n for _, _, n in TOPICS.values())
+    assert Counter(topic for topic, *_ in messages(annotated)) == {topic: n for topic, (_, _, n) in TOPICS.items()}
     assert summary.statistics.message_start_time == 1_700_000_000_000_000_123
     assert summary.statistics.message_end_time == 1_700_000_005_992_000_123
     assert set().union(*(c.message_index_offsets for c in summary.chunk_indexes)) == set(summary.channels)
@@ -163,7 +155,6 @@ def test_source_is_kept_bit_for_bit(annotated, source):
 
 def test_messages_are_merged_by_log_time(annotated):
     times = [t for _, t, *_ in messages(annotated)]
-    assert len(times) == sum(n for _, _, n in TOPICS.values())
     assert times == sorted(times)
     with annotated.open("rb") as stream:
         starts = [c.message_start_time for c in make_reader(stream).get_summary().chunk_indexes]

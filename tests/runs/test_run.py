@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +14,22 @@ import polars as pl
 import pytest
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
+from pdhef_logtool.cli.run_tables import render_run
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import all_names
+from pdhef_logtool.model import fit
+from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.reasons import STUCK_AY
+from pdhef_logtool.results.parquet_sink import list_estimators, read_track
+from pdhef_logtool.results.run_report import report_markdown
+from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.run_result import RunResult
+from tests.command_line import rendered
 from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
@@ -156,3 +171,312 @@ def test_what_ran_under_a_name_stands_in_every_record(dlc_run: Path) -> None:
     with (folder / "annotated.mcap").open("rb") as stream:
         (record,) = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == "pdhef.metrics"]
     assert {n: json.loads(record[f"{n}/algorithm"]) for n in told} == told
+
+
+#: The road of the drives with this vehicle file.
+SLIPPERY = 0.3
+
+TOLD = """fill_recognised = true
+[signals.friction]
+topic = "/truth/perfect/state"
+field = "friction"
+"""
+
+
+@pytest.fixture(scope="module")
+def files(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    vehicle = read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle.model_copy(update={"friction": None})
+    (folder / "car.toml").write_text(part_toml(vehicle))
+    (folder / "told.toml").write_text(TOLD)
+    return folder
+
+
+def run(log: Path, out: Path, **changes: Any) -> tuple[dict[str, Any], pl.DataFrame]:
+    values: dict[str, Any] = {"keep": "estimates", "network": Path("none"), "estimators": ("phy-ukf",), **changes}
+    result = run_logs([str(log)], out, RunConfig(**values), report=False)
+    report = result.results[0].report
+    assert report is not None
+    table = pl.read_parquet(out / "logs" / log.stem / "estimates.parquet")
+    return report, table.with_columns(pl.col("estimator").cast(pl.String))
+
+
+@pytest.mark.parametrize(
+    ("choice", "with_topic", "car", "source", "value"),
+    [
+        ("auto", True, "sample", "topic", SLIPPERY),
+        ("auto", False, "sample", "vehicle file", 0.85),
+        ("file", True, "sample", "vehicle file", 0.85),
+        (0.5, False, "car", "option", 0.5),
+        ("auto", False, "car", "no value given", 1.0),
+        ("auto", False, None, "default sedan", 0.85),
+    ],
+)
+def test_what_is_asked_for_is_told_to_the_estimators(
+    choice: Any, with_topic: bool, car: str | None, source: str, value: float,
+    files: Path, sample_logs_dir: Path, tmp_path: Path,
+) -> None:  # fmt: skip
+    file = {"sample": sample_logs_dir / "vehicle.toml", "car": files / "car.toml", None: None}[car]
+    mapping = files / "told.toml" if with_topic else None
+    report, track = run(sample_logs_dir / "sweep.mcap", tmp_path, car=file, mapping=mapping, friction=choice, end="+3s")
+    assert report["friction"]["source"] == source
+    assert report["friction"]["given"] is (source not in ("no value given", "default sedan"))
+    assert report["friction"]["topic"] == ("/truth/perfect/state.friction" if source == "topic" else None)
+    friction = track.filter(pl.col("estimator") != "truth")["friction"].drop_nulls().drop_nans().to_numpy()
+    assert friction.size
+    np.testing.assert_allclose(friction, value, atol=1e-6)
+
+
+#: Planted faults, s from the start.
+FAULTS = {("yaw_rate_rad_s", "burst"): (5.0, 8.0), ("ay_m_s2", "stuck"): (12.0, 14.0)}
+START_S, END_S = FAULTS["ay_m_s2", "stuck"]
+
+
+@pytest.fixture(scope="module")
+def result(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    config = RunConfig(car=Path("saloon"), estimators=("phy-ukf", "pd-hef"), keep="estimates", end="20")
+    return run_logs([str(sample_logs_dir / "faults.mcap")], tmp_path_factory.mktemp("out"), config, report=False)
+
+
+@pytest.fixture(scope="module")
+def report(result: RunResult) -> dict[str, Any]:
+    document = json.loads((Path(str(result.place)) / "logs/faults/report.json").read_text())
+    follows(document)
+    return dict(document)
+
+
+def told(text: str) -> tuple[float, float]:
+    found = re.search(r"a_y stuck (\d+\.\d)-(\d+\.\d) s", text)
+    assert found, text
+    return float(found[1]), float(found[2])
+
+
+def test_the_report_names_the_faults_with_their_times(report: dict[str, Any]) -> None:
+    assert report["plan"] is None  # nobody gave one, and one drive decides little
+    start_ns = report["log"]["start_ns"]
+    found = {
+        (f["sensor"], f["kind"]): ((i["start_ns"] - start_ns) * 1e-9, (i["end_ns"] - start_ns) * 1e-9)
+        for f in report["faults"]
+        for i in f["intervals"]
+    }
+    assert found == {fault: pytest.approx(times, abs=0.7) for fault, times in FAULTS.items()}
+    # It is reported after it has lasted for 0.05 s.
+    assert told(report_markdown(report)) == pytest.approx((START_S, END_S), abs=0.11)
+
+
+def test_the_track_has_the_bit_where_the_sensor_stuck_and_nowhere_else(
+    result: RunResult, report: dict[str, Any]
+) -> None:
+    track = read_track(Path(str(result.place)) / "logs/faults/estimates.parquet", "pd-hef")
+    times = (track.stamps_ns - report["log"]["start_ns"]) * 1e-9
+    stuck = track.reason & STUCK_AY > 0
+    assert stuck[(times > START_S + 0.1) & (times < END_S - 0.05)].all()
+    assert not stuck[(times < START_S) | (times > END_S + 0.1)].any()
+    assert np.isfinite(track.mixture_weight[track.valid]).all()
+
+
+def test_the_terminal_says_it_in_one_line(result: RunResult) -> None:
+    (line,) = [one for one in rendered(render_run, result, 200).splitlines() if "a_y stuck" in one]
+    assert line.strip().startswith("faults of the sensors: ")
+    assert told(line) == pytest.approx((START_S, END_S), abs=0.11)
+
+
+REFERENCE = Path(__file__).resolve().parents[1] / "reference"
+
+
+def _run(log: Path, out: Path) -> tuple[pl.DataFrame, int]:
+    mapping, car = (REFERENCE / folder / "revs_250lm.toml" for folder in ("mappings", "vehicles"))
+    config = RunConfig(mapping=mapping, car=car, estimators=("phy-ukf",), keep="estimates", model="off", end="200")
+    result = run_logs([str(log)], out, config, report=False)
+    folder = out / "logs" / result.results[0].outcome.log
+    return pl.read_parquet(folder / "estimates.parquet"), result.exit_code
+
+
+@pytest.fixture(scope="module")
+def whole(shared_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> pl.DataFrame:
+    return _run(shared_dir / "data/drives/revs_250lm_a.mcap", tmp_path_factory.mktemp("intact"))[0]
+
+
+#: First loss and end of the last gap, s from the first stamp, by file (README of the faulty drives).
+FAULTY = {"revs_250lm_a_flipped_byte.mcap": (146.2, 154.8), "revs_250lm_a_disorder.mcap": (9.2, 165.0)}
+
+
+@pytest.mark.parametrize("name", FAULTY)
+def test_damage_costs_what_it_hit_and_nothing_else(
+    shared_dir: Path, tmp_path: Path, whole: pl.DataFrame, name: str
+) -> None:
+    hurt, code = _run(shared_dir / "data/drives/faulty" / name, tmp_path)
+    assert code == 3
+    first_loss_s, last_gap_s = FAULTY[name]
+    elapsed = (pl.col("stamp_ns") - whole["stamp_ns"].min()) / 1e9
+    hurt, sound = (f.filter(pl.col("estimator") == "phy-ukf").drop("estimator") for f in (hurt, whole))
+    before = elapsed < first_loss_s - 0.05
+    assert hurt.filter(before).equals(sound.filter(before), null_equal=True)
+    both = hurt.join(sound, on="stamp_ns").filter(elapsed >= last_gap_s + 5.0)
+    # Single samples that are lost: NaN, and stamps that hide those of the samples.
+    faults = json.loads((shared_dir / "data/drives/faulty/faults.json").read_text())[name]
+    lost = [n["stamp_s"] for n in faults.get("nan", ())]
+    lost += [row / 100.0 for row in faults.get("stamp_equals_previous", {"rows": ()})["rows"]]
+    for lost_s in lost:
+        both = both.filter((elapsed < lost_s) | (elapsed >= lost_s + 5.0))
+    assert both.height > 2_000
+    difference_deg = np.degrees(np.abs((both["sideslip_rad"] - both["sideslip_rad_right"]).to_numpy()))
+    # A sample at the very edge of the 6-sigma gate may be taken in one run and refused in the other: a tail that
+    # is 1e-4 degrees long by then decides it, and some hundredths of a second show it.
+    assert np.mean(difference_deg >= 0.01) < 0.0005
+    assert np.nanmax(difference_deg) < 0.02
+    report = json.loads((tmp_path / "logs" / Path(name).stem / "report.json").read_text())
+    start_ns = report["log"]["start_ns"]
+    gaps = {
+        x["where"]: (x["start_ns"] - start_ns, x["end_ns"] - start_ns) for x in report["losses"] if x["kind"] == "gap"
+    }
+    if "disorder" in name:  # its IMU is silent for half a minute
+        assert np.divide(gaps["/imu/data.angular_velocity.z"], 1e9) == pytest.approx([135.0, 165.0], abs=0.05)
+        assert all(where.startswith("/imu/data") for where in gaps)
+
+
+#: End of the part of the road drive that suffices for a calibration.
+END = "110"
+NAMES = ("zero", "open-loop", "open-loop:calibrated", "phy-ukf", "physics")
+
+
+@pytest.fixture(scope="module")
+def wrong_car(bare_vehicle: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a bare vehicle file of the sample logs' car with half the front axle stiffness."""
+    path = tmp_path_factory.mktemp("car") / "vehicle.toml"
+    path.write_text(bare_vehicle.replace("B = 11.146", "B = 5.6"))
+    return path
+
+
+def run_with(log: Path, car: Path, out: Path, **changes: Any) -> dict[str, Any]:
+    values: dict[str, Any] = {"car": car, "keep": "estimates", "estimators": NAMES, "end": END, **changes}
+    run_logs([str(log)], out, RunConfig(**values), report=False)
+    return json.loads((out / "logs" / log.stem / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def calibrated(sample_logs_dir: Path, wrong_car: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("log")
+    run_with(sample_logs_dir / "road.mcap", wrong_car, out)
+    return out
+
+
+def causal_rows(folder: Path) -> dict[object, pl.Series]:
+    """Return the column ``causal`` of estimates.parquet by estimator."""
+    rows = pl.read_parquet(folder / "estimates.parquet").with_columns(pl.col("estimator").cast(pl.String))
+    return {name: part["causal"] for (name,), part in rows.group_by("estimator", maintain_order=True)}
+
+
+def rmse(out: Path, estimator: str) -> float:
+    chosen = {"estimator": estimator, "signal": "sideslip_rad", "metric": "rmse", "segment": "all"}
+    return float(pl.read_parquet(out / "metrics.parquet").filter(**chosen)["value"].item())
+
+
+def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the_file(calibrated: Path) -> None:
+    report = json.loads((calibrated / "logs/road/report.json").read_text())
+    follows(report)
+    told = {e["name"]: e for e in report["estimators"]}
+    for name in ("physics", "open-loop:calibrated"):
+        assert not told[name]["causal"]
+        assert any("whole log" in note for note in told[name]["notes"])
+    assert all(told[name]["causal"] for name in ("zero", "open-loop", "phy-ukf"))
+    assert told["phy-ukf"]["algorithm"]["physics_sha256"] == report["vehicle"]["sha256"]
+    assert told["physics"]["algorithm"]["physics_sha256"] != report["vehicle"]["sha256"]
+    assert "calibrated on this log without ground truth" in report["answer"]["texts"]["assumed"]
+    assert told["physics"]["intervals"] == ["intervals: own, parameters and sensors"]
+    assert told["open-loop:calibrated"]["intervals"] == []
+    assert not causal_rows(calibrated / "logs/road")["zero"].any(), "settings and model are those of the whole log"
+
+
+def test_a_wrong_file_is_mended(calibrated: Path) -> None:
+    assert rmse(calibrated, "physics") < 0.65 * rmse(calibrated, "phy-ukf")
+
+
+def test_off_is_the_prior_about_the_file_and_causal(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+    report = run_with(sample_logs_dir / "road.mcap", wrong_car, tmp_path, model="off", end="30", estimators=NAMES[:2])
+    assert (report["self_calibration"]["parameters"], report["self_calibration"]["refused"]) == ([], None)
+    assert all(e["causal"] for e in report["estimators"])
+
+
+def test_a_model_of_an_earlier_drive_is_causal_and_mends_the_file(
+    sample_logs_dir: Path, wrong_car: Path, calibrated: Path, tmp_path: Path
+) -> None:
+    model = calibrated / "logs/road/model.toml"
+    report = run_with(sample_logs_dir / "dlc.mcap", wrong_car, tmp_path, model=model, end=None)
+    follows(report)
+    assert all(e["causal"] for e in report["estimators"] if e["name"] != "open-loop:calibrated")
+    assert report["model"]["source"] == "file"
+    causal = causal_rows(tmp_path / "logs/dlc")
+    assert causal["zero"][100:].all() and causal["truth"].is_null().all()
+    assert not causal["open-loop:calibrated"].any() and causal["selected"].equals(causal["physics"])
+    assert "from earlier drives" in report["answer"]["texts"]["assumed"]
+    assert rmse(tmp_path, "physics") < 0.65 * rmse(tmp_path, "phy-ukf")
+    passed_on = tomllib.loads((tmp_path / "logs/dlc/model.toml").read_text())
+    assert passed_on["parameters"] == tomllib.loads(model.read_text())["parameters"] != []
+
+
+def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
+    """The same log with its truth made unreadable gives the same bits."""
+    log, car, options = sample_logs_dir / "road.mcap", Car.load(wrong_car), ReadOptions(end=END)
+    with read_drive(log, car, options=options) as drive:
+        found = read_driving(drive)
+        with_truth = DriveModel.fit(drive).posterior
+    with read_drive(log, car, options=options, adjust=lambda _log, mapping, _tell: replace(mapping, truth={})) as drive:
+        assert drive.plan.truth is None
+        np.testing.assert_array_equal(read_driving(drive).columns, found.columns)
+        alone = DriveModel.fit(drive).posterior
+    assert with_truth is not None and alone is not None
+    assert alone.to_dict() == with_truth.to_dict()
+
+
+def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+    report = run_with(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, end="4")
+    assert "are needed" in report["self_calibration"]["refused"]
+    told = {e["name"]: e for e in report["estimators"]}
+    assert told["open-loop:calibrated"]["outcome"] == "skipped"
+    assert "not calibrated on this log" in report["answer"]["texts"]["assumed"]
+
+
+@pytest.mark.parametrize("given", [None, 0.8])
+def test_a_car_that_slides_has_the_friction_that_it_reaches_if_none_is_given(
+    sample_logs_dir: Path, wrong_car: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: float | None
+) -> None:
+    monkeypatch.setattr(fit, "SLIDING_RAD", 0.001)
+    car = tmp_path / "vehicle.toml"
+    car.write_text("\n".join(x for x in wrong_car.read_text().splitlines() if not x.startswith("friction =")))
+    friction = {} if given is None else {"friction": given}
+    report = run_with(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "physics"), **friction)
+    assert "slides" in report["self_calibration"]["refused"]
+    causal = {e["name"]: e["causal"] for e in report["estimators"]}
+    assert (causal["phy-ukf"], causal["physics"]) == (True, given is not None)
+    assert report["friction"]["source"] == ("largest lateral acceleration" if given is None else "option")
+    if given is None:  # a drive has one model, however often it is fitted
+        with read_drive(sample_logs_dir / "sweep.mcap", Car.load(car), options=ReadOptions(end=END)) as drive:
+            first, again = DriveModel.fit(drive), DriveModel.fit(drive)
+        assert first.friction == again.friction and first.friction.to_dict() == report["friction"]
+        assert first.car.self_calibrated is not None and again.car.self_calibrated is not None
+
+
+def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir: Path) -> None:
+    with read_drive(sample_logs_dir / "road.mcap", Car.load(sample_logs_dir / "vehicle.toml")) as drive:
+        assert drive.car.has_evidence
+        assert DriveModel.fit(drive).posterior is None
+
+
+def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_name(
+    sample_logs_dir: Path, wrong_car: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever pd-hef is on this car, it stands for a large d2 here."""
+    if Car.load().network is None:
+        pytest.skip("no network is shipped, without which there is no pd-hef")
+    monkeypatch.setattr(selection, "FACTOR", 0.0)
+    names = ("zero", "phy-ukf", "pd-hef", "physics")
+    report = run_with(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, estimators=names, end=None)
+    follows(report)
+    assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
+    assert report["selected_estimate"] == "physics"
+    file = tmp_path / "logs" / "sweep" / "estimates.parquet"
+    assert list_estimators(file) == ("truth", *names)
+    selected, named, other = (read_track(file, name) for name in ("selected", "physics", "pd-hef"))
+    np.testing.assert_array_equal(selected.sideslip_rad, named.sideslip_rad)
+    assert (selected.sideslip_rad != other.sideslip_rad).any()

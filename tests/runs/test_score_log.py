@@ -19,6 +19,7 @@ from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from tests.run_report import follows
 from tests.runs.test_inspection_page import write_log
+from tests.runs.test_run import NO_TRUTH_MAPPING
 
 ERRORS = ("rmse", "rmse_relative", "mae", "bias", "p95_abs", "max_abs", "coverage95", "lag_s", "availability", "nees")
 
@@ -132,6 +133,9 @@ def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path
         (("sideslip_rad=/pdhef/phy_ukf/state",), UsageError, "sideslip_rad=/pdhef/phy_ukf/state.FIELD"),
         (("/pdhef/phy_ukf/state", "/pdhef/zero/state"), UsageError, "each signal once"),
         (("sideslip_std_rad=/pdhef/phy_ukf/state.sideslip_std_rad",), UsageError, "one of sideslip_rad"),
+        (("colour=/pdhef/phy_ukf/state.sideslip_rad",), UsageError, "got 'colour'"),
+        (("=/pdhef/phy_ukf/state.sideslip_rad",), UsageError, "SIGNAL out of"),
+        (("sideslip_rad=/nowhere/near.beta",), MappingError, "pdhef inspect lists the topics"),
         ((), UsageError, "an estimate to score"),
     ],
 )
@@ -226,3 +230,36 @@ def test_key_figures_of_manoeuvres_are_those_of_the_run(sample_logs_dir: Path, t
     assert log.report is not None
     assert steps(log.report["metrics"]) == pytest.approx(of_run, rel=1e-5)
     assert {estimator for estimator, *_ in of_run} == {"zero", "truth"}
+
+
+ESTIMATE = ("/rtk/odometry",)
+
+
+def _metrics(log, **settings):
+    config = RunConfig(car=log.parent / "vehicle.toml", end="8", **settings)
+    report = score_log(str(log), config, estimates=ESTIMATE).results[0].report
+    assert report is not None
+    found = {m["metric"]: m["value"] for m in report["metrics"] if m["signal"] == "sideslip_rad"}
+    return report, found
+
+
+def test_beside_ground_truth_both_figures_exist(sample_logs_dir):
+    log = sample_logs_dir / "dlc.mcap"
+    report, found = _metrics(log, reference="on")
+    assert report["truth"]["available"]
+    assert np.degrees(found["rmse"]) < 0.1
+    assert np.degrees(found["reference_rms"]) < 3.0 * np.degrees(found["reference_std"])
+    _, alone = _metrics(log)
+    assert alone["rmse"] == found["rmse"]
+    assert "reference_rms" not in alone
+
+
+def test_without_ground_truth_no_figure_is_an_error(sample_logs_dir, tmp_path):
+    mapping = tmp_path / "mapping.toml"
+    mapping.write_text(NO_TRUTH_MAPPING)
+    report, found = _metrics(sample_logs_dir / "dlc.mcap", mapping=mapping)
+    assert not report["truth"]["available"]
+    assert "rmse" not in found
+    assert np.degrees(found["reference_rms"]) < 0.5
+    with pytest.raises(MappingError, match="ground truth"):
+        _metrics(sample_logs_dir / "dlc.mcap", mapping=mapping, reference="off")

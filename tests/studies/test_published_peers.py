@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 
+from pdhef_logtool import Car
 from pdhef_logtool.records.tracks import make_track
-from studies.pages import DOCS, RESULTS
+from studies import conditions
+from studies.calibration import coverage_table
+from studies.drawn_cars import fit_vehicle
+from studies.pages import DOCS, RESULTS, ROOT
 from studies.peers import __main__ as study
 from studies.peers.drives import FULL_SIZE, PEER_DRIVES
 from studies.peers.page import estimator_table
 from studies.peers.scoring import errors, scores
+from studies.teaching import CARS, STORED, Pair, is_worse, pair_table, ratio, summary
+from truthsim.vehicle_choice import choose_vehicle
 
 
 def track(sideslip: np.ndarray, speed: float = 10.0):
@@ -89,3 +99,76 @@ def test_the_benchmark_weighs_drives_by_time_and_compares_with_zero_on_the_same_
     assert head.startswith("| estimator | drives | RMSE |")
     assert half == "| `half` | 1 | 1.00 | – to – | 0.50 | 1.00 | 1.00 | 100% | – | – | 2.0 |"
     assert [cell.strip() for cell in zero.split("|")[2:4]] == ["2", f"{np.sqrt((30 * 16 + 10 * 4) / 40):.2f}"]
+
+
+def pair(untaught: float, hybrid: float) -> Pair:
+    ways = {"untaught": untaught, "prior": untaught, "hybrid": hybrid}
+    scores = {n: {"rmse_deg": x, "without_constant_deg": x, "active": 0.6, "covered": 0.95} for n, x in ways.items()}
+    about = {"car": "car", "taught": "a", "scored": "b", "rung": "linear", "reference": None}
+    return {**about, **scores, "kinematic_deg": 1.0, "paper_deg": 1.0}
+
+
+def test_a_pair_is_worse_beyond_the_larger_of_both_limits() -> None:
+    assert not is_worse(pair(0.2, 0.229)) and is_worse(pair(0.2, 0.231))
+    assert not is_worse(pair(2.0, 2.09)) and is_worse(pair(2.0, 2.11))
+    text = summary([pair(1.0, 0.5), pair(1.0, 0.8)])
+    assert "0.63 (2 pairs)" in text and "worse" in pair_table([pair(0.2, 0.3)])
+
+
+#: Scored drives of the stored pairs that are worse than untaught, as README.md and docs/peers.md state.
+WORSE = ["f1tenth_xray_0"]
+
+
+def test_the_stored_results_have_every_pair_and_only_the_named_one_is_worse_than_untaught() -> None:
+    stored = json.loads((RESULTS / "teaching" / STORED).read_text(encoding="utf-8"))
+    counts = {car.name: len(car.parts) for car in CARS}
+    for car in CARS:
+        wanted = len(car.parts) - car.taught_on if car.taught_on > 1 else counts[car.name] * (counts[car.name] - 1)
+        assert sum(r["car"] == car.name for r in stored) == wanted
+    worse = [r for r in stored if is_worse(r)]
+    assert [r["scored"] for r in worse] == WORSE
+    assert all(ratio(r) <= 1.07 for r in worse)
+    assert math.prod(map(ratio, stored)) <= 0.93 ** len(stored)
+    page = (DOCS / "peers.md").read_text(encoding="utf-8")
+    assert pair_table(stored) in page and summary(stored) in page
+
+
+def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(sample_logs_dir: Path) -> None:
+    vehicle = Car.load(sample_logs_dir / "vehicle.toml").vehicle
+    fitted = fit_vehicle(choose_vehicle("sedan,mass=1.2,stiffness=0.85"), 0.3, vehicle)
+    assert fitted.mass_kg == pytest.approx(1.2 * 1440.0)
+    soft = fitted.cornering_stiffness_n_per_rad(True, 0.3)
+    stiff = fit_vehicle(choose_vehicle("sedan,mass=1.2"), 0.3, vehicle).cornering_stiffness_n_per_rad(True, 0.3)
+    assert soft / stiff == pytest.approx(0.85, rel=0.08)
+
+
+def test_the_stored_page_is_that_of_the_stored_results(tmp_path: Path) -> None:
+    results = RESULTS / "conditions"
+    for name in ("facts.json", "metrics.parquet"):
+        (tmp_path / name).write_bytes((results / name).read_bytes())
+    assert conditions.main(["--stored", "--results", str(tmp_path), "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "conditions.md").read_bytes() == (DOCS / "conditions.md").read_bytes()
+
+
+def test_a_calibrated_figure_is_accepted_and_others_are_not() -> None:
+    errors = np.random.default_rng(0).normal(size=2000)
+    scores = [
+        {"figure": name, "drive": "road", "score": float(e) / sd}
+        for name, sd in {"right": 1.0, "narrow": 0.5, "wide": 3.0}.items()
+        for e in errors
+    ]
+    lines = [line.split("|") for line in coverage_table(pl.DataFrame(scores)).splitlines()[2:]]
+    assert {line[1].strip(): line[-2].strip() for line in lines} == {"right": "yes", "narrow": "no", "wide": "too wide"}
+
+
+DOCUMENTS = [*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile", *ROOT.glob("sample_logs/*.toml")]
+TEXTS = {p.name: p.read_text(encoding="utf-8") for p in DOCUMENTS}
+
+
+def test_every_command_and_file_that_a_document_names_is_there() -> None:
+    named = {(p, m) for p, t in TEXTS.items() for m in re.findall(r"-m ((?:benchmarks|studies)(?:\.\w+)*)", t)}
+    assert {"studies.paper", "studies.peers", "benchmarks.performance"} <= {m for _, m in named}
+    assert not {(p, m) for p, m in named if find_spec(m) is None}
+    files = {(p, f) for p, t in TEXTS.items() for f in re.findall(r"(?:benchmarks|studies)/[\w/]+\.py", t)}
+    assert files
+    assert not {(p, f) for p, f in files if not (ROOT / f).is_file()}

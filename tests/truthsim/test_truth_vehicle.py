@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pdhef_logtool.records.errors import VehicleError
 from truthsim.linear_theory import steady_roll, understeer_gradient_rad_per_m_s2
 from truthsim.manoeuvres import Plan
 from truthsim.motion import Motion, simulate_motion
 from truthsim.randomisation import randomise
+from truthsim.tyres import Tyre, cornering_stiffness_n_per_rad, forces_n
 from truthsim.vehicle import Vehicle
 from truthsim.vehicle_files import VEHICLES, load_vehicle
 
 CAR = Vehicle()
-LF, LR, L, M, IZ, TRACK, H_CG = 1.16, 1.71, 2.87, 1440.0, 1523.0, 1.57, 0.64  # the paper's Table 3
 
 
 def open_loop(speed: float, steer: np.ndarray) -> Plan:
@@ -101,7 +104,11 @@ def test_with_the_other_s_values_the_difference_goes(shared_dir) -> None:
         found = against_another_simulator(shared_dir, run, friction, LIKE_THE_OTHER)
         check_bands(found, {"ay": (0.95, 1.05, 0.97), "yaw_rate": (1.0, 1.12, 0.995), "roll": (1.0, 1.15, 0.95)})
     # The bands see a steering 10 % too strong, one the wrong way round, and a car that yaws against its moments.
-    for gain, car in ((1.1, LIKE_THE_OTHER), (-1.0, LIKE_THE_OTHER), (1.0, CAR._replace(yaw_inertia_kg_m2=-IZ))):
+    for gain, car in (
+        (1.1, LIKE_THE_OTHER),
+        (-1.0, LIKE_THE_OTHER),
+        (1.0, CAR._replace(yaw_inertia_kg_m2=-CAR.yaw_inertia_kg_m2)),
+    ):
         with pytest.raises(AssertionError), np.errstate(all="ignore"):
             check_bands(against_another_simulator(shared_dir, *step, car, gain=gain), CLOSE)
 
@@ -168,3 +175,34 @@ def test_randomised_cars_drive(name: str) -> None:
         motion = simulate_motion(Plan(22.0, 3.9, steer_rad=steer), 0.7, vehicle=randomise(load_vehicle(name), seed))
         assert np.isfinite(motion.observed).all()
         assert 0.25 < np.abs(motion.column("ay_m_s2")).max() / 9.80665 < 0.72
+
+
+TYRE = Tyre()
+
+slips = st.floats(-0.5, 0.5)
+tyre_loads = st.floats(500.0, 8000.0)
+roads = st.floats(0.1, 1.2)
+
+
+def test_cornering_stiffness_is_that_of_a_mid_size_tyre() -> None:
+    # 205/55 R16 at 3.5 kN: 15 to 17 times the load per radian; pinned, so that a wrong gain is seen.
+    assert cornering_stiffness_n_per_rad(TYRE, 3530.0, 0.85) == pytest.approx(55_650.0, rel=2e-3)
+    assert 14.0 < cornering_stiffness_n_per_rad(TYRE, 3530.0, 0.85) / 3530.0 < 17.0
+
+
+def test_peak_force_is_friction_times_load_and_lies_at_a_usual_slip_angle() -> None:
+    alpha = np.linspace(0.0, 0.4, 4001)
+    force = np.array([forces_n(TYRE, 0.0, math.tan(a), 3530.0, 0.85)[1] for a in alpha])
+    assert force.max() == pytest.approx(0.85 * 3530.0, rel=1e-4)
+    assert 6.0 < np.degrees(alpha[force.argmax()]) < 11.0
+    assert 0.8 < force[-1] / force.max() < 1.0
+
+
+@given(tyre_loads, slips, slips, roads)
+@settings(derandomize=True, max_examples=200)
+def test_resultant_never_exceeds_friction_and_mirrors(load: float, kappa: float, alpha: float, mu: float) -> None:
+    fx, fy, _ = forces_n(TYRE, kappa, alpha, load, mu)
+    assert math.hypot(fx, fy) <= 1.15 * mu * load
+    assert forces_n(TYRE, kappa, -alpha, load, mu)[:2] == pytest.approx((fx, -fy), abs=1e-9)
+    assert forces_n(TYRE, -kappa, alpha, load, mu)[:2] == pytest.approx((-fx, fy), abs=1e-9)
+    assert fx * kappa >= 0.0 and fy * alpha >= 0.0
