@@ -15,7 +15,7 @@ from pdhef_logtool.car.assumed_values import assumed_car
 from pdhef_logtool.car.car import SHIPPED_CARS, Car
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedPhysics, LearntOn
 from pdhef_logtool.car.toml_files import VehicleEntries, part_toml, read_vehicle_file, vehicle_of_entries
-from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.evaluation.validation_plan import PlanTable
 from pdhef_logtool.model import priors
 from pdhef_logtool.records.errors import VehicleError
