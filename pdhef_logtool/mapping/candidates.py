@@ -36,6 +36,8 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
 #: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
+#: Words that leave the quantity of a field open: it may be any of them.
+_OPEN_WORDS = naming.COUNTING | {"angle", "yaw"}
 #: Affix that distinguishes the name of a sign from the name of its magnitude; YawToRight belongs to YawRate.
 _SIGN = re.compile("|".join(VOCABULARY["patterns"]["sign"]), re.IGNORECASE)
 #: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
@@ -271,7 +273,7 @@ def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tu
 def _units_without_name(info: FieldInfo) -> Units:
     """Return the possible units of a field without a unit by quantity, if no word of its name has a meaning."""
     words = set(words_of(info.path)) - STATES
-    unknown = all(len(w) == 1 or w.isdigit() or w in naming.COUNTING or w not in naming.KNOWN for w in words)
+    unknown = all(len(w) == 1 or w.isdigit() or w in _OPEN_WORDS or w not in naming.KNOWN for w in words)
     quantities = ("speed", "acceleration", "rate", "steering")
     return {q: HYPOTHESES[q][:2] for q in quantities} if unknown and not info.unit and not words & NOT_VALUES else {}
 
