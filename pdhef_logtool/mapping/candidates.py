@@ -222,14 +222,21 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     return results
 
 
-def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> Iterator[Named]:
-    """Yield the fields without a usable name that the drive's motion explains, for quantities that no name gives."""
-    there = {(n[3].quantity, part) for n in named if n[1] != "command" for part in (n[3].part, "any")}
+def proposed_fields(
+    log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], mapped: Sequence[SignalSource]
+) -> Iterator[Named]:
+    """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives."""
+    known = {s: meaning_of_signal(s.name) for s in mapped if isinstance(s.scale, float)}
+    meanings = [*(n[3] for n in named if n[1] != "command"), *known.values()]
+    there = {(m.quantity, part) for m in meanings for part in (m.part, "any")}
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
     sensors = {t.name: t for t, role in topics if role == "sensor"}
     sensors = {n: t for n, t in sensors.items() if not holds_frames(n, log.fields(n, quiet=True))}
     columns = _compared(log, [*sensors], named) if wanted else {}
+    columns |= {
+        (s.topic, s.paths[0]): ({m.quantity: (("", abs(s.scale)),)}, (m.quantity, m.part)) for s, m in known.items()
+    }
     if all(role is not None for _, role in columns.values()):
         return
     pieces = Pieces(log)

@@ -92,9 +92,9 @@ def weigh(
     topics : topics that may contain candidates, with their kinds of data.
     signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
     """
-    named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
-    if log.end_ns > log.start_ns and not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
-        named += proposed_fields(log, topics, named)
+    topics = topics if log.end_ns > log.start_ns else []
+    named = named_fields(log, topics, vendors)
+    named += proposed_fields(log, topics, named, [*signals.values()])
     if not named:
         return Weighing(Fields(Pieces(log), {}, [], []))
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
