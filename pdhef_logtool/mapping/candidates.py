@@ -163,11 +163,6 @@ class Field:
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
 
     @property
-    def is_off_centre(self) -> bool:
-        """Return whether it is far from 0 at all times, as a servo's command is and a steering angle is not."""
-        return bool(abs(np.nanmedian(self.seen.values)) > 3.0 * np.nanstd(self.seen.values))
-
-    @property
     def score(self) -> float:
         """Confidence in the quantity given by the name, 0 to 1."""
         if self.fixed:
@@ -226,17 +221,17 @@ def proposed_fields(
     log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], mapped: Sequence[SignalSource]
 ) -> Iterator[Named]:
     """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives."""
-    known = {s: meaning_of_signal(s.name) for s in mapped if isinstance(s.scale, float)}
-    meanings = [*(n[3] for n in named if n[1] != "command"), *known.values()]
+    known = [(s, abs(s.scale)) for s in mapped if isinstance(s.scale, float)]
+    meanings = [*(n[3] for n in named if n[1] != "command"), *(meaning_of_signal(s.name) for s, _ in known)]
     there = {(m.quantity, part) for m in meanings for part in (m.part, "any")}
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
     sensors = {t.name: t for t, role in topics if role == "sensor"}
     sensors = {n: t for n, t in sensors.items() if not holds_frames(n, log.fields(n, quiet=True))}
     columns = _compared(log, [*sensors], named) if wanted else {}
-    columns |= {
-        (s.topic, s.paths[0]): ({m.quantity: (("", abs(s.scale)),)}, (m.quantity, m.part)) for s, m in known.items()
-    }
+    for source, factor in known:
+        its = meaning_of_signal(source.name)
+        columns[source.topic, source.paths[0]] = {its.quantity: (("", factor),)}, (its.quantity, its.part)
     if all(role is not None for _, role in columns.values()):
         return
     pieces = Pieces(log)

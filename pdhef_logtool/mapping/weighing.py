@@ -52,7 +52,6 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray
 #: Ground truth quantities of a single field.
 _TRUTH = ("vx_m_s", "vy_m_s", "sideslip_rad", "yaw_rate_rad_s", "lat_deg", "lon_deg", "course_rad", "yaw_rad")
 _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
-_SPEEDS = {"wheel rate": "speed", "wheel speed": "speed"}
 #: Words of a velocity x, y, z in the body's axes by convention.
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
@@ -155,8 +154,8 @@ class Weighing:
     def _usable(self) -> list[Field]:
         """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation")]
-        named = {f.meaning.quantity for f in usable if names_of(f.meaning.quantity, f.meaning.part)}
-        lacking = {"acceleration", "rate", "speed", "steering"} - {_SPEEDS.get(q, q) for q in named}
+        given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
+        lacking = {"acceleration", "rate", "speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
         usable = [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
@@ -294,7 +293,7 @@ class Weighing:
                 judged.append((score, name, item))
         if not judged:
             return
-        judged.sort(key=lambda j: (-j[0], j[2].is_off_centre, -j[2].topic.messages, j[2].topic.name, j[2].path))
+        judged.sort(key=lambda j: (-j[0], j[2].seen.is_off_centre, -j[2].topic.messages, j[2].topic.name, j[2].path))
         _, name, best = judged[0]
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
