@@ -221,17 +221,13 @@ def proposed_fields(
     log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], mapped: Sequence[SignalSource]
 ) -> Iterator[Named]:
     """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives."""
-    known = [(s, abs(s.scale)) for s in mapped if isinstance(s.scale, float)]
-    meanings = [*(n[3] for n in named if n[1] != "command"), *(meaning_of_signal(s.name) for s, _ in known)]
+    meanings = [*(n[3] for n in named if n[1] != "command"), *(meaning_of_signal(s.name) for s in mapped)]
     there = {(m.quantity, part) for m in meanings for part in (m.part, "any")}
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
     sensors = {t.name: t for t, role in topics if role == "sensor"}
     sensors = {n: t for n, t in sensors.items() if not holds_frames(n, log.fields(n, quiet=True))}
-    columns = _compared(log, [*sensors], named) if wanted else {}
-    for source, factor in known:
-        its = meaning_of_signal(source.name)
-        columns[source.topic, source.paths[0]] = {its.quantity: (("", factor),)}, (its.quantity, its.part)
+    columns = _compared(log, [*sensors], named, mapped) if wanted else {}
     if all(role is not None for _, role in columns.values()):
         return
     pieces = Pieces(log)
@@ -247,7 +243,7 @@ def proposed_fields(
 
 
 def _compared(
-    log: DriveLog, topics: Sequence[str], named: Sequence[Named]
+    log: DriveLog, topics: Sequence[str], named: Sequence[Named], mapped: Sequence[SignalSource]
 ) -> dict[tuple[str, str], tuple[Units, tuple[str, str] | None]]:
     """Return units and quantity by name, or None, of the fields that take part in a comparison, by topic and path."""
     columns: dict[tuple[str, str], tuple[Units, tuple[str, str] | None]] = {**dict(_named_columns(named))}
@@ -257,6 +253,11 @@ def _compared(
         units = _units_without_name(info) if is_column and (topic, info.path) not in by_name else {}
         if units and len(columns) < MOST_PROPOSED:
             columns[topic, info.path.removesuffix("[]")] = units, None
+    for source in mapped:
+        if isinstance(source.scale, float):
+            its = meaning_of_signal(source.name)
+            units = {its.quantity: (("", abs(source.scale)),)}
+            columns[source.topic, source.paths[0]] = units, (its.quantity, its.part)
     return columns
 
 
