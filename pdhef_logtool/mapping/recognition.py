@@ -429,9 +429,8 @@ def _speed_of_receiver(draft: _Draft) -> None:
     scales = tuple(s.scale for s in velocity if s is not None and isinstance(s.scale, float))
     if has_speed(draft.signals) or velocity[0] is None or len(paths) < len(velocity) or len({*scales}) != 1:
         return
-    source = draft.signals["speed_m_s"] = replace(
-        velocity[0], name="speed_m_s", field=paths, scale=scales, combine="norm"
-    )
+    source = replace(velocity[0], name="speed_m_s", field=paths, scale=scales, combine="norm")
+    draft.signals["speed_m_s"] = source
     draft.notes.append(f"speed_m_s comes from {source.topic}: it is {navigation.NEVER_NEGATIVE}")
     draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
 
