@@ -36,6 +36,8 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
 #: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
+#: Words that leave the quantity of a field open: it may be any of them.
+_OPEN_WORDS = naming.COUNTING | {"angle", "yaw"}
 #: Affix that distinguishes the name of a sign from the name of its magnitude; YawToRight belongs to YawRate.
 _SIGN = re.compile("|".join(VOCABULARY["patterns"]["sign"]), re.IGNORECASE)
 #: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
@@ -161,11 +163,6 @@ class Field:
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
 
     @property
-    def is_off_centre(self) -> bool:
-        """Return whether it is far from 0 at all times, as a servo's command is and a steering angle is not."""
-        return bool(abs(np.nanmedian(self.seen.values)) > 3.0 * np.nanstd(self.seen.values))
-
-    @property
     def score(self) -> float:
         """Confidence in the quantity given by the name, 0 to 1."""
         if self.fixed:
@@ -220,14 +217,17 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     return results
 
 
-def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]) -> Iterator[Named]:
-    """Yield the fields without a usable name that the drive's motion explains, for quantities that no name gives."""
-    there = {(n[3].quantity, part) for n in named if n[1] != "command" for part in (n[3].part, "any")}
+def proposed_fields(
+    log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], mapped: Sequence[SignalSource]
+) -> Iterator[Named]:
+    """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives."""
+    meanings = [*(n[3] for n in named if n[1] != "command"), *(meaning_of_signal(s.name) for s in mapped)]
+    there = {(m.quantity, part) for m in meanings for part in (m.part, "any")}
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
     sensors = {t.name: t for t, role in topics if role == "sensor"}
     sensors = {n: t for n, t in sensors.items() if not holds_frames(n, log.fields(n, quiet=True))}
-    columns = _compared(log, [*sensors], named) if wanted else {}
+    columns = _compared(log, [*sensors], named, mapped) if wanted else {}
     if all(role is not None for _, role in columns.values()):
         return
     pieces = Pieces(log)
@@ -243,7 +243,7 @@ def proposed_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], nam
 
 
 def _compared(
-    log: DriveLog, topics: Sequence[str], named: Sequence[Named]
+    log: DriveLog, topics: Sequence[str], named: Sequence[Named], mapped: Sequence[SignalSource]
 ) -> dict[tuple[str, str], tuple[Units, tuple[str, str] | None]]:
     """Return units and quantity by name, or None, of the fields that take part in a comparison, by topic and path."""
     columns: dict[tuple[str, str], tuple[Units, tuple[str, str] | None]] = {**dict(_named_columns(named))}
@@ -253,6 +253,11 @@ def _compared(
         units = _units_without_name(info) if is_column and (topic, info.path) not in by_name else {}
         if units and len(columns) < MOST_PROPOSED:
             columns[topic, info.path.removesuffix("[]")] = units, None
+    for source in mapped:
+        if isinstance(source.scale, float):
+            its = meaning_of_signal(source.name)
+            units = {its.quantity: (("", abs(source.scale)),)}
+            columns[source.topic, source.paths[0]] = units, (its.quantity, its.part)
     return columns
 
 
@@ -271,7 +276,7 @@ def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tu
 def _units_without_name(info: FieldInfo) -> Units:
     """Return the possible units of a field without a unit by quantity, if no word of its name has a meaning."""
     words = set(words_of(info.path)) - STATES
-    unknown = all(len(w) == 1 or w.isdigit() or w in naming.COUNTING or w not in naming.KNOWN for w in words)
+    unknown = all(len(w) == 1 or w.isdigit() or w in _OPEN_WORDS or w not in naming.KNOWN for w in words)
     quantities = ("speed", "acceleration", "rate", "steering")
     return {q: HYPOTHESES[q][:2] for q in quantities} if unknown and not info.unit and not words & NOT_VALUES else {}
 

@@ -123,15 +123,12 @@ def gate_mask(
         return np.zeros(stamps_ns.shape[0], np.bool_)
     passes = np.zeros(gate_values.shape[0], np.bool_)
     if gate.min is not None or gate.max is not None:
-        low = -np.inf if gate.min is None else gate.min
-        high = np.inf if gate.max is None else gate.max
+        low, high = -np.inf if gate.min is None else gate.min, np.inf if gate.max is None else gate.max
         passes |= (gate_values >= low) & (gate_values <= high)
     if gate.values:
         passes |= np.isin(gate_values, np.asarray(gate.values))
     last = np.searchsorted(gate_stamps_ns, stamps_ns, side="right") - 1
-    follows_gate = last >= 0
-    last = np.maximum(last, 0)
-    return np.asarray(follows_gate & passes[last] & (stamps_ns - gate_stamps_ns[last] <= hold_ns), dtype=np.bool_)
+    return np.asarray((last >= 0) & passes[last] & (stamps_ns - gate_stamps_ns[last] <= hold_ns), dtype=np.bool_)
 
 
 def read_signals(
@@ -255,8 +252,7 @@ class _Reading:
         values = si_values(topic, source)
         if not times.usable.all():
             values = values[times.usable]
-        low, high = source.valid_min, source.valid_max
-        clean = clean_samples(*self.measured[key], values, valid_min=low, valid_max=high)
+        clean = clean_samples(*self.measured[key], values, valid_min=source.valid_min, valid_max=source.valid_max)
         lost = {"nan": clean.nan_at, "out-of-range": clean.out_of_range_at}
         count.update({"read": len(topic), "bad-stamp": int(np.count_nonzero(~times.usable))})
         count.update({kind: rows.shape[0] for kind, rows in lost.items()})
@@ -307,7 +303,6 @@ def si_of(source: SignalSource, parts: Sequence[FloatArray]) -> FloatArray:
     """Return :func:`si_values` for the raw values of a source's fields."""
     raw = parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
     width = source.columns
-    n = raw.shape[0]
     if width == 1 and len(parts) > 1 and raw.ndim == 2:
         # Summed one by one: a matrix product may round differently with the number of rows.
         scales = np.broadcast_to(np.asarray(source.scale), len(parts))
@@ -320,7 +315,7 @@ def si_of(source: SignalSource, parts: Sequence[FloatArray]) -> FloatArray:
         if source.combine == "root":
             total = np.sqrt(np.maximum(total, 0.0))
         return np.asarray(total + source.offset, dtype=np.float64)
-    shape = (n, width) if width > 1 else (n,)
+    shape = (len(raw), width) if width > 1 else (len(raw),)
     if raw.shape != shape:
         raw = np.full(shape, np.nan)  # Wrong number of columns: every sample is counted as lost.
     return np.asarray(raw * np.asarray(source.scale) + np.asarray(source.offset), dtype=np.float64)

@@ -93,8 +93,7 @@ def _base(signals: Mapping[str, SignalSource], where: str) -> SignalSource:
 def _name_of(topic: str) -> str:
     words = [w for w in re.split(r"[^A-Za-z0-9]+", topic) if w]
     if words[:1] == ["pdhef"] and len(words) > 2:
-        words = words[1:-1]  # topic of this package: /pdhef/<estimator>/state
-        return "-".join(words)
+        return "-".join(words[1:-1])  # topic of this package: /pdhef/<estimator>/state
     name = "_".join(words) or "estimate"
     return f"{name}_" if name in RESERVED_NAMES else name
 

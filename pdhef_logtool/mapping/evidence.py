@@ -80,6 +80,11 @@ class Seen:
         finite = self.values[np.isfinite(self.values)]
         return finite.shape[0] > 1 and bool(np.ptp(finite) > 0.0)
 
+    @property
+    def is_off_centre(self) -> bool:
+        """Return whether it is far from 0 at all times, as a servo's command is and a steering angle is not."""
+        return bool(abs(np.nanmedian(self.values)) > 3.0 * np.nanstd(self.values))
+
 
 class Pieces:
     """A few pieces of a log on a common grid of 0.1 s."""

@@ -215,7 +215,7 @@ def decide_units(fields: Fields) -> None:
 def _by_gravity(fields: Fields) -> None:
     groups: dict[str, dict[str, Field]] = {}
     for item in fields.candidates:
-        if item.meaning.quantity == "acceleration" and item.is_axis:
+        if item.meaning.quantity == "acceleration" and item.meaning.part != "ahead" and item.is_axis:
             groups.setdefault(triad_of(item), {})[item.meaning.part] = item
     for axes in groups.values():
         if set(axes) in ({"z"}, set("xyz")):
@@ -257,11 +257,15 @@ def _speeds(fields: Fields) -> None:
 
 
 def _by_speeding_up(fields: Fields) -> None:
-    """Determine the units of speeds and of a_x by a_x ≈ v̇."""
-    for speed, ax in itertools.product(fields.open("speed"), fields.open("acceleration", "x")):
+    """Determine by a_x ≈ v̇ the units of speeds and of a_x, and whether an acceleration without an axis is a_x."""
+    along = fields.open("acceleration", "x") + fields.open("acceleration", "ahead")
+    for speed, ax in itertools.product(fields.open("speed"), along):
         relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
         if relation is not None and relation.correlation >= CLEAR:
             settle((ax, speed), [Gain((1, -1), relation.slope, BY_DRIVING)], "a_x ≈ v̇", bonus=0.3)
+            if ax.meaning.part == "ahead":
+                ax.meaning, ax.bonus = replace(ax.meaning, part="x"), ax.bonus - 0.1
+                ax.doubts.append("its name gives no axis; it follows the derivative of the speed")
 
 
 def _by_turning(fields: Fields) -> None:

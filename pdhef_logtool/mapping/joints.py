@@ -21,13 +21,9 @@ def is_joints(topic: TopicInfo) -> bool:
 
 def joint_names(log: DriveLog, topic: TopicInfo) -> tuple[str, ...]:
     """Return the joints of a topic in their order; empty if the order varies between messages."""
-    messages = log.first_messages(topic.name, MESSAGES)
-    orders = {tuple(str(n) for n in names) for m in messages if (names := _listed(value_at(m, ("name",))))}
+    listed = (value_at(m, ("name",)) for m in log.first_messages(topic.name, MESSAGES))
+    orders = {tuple(map(str, names)) for names in listed if isinstance(names, list | tuple) and names}
     return next(iter(orders)) if len(orders) == 1 else ()
-
-
-def _listed(value: object) -> tuple[object, ...]:
-    return tuple(value) if isinstance(value, list | tuple) else ()
 
 
 def joint_meanings(log: DriveLog, topic: TopicInfo) -> Iterator[tuple[str, Meaning]]:

@@ -68,8 +68,8 @@ def _steering(
     with np.errstate(invalid="ignore", divide="ignore"):
         rate = cells[turning] * factor[turning] / (speed if r is None else 1.0)
         curvature, lateral = np.where(speed > 1.0, rate / speed, np.nan), rate * speed
-    free = [i for i, c in enumerate(columns) if i not in places and c.role is None and "steering" in c.units]
-    surest, steering = max(((abs(correlation(cells[i], curvature)), i) for i in free), default=(0.0, 0))
+    free = {i for i, c in enumerate(columns) if c.role is None and "steering" in c.units and not c.seen.is_off_centre}
+    surest, steering = max(((abs(correlation(cells[i], curvature)), i) for i in free - {*places}), default=(0.0, 0))
     # A roll angle follows the lateral acceleration better than the curvature.
     return steering if surest > max(LEAST, abs(correlation(cells[steering], lateral))) else None
 

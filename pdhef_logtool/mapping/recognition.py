@@ -320,9 +320,8 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
     draft.signals |= navigation.gnss_signals(draft.signals, draft.truth)
-    instruments = (
-        {_device(source.topic) for source in draft.truth.values()} if navigation.has_heading(draft.truth) else set()
-    )
+    is_ins = navigation.has_heading(draft.truth)
+    instruments = {_device(source.topic) for source in draft.truth.values() if is_ins}
     others = [t for t in topics if not _named(t, "truth") and _device(t.name) not in instruments]
     receivers = list(_receivers(draft, others, vendors))
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
@@ -330,11 +329,7 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
             draft.signals |= signals
     if not has_gnss(draft.signals):
         _map_twist(draft, others)
-        if (
-            has_gnss(draft.signals)
-            or not navigation.has_heading(draft.truth)
-            or not {"lat_deg", "x_m"} & set(draft.truth)
-        ):
+        if has_gnss(draft.signals) or not (is_ins and {"lat_deg", "x_m"} & set(draft.truth)):
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 

@@ -92,9 +92,9 @@ def weigh(
     topics : topics that may contain candidates, with their kinds of data.
     signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
     """
-    named = named_fields(log, topics, vendors) if log.end_ns > log.start_ns else []
-    if log.end_ns > log.start_ns and not {"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"} & set(signals):
-        named += proposed_fields(log, topics, named)
+    topics = topics if log.end_ns > log.start_ns else []
+    named = named_fields(log, topics, vendors)
+    named += proposed_fields(log, topics, named, [*signals.values()])
     if not named:
         return Weighing(Fields(Pieces(log), {}, [], []))
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
@@ -155,7 +155,7 @@ class Weighing:
         """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation")]
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
-        lacking = {"speed", "steering"} - given
+        lacking = {"acceleration", "rate", "speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
         usable = [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
@@ -293,7 +293,7 @@ class Weighing:
                 judged.append((score, name, item))
         if not judged:
             return
-        judged.sort(key=lambda j: (-j[0], j[2].is_off_centre, -j[2].topic.messages, j[2].topic.name, j[2].path))
+        judged.sort(key=lambda j: (-j[0], j[2].seen.is_off_centre, -j[2].topic.messages, j[2].topic.name, j[2].path))
         _, name, best = judged[0]
         near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
