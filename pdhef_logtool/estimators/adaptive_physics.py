@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -43,11 +43,20 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
-#: Possible deficiencies of a model, as parts of ``physics``; each is the state of one filter, which uses this share of
-#: the residual, and has these odds against F1 before any measurement. Shares and odds were chosen on simulated drives
-#: that no table contains; with even odds, tyres near their limit on a level road are taken for a bank.
-CURES = {"force_scale": 0.5, "bank": 0.0}
-ODDS = {"force_scale": 1.0, "bank": math.exp(-2.0)}
+
+class Cure(NamedTuple):
+    """A possible deficiency of the model, as the state of one filter.
+
+    That filter uses a ``share`` of the residual, and has ``odds`` against F1 before any measurement.
+    """
+
+    share: float
+    odds: float
+
+
+#: By part of ``physics``; chosen on simulated drives that no table contains. With even odds, tyres near their limit on
+#: a level road are taken for a bank.
+CURES = {"force_scale": Cure(0.5, 1.0), "bank": Cure(0.0, math.exp(-2.0))}
 #: Factor on the 1-sigma of the process noise of v_y and yaw rate at gain 1 of a network that was trained with the
 #: filter. Chosen on the same drives: from 0.65 to 0.3 little changes.
 RESIDUAL_NOISE = 0.5
@@ -204,12 +213,12 @@ class AdaptivePhysics:
     @property
     def residual_shares(self) -> tuple[float, ...]:
         """Share of the residual in each filter."""
-        return 1.0, *(CURES[cure] for cure in self.cures)
+        return 1.0, *(CURES[cure].share for cure in self.cures)
 
     @property
     def odds(self) -> tuple[float, ...]:
         """Odds of each filter before any measurement."""
-        return 1.0, *(ODDS[cure] for cure in self.cures)
+        return 1.0, *(CURES[cure].odds for cure in self.cures)
 
     @property
     def filters(self) -> tuple[VehicleUkf, ...]:

@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 
 from pdhef_logtool.logs.definitions import schema_file
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.printable import utf8
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
 from pdhef_logtool.results.sink import TRUTH, rounded
@@ -45,10 +44,21 @@ def arrow_schema(name: str) -> pa.Schema:
 
 
 def arrow_array(values: Any, kind: pa.DataType) -> pa.Array:
-    """Return numbers or strings [N] as a column; NaN and None are null."""
+    """Return numbers or strings [N], null for NaN and None; ``pa.array`` would import an installed pandas."""
+    if isinstance(values, np.ndarray) and values.dtype.kind != "U":
+        is_there = ~np.isnan(values)
+    else:
+        is_there = np.array([v is not None and v == v for v in values], dtype=np.bool_)  # NaN differs from itself
+        filler = "" if pa.types.is_string(kind) else 0
+        values = [v if there else filler for v, there in zip(values, is_there, strict=True)]
+    validity = None if is_there.all() else pa.py_buffer(np.packbits(is_there, bitorder="little"))
     if pa.types.is_string(kind):
-        values = [None if v is None else utf8(str(v)) for v in values]
-    return pa.array(values, kind, from_pandas=True)
+        texts = [str(v).encode("utf-8", "backslashreplace") for v in values]
+        offsets = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        return pa.Array.from_buffers(kind, len(texts), [validity, pa.py_buffer(offsets), pa.py_buffer(b"".join(texts))])
+    values = np.ascontiguousarray(values, dtype=kind.to_pandas_dtype())
+    data = np.packbits(values, bitorder="little") if values.dtype == np.bool_ else values
+    return pa.Array.from_buffers(kind, len(values), [validity, pa.py_buffer(data)])
 
 
 #: Rows of a row group: 10 h at 100 Hz make 110 row groups an estimator.

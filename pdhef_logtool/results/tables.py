@@ -172,12 +172,13 @@ def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str]
         while some := [*islice(left, _PARTS_AT_ONCE)]:
             whole = pa.concat_tables(some)
             for name, writer in writers.items():
-                rows = whole[name].combine_chunks().flatten()
-                table = pa.Table.from_arrays(rows.flatten(), schema=schemas[name])
+                # To flatten the lists would import all functions of pyarrow.
+                bounds = [(x.values, x.offsets[0].as_py(), x.offsets[-1].as_py()) for x in whole[name].chunks]
+                rows = pa.concat_arrays([values[first:end] for values, first, end in bounds])
+                columns = dict(zip(schemas[name].names, rows.flatten(), strict=True))
                 if name == "drives" and folders is not None:
-                    column, of_some = table.schema.get_field_index("folder"), folders[done : done + len(some)]
-                    table = table.set_column(column, table.field(column), arrow_array(of_some, pa.string()))
-                writer.write_table(table)
+                    columns["folder"] = arrow_array(folders[done : done + len(some)], pa.string())
+                writer.write_table(pa.Table.from_arrays([*columns.values()], schema=schemas[name]))
             done += len(some)
 
 
