@@ -12,6 +12,7 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource
 from studies.pages import ROOT
 from studies.strangers.cars import Series
+from studies.strangers.recordings import Expected
 from studies.strangers.scoring import read_answers
 
 SHARED = ROOT.parent / "shared"
@@ -25,24 +26,26 @@ class Answer:
     file: str
     right: dict[str, tuple[SignalSource, ...]]
     allowed: dict[str, tuple[SignalSource, ...]]
-    at_fault: tuple[str, ...]
+    at_fault: frozenset[str]
 
     @property
     def path(self) -> Path:
         """Where the recording lies, if it is there."""
         return SHARED / self.file
 
-    def series(self) -> tuple[dict[str, tuple[Series, ...]], dict[str, tuple[Series, ...]]]:
+    def expected(self) -> Expected:
         """Read the right and the allowed channels."""
         right, allowed = (_read(self.path, sources) for sources in (self.right, self.allowed))
-        return right, allowed
+        return Expected(self.file, "recording", "", right, allowed, at_fault=self.at_fault)
 
 
 def load_answers() -> Iterator[Answer]:
     """Yield all of them, whether the recordings are there or not."""
     for file, table in _tables().items():
         if "same_as" not in table:
-            yield Answer(file, _sources(table), _sources(table.get("allowed", {})), tuple(table.get("at_fault", ())))
+            yield Answer(
+                file, _sources(table), _sources(table.get("allowed", {})), frozenset(table.get("at_fault", ()))
+            )
 
 
 def answered_files() -> frozenset[str]:

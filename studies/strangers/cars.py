@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -111,7 +111,7 @@ DRIVES: dict[str, DriveSpec] = {
 def drive(name: str, imu_x_m: float = 0.0) -> Car:
     """Drive one of :data:`DRIVES`, with the IMU ``imu_x_m`` before the centre of gravity."""
     spec = DRIVES[name]
-    made = (spec if not imu_x_m else _with_imu_at(spec, imu_x_m)).simulate()
+    made = replace(spec, sensors=(*spec.sensors, ("imu_x_m", imu_x_m))).simulate()
     start = made.start_ns
     channels = made.channels
     ins = channels["rtk"]
@@ -133,12 +133,6 @@ def drive(name: str, imu_x_m: float = 0.0) -> Car:
         yaw_rate=_series(ins, start, "yaw_rate_rad_s")[0],
         fix=_series(channels["fix"], start, "lat_deg", "lon_deg", "alt_m"),
     )
-
-
-def _with_imu_at(spec: DriveSpec, imu_x_m: float) -> DriveSpec:
-    from dataclasses import replace
-
-    return replace(spec, sensors=(*spec.sensors, ("imu_x_m", imu_x_m)))
 
 
 def _series(channel: SensorChannel, start_ns: int, *names: str) -> Series:

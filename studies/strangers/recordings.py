@@ -45,32 +45,36 @@ NAVIGATION = ("position", "course", "heading")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recording:
-    """A log of our own making.
+class Expected:
+    """What the tool must find in a log.
 
     Attributes
     ----------
-    name : of the log; logs of one ``kind`` count as one.
-    group : ``fault``, ``layout`` or ``held-out`` (built last, run once).
-    what : description in one line.
+    name : of the log. what : description in one line. page : where the layout is documented.
+    group : ``fault``, ``layout``, ``recording`` or ``held-out`` (built last, run once).
     right : by channel (``truth.`` before ground truth) the expected series, any one of them.
     allowed : channels that may be mapped, and are not missed: an INS that is no ground truth, a second source.
     cause : pattern of a message that names the cause; empty for a log without a fault.
     at_fault : channels with the fault; of all others no check may fail.
-    page : where the layout is documented.
     """
 
     name: str
     group: str
     what: str
-    container: str
-    topics: tuple[Topic, ...]
-    right: Mapping[str, tuple[Series, ...]]
+    right: Mapping[str, Sequence[Series]]
+    allowed: Mapping[str, Sequence[Series]] = field(default_factory=dict)
     cause: str = ""
     at_fault: frozenset[str] = frozenset()
-    kind: str = ""
     page: str = ""
-    allowed: Mapping[str, tuple[Series, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording(Expected):
+    """A log of our own making; logs of one ``kind`` count as one."""
+
+    container: str = "mcap"
+    topics: tuple[Topic, ...] = ()
+    kind: str = ""
 
     @property
     def counted_as(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -24,7 +24,8 @@ from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import POSITIONS, Channel, FloatArray
 from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.strangers.cars import Series
-from studies.strangers.recordings import ITEMS, NAVIGATION
+from studies.strangers.page import Result
+from studies.strangers.recordings import ITEMS, NAVIGATION, Expected
 
 #: Values are compared as means over so long: noise and a late stamp of a few milliseconds count little.
 BIN_S = 0.25
@@ -80,33 +81,6 @@ class Told:
         return "\n".join([*said, *self.doubts, self.error])
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One item of one log.
-
-    ``verdict`` is ``right``, ``wrong`` or ``missing``; ``told`` whether a failed or undecided check or a doubt names
-    a wrong one; ``checked`` the verdicts of the checks on its channels; ``what`` the mapped sources;
-    ``doubted`` whether a sentence doubts it.
-    """
-
-    item: str
-    verdict: str
-    told: bool
-    checked: frozenset[str]
-    what: str
-    doubted: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Score:
-    """Outcome of one log: its findings, the failed checks on right channels, whether the cause was named."""
-
-    findings: tuple[Finding, ...]
-    false_alarms: tuple[str, ...]
-    cause_named: bool | None
-    told: Told
-
-
 # ------------------------------------------------------------------------------------------------ messages of the tool
 
 
@@ -143,10 +117,14 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
     error = error or refused_run
     messages = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
-    clocks = fit_clocks(log, inspection.mapping, log.start_ns, log.end_ns)
-    read = read_signals(log, inspection.mapping, clocks, log.start_ns, log.end_ns)
-    channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
-    return inspection.mapping, messages, channels
+    return inspection.mapping, messages, _channels(log, inspection.mapping)
+
+
+def _channels(log: DriveLog, mapping: SignalMapping) -> dict[str, Channel]:
+    """Return the channels of a log by a mapping."""
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    read = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    return read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
 
 
 def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
@@ -162,9 +140,7 @@ def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
 def read_answers(path: Path, mapping: SignalMapping) -> dict[str, tuple[Series, ...]]:
     """Return the right channels of a recording by a mapping that a person wrote."""
     with closing(open_log(path)) as log:
-        clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-        read = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
-    channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
+        channels = _channels(log, mapping)
     return {n: (Series(c.stamps_ns, c.arrival_ns, c.values),) for n, c in channels.items() if len(c)}
 
 
@@ -240,28 +216,19 @@ def bias_of(name: str) -> float:
 # ------------------------------------------------------------------------------------------------ the score
 
 
-def score_log(
-    path: Path,
-    right: Mapping[str, Sequence[Series]],
-    *,
-    allowed: Mapping[str, Sequence[Series]] | None = None,
-    cause: str = "",
-    at_fault: Iterable[str] = (),
-    start_ns: int | None = None,
-) -> Score:
+def score_log(path: Path, expected: Expected, start_ns: int | None = None) -> Result:
     """Let the tool map a log and compare the mapping with the right answers.
+
+    A channel of :data:`ITEMS` that is neither right nor allowed is wrong.
 
     Parameters
     ----------
-    right : expected series by channel. A channel of :data:`ITEMS` that is neither here nor allowed is wrong.
-    allowed : channels that may also be mapped, and do not count as missing.
-    cause : pattern that a message must match; empty without a cause.
-    at_fault : channels for which checks may fail despite a right mapping.
     start_ns : zero of the clock of a log with times relative to its start.
     """
+    right = expected.right
     mapping, messages, channels = look(path)
     sources = {} if mapping is None else _sources(mapping)
-    fitting = {**(allowed or {}), **right}
+    fitting = {**expected.allowed, **right}
     first = min((int(c.arrival_ns[0]) for c in channels.values() if len(c)), default=None)
     if start_ns is not None and first is not None and first < RELATIVE_NS + FEWEST_WEEKS_NS:
         # A clock without a date counts from its own zero, such as the start of a GPS week.
@@ -271,35 +238,38 @@ def score_log(
         name: any(agrees(channel, series, floor_of(name), bias_of(name)) for series in fitting.get(name, ()))
         for name, channel in channels.items()
     }
-    findings = []
+    items, wrong, verdicts, doubted, silent = dict[str, str](), dict[str, str](), dict[str, str](), [], []
     for item, names in ITEMS.items():
         mapped = [n for n in names if n in channels]
         present = any(n in right for n in names)
         if item in NAVIGATION and not present:
             continue
-        if not mapped:
-            if present:
-                findings.append(Finding(item, "missing", True, frozenset(), ""))
-            continue
-        wrong = [n for n in mapped if not is_right[n]]
-        checked = frozenset(c["verdict"] for c in messages.checks if c["subject"] in mapped)
-        what = ", ".join(f"{n} = {sources[n]}" for n in (wrong or mapped) if n in sources)
-        if wrong:
-            findings.append(Finding(item, "wrong", all(_is_told(n, sources, messages) for n in wrong), checked, what))
+        bad = [n for n in mapped if not is_right[n]]
+        if bad:
+            is_told = all(_is_told(n, sources, messages) for n in bad)
+            items[item] = "wrong, reported" if is_told else "wrong, not reported"
+            wrong[item] = ", ".join(f"{n} = {sources[n]}" for n in bad if n in sources)
+            silent += [] if is_told else [f"{item} ({wrong[item]})"]
+        elif present and mapped:
+            items[item] = "right"
+            checked = {c["verdict"] for c in messages.checks if c["subject"] in mapped}
+            verdicts[item] = next((v for v in ("failed", "undecided", "passed") if v in checked), "none")
+            doubted += [item] if any(_is_doubted(n, sources.get(n, ""), messages) for n in mapped) else []
         elif present:
-            doubted = any(_is_doubted(n, sources.get(n, ""), messages) for n in mapped)
-            findings.append(Finding(item, "right", True, checked, what, doubted))
-    blamed = set(at_fault)
-    false_alarms = tuple(
+            items[item] = "missing"
+    alarms = tuple(
         f"{c['name']} ({c['subject']}): {c.get('evidence', '')}"
         for c in messages.checks
         if c["verdict"] == "failed"
         and is_right.get(c["subject"], False)
-        and c["subject"] not in blamed
+        and c["subject"] not in expected.at_fault
         and not c["name"].endswith(".corrected")  # the correction made it right
     )
-    named = bool(re.search(cause, messages.text, re.IGNORECASE)) if cause else None
-    return Score(tuple(findings), false_alarms, named, messages)
+    named = bool(re.search(expected.cause, messages.text, re.IGNORECASE)) if expected.cause else None
+    return Result(
+        expected.name, expected.group, expected.what, items, expected.page, wrong, verdicts, tuple(silent),
+        tuple(doubted), alarms, named, messages.text,
+    )  # fmt: skip
 
 
 def _sources(mapping: SignalMapping) -> dict[str, str]:
