@@ -14,16 +14,11 @@ from pdhef_logtool.records.signals import FloatArray
 from studies.strangers import recordings
 from studies.strangers.cars import Car, Series, drive
 from studies.strangers.containers import Topic
-from studies.strangers.recordings import DEG, DOWN, G_M_S2, KMH, Recording, answers, message
+from studies.strangers.recordings import DEG, DOWN, G_M_S2, KMH, SCORING, Recording, answers, message
 from truthsim.recording import quaternion
 
 #: Patterns of messages that name a cause.
-CAUSES = {
-    # An IMU with axes that differ from the axes of the car.
-    "MOUNTING": r"mount|rotat|upside|z-down|z down|lies|imu[^.;]{0,60}(turned|tilt)|(turned|tilt)[^.;]{0,60}imu",
-    "UNITS": r"unit|degree|deg/s|\bdeg\b|km/h|\bg\b|factor|scale|57\.|9\.8|3\.6",
-    "SIGNS": r"sign|negat|opposite|mirror",
-}
+CAUSES: dict[str, str] = SCORING["causes"]
 
 
 def rotation(axis: tuple[float, float, float], angle_rad: float) -> FloatArray:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,28 +22,9 @@ KMH = 1.0 / 3.6
 #: Turns forward, left, up into forward, right, down and back.
 DOWN: FloatArray = np.diag([1.0, -1.0, -1.0])
 
+SCORING = tomllib.loads(Path(__file__).with_name("scoring.toml").read_text(encoding="utf-8"))
 #: Scored items: a part of a log that a person can find in it, and the channels that it may be mapped to.
-ITEMS: dict[str, tuple[str, ...]] = {
-    "steering": ("steer_rad", "steering_wheel_rad"),
-    "ax": ("ax_m_s2",),
-    "ay": ("ay_m_s2",),
-    "yaw rate": ("yaw_rate_rad_s",),
-    "speed": ("speed_m_s",),
-    "wheel speeds": tuple(f"wheel_speed_{w}_{unit}" for unit in ("m_s", "rad_s") for w in WHEELS),
-    "ground truth: velocity": (
-        "truth.vx_m_s",
-        "truth.vy_m_s",
-        "truth.sideslip_rad",
-        "truth.enu_velocity_m_s",
-        "truth.ecef_velocity_m_s",
-    ),
-    "ground truth: yaw rate": ("truth.yaw_rate_rad_s",),
-    "position": ("truth.lat_deg", "truth.lon_deg", "gnss_latitude_deg", "gnss_longitude_deg"),
-    "course": ("truth.course_rad", "gnss_course_rad", "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"),
-    "heading": ("truth.yaw_rad", "gnss_heading_rad"),
-}
-#: Items of a navigation system, scored only where a layout names them.
-NAVIGATION = ("position", "course", "heading")
+ITEMS: dict[str, list[str]] = SCORING["items"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

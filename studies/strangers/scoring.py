@@ -25,30 +25,13 @@ from pdhef_logtool.records.signals import POSITIONS, Channel, FloatArray
 from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.strangers.cars import Series
 from studies.strangers.page import Result
-from studies.strangers.recordings import ITEMS, NAVIGATION, Expected
+from studies.strangers.recordings import ITEMS, SCORING, Expected
 
 #: Values are compared as means over so long: noise and a late stamp of a few milliseconds count little.
 BIN_S = 0.25
 #: Two channels agree when they differ by less than this share of the right one's rms, or by the floor of its unit.
 SHARE = 0.04
-FLOORS: dict[str, float] = {
-    "steer_rad": 0.002,
-    "steering_wheel_rad": 0.03,
-    "ax_m_s2": 0.12,
-    "ay_m_s2": 0.12,
-    "yaw_rate_rad_s": 0.004,
-    "speed_m_s": 0.15,
-    "rad_s": 0.5,
-    "m_s": 0.15,
-    "truth.vx_m_s": 0.15,
-    "truth.vy_m_s": 0.02,
-    "truth.sideslip_rad": 0.001,
-    "truth.enu_velocity_m_s": 0.15,
-    "truth.ecef_velocity_m_s": 0.15,
-    "truth.yaw_rate_rad_s": 0.004,
-    **dict.fromkeys(("truth.lat_deg", "truth.lon_deg", "gnss_latitude_deg", "gnss_longitude_deg"), 1e-4),
-    **dict.fromkeys(("truth.course_rad", "gnss_course_rad", "truth.yaw_rad", "gnss_heading_rad"), 0.05),
-}
+FLOORS: dict[str, float] = {name: group["floor"] for group in SCORING["floors"] for name in group["channels"]}
 WEAK_SHARE = 0.6
 #: Largest constant (m/s²) that counts as accelerometer bias: it cannot be distinguished from a tilt of two degrees.
 BIAS_M_S2 = 0.3
@@ -242,7 +225,7 @@ def score_log(path: Path, expected: Expected, start_ns: int | None = None) -> Re
     for item, names in ITEMS.items():
         mapped = [n for n in names if n in channels]
         present = any(n in right for n in names)
-        if item in NAVIGATION and not present:
+        if item in SCORING["only_if_named"] and not present:
             continue
         bad = [n for n in mapped if not is_right[n]]
         if bad:

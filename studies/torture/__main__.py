@@ -17,21 +17,22 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
+from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
 from studies.pages import DOCS, ROOT, fill, options, table, write
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
-from studies.torture.hours import write_hours
 from studies.torture.mutants import HANG_S, format_judge, log_judge
-from studies.torture.outside import measured
 from studies.torture.seeds import FORMATS
-from studies.torture.workers import NO_VERDICT, Verdict, judge, run_cases
+from studies.torture.workers import NO_VERDICT, Verdict, judge, measured, run_cases
 
+_IMU = "/imu/data"
+_TOPICS = (_IMU, "/vehicle/status/steering_status", "/vehicle/wheel_speeds", "/truth/perfect/odometry")
 _THREE = ("run", "--car", "saloon", "--annotate", "none", "--estimators", "zero,kinematic,phy-ukf")
 
 
@@ -66,6 +67,21 @@ def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdi
         collected.append({"name": name, "end": verdict.end, "problem": verdict.problem, **verdict.costs})
         _say(f"{part}: {name}: {verdict.end}{verdict.problem and ', WRONG: ' + verdict.problem}")
     return collected
+
+
+def write_hours(path: Path, hours: float) -> None:
+    """Write a log of the given hours: the sample road drive repeated, each time from the end of the last one."""
+    once = [m for m in messages(ROOT / "sample_logs" / "road.mcap") if m.topic in _TOPICS]
+    imu_ns = [m.log_time_ns for m in once if m.topic == _IMU]
+    lasts_ns = imu_ns[-1] - imu_ns[0] + 10_000_000
+
+    def repeated() -> Iterator[Message]:
+        for shift_ns in range(0, round(hours * 3600e9 / lasts_ns) * lasts_ns, lasts_ns):
+            for m in once:
+                at_ns, published_ns = m.log_time_ns + shift_ns, m.publish_time_ns + shift_ns
+                yield stamped(m, stamp_ns(m) + shift_ns)._replace(log_time_ns=at_ns, publish_time_ns=published_ns)
+
+    write_log(path, repeated(), "ros2")
 
 
 def long_log(hours: float, words: Sequence[str], folder: Path) -> Verdict:
