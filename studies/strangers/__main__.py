@@ -11,13 +11,12 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from studies.pages import DOCS, RESULTS, ROOT, options, write
+from studies.pages import DOCS, RESULTS, ROOT, options, read_toml, write
 from studies.strangers.answers import SHARED, answered_files, load_answers
 from studies.strangers.containers import write as write_log
 from studies.strangers.layouts import layouts, mountings
@@ -26,7 +25,7 @@ from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import look, score_log
 
 #: First results of held-out layouts, present and former.
-FIRST_RUNS: dict[str, str] = tomllib.loads(Path(__file__).with_name("first_runs.toml").read_text(encoding="utf-8"))
+FIRST_RUNS: dict[str, str] = read_toml(Path(__file__).with_name("first_runs.toml"))
 
 
 def score_recording(recording: Recording, folder: Path) -> Result:

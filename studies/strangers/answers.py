@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource
-from studies.pages import ROOT
+from studies.pages import ROOT, read_toml
 from studies.strangers.cars import Series
 from studies.strangers.recordings import Expected
 from studies.strangers.scoring import read_answers
@@ -41,7 +40,7 @@ class Answer:
 
 def load_answers() -> Iterator[Answer]:
     """Yield all of them, whether the recordings are there or not."""
-    for file, table in _tables().items():
+    for file, table in read_toml(ANSWERS).items():
         if "same_as" not in table:
             yield Answer(
                 file, _sources(table), _sources(table.get("allowed", {})), frozenset(table.get("at_fault", ()))
@@ -50,11 +49,7 @@ def load_answers() -> Iterator[Answer]:
 
 def answered_files() -> frozenset[str]:
     """Return the recordings that somebody has looked at."""
-    return frozenset(_tables())
-
-
-def _tables() -> dict[str, dict[str, Any]]:
-    return tomllib.loads(ANSWERS.read_text(encoding="utf-8"))
+    return frozenset(read_toml(ANSWERS))
 
 
 def _sources(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:

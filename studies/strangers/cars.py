@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
+from studies.pages import read_toml
 from truthsim.batch import DriveSpec
 from truthsim.sensors import SensorChannel
 
@@ -94,7 +94,7 @@ class Car:
         return Series(v.stamps_ns, v.arrival_ns, np.where(moves, np.arctan2(v.values[:, 1], v.values[:, 0]), 0.0))
 
 
-_DRIVES = tomllib.loads(Path(__file__).with_name("drives.toml").read_text(encoding="utf-8"))
+_DRIVES = read_toml(Path(__file__).with_name("drives.toml"))
 
 
 @lru_cache(maxsize=16)

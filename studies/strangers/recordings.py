@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import WHEELS, FloatArray
+from studies.pages import read_toml
 from studies.strangers.cars import Car, Series
 from studies.strangers.containers import Topic
 from truthsim.recording import quaternion
@@ -22,7 +22,7 @@ KMH = 1.0 / 3.6
 #: Turns forward, left, up into forward, right, down and back.
 DOWN: FloatArray = np.diag([1.0, -1.0, -1.0])
 
-SCORING = tomllib.loads(Path(__file__).with_name("scoring.toml").read_text(encoding="utf-8"))
+SCORING = read_toml(Path(__file__).with_name("scoring.toml"))
 #: Scored items: a part of a log that a person can find in it, and the channels that it may be mapped to.
 ITEMS: dict[str, list[str]] = SCORING["items"]
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,6 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import IntArray
+from studies.pages import read_toml
 
 if TYPE_CHECKING:
     from studies.strangers.containers import Topic
@@ -27,10 +27,7 @@ if TYPE_CHECKING:
 #: GPS time is ahead of UTC by 18 leap seconds, and began 315964800 s after 1970.
 _GPS_NS, _WEEK_NS, _DAY_NS = (18 - 315_964_800) * 10**9, 604_800 * 10**9, 86_400 * 10**9
 #: Text files and files of nested tables, documented in their files.
-_DIALECTS, _DOCUMENTS = (
-    tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
-    for name in ("dialects", "documents")
-)
+_DIALECTS, _DOCUMENTS = (read_toml(Path(__file__).with_name(f"{name}.toml")) for name in ("dialects", "documents"))
 
 
 def _columns(topics: Sequence[Topic]) -> tuple[IntArray, dict[str, NDArray[np.float64]]]:

@@ -320,7 +320,7 @@ def kill_run(
     """
     before, quiet, told = _prepared(output), subprocess.DEVNULL, subprocess.PIPE
     words = ("run", *arguments, "-o", str(output))
-    with start(*words, stdout=quiet, stderr=told, text=True, preexec_fn=_notice_interrupts) as process:
+    with start(*words, stdout=quiet, stderr=told, preexec_fn=_notice_interrupts) as process:
         while writing and process.poll() is None and _prepared(output) <= before:
             time.sleep(0.002)
         try:
@@ -330,7 +330,7 @@ def kill_run(
             done = False
             process.send_signal(number)
         try:
-            said = process.communicate(timeout=LONGEST_END_S)[1]
+            said = process.communicate(timeout=LONGEST_END_S)[1].decode()
         except subprocess.TimeoutExpired:
             process.kill()
             raise

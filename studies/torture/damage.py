@@ -15,7 +15,6 @@ import random
 import re
 import sqlite3
 import struct
-import tomllib
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -24,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from studies.pages import read_toml
 from studies.torture.seeds import TOPICS
 
 #: Numbers at which arithmetic, allocation and time go wrong.
@@ -297,7 +297,7 @@ def _packed(compression: bytes, body: bytes) -> bytes:
 # ------------------------------------------------------------------------------------------------ databases
 
 #: Statements with a value and an identifier, and statements that change the structure.
-_SQL = tomllib.loads(Path(__file__).with_name("statements.toml").read_text(encoding="utf-8"))
+_SQL = read_toml(Path(__file__).with_name("statements.toml"))
 ENDLESS_VIEW: str = _SQL["structure"][-1]
 
 

@@ -113,7 +113,7 @@ def _descriptors() -> bytes:
     from google.protobuf import descriptor_pb2, text_format
 
     text = Path(__file__).with_name("state.txtpb").read_text(encoding="utf-8")
-    return text_format.Parse(text, descriptor_pb2.FileDescriptorSet()).SerializeToString()
+    return bytes(text_format.Parse(text, descriptor_pb2.FileDescriptorSet()).SerializeToString())
 
 
 def _protobuf(values: dict[str, Any]) -> bytes:
