@@ -14,7 +14,7 @@ from reference_car import FRONT_TYRE, REAR_TYRE, Drive, drive, keep, with_noise
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.records.tracks import make_track
 from studies.defaults.axle_forces import FitDrive, axle_samples
-from studies.defaults.physics_fit import STARTS, build_car, drive_errors, fit_physics, make_priors
+from studies.defaults.fit_physics import STARTS, build_car, drive_errors, fit_physics, make_priors
 
 STATIC = PhysicsParts()
 #: Slope of the true tyres at no slip, N/rad at friction 0.85.
