@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.toml_files import vehicle_of_entries
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.mapping import Mapping, load_mapping
-from studies.pages import DRIVES, ROOT, read_toml, write_toml
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.mapping.mapping_file import mapping_from_dict
+from studies.pages import DRIVES, ROOT, read_toml
 
 REFERENCE = ROOT / "tests" / "reference"
 #: Groups of the page: full-size cars on roads, small or off-road cars, and drives with an offset in the ground truth.
@@ -107,11 +107,9 @@ def beside_vehicle(document: Table[str, Any]) -> dict[str, Any]:
 
 def mapping_of(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = False) -> Mapping:
     """Return the mapping of a drive, as :func:`mapping_table`."""
-    with tempfile.TemporaryDirectory() as work:
-        return load_mapping(write_toml(Path(work) / "mapping.toml", mapping_table(drive, folder, receiver=receiver)))
+    return mapping_from_dict(mapping_table(drive, folder, receiver=receiver), where=drive.log)
 
 
 def vehicle_of(drive: PeerDrive, folder: Path = DRIVES) -> VehicleParameters:
     """Return the published vehicle of a drive."""
-    with tempfile.TemporaryDirectory() as work:
-        return Car.load(write_toml(Path(work) / "vehicle.toml", vehicle_table(drive, folder))).vehicle
+    return vehicle_of_entries(vehicle_table(drive, folder), where=drive.log).vehicle
