@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import subprocess
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -200,6 +201,14 @@ def mistakes(log: str, kinds: Sequence[tuple[str, str]], tool: Tool) -> Figures:
     return {name: Figure(float(counts[name]), "count", 0.0) for name in VERDICTS}
 
 
+def written(file: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    """Return a JSON document that a module has written; raises RuntimeError if it has not."""
+    if not file.is_file():
+        raise RuntimeError(done.stderr[-2000:])
+    document: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return document
+
+
 # ------------------------------------------------------------------------------------------------ third-party logs
 
 
@@ -208,11 +217,8 @@ def strangers(only: Sequence[str], tool: Tool) -> Figures:
     name = f"strangers-{len(only)}"
     kept = tool.work / f"{name}.json"
     chosen = ("--only", *only) if only else ()
-    done = tool.python("studies.strangers", "--held-out", "--work", tool.work / name, "--keep", kept,
-                       "--out", tool.work / f"{name}.md", *chosen)  # fmt: skip
-    if not kept.is_file():
-        raise RuntimeError(done.stderr[-2000:])
-    logs = json.loads(kept.read_text(encoding="utf-8"))
+    given = ("--work", tool.work / name, "--keep", kept, "--out", tool.work / f"{name}.md")
+    logs = written(kept, tool.python("studies.strangers", "--held-out", *given, *chosen))
     counts = Counter(outcome for log in logs.values() for outcome in log["items"].values())
     share = 100.0 * counts["right"] / counts.total()
     silent = Figure(float(counts["wrong, not reported"]), "count", 0.0)
@@ -226,11 +232,7 @@ def fuzz(name: str, count: int, tool: Tool) -> Figures:
     """Count how commands end on mutants of a format."""
     work = tool.work / f"fuzz-{name}-{count}"
     given = ("--work", work, "--jobs", "1", "--format", name, "--count", str(count), "--out", work / "none.md")
-    done = tool.python("studies.torture", "formats", *given)
-    file = work / "formats.json"
-    if not file.is_file():
-        raise RuntimeError(done.stderr[-2000:])
-    judged = json.loads(file.read_text(encoding="utf-8"))[name]
+    judged = written(work / "formats.json", tool.python("studies.torture", "formats", *given))[name]
     figures = {f"{name}: problems": Figure(float(len(judged["problems"])), "count", 0.0)}
     for end in ("exit 0", "exit 1", "exit 3"):
         ended = sum(n for text, n in judged["ends"].items() if text.partition(",")[0] == end)

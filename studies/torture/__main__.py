@@ -47,10 +47,10 @@ def judged(given: argparse.Namespace, name: str) -> dict[str, Any]:
         "seed": seed,
         "wall_s": time.monotonic() - begin,
         "count": count,
-        "ends": dict(sorted(Counter(case.end for case in cases).items())),
-        "problems": [(case.number, case.problem[-800:]) for case in cases if case.problem],
-        "slowest_s": max((case.wall_s for case in cases), default=0.0),
-        "peak_bytes": max((case.peak_bytes for case in cases), default=0),
+        "ends": dict(sorted(Counter(case.end for case in cases.values()).items())),
+        "problems": [(number, case.problem[-800:]) for number, case in cases.items() if case.problem],
+        "slowest_s": max((case.costs.get("s", 0.0) for case in cases.values()), default=0.0),
+        "peak_bytes": max((int(case.costs.get("bytes", 0)) for case in cases.values()), default=0),
     }
 
 
@@ -184,14 +184,13 @@ def main() -> int:
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
+        former = json.loads(kept.read_text()) if kept.is_file() else None
         again = name == "formats" and given.format
-        if (again or not kept.is_file()) and (not parts or name in parts):
-            done = do()
-            if again and kept.is_file():
-                done = json.loads(kept.read_text()) | done
-            kept.write_text(json.dumps(done, indent=1))
-        if kept.is_file():
-            results[name] = json.loads(kept.read_text())
+        if (again or former is None) and (not parts or name in parts):
+            former = (former or {}) | do() if again else do()
+            kept.write_text(json.dumps(former, indent=1))
+        if former is not None:
+            results[name] = json.loads(json.dumps(former))
     if given.out.is_file():
         counts = f"--logs {given.logs} --count {given.count}"
         counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"

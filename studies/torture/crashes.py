@@ -295,10 +295,8 @@ LONGEST_END_S = 120.0
 
 @dataclass(frozen=True)
 class Killed:
-    """How a command ended: ``after_s`` of the signal, exit code (None if it was done before it), and its stderr."""
+    """How a command ended: exit code (None if it was done before the signal), and its stderr."""
 
-    number: int
-    after_s: float
     exit_code: int | None
     said: str
 
@@ -334,7 +332,7 @@ def kill_run(
         except subprocess.TimeoutExpired:
             process.kill()
             raise
-    return Killed(number, after_s, None if done else process.returncode, said)
+    return Killed(None if done else process.returncode, said)
 
 
 def _notice_interrupts() -> None:

@@ -15,7 +15,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from unittest.mock import patch
@@ -50,17 +50,6 @@ class Verdict:
     end: str
     problem: str = ""
     costs: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """Outcome of a case by its number, as one line of the journal; the peak is the peak of its process so far."""
-
-    number: int
-    end: str
-    problem: str
-    wall_s: float = 0.0
-    peak_bytes: int = 0
 
 
 def command(*arguments: str) -> Ended:
@@ -112,40 +101,42 @@ def run_cases(
     jobs: int = 2,
     tell: Callable[[str], None] = print,
     limits: Limits | None = None,
-) -> list[Case]:
-    """Judge the cases 0 to ``count`` - 1 in supervised processes; none that is in the journal already."""
-    done = {case.number: case for case in read_journal(journal)}
+) -> dict[int, Verdict]:
+    """Judge the cases 0 to ``count`` - 1 in supervised processes; none that is in the journal already.
+
+    Their costs are seconds and bytes; without others, the peak is that of the process so far.
+    """
+    done = read_journal(journal)
     left = [n for n in range(count) if n not in done]
     limits = limits or Limits(silence_s=LIMIT_S, memory_bytes=LIMIT_BYTES)
     journal.parent.mkdir(parents=True, exist_ok=True)
     with journal.open("a") as file:
         for ended in supervise(partial(_case, judge_case), left, jobs=jobs, limits=limits, preload=_PRELOAD):
-            case = ended.result
-            if case is None:
-                case = Case(ended.item, NO_VERDICT, "" if ended.failure is None else ended.failure.reason)
-            done[case.number] = case
-            file.write(json.dumps(astuple(case)) + "\n")
+            reason = "" if ended.failure is None else ended.failure.reason
+            done[ended.item] = verdict = ended.result or Verdict(NO_VERDICT, reason)
+            file.write(json.dumps([ended.item, *astuple(verdict)]) + "\n")
             file.flush()
             if len(done) % _TOLD_EVERY == 0:
                 tell(f"{journal.stem}: {len(done)} of {count}")
-    return [done[n] for n in range(count)]
+    return {n: done[n] for n in range(count)}
 
 
-def _case(judge_case: Callable[[int], Verdict], number: int, tell: Tell) -> Case:
+def _case(judge_case: Callable[[int], Verdict], number: int, tell: Tell) -> Verdict:
     del tell
     begin = time.monotonic()
     verdict = judge_case(number)
-    peak_bytes = verdict.costs.get("bytes", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10)
-    return Case(number, verdict.end, verdict.problem, verdict.costs.get("s", time.monotonic() - begin), int(peak_bytes))
+    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+    return replace(verdict, costs={"s": time.monotonic() - begin, "bytes": peak_bytes, **verdict.costs})
 
 
-def read_journal(journal: Path) -> Iterator[Case]:
-    """Return the completed cases; lines cut by a kill are skipped."""
-    if not journal.is_file():
-        return
-    for line in journal.read_text().splitlines():
+def read_journal(journal: Path) -> dict[int, Verdict]:
+    """Return the completed cases by number; lines cut by a kill are skipped."""
+    done: dict[int, Verdict] = {}
+    for line in journal.read_text().splitlines() if journal.is_file() else ():
         with contextlib.suppress(ValueError):
-            yield Case(*json.loads(line))
+            number, *verdict = json.loads(line)
+            done[number] = Verdict(*verdict)
+    return done
 
 
 # ------------------------------------------------------------------------------------------------ separate processes
