@@ -17,12 +17,11 @@ from itertools import chain
 from pathlib import Path
 
 from studies.pages import DOCS, RESULTS, ROOT, options, read_toml, write
-from studies.strangers.answers import SHARED, answered_files, load_answers
 from studies.strangers.containers import write as write_log
 from studies.strangers.layouts import layouts, mountings
 from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
-from studies.strangers.scoring import look, score_log
+from studies.strangers.scoring import SHARED, answered_files, load_answers, look, score_log
 
 #: First results of held-out layouts, present and former.
 FIRST_RUNS: dict[str, str] = read_toml(Path(__file__).with_name("first_runs.toml"))

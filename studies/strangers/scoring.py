@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,11 +18,12 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import fit_clocks, read_signals
+from pdhef_logtool.mapping import SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import POSITIONS, Channel, FloatArray
 from pdhef_logtool.runs.inspection.report import inspect_drive_log
+from studies.pages import ROOT, read_toml
 from studies.strangers.cars import Series
 from studies.strangers.page import Result
 from studies.strangers.recordings import ITEMS, SCORING, Expected
@@ -118,13 +119,6 @@ def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
             return [asdict(check) for check in getattr(drive, "checks", ())], ""
     except PdhefError as error:
         return [], str(error)
-
-
-def read_answers(path: Path, mapping: SignalMapping) -> dict[str, tuple[Series, ...]]:
-    """Return the right channels of a recording by a mapping that a person wrote."""
-    with closing(open_log(path)) as log:
-        channels = _channels(log, mapping)
-    return {n: (Series(c.stamps_ns, c.arrival_ns, c.values),) for n, c in channels.items() if len(c)}
 
 
 # ------------------------------------------------------------------------------------------------ by value
@@ -276,3 +270,75 @@ def _is_doubted(name: str, source: str, messages: Told) -> bool:
     topic = source.partition(".")[0]
     named = [part for part in (name.removeprefix("truth."), source, topic) if part]
     return any(_DOUBT.search(d) and any(part in d for part in named) for d in messages.doubts)
+
+
+# ------------------------------------------------------------------------------------------------ recordings of others
+
+SHARED = ROOT.parent / "shared"
+ANSWERS = Path(__file__).with_name("answers.toml")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Right sources of one recording by channel (alternatives), sources that are also allowed, and faulty channels."""
+
+    file: str
+    right: dict[str, tuple[SignalSource, ...]]
+    allowed: dict[str, tuple[SignalSource, ...]]
+    at_fault: frozenset[str]
+
+    @property
+    def path(self) -> Path:
+        """Where the recording lies, if it is there."""
+        return SHARED / self.file
+
+    def expected(self) -> Expected:
+        """Read the right and the allowed channels."""
+        right, allowed = (_read(self.path, sources) for sources in (self.right, self.allowed))
+        return Expected(self.file, "recording", "", right, allowed, at_fault=self.at_fault)
+
+
+def load_answers() -> Iterator[Answer]:
+    """Yield all of them, whether the recordings are there or not."""
+    for file, table in read_toml(ANSWERS).items():
+        if "same_as" not in table:
+            yield Answer(
+                file,
+                _alternatives(table),
+                _alternatives(table.get("allowed", {})),
+                frozenset(table.get("at_fault", ())),
+            )
+
+
+def answered_files() -> frozenset[str]:
+    """Return the recordings that somebody has looked at."""
+    return frozenset(read_toml(ANSWERS))
+
+
+def _alternatives(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:
+    sources_by_name = {}
+    for name, given in table.items():
+        if name not in ("allowed", "at_fault"):
+            texts = given if isinstance(given, list) else [given]
+            sources_by_name[name] = tuple(_source(name.removeprefix("truth."), *text.split()) for text in texts)
+    return sources_by_name
+
+
+def _source(name: str, topic: str, field: str, scale: str = "1", offset: str = "0") -> SignalSource:
+    return SignalSource(name, topic, field, scale=float(scale), offset=float(offset))
+
+
+def _read(path: Path, sources: dict[str, tuple[SignalSource, ...]]) -> dict[str, tuple[Series, ...]]:
+    """Return the channels of a recording, several where a channel has alternative sources."""
+    series: dict[str, tuple[Series, ...]] = {}
+    with closing(open_log(path)) as log:
+        for turn in range(max(map(len, sources.values()), default=0)):
+            signals, truth = dict[str, SignalSource](), dict[str, SignalSource]()
+            for name, alternatives in sources.items():
+                if turn < len(alternatives):
+                    section = truth if name.startswith("truth.") else signals
+                    section[name.removeprefix("truth.")] = alternatives[turn]
+            for name, c in _channels(log, SignalMapping(signals=signals, truth=truth)).items():
+                if len(c):
+                    series[name] = (*series.get(name, ()), Series(c.stamps_ns, c.arrival_ns, c.values))
+    return series
