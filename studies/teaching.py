@@ -96,25 +96,20 @@ def inputs(tool: Tool, part: TeachPart, *, receiver: bool = False, truth: bool =
     return [DRIVES / part.log, "--mapping", file, *span]
 
 
-def learn(tool: Tool, car: Path, parts: Sequence[TeachPart], name: str) -> tuple[Path, str]:
-    """Teach a car on parts; return it and the name of its residual."""
+def learn(tool: Tool, car: Path, name: str, *given: str | Path) -> Path:
+    """Teach a car on logs with their options; return it. Raises RuntimeError if they do not teach."""
     output = tool.work / "cars" / name
-    _, *options_of = inputs(tool, parts[0])  # parts that teach together have the same mapping and slice
-    tool.json("learn", *(DRIVES / part.log for part in parts), *options_of, "--car", car, "-o", output)
-    taught = read_toml(output / "model.toml")
-    return output, taught.get("residual", {}).get("rung", "none")
+    tool.json("learn", *given, "--car", car, "-o", output)
+    return output
 
 
 def learn_by_reference(tool: Tool, car: Path, part: TeachPart, name: str) -> Path | None:
     """Teach a car on a drive of the V40 by the reference with its receiver; None if it does not teach."""
-    output = tool.work / "cars" / name
-    given = (*inputs(tool, part, receiver=True, truth=False), "--car", car, "-o", output)
     try:
-        tool.json("learn", *given, "--set", "reference=on")
+        return learn(tool, car, name, *inputs(tool, part, receiver=True, truth=False), "--set", "reference=on")
     except RuntimeError as refused:
         print(f"{name}: {refused}", file=sys.stderr)
         return None
-    return output
 
 
 def scores(tool: Tool, part: TeachPart, car: Path, names: Sequence[str], *options_of: str) -> dict[str, Score]:
@@ -146,7 +141,8 @@ def pairs_of(tool: Tool, car: TeachCar) -> Iterator[Pair]:
     teachers = [(a,) for a in range(len(parts))] if car.taught_on == 1 else [tuple(range(car.taught_on))]
     for chosen in teachers:
         name, first = f"{stem}-{chosen[0]}", parts[chosen[0]]
-        taught, rung = learn(tool, file, [parts[i] for i in chosen], name)
+        _, *options_of = inputs(tool, first)  # parts that teach together have the same mapping and slice
+        taught = learn(tool, file, name, *(DRIVES / parts[i].log for i in chosen), *options_of)
         has_receiver = first.log.startswith("v40_")
         by_reference = learn_by_reference(tool, file, first, f"{name}-reference") if has_receiver else None
         for k in (k for k in range(len(parts)) if k not in chosen):
@@ -160,7 +156,7 @@ def pairs_of(tool: Tool, car: TeachCar) -> Iterator[Pair]:
                 "hybrid": after["pd-hef"],
                 "kinematic_deg": untaught[k]["kinematic"]["rmse_deg"],
                 "paper_deg": paper[k]["rmse_deg"],
-                "rung": rung,
+                "rung": read_toml(taught / "model.toml").get("residual", {}).get("rung", "none"),
                 "reference": by_reference and scores(tool, parts[k], by_reference, ("pd-hef",))["pd-hef"],
             }
 

@@ -302,12 +302,8 @@ def load_answers() -> Iterator[Answer]:
     """Yield all of them, whether the recordings are there or not."""
     for file, table in read_toml(ANSWERS).items():
         if "same_as" not in table:
-            yield Answer(
-                file,
-                _alternatives(table),
-                _alternatives(table.get("allowed", {})),
-                frozenset(table.get("at_fault", ())),
-            )
+            allowed, at_fault = _alternatives(table.get("allowed", {})), frozenset(table.get("at_fault", ()))
+            yield Answer(file, _alternatives(table), allowed, at_fault)
 
 
 def answered_files() -> frozenset[str]:
