@@ -58,10 +58,9 @@ def mapping_table(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = F
     """Return the mapping file of a drive as a document; ``receiver``: the GNSS velocity of a V40 replaces its speed."""
     if drive.log.startswith("v40_"):
         document = read_toml(_HERE / "v40_gnss.toml")
-        of_receiver = document.pop("receiver")
         if receiver:
             del document["signals"]["speed_m_s"]
-            document["signals"] |= of_receiver
+            document["signals"] |= read_toml(_HERE / "v40_receiver.toml")
         return document
     if drive.files:
         return read_toml(REFERENCE / "mappings" / f"{drive.files}.toml")
