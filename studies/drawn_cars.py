@@ -7,6 +7,7 @@ fitted to a ramp steer (``fit_vehicle``), as after a measurement.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from studies.defaults.fit_nominal_tyres import (
     ramp,
     roll_gradient_rad_per_m_s2,
 )
+from studies.pages import read_toml
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.sensors import SensorNoise
 from truthsim.vehicle import GRAVITY_M_S2, Vehicle
@@ -28,21 +30,8 @@ from truthsim.vehicle_choice import choose_vehicle
 KINDS = ("sedan", "suv")
 #: Share of the cars that get the tyres of the other kind.
 OTHER_TYRES_SHARE = 0.3
-#: Ranges of the uniform draws, in addition to the draws of ``truthsim.randomisation``.
-RANGES = {"mass": (0.85, 1.15), "cg": (-0.10, 0.12), "height": (0.9, 1.1), "stiffness": (0.8, 1.25)}
-#: Factors on the usual 1-sigma of sensors, uniform in the logarithm.
-SENSOR_FACTORS = {
-    "acceleration_m_s2": (0.5, 2.0),
-    "yaw_rate_rad_s": (0.4, 1.6),
-    "steer_rad": (0.5, 2.0),
-    "wheel_speed_m_s": (0.5, 2.0),
-    "acceleration_bias_m_s2": (0.3, 1.5),
-    "yaw_rate_bias_rad_s": (0.2, 1.5),
-    "steer_bias_rad": (0.5, 2.0),
-    # Noise of accelerometers that is not white: vibration of the body, temperature.
-    "acceleration_walk_m_s2": (1.0, 5.0),
-    "walk_time_s": (0.005, 1.0),
-}
+#: Ranges of the uniform draws, and factors on the usual 1-sigma of sensors.
+_DRAWS = read_toml(Path(__file__).with_suffix(".toml"))
 DELAY_S = (0.0, 0.040)
 STEER_GAIN = 0.01
 #: Free play of the steering at the road wheels: up to 2.5 degrees at a steering wheel of ratio 15.
@@ -69,7 +58,7 @@ def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str
     while True:
         kind = str(rng.choice(kinds))
         words = [f"{kind}~{rng.integers(2**31)}"]
-        words += [f"{name}={rng.uniform(*limits):.3f}" for name, limits in RANGES.items()]
+        words += [f"{name}={rng.uniform(*limits):.3f}" for name, limits in _DRAWS["ranges"].items()]
         if rng.uniform() < OTHER_TYRES_SHARE:
             words.append(f"tyres={KINDS[1 - KINDS.index(kind)] if kind in KINDS else KINDS[0]}")
         text = ",".join(words)
@@ -88,7 +77,7 @@ def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
     usual = SensorNoise()._asdict()
     values = {
         name: usual[name] * float(np.exp(rng.uniform(np.log(low), np.log(high))))
-        for name, (low, high) in SENSOR_FACTORS.items()
+        for name, (low, high) in _DRAWS["sensor_factors"].items()
     }
     values["can_delay_s"] = float(rng.uniform(*DELAY_S))
     values["steer_gain"] = STEER_GAIN

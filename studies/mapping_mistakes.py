@@ -20,7 +20,7 @@ from typing import Any
 
 from pdhef_logtool import PdhefError, inspect_log
 from studies.gates.tool import Tool
-from studies.pages import ROOT, write_toml
+from studies.pages import ROOT, read_toml, write_toml
 from studies.peers.drives import PEER_DRIVES, mapping_table
 
 _UNITS = {"57.3": 57.3, "9.81": 9.81, "3.6": 3.6}
@@ -29,19 +29,7 @@ AXIS = "axis"
 VERDICTS = ("named", "refused", "stopped", "other", "silent", "open")
 SAMPLES = ("dlc", "fishhook", "step", "sweep", "road")
 #: The source that is read instead of a signal's; two axes of an accelerometer, and of a velocity, are exchanged.
-OTHER = {
-    "ax_m_s2": "ay_m_s2",
-    "ay_m_s2": "ax_m_s2",
-    "yaw_rate_rad_s": "ay_m_s2",
-    "steer_rad": "yaw_rate_rad_s",
-    "steering_wheel_rad": "yaw_rate_rad_s",
-    "speed_m_s": "yaw_rate_rad_s",
-    "wheel_speed": "yaw_rate_rad_s",
-    "truth.vx_m_s": "truth.vy_m_s",
-    "truth.vy_m_s": "truth.vx_m_s",
-    "truth.yaw_rate_rad_s": "truth.vy_m_s",
-    "truth.sideslip_rad": "truth.yaw_rate_rad_s",
-}
+OTHER: dict[str, str] = read_toml(Path(__file__).with_suffix(".toml"))
 EXCHANGED = {"ax_m_s2", "ay_m_s2", "truth.vx_m_s", "truth.vy_m_s"}
 _UNDOES = re.compile(r"scale(?: in the mapping)?(?: by| =) ([-+.\de]+)")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,11 @@ def write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, text.encode())
     print(path)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return a TOML file as a document."""
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def write_toml(path: Path, document: Mapping[str, Any]) -> Path:

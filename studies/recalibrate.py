@@ -19,7 +19,6 @@ import shutil
 import subprocess
 import sys
 import time
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -27,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.storage.documents import digest
-from studies.pages import ROOT, options, table
+from studies.pages import ROOT, options, read_toml, table
 
 STAMPS = Path("out") / "recalibrate"
 TABLE = Path(__file__).with_suffix(".toml")
@@ -47,7 +46,7 @@ class Stage:
 
 def load_stages(file: Path = TABLE) -> tuple[Stage, ...]:
     """Return the stages of a table, with the sets of its inputs expanded."""
-    document = tomllib.loads(file.read_text(encoding="utf-8"))
+    document = read_toml(file)
     sets = document.pop("sets", {})
 
     def expanded(patterns: Sequence[str]) -> Iterator[str]:

@@ -15,7 +15,6 @@ import heapq
 import json
 import math
 import sys
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -33,7 +32,7 @@ from studies.drawn_cars import FIT_FRICTION, fit_vehicle
 from studies.gates.tool import Tool, estimates, reports, sideslip_rmse_deg
 from studies.mcap_logs import Message, messages, write_log
 from studies.pages import DRIVES, ROOT, number, table, write_toml
-from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
+from studies.peers.drives import PEER_DRIVES, mapping_table, peer_drive, vehicle_table
 from studies.recalibrate import input_digest
 from truthsim.batch import DriveSpec
 from truthsim.drive import DEFAULT_VEHICLE
@@ -64,11 +63,8 @@ class Receiver:
     delay_s: float = 0.0
 
 
-RECEIVERS = {
-    "RTK 10 Hz": Receiver(10.0, 0.02, 0.01, 5.0),
-    "Doppler 10 Hz": Receiver(10.0, 0.05, 0.02, 5.0, 0.02),
-    "single point 1 Hz": Receiver(1.0, 0.10, 0.05, 20.0, 0.05),
-}
+_TABLES = pages.read_toml(Path(__file__).with_suffix(".toml"))
+RECEIVERS = {name: Receiver(**entries) for name, entries in _TABLES["receivers"].items()}
 NONE, REAL = "none", "recorded"
 
 
@@ -161,50 +157,21 @@ MOVED_IMU, REAR_IMU = "accelerometer at the rear axle", (("imu_x_m", -1.71),)
 AT_ANTENNA = "ground truth at the antenna"
 
 
-def _simulated(manoeuvre: str, speed_km_h: float, friction: float, **options: Any) -> DriveSpec:
-    duration_s = options.pop("duration_s", 14.0)
-    return DriveSpec(manoeuvre, speed_km_h, friction, options.pop("seed", 1), duration_s, **options)
+def _specs(entries: dict[str, dict[str, Any]]) -> dict[str, DriveSpec]:
+    usual = {"friction": 0.85, "seed": 1, "duration_s": 14.0}
+    return {title: DriveSpec(**usual | entry) for title, entry in entries.items()}
 
 
-_ROAD = _simulated("road", 80.0, 0.85, seed=3, duration_s=60.0)
-SIMULATED = {
-    "step steer, 100 km/h": _simulated("step-steer", 100.0, 0.85),
-    "sine with dwell, 80 km/h": _simulated("sine-with-dwell", 80.0, 0.85, seed=2),
-    "sine sweep, 100 km/h": _simulated("sine-sweep", 100.0, 0.85),
-    "fishhook, 70 km/h": _simulated("fishhook", 70.0, 0.85),
-    "double lane change, 100 km/h": _simulated("dlc", 100.0, 0.85),
-    "spin, fishhook at 110 km/h": _simulated("fishhook", 110.0, 0.85, amplitude=1.6, keep_spins=True),
-    "banked road": _simulated("banked-road", 80.0, 0.85, duration_s=40.0),
-    "stop and go": _simulated("stop-and-go", 50.0, 0.85, duration_s=40.0),
-    "road, 10 s": _simulated("road", 90.0, 0.9, seed=5, duration_s=10.0),
-    "road, 20 s": _simulated("road", 90.0, 0.9, seed=5, duration_s=20.0),
-    "road, 300 s": _simulated("road", 80.0, 0.85, seed=3, duration_s=300.0),
-    "road, 1200 s": _simulated("road", 80.0, 0.85, seed=4, duration_s=1200.0),
-}
-#: Cars that no constant was chosen with, each with a vehicle file fitted to its ramp steer.
-OTHER_CARS = {
-    f"{manoeuvre} {speed} km/h, {car}": _simulated(
-        manoeuvre, speed, 0.85, seed=900 + speed, vehicle=f"{car}~{900 + speed}", duration_s=duration_s
-    )
-    for car, slower in (("hatchback", 0), ("suv", 12), ("sedan", 3))
-    for manoeuvre, fastest, duration_s in (("fishhook", 72, 14.0), ("dlc", 98, 14.0), ("sine-sweep", 92, 14.0),
-                                           ("sine-with-dwell", 84, 14.0), ("road", 82, 60.0))
-    for speed in (fastest - slower,)
-}  # fmt: skip
-_RECORDED_TITLES = {
-    "revs_250lm_a.mcap": "Ferrari 250 LM, race track", "niki_gti_1khz.mcap": "VW GTI, handling course",
-    "gti_pole_aa.mcap": "VW GTI, slow and tight", "gti_low_speed.mcap": "VW GTI, slow laps",
-    "stanford_wet_1.mcap": "VW GTI, wet laps", "tts_kk.mcap": "Audi TT-S",
-    "v40_swd_gnss.mcap": "Volvo V40, sine with dwell", "v40_slalom.mcap": "Volvo V40, slalom",
-}  # fmt: skip
+SIMULATED = _specs(_TABLES["simulated"])
+OTHER_CARS = _specs({
+    f"{manoeuvre} {fastest - slower} km/h, {car}": {
+        "manoeuvre": manoeuvre, "speed_km_h": fastest - slower, "seed": 900 + fastest - slower,
+        "vehicle": f"{car}~{900 + fastest - slower}", "duration_s": 60.0 if manoeuvre == "road" else 14.0,
+    }
+    for car, slower in _TABLES["other_cars"]["slower_km_h"].items()
+    for manoeuvre, fastest in _TABLES["other_cars"]["fastest_km_h"].items()
+})  # fmt: skip
 MADE = "Doppler 10 Hz"
-#: RMSE that the reference must reach on recorded drives, by log and GNSS.
-TARGETS_DEG = {
-    ("v40_swd_gnss.mcap", REAL): 0.25, ("v40_slalom.mcap", REAL): 0.30, ("revs_250lm_a.mcap", MADE): 0.15,
-    ("niki_gti_1khz.mcap", MADE): 0.40, ("v40_swd_gnss.mcap", NONE): 0.35, ("v40_slalom.mcap", NONE): 0.35,
-    ("revs_250lm_a.mcap", NONE): 0.60, ("stanford_wet_1.mcap", NONE): 0.90,
-}  # fmt: skip
-_SINGLE = ("step steer, 100 km/h", "sine with dwell, 80 km/h", "sine sweep, 100 km/h")
 
 
 def cases() -> Iterator[Case]:
@@ -212,26 +179,25 @@ def cases() -> Iterator[Case]:
     for drive in PEER_DRIVES:
         if drive.log == "lunda_v40":  # the drive of v40_swd_gnss without its receiver
             continue
-        title = _RECORDED_TITLES.get(drive.log, f"{drive.car}, {drive.log.partition('.')[0]}")
-        kinds = (NONE, REAL) if drive.log.startswith("v40_") else (NONE, MADE) if drive.log in _RECORDED_TITLES else ()
-        for gnss in kinds or (NONE,):
-            target = TARGETS_DEG.get((drive.log, gnss))
+        entry = _TABLES["recorded"].get(drive.log, {})
+        title = entry.get("title", f"{drive.car}, {drive.log.partition('.')[0]}")
+        received = REAL if drive.log.startswith("v40_") else MADE
+        for gnss in (NONE, received) if entry else (NONE,):
+            target = entry.get("targets_deg", {}).get(gnss)
             yield Case(title, gnss, log=drive.log, target_deg=target, least_speed_m_s=drive.least_speed_m_s)
             if gnss == REAL:
                 yield Case(title, gnss, log=drive.log, fault=AT_ANTENNA, target_deg=target)
     for title, spec in SIMULATED.items():
         for gnss in (NONE, *RECEIVERS):
-            target = 0.5 if "spin" in title else 0.35 if gnss == NONE else 0.25
-            wanted = title in _SINGLE or ("spin" in title and gnss != NONE)
-            yield Case(title, gnss, spec=spec, target_deg=target if wanted else None)
+            targets = _TABLES["simulated_targets_deg"].get(title, {})
+            yield Case(title, gnss, spec=spec, target_deg=targets.get(NONE if gnss == NONE else "made"))
     for title, spec in OTHER_CARS.items():
         for gnss in (NONE, MADE):
             yield Case(title, gnss, spec=spec)
+    ((title, spec),) = _specs(_TABLES["road"]).items()
     for fault in (*FAULTS, WRONG_AXLE):
-        for gnss in (NONE, MADE):
-            if gnss == NONE and fault in (OUTAGE, MULTIPATH):
-                continue
-            yield Case("road, 60 s", gnss, spec=_ROAD, fault=fault)
+        for gnss in (MADE,) if fault in (OUTAGE, MULTIPATH) else (NONE, MADE):
+            yield Case(title, gnss, spec=spec, fault=fault)
     for title in ("sine with dwell, 80 km/h", "fishhook, 70 km/h", "double lane change, 100 km/h"):
         yield Case(title, MADE, spec=replace(SIMULATED[title], sensors=REAR_IMU), fault=MOVED_IMU)
 
@@ -277,12 +243,12 @@ def figures(case: Case, tool: Tool) -> Figures:
 def drive_of(case: Case, tool: Tool, name: str) -> tuple[Path, dict[str, Any], dict[str, Any], Motion | None]:
     """Return the log of a case, its mapping and vehicle file, and the motion of a simulated drive."""
     if case.spec is None:
-        peer = _peer(case.log)
+        peer = peer_drive(case.log)
         mapping = mapping_table(peer, receiver=case.gnss == REAL)
         return DRIVES / case.log, mapping, vehicle_table(peer), None
     drive = case.spec.simulate()
     log = tool.log(f"{name}-simulated", drive)
-    vehicle = tomllib.loads(pages.SAMPLE_VEHICLE.read_text(encoding="utf-8"))
+    vehicle = pages.read_toml(pages.SAMPLE_VEHICLE)
     if case.spec.vehicle != DEFAULT_VEHICLE:
         fitted = fit_vehicle(choose_vehicle(case.spec.vehicle), FIT_FRICTION, Car.load(pages.SAMPLE_VEHICLE).vehicle)
         vehicle = fitted.model_dump(mode="json", exclude_none=True)
@@ -381,8 +347,8 @@ def _row(case: Case, got: Figures) -> list[str]:
 def _rankings(done: Sequence[tuple[Case, Figures]]) -> list[list[str]]:
     rows = []
     for name, titles in (
-        ("recorded", _RECORDED_TITLES.values()),
-        ("simulated", (*SIMULATED, "road, 60 s")),
+        ("recorded", [entry["title"] for entry in _TABLES["recorded"].values()]),
+        ("simulated", (*SIMULATED, *_TABLES["road"])),
         ("simulated, other cars", OTHER_CARS),
     ):
         pairs = [f["pairs"] for c, f in done if c.title in titles and c.fault != AT_ANTENNA]
@@ -427,10 +393,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         pages.write(file, json.dumps(stored, indent=1) + "\n")
     pages.update(given.out, "reference.md", blocks(stored))
     return 0
-
-
-def _peer(log: str) -> PeerDrive:
-    return next(drive for drive in PEER_DRIVES if drive.log == log)
 
 
 if __name__ == "__main__":

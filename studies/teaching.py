@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +22,8 @@ import numpy as np
 import polars as pl
 
 from studies.gates.tool import Tool, estimates
-from studies.pages import DRIVES, ROOT, number, page_options, table, update, write, write_toml
-from studies.peers.drives import FULL_SIZE, PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
+from studies.pages import DRIVES, ROOT, number, page_options, read_toml, table, update, write, write_toml
+from studies.peers.drives import FULL_SIZE, PEER_DRIVES, mapping_table, peer_drive, vehicle_table
 
 STORED = "pairs.json"
 #: No pair may be worse than untaught by more than the larger of this share and this many degrees.
@@ -37,12 +36,12 @@ PAPER = "pd-hef-paper"
 
 @dataclass(frozen=True, slots=True)
 class TeachPart:
-    """A slice of a log, in seconds from its start; ``steering_gain`` makes a road-wheel angle of its channel."""
+    """A slice of a log, in seconds from its start; ``steering_ratio`` makes a road-wheel angle of its channel."""
 
     log: str
     start: str | None = None
     end: str | None = None
-    steering_gain: float = 1.0
+    steering_ratio: float = 1.0
 
     @property
     def name(self) -> str:
@@ -60,19 +59,10 @@ class TeachCar:
     taught_on: int = 1
 
 
-_F1TENTH = sorted(p.log for p in PEER_DRIVES if p.car == "1:10 F1TENTH")
-CARS = (
-    TeachCar("250 LM", (TeachPart("revs_250lm_a.mcap", None, "150"), TeachPart("revs_250lm_a.mcap", "150"))),
-    TeachCar("GTI", (
-        TeachPart("gti_pole_aa.mcap"), TeachPart("gti_low_speed.mcap"), TeachPart("niki_gti_1khz.mcap", None, "50"),
-        TeachPart("stanford_wet_1.mcap", steering_gain=1.0 / 13.9),
-    )),
-    TeachCar("V40", (TeachPart("v40_slalom.mcap"), TeachPart("v40_swd_gnss.mcap"))),
-    TeachCar("TT-S", (TeachPart("tts_kk.mcap", None, "62"), TeachPart("tts_kk.mcap", "62"))),
-    TeachCar("Polaris", (TeachPart("polaris_a.mcap"), TeachPart("polaris_b.mcap"))),
-    TeachCar("1:10 DART", (TeachPart("dart_circles_fast.mcap"), TeachPart("dart_steer_rate.mcap"))),
-    TeachCar("1:10 F1TENTH", tuple(map(TeachPart, _F1TENTH)), taught_on=5),
-)  # fmt: skip
+CARS = tuple(
+    TeachCar(name, tuple(TeachPart(**part) for part in entry.pop("parts")), **entry)
+    for name, entry in read_toml(Path(__file__).with_suffix(".toml")).items()
+)
 
 
 #: RMSE in degrees, also without the constant; shares with an active residual and inside 95 % intervals.
@@ -92,17 +82,12 @@ def is_worse(pair: Pair, way: str = "hybrid") -> bool:
     return bool(pair[way]["rmse_deg"] > max((1.0 + WORSE_SHARE) * untaught, untaught + WORSE_DEG))
 
 
-def peer_of(part: TeachPart) -> PeerDrive:
-    """Return the recorded drive of a part."""
-    return next(p for p in PEER_DRIVES if p.log == part.log)
-
-
 def inputs(tool: Tool, part: TeachPart, *, receiver: bool = False, truth: bool = True) -> list[str | Path]:
     """Return the log of a part with the options for its mapping and slice; ``receiver``: of the V40's GNSS."""
-    mapping = mapping_table(peer_of(part), receiver=receiver)
-    if part.steering_gain != 1.0:
+    mapping = mapping_table(peer_drive(part.log), receiver=receiver)
+    if part.steering_ratio != 1.0:
         wheel = mapping["signals"].pop("steering_wheel_rad")
-        mapping["signals"]["steer_rad"] = wheel | {"scale": wheel["scale"] * part.steering_gain}
+        mapping["signals"]["steer_rad"] = wheel | {"scale": wheel["scale"] * (1.0 / part.steering_ratio)}
     if not truth:
         del mapping["truth"]
     name = f"{part.log}{'-gnss' if receiver else ''}{'' if truth else '-without'}.toml"
@@ -111,25 +96,20 @@ def inputs(tool: Tool, part: TeachPart, *, receiver: bool = False, truth: bool =
     return [DRIVES / part.log, "--mapping", file, *span]
 
 
-def learn(tool: Tool, car: Path, parts: Sequence[TeachPart], name: str) -> tuple[Path, str]:
-    """Teach a car on parts; return it and the name of its residual."""
+def learn(tool: Tool, car: Path, name: str, *given: str | Path) -> Path:
+    """Teach a car on logs with their options; return it. Raises RuntimeError if they do not teach."""
     output = tool.work / "cars" / name
-    _, *options_of = inputs(tool, parts[0])  # parts that teach together have the same mapping and slice
-    tool.json("learn", *(DRIVES / part.log for part in parts), *options_of, "--car", car, "-o", output)
-    taught = tomllib.loads((output / "model.toml").read_text(encoding="utf-8"))
-    return output, taught.get("residual", {}).get("rung", "none")
+    tool.json("learn", *given, "--car", car, "-o", output)
+    return output
 
 
 def learn_by_reference(tool: Tool, car: Path, part: TeachPart, name: str) -> Path | None:
     """Teach a car on a drive of the V40 by the reference with its receiver; None if it does not teach."""
-    output = tool.work / "cars" / name
-    given = (*inputs(tool, part, receiver=True, truth=False), "--car", car, "-o", output)
     try:
-        tool.json("learn", *given, "--set", "reference=on")
+        return learn(tool, car, name, *inputs(tool, part, receiver=True, truth=False), "--set", "reference=on")
     except RuntimeError as refused:
         print(f"{name}: {refused}", file=sys.stderr)
         return None
-    return output
 
 
 def scores(tool: Tool, part: TeachPart, car: Path, names: Sequence[str], *options_of: str) -> dict[str, Score]:
@@ -155,13 +135,14 @@ def pairs_of(tool: Tool, car: TeachCar) -> Iterator[Pair]:
     """Yield the results of a car's pairs."""
     parts = car.parts
     stem = car.name.replace(" ", "-").replace(":", "-")
-    file = write_toml(tool.work / "cars" / f"{stem}.toml", vehicle_table(peer_of(parts[0])))
+    file = write_toml(tool.work / "cars" / f"{stem}.toml", vehicle_table(peer_drive(parts[0].log)))
     untaught = [scores(tool, part, file, ("physics", "kinematic")) for part in parts]
     paper = [scores(tool, part, file, (PAPER,), "--network", "default")[PAPER] for part in parts]
     teachers = [(a,) for a in range(len(parts))] if car.taught_on == 1 else [tuple(range(car.taught_on))]
     for chosen in teachers:
         name, first = f"{stem}-{chosen[0]}", parts[chosen[0]]
-        taught, rung = learn(tool, file, [parts[i] for i in chosen], name)
+        _, *options_of = inputs(tool, first)  # parts that teach together have the same mapping and slice
+        taught = learn(tool, file, name, *(DRIVES / parts[i].log for i in chosen), *options_of)
         has_receiver = first.log.startswith("v40_")
         by_reference = learn_by_reference(tool, file, first, f"{name}-reference") if has_receiver else None
         for k in (k for k in range(len(parts)) if k not in chosen):
@@ -175,7 +156,7 @@ def pairs_of(tool: Tool, car: TeachCar) -> Iterator[Pair]:
                 "hybrid": after["pd-hef"],
                 "kinematic_deg": untaught[k]["kinematic"]["rmse_deg"],
                 "paper_deg": paper[k]["rmse_deg"],
-                "rung": rung,
+                "rung": read_toml(taught / "model.toml").get("residual", {}).get("rung", "none"),
                 "reference": by_reference and scores(tool, parts[k], by_reference, ("pd-hef",))["pd-hef"],
             }
 

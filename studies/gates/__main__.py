@@ -11,7 +11,6 @@ tree under test, for figures in the file and for rows missing from it. It saves 
 
 from __future__ import annotations
 
-import csv
 import math
 import shutil
 import subprocess
@@ -22,6 +21,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
+
+import polars as pl
 
 from studies.gates.rows import FULL, QUICK, Figure, Figures, GateRow, SkippedRowError, all_rows
 from studies.gates.tool import Tool
@@ -47,24 +48,19 @@ def read(file: Path) -> dict[Key, Frozen]:
     """Return the frozen figures by gate, row and figure."""
     if not file.is_file():
         return {}
-    with file.open(encoding="utf-8", newline="") as lines:
-        return {
-            (r["gate"], r["row"], r["figure"]): Frozen(
-                Figure(float(r["value"]), r["unit"], float(r["relative"]), float(r["absolute"])), r["commit"]
-            )
-            for r in csv.DictReader(lines)
-        }
+    kinds = {name: pl.Float64 if name in ("value", "relative", "absolute") else pl.String for name in HEAD}
+    rows = pl.read_csv(file, schema=kinds).iter_rows()
+    return {(gate, row, name): Frozen(Figure(*figure), commit) for gate, row, name, *figure, commit in rows}
 
 
 def write(file: Path, frozen: dict[Key, Frozen]) -> None:
     """Write the frozen figures in the order of the rows."""
     order = {(row.gate, row.name): i for i, row in enumerate(all_rows())}
-    with file.open("w", encoding="utf-8", newline="") as lines:
-        writer = csv.writer(lines, lineterminator="\n")
-        writer.writerow(HEAD)
-        for key, (figure, commit) in sorted(frozen.items(), key=lambda kv: (order.get(kv[0][:2], -1), kv[0])):
-            numbers = (f"{figure.value:.6g}", figure.unit, f"{figure.relative:g}", f"{figure.absolute:g}")
-            writer.writerow((*key, *numbers, commit))
+    rows = [
+        (*key, f"{figure.value:.6g}", figure.unit, f"{figure.relative:g}", f"{figure.absolute:g}", commit)
+        for key, (figure, commit) in sorted(frozen.items(), key=lambda kv: (order.get(kv[0][:2], -1), kv[0]))
+    ]
+    pl.DataFrame(rows, HEAD, orient="row").write_csv(file)
 
 
 def moved(was: Figure, now: Figure | None) -> bool:

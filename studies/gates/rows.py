@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import subprocess
 import threading
-import tomllib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,16 +20,17 @@ from studies.calibration import DRIVEN, errors_over_sd, true_values, wrong_file
 from studies.conditions import row_inputs, row_logs
 from studies.gates.tool import Tool, commands_and_options, coverage_percent, reports, sideslip_rmse_deg
 from studies.mapping_mistakes import VERDICTS, outcomes
-from studies.pages import DRIVES, write_toml
+from studies.pages import DRIVES, ROOT, SAMPLE_VEHICLE, read_toml, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.torture.seeds import FORMATS, RECORDINGS
 from truthsim.conditions import ROWS
 from truthsim.drive import simulate_drive
 from truthsim.sensors import SensorNoise
 
-SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
+SAMPLES = ROOT / "sample_logs"
 ESTIMATORS = "zero,kinematic,open-loop,linear-regression,phy-ukf,physics,pure-lstm,pd-hef-paper,pd-hef,pd-hef-smoothed"
 QUICK, FULL = "quick", "full"
+_TABLES = read_toml(Path(__file__).with_suffix(".toml"))
 
 
 class Figure(NamedTuple):
@@ -126,14 +127,8 @@ QUICK_DRIVES = ("gti_pole_aa.mcap", "v40_slalom.mcap", "f1tenth_xray_0.bag")
 
 #: Manoeuvre, km/h, friction, longest duration (s) of the drives of the reference.
 REFERENCE_DRIVES: dict[str, tuple[str, float, float, float | None]] = {
-    "step steer": ("step-steer", 100.0, 0.85, None),
-    "sine with dwell": ("sine-with-dwell", 80.0, 0.85, None),
-    "sine sweep": ("sine-sweep", 100.0, 0.85, None),
-    "double lane change": ("dlc", 100.0, 0.85, None),
-    "fishhook": ("fishhook", 70.0, 0.85, None),
-    "banked road": ("banked-road", 80.0, 0.85, 40.0),
-    "stop and go": ("stop-and-go", 50.0, 0.85, 40.0),
-    "road": ("road", 80.0, 0.85, 300.0),
+    name: (entry["manoeuvre"], entry["speed_km_h"], 0.85, entry.get("duration_s"))
+    for name, entry in _TABLES["reference_drives"].items()
 }
 
 
@@ -151,8 +146,7 @@ def simulated_log(
 
 def bare_vehicle() -> dict[str, Any]:
     """Return the vehicle file of the saloon without its validation data."""
-    document = tomllib.loads((SAMPLES / "vehicle.toml").read_text(encoding="utf-8"))
-    return {name: value for name, value in document.items() if name != "network"}
+    return {name: value for name, value in read_toml(SAMPLE_VEHICLE).items() if name != "network"}
 
 
 def reference(name: str, tool: Tool) -> Figures:
@@ -194,7 +188,7 @@ def plus_minus(seeds: range, tool: Tool) -> Figures:
 # ------------------------------------------------------------------------------------------------ mapping mistakes
 
 
-def mistakes(log: str, kinds: tuple[tuple[str, str], ...], tool: Tool) -> Figures:
+def mistakes(log: str, kinds: Sequence[tuple[str, str]], tool: Tool) -> Figures:
     """Count the verdicts of the checks of ``inspect`` on mistakes in a mapping."""
     path, folder = SAMPLES / log, tool.work / "mappings"
 
@@ -207,19 +201,24 @@ def mistakes(log: str, kinds: tuple[tuple[str, str], ...], tool: Tool) -> Figure
     return {name: Figure(float(counts[name]), "count", 0.0) for name in VERDICTS}
 
 
+def written(file: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    """Return a JSON document that a module has written; raises RuntimeError if it has not."""
+    if not file.is_file():
+        raise RuntimeError(done.stderr[-2000:])
+    document: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return document
+
+
 # ------------------------------------------------------------------------------------------------ third-party logs
 
 
-def strangers(only: tuple[str, ...], tool: Tool) -> Figures:
+def strangers(only: Sequence[str], tool: Tool) -> Figures:
     """Count the recognised and the wrong signals of logs of unknown layout."""
     name = f"strangers-{len(only)}"
     kept = tool.work / f"{name}.json"
     chosen = ("--only", *only) if only else ()
-    done = tool.python("studies.strangers", "--held-out", "--work", tool.work / name, "--keep", kept,
-                       "--out", tool.work / f"{name}.md", *chosen)  # fmt: skip
-    if not kept.is_file():
-        raise RuntimeError(done.stderr[-2000:])
-    logs = json.loads(kept.read_text(encoding="utf-8"))
+    given = ("--work", tool.work / name, "--keep", kept, "--out", tool.work / f"{name}.md")
+    logs = written(kept, tool.python("studies.strangers", "--held-out", *given, *chosen))
     counts = Counter(outcome for log in logs.values() for outcome in log["items"].values())
     share = 100.0 * counts["right"] / counts.total()
     silent = Figure(float(counts["wrong, not reported"]), "count", 0.0)
@@ -233,11 +232,7 @@ def fuzz(name: str, count: int, tool: Tool) -> Figures:
     """Count how commands end on mutants of a format."""
     work = tool.work / f"fuzz-{name}-{count}"
     given = ("--work", work, "--jobs", "1", "--format", name, "--count", str(count), "--out", work / "none.md")
-    done = tool.python("studies.torture", "formats", *given)
-    file = work / "formats.json"
-    if not file.is_file():
-        raise RuntimeError(done.stderr[-2000:])
-    judged = json.loads(file.read_text(encoding="utf-8"))[name]
+    judged = written(work / "formats.json", tool.python("studies.torture", "formats", *given))[name]
     figures = {f"{name}: problems": Figure(float(len(judged["problems"])), "count", 0.0)}
     for end in ("exit 0", "exit 1", "exit 3"):
         ended = sum(n for text, n in judged["ends"].items() if text.partition(",")[0] == end)
@@ -252,39 +247,17 @@ def exit_codes(tool: Tool) -> Figures:
     """Return the exit codes of commands that end well and badly."""
     folder = tool.work / "contract"
     folder.mkdir(parents=True, exist_ok=True)
-    sample = SAMPLES / "dlc.mcap"
-    content = sample.read_bytes()
+    content = (SAMPLES / "dlc.mcap").read_bytes()
     (folder / "cut.mcap").write_bytes(content[: len(content) // 2])
     (folder / "noise.mcap").write_bytes(bytes(range(256)) * 40)
-    strict = folder / "plan.toml"
-    strict.write_text(
-        '[[requirement]]\nid = "a"\ntitle = "a"\nsignal = "sideslip_rad"\nmetric = "rmse"\nlimit_deg = 0.0001\n'
-    )
-    quiet = ("--annotate", "none", "--no-report", "--car", "saloon", "--estimators", "zero")
-    must = ("--plan", strict, "--set", "strict=true")
-    cases: dict[str, tuple[str | Path, ...]] = {
-        "run": ("run", sample, "-o", folder / "ok", *quiet),
-        "run, log cut in half": ("run", folder / "cut.mcap", "-o", folder / "cut", *quiet),
-        "run, all logs unreadable": ("run", folder / "noise.mcap", "-o", folder / "noise", *quiet),
-        "run, one of two logs unreadable": ("run", sample, folder / "noise.mcap", "-o", folder / "two", *quiet),
-        "run, requirement not met": ("run", sample, "-o", folder / "plan", *must, *quiet),
-        "run, no output given": ("run", sample),
-        "run, unknown option": ("run", sample, "-o", folder / "x", "--nonsense"),
-        "run, unknown estimator": ("run", sample, "-o", folder / "x", "--estimators", "nonsense"),
-        "run, no such log": ("run", folder / "absent.mcap", "-o", folder / "x"),
-        "inspect": ("inspect", sample),
-        "inspect, log cut in half": ("inspect", folder / "cut.mcap"),
-        "inspect, unreadable": ("inspect", folder / "noise.mcap"),
-        "compare": ("compare", folder / "ok", folder / "plan"),
-        "plan init": ("plan", "init", "-o", folder / "new-plan.toml"),
-        "simulate": ("simulate", "dlc", "-o", folder / "simulated.mcap"),
-        "convert": ("convert", sample, "-o", folder / "converted.mcap"),
-        "events": ("events", folder / "ok", "--where", "nonsense ==="),
-        "unknown command": ("nonsense",),
-    }
+    write_toml(folder / "plan.toml", {"requirement": [_TABLES["requirement"]]})
     for name in ("new-plan.toml", "simulated.mcap", "converted.mcap"):
         (folder / name).unlink(missing_ok=True)
-    return {name: Figure(float(tool.pdhef(*words).returncode), "exit code", 0.0) for name, words in cases.items()}
+    given = {"sample": SAMPLES / "dlc.mcap", "folder": folder}
+    return {
+        name: Figure(float(tool.pdhef(*(word.format(**given) for word in words)).returncode), "exit code", 0.0)
+        for name, words in _TABLES["exit_codes"].items()
+    }
 
 
 def options(tool: Tool) -> Figures:
@@ -337,9 +310,6 @@ def speed(benchmark: str, tool: Tool) -> Figures:
 
 # ------------------------------------------------------------------------------------------------ all
 
-_FEW_MISTAKES = (("steer_rad", "sign"), ("yaw_rate_rad_s", "x57.3"), ("ay_m_s2", "/9.81"), ("wheel_speed", "x3.6"),
-                 ("ax_m_s2", "axis"), ("truth.vy_m_s", "sign"))  # fmt: skip
-_FEW_LAYOUTS = ("csv-german", "can-mdf", "vbo-file", "z-down", "steering-deg", "kart-parquet", "electric-blf")
 #: Formats of which a few mutants are quick.
 _FEW_FORMATS = ("csv", "blf", *RECORDINGS)
 
@@ -350,6 +320,7 @@ def all_rows() -> list[GateRow]:
     contract = {"exit codes": exit_codes, "options": options, "files and keys": files_and_keys}
     sets = {name: quick if name in (*QUICK_DRIVES, "double lane change") else full
             for name in (*REFERENCE_DRIVES, *(d.log for d in PEER_DRIVES))}  # fmt: skip
+    few_mistakes = _TABLES["few_mistakes"]
     gnss = [d for d in PEER_DRIVES if d.log.startswith("v40_")]
     counts = [(name, few) for name in FORMATS for few in (False, True) if not few or name in _FEW_FORMATS]
     return [
@@ -364,11 +335,11 @@ def all_rows() -> list[GateRow]:
         ),
         *(GateRow("speed", name, full, partial(speed, name)) for name in ("reading", "reading_mdf")),
         GateRow("third-party logs", "all", full, partial(strangers, ())),
-        GateRow("third-party logs", "7 layouts", quick, partial(strangers, _FEW_LAYOUTS)),
+        GateRow("third-party logs", "7 layouts", quick, partial(strangers, _TABLES["few_layouts"])),
         GateRow("plus-minus", "20 cars", full, partial(plus_minus, range(20))),
         GateRow("plus-minus", "1 car", quick, partial(plus_minus, range(2, 3))),
         *(GateRow("mapping mistakes", log, full, partial(mistakes, log, ())) for log in ("dlc.mcap", "road.mcap")),
-        GateRow("mapping mistakes", "dlc.mcap, 6 mistakes", quick, partial(mistakes, "dlc.mcap", _FEW_MISTAKES)),
+        GateRow("mapping mistakes", "dlc.mcap, 6 mistakes", quick, partial(mistakes, "dlc.mcap", few_mistakes)),
         *(
             GateRow("fuzz", f"{n}, 3 mutants" if few else n, quick if few else full, partial(fuzz, n, 3 if few else 50))
             for n, few in counts

@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from studies.pages import read_toml
 from truthsim.drive import Drive, write_drive
 
 #: The longest time for one command, s.
@@ -74,7 +74,7 @@ class Tool:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.unlink(missing_ok=True)
         self.json("inspect", log, "--write-mapping", file)
-        return tomllib.loads(file.read_text(encoding="utf-8"))
+        return read_toml(file)
 
 
 def sideslip_rmse_deg(run: Path) -> dict[str, float]:

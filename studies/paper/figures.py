@@ -12,12 +12,10 @@ import numpy as np
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.geometry import dead_reckon, wrap_angle
 from pdhef_logtool.records.signals import FloatArray
-from studies.paper import published
-from studies.paper.comparison import spread
-from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B, Experiment, time_s, valid
+from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B, Experiment, spread, time_s, valid
 from studies.paper.probes import RESIDUAL_ROWS, ResidualFit, TrustCurve
 from studies.paper.results import Results
-from studies.paper.schemes import DRAWN
+from studies.paper.schemes import DRAWN, PUBLISHED
 from studies.pictures import STYLE, save, subplots
 
 COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
@@ -48,7 +46,7 @@ def _thin(name: str) -> dict[str, Any]:
 def convergence(folder: Path, losses: Mapping[str, Sequence[float]]) -> None:
     """Figure 9: losses of the paper's network over the epochs; the paper's values after 150 epochs dotted."""
     fig, axes = subplots(1, 1, 7.4, 3.0, _STYLE)
-    for (name, values), colour, theirs in zip(losses.items(), ("#0072B2", "#D55E00"), published.LOSSES, strict=True):
+    for (name, values), colour, theirs in zip(losses.items(), ("#0072B2", "#D55E00"), PUBLISHED["losses"], strict=True):
         axes[0, 0].semilogy(range(1, len(values) + 1), values, color=colour, label=name.replace("_", " "))
         axes[0, 0].axhline(theirs, color=colour, linestyle=":", label="paper")
     axes[0, 0].set(xlabel="epoch", ylabel="mean square of\nnormalised targets")
@@ -61,9 +59,9 @@ def step_time_bars(folder: Path, times: Mapping[str, Mapping[str, float]]) -> No
     names = [n for n in BARS if n in times][::-1]
     fig, axes = subplots(1, 1, 7.4, 3.0, _STYLE)
     axes[0, 0].barh(names, [times[n]["median_us"] for n in names], color=[COLOURS[n] for n in names], height=0.72)
-    theirs = {"phy-ukf": published.STEP_MS["phy-ukf"], "pd-hef-paper": published.STEP_MS["pd-hef"]}
+    theirs = {"phy-ukf": PUBLISHED["step_ms"]["phy-ukf"], "pd-hef-paper": PUBLISHED["step_ms"]["pd-hef"]}
     axes[0, 0].plot([1e3 * ms for ms in theirs.values()], list(theirs), "o", color="#222222", label="paper, MATLAB")
-    axes[0, 0].axvline(1e3 * published.CYCLE_MS, color="#222222", linestyle=":", label="cycle of a controller")
+    axes[0, 0].axvline(1e3 * PUBLISHED["cycle_ms"], color="#222222", linestyle=":", label="cycle of a controller")
     axes[0, 0].set(xscale="log", xlabel="processor time per step, µs")
     axes[0, 0].grid(axis="y", visible=False)
     _legend_above(axes[0, 0])
@@ -192,7 +190,7 @@ def trust(folder: Path, curves: Mapping[str, Mapping[str, TrustCurve]]) -> None:
             ax.plot(curve.ay_g, curve.trust, ".", markersize=2.0, alpha=0.35, color=colour)
             ax.fill_between(curve.centre_g, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
             ax.plot(curve.centre_g, curve.median, "o-", markersize=4, color=colour, label=f"{scheme}, median of a bin")
-        for level in published.TRUST:
+        for level in PUBLISHED["residual_gain"]:
             ax.axhline(level, color=COLOURS["truth"], linestyle="--", linewidth=1.0)
         ax.set(xlabel="true |lateral acceleration|, g", ylim=(0.0, 1.0), title=f"scenario {scenario}")
     axes[0, 0].set(ylabel="β")
@@ -223,7 +221,7 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
                     continue
                 ax.barh(k, s["median"], color=COLOURS[name], height=0.72)
                 ax.plot([s["low"], s["high"]], [k, k], color="#222222", linewidth=1.1)
-            theirs = published.RMSE.get((scenario, figure))
+            theirs = PUBLISHED["rmse"][scenario].get(figure)
             if theirs is not None:
                 ax.axvline(theirs, color="#222222", linestyle=":", linewidth=1.4)
             ax.set_yticks(range(len(names)), names)

@@ -1,4 +1,4 @@
-"""``docs/paper.md`` and its details, rendered from ``results.json`` and :mod:`studies.paper.published`."""
+"""``docs/paper.md`` and its details, rendered from ``results.json`` and ``published.toml``."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from studies.pages import table, template
-from studies.paper import published
-from studies.paper.schemes import HYBRID, PAPER, SCHEMES
+from studies.paper.schemes import HYBRID, PAPER, PUBLISHED, SCHEMES
 from truthsim.sensors import SensorNoise
 
 #: Figures of the page; the folder of results contains all.
@@ -109,7 +108,7 @@ def _sensitivity(constants: Document) -> str:
 
 
 def _scenarios(d: Document) -> str:
-    lines = []
+    lines, speed_km_h, peak_g = [], PUBLISHED["dlc_speed_km_h"], PUBLISHED["dlc_peak_g"]
     for s in d["scenarios"]:
         drives = [f for f in d["drives"] if f["scenario"] == s["name"]]
         peak, slip = (max(f[key] for f in drives) for key in ("peak_ay_g", "peak_sideslip_deg"))
@@ -121,8 +120,8 @@ def _scenarios(d: Document) -> str:
         )
     lines += [
         "",
-        f"The paper calls A an ISO 3888-2 course at {published.DLC_SPEED_KM_H:g} km/h, which is beyond the friction.",
-        f"Therefore A is the ISO 3888-1 course with its offset scaled to {published.DLC_PEAK_G:g} g.",
+        f"The paper calls A an ISO 3888-2 course at {speed_km_h:g} km/h, which is beyond the friction.",
+        f"Therefore A is the ISO 3888-1 course with its offset scaled to {peak_g:g} g.",
     ]
     return "\n".join(lines)
 
@@ -130,25 +129,25 @@ def _scenarios(d: Document) -> str:
 def _adaptation(d: Document) -> Iterator[tuple[str, ...]]:
     """Yield the same of the adaptive mechanism."""
     for scheme, r in d["r_factor"].items():
-        paper = number(published.R_NORM[1] / published.R_NORM[0])
+        paper = number(PUBLISHED["r_norm"][1] / PUBLISHED["r_norm"][0])
         yield "20", f"factor on R of a_y in the noise burst, `{scheme}`", paper, number(r["within"] / r["before"])
     for scenario, curves in d["trust"].items():
         for scheme, c in curves.items():
             here = f"{number(c['median'][0])} … {number(c['median'][-1])}"
-            low, high = published.TRUST
+            low, high = PUBLISHED["residual_gain"]
             yield "21", f"residual gain at low and high a_y in {scenario}, `{scheme}`", f"{low:g} … {high:g}", here
 
 
 def _compared(d: Document) -> Iterator[tuple[str, ...]]:
     """Yield figure, quantity, value of the paper and value here."""
-    for (name, values), theirs in zip(d["losses"].items(), published.LOSSES, strict=True):
+    for (name, values), theirs in zip(d["losses"].items(), PUBLISHED["losses"], strict=True):
         yield "9", f"{name.replace('_', ' ')} after {len(values)} epochs", f"{theirs:g}", number(values[-1])
     for paper_scheme, scheme, values in (
-        ("PD-HEF", PAPER, published.RMSE),
-        ("PD-HEF", HYBRID, published.RMSE),
-        ("Phy-UKF", "phy-ukf", published.PHY_RMSE),
+        ("PD-HEF", PAPER, PUBLISHED["rmse"]),
+        ("PD-HEF", HYBRID, PUBLISHED["rmse"]),
+        ("Phy-UKF", "phy-ukf", PUBLISHED["phy_rmse"]),
     ):
-        for (scenario, figure), value in values.items():
+        for scenario, figure, value in ((s, f, v) for s, of in values.items() for f, v in of.items()):
             place = 11 if scenario == "A" else 15
             place += ("position_m", "sideslip_deg", "yaw_rate_rad_s", "ay_g").index(figure)
             if scheme in d["summary"][scenario]:
@@ -163,16 +162,16 @@ def _compared(d: Document) -> Iterator[tuple[str, ...]]:
             yield figure, f"explained share of the residual of {name} in {scenario}", "–", percent(share)
         paper_text, here = (
             " … ".join(f"{v:.3g}".replace("-", "−") for v in limits)
-            for limits in (published.NETWORK_OUTPUT_RAD_S, fit["yaw_rate_increment_rad_s"])
+            for limits in (PUBLISHED["network_output_rad_s"], fit["yaw_rate_increment_rad_s"])
         )
         yield figure, f"network output in {scenario}: yaw rate per step, rad/s", paper_text, here
     yield from _adaptation(d)
     for gain in d["improvements"]:
         if gain["baseline"] == "phy-ukf" and gain["scenario"] in "AB":
             text = f"reduction of the sideslip RMSE against Phy-UKF in {gain['scenario']}, `{gain['scheme']}`"
-            yield "22", text, f"above {percent(published.IMPROVEMENT)}", gain_text(gain)
+            yield "22", text, f"above {percent(PUBLISHED['improvement'])}", gain_text(gain)
     times = {scheme: t["median_us"] for scheme, t in d["step_time_us"].items()}
-    ratio = number(published.STEP_MS["pd-hef"] / published.STEP_MS["phy-ukf"])
+    ratio = number(PUBLISHED["step_ms"]["pd-hef"] / PUBLISHED["step_ms"]["phy-ukf"])
     for scheme in (PAPER, HYBRID):
         yield "23", f"step time over Phy-UKF, `{scheme}`", ratio, number(times[scheme] / times["phy-ukf"])
 

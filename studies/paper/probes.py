@@ -1,17 +1,22 @@
-"""Quantities of Figures 10 and 19 to 21: residuals, adaptation of R, scheduling of the residual gain."""
+"""Quantities of Figures 10, 19 to 21 and 23: residuals, adaptation of R, residual gain, time of a step."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.parallel_physics import filter_of
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.network.residuals import residual_rows
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import ModelBundle
+from pdhef_logtool.runs.estimating import estimate_drive
 from studies.paper.experiment import GRAVITY_M_S2, Experiment, time_s, valid
 
 #: Rows of the residual, with their units.
@@ -102,3 +107,27 @@ def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float])
     if not before.size or not within.size or np.nanmax(scale) - np.nanmin(scale) < 1e-9:
         return None
     return {"before": float(np.median(before)), "within": float(within.max())}
+
+
+#: Rounds of the step times.
+ROUNDS = 15
+
+
+def step_times(whole: WholeDrive, car: Car, names: Sequence[str], rounds: int = ROUNDS) -> dict[str, dict[str, float]]:
+    """Return median, fastest and slowest of several rounds in turns, in microseconds of processor time a step.
+
+    The first round compiles and does not count.
+    """
+    schemes, corrected = [make_estimator(name, car) for name in names], DriveSignals.of(whole.signals, car)
+    seconds: dict[str, list[float]] = {s.name: [] for s in schemes}
+    for number in range(rounds + 1):
+        for scheme in schemes:
+            start = time.process_time()
+            estimate_drive(whole, corrected, [scheme])
+            if number:
+                seconds[scheme.name].append(time.process_time() - start)
+    us = 1e6 / len(whole.signals)
+    return {
+        name: {"median_us": us * float(np.median(taken)), "low_us": us * min(taken), "high_us": us * max(taken)}
+        for name, taken in seconds.items()
+    }

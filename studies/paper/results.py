@@ -14,11 +14,21 @@ from pdhef_logtool.learning.network.train_command import HISTORY_FILE
 from pdhef_logtool.residual_model.bundle import PAPER_FOLDER
 from pdhef_logtool.results.run_report import tool_versions
 from studies.gates.tool import Tool
-from studies.paper.comparison import improvement, spread
-from studies.paper.experiment import BURST, BURST_S, FIGURES, A, B, Experiment, on_the_road, read_log, run_experiment
-from studies.paper.probes import ResidualFit, TrustCurve, inflation, residual_fit, trust_curve
+from studies.paper.experiment import (
+    BURST,
+    BURST_S,
+    FIGURES,
+    A,
+    B,
+    Experiment,
+    improvement,
+    on_the_road,
+    read_log,
+    run_experiment,
+    spread,
+)  # fmt: skip
+from studies.paper.probes import ResidualFit, TrustCurve, inflation, residual_fit, step_times, trust_curve
 from studies.paper.schemes import ESP, PAIRS
-from studies.paper.step_time import step_times
 
 SCENARIOS = (A, B, BURST)
 #: Schemes with a variable gain or factor on R.

@@ -1,6 +1,13 @@
-"""The schemes of the comparison, and the selection for the figures."""
+"""The schemes of the comparison, the selection for the figures, and published values."""
 
 from __future__ import annotations
+
+from pathlib import Path
+
+from studies.pages import read_toml
+
+#: Published values, documented in their file.
+PUBLISHED = read_toml(Path(__file__).with_name("published.toml"))
 
 #: End of the names of schemes without wheel speed, the paper's sensor set.
 ESP = ", esp"

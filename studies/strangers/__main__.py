@@ -11,62 +11,30 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from studies.pages import DOCS, RESULTS, ROOT, options, write
-from studies.strangers.answers import SHARED, answered_files, load_answers
+from studies.pages import DOCS, RESULTS, ROOT, options, read_toml, write
 from studies.strangers.containers import write as write_log
-from studies.strangers.layouts import layouts
-from studies.strangers.mountings import mountings
+from studies.strangers.layouts import layouts, mountings
 from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
-from studies.strangers.scoring import Score, look, score_log
+from studies.strangers.scoring import SHARED, answered_files, load_answers, look, score_log
 
 #: First results of held-out layouts, present and former.
-FIRST_RUNS: dict[str, str] = tomllib.loads(Path(__file__).with_name("first_runs.toml").read_text(encoding="utf-8"))
-
-
-def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:
-    """Return the stored part of a score."""
-    wrong = [f for f in score.findings if f.verdict == "wrong"]
-    right = [f for f in score.findings if f.verdict == "right"]
-    ends = {True: "wrong, reported", False: "wrong, not reported"}
-    verdicts = ("failed", "undecided", "passed")
-    return Result(
-        name=name,
-        group=group,
-        what=what,
-        page=page_url,
-        items={f.item: ends[f.told] if f.verdict == "wrong" else f.verdict for f in score.findings},
-        wrong={f.item: f.what for f in wrong},
-        verdicts={f.item: next((v for v in verdicts if v in f.checked), "none") for f in right},
-        doubted=tuple(f.item for f in right if f.doubted),
-        silent=tuple(f"{f.item} ({f.what})" for f in wrong if not f.told),
-        alarms=score.false_alarms,
-        named=score.cause_named,
-        said=score.told.text,
-    )
+FIRST_RUNS: dict[str, str] = read_toml(Path(__file__).with_name("first_runs.toml"))
 
 
 def score_recording(recording: Recording, folder: Path) -> Result:
     """Write a log of our own, score it, and remove it."""
     path = write_log(recording.topics, folder / recording.name, recording.container)
+    start_ns = min((int(t.arrival_ns[0]) for t in recording.topics if len(t.arrival_ns)), default=None)
     try:
-        score = score_log(
-            path,
-            recording.right,
-            allowed=recording.allowed,
-            cause=recording.cause,
-            at_fault=recording.at_fault,
-            start_ns=min((int(t.arrival_ns[0]) for t in recording.topics if len(t.arrival_ns)), default=None),
-        )
+        return score_log(path, recording, start_ns)
     finally:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    return result_of(score, recording.name, recording.group, recording.what, recording.page)
 
 
 def score_own(recordings: Sequence[Recording], folder: Path) -> Iterator[tuple[str, Result]]:
@@ -84,9 +52,7 @@ def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
     for answer in load_answers():
         if _wanted(answer.file, only) and answer.path.exists():
             print(answer.file, file=sys.stderr)
-            right, allowed = answer.series()
-            score = score_log(answer.path, right, allowed=allowed, at_fault=answer.at_fault)
-            yield answer.file, result_of(score, answer.file, "recording", "")
+            yield answer.file, score_log(answer.path, answer.expected())
 
 
 def first_run() -> str:

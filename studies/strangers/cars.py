@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
+from studies.pages import read_toml
 from truthsim.batch import DriveSpec
 from truthsim.sensors import SensorChannel
 
@@ -92,26 +94,13 @@ class Car:
         return Series(v.stamps_ns, v.arrival_ns, np.where(moves, np.arctan2(v.values[:, 1], v.values[:, 0]), 0.0))
 
 
-#: The drives: country roads with town and motorway, each of another car, and banked bends.
-DRIVES: dict[str, DriveSpec] = {
-    "sedan": DriveSpec("road", 90.0, 0.9, 11, 90.0),
-    "hatchback": DriveSpec("road", 100.0, 0.85, 12, 90.0, vehicle="hatchback"),
-    "suv": DriveSpec("road", 80.0, 0.9, 13, 90.0, vehicle="suv"),
-    "bends": DriveSpec("banked-road", 80.0, 0.9, 3, 60.0),
-    "short": DriveSpec("road", 80.0, 0.9, 21, 60.0),
-    "brief": DriveSpec("stop-and-go", 50.0, 0.9, 1, 12.0),
-    "motorway": DriveSpec("road", 120.0, 0.95, 41, 90.0),
-    "gravel": DriveSpec("road", 90.0, 0.6, 42, 110.0, vehicle="suv"),
-    "ring": DriveSpec("banked-road", 95.0, 0.95, 43, 75.0, vehicle="hatchback"),
-    "other": DriveSpec("road", 60.0, 0.9, 31, 60.0, vehicle="hatchback"),
-}
+_DRIVES = read_toml(Path(__file__).with_name("drives.toml"))
 
 
 @lru_cache(maxsize=16)
 def drive(name: str, imu_x_m: float = 0.0) -> Car:
-    """Drive one of :data:`DRIVES`, with the IMU ``imu_x_m`` before the centre of gravity."""
-    spec = DRIVES[name]
-    made = (spec if not imu_x_m else _with_imu_at(spec, imu_x_m)).simulate()
+    """Drive one of ``drives.toml``, with the IMU ``imu_x_m`` before the centre of gravity."""
+    made = DriveSpec(**_DRIVES[name], sensors=(("imu_x_m", imu_x_m),)).simulate()
     start = made.start_ns
     channels = made.channels
     ins = channels["rtk"]
@@ -133,12 +122,6 @@ def drive(name: str, imu_x_m: float = 0.0) -> Car:
         yaw_rate=_series(ins, start, "yaw_rate_rad_s")[0],
         fix=_series(channels["fix"], start, "lat_deg", "lon_deg", "alt_m"),
     )
-
-
-def _with_imu_at(spec: DriveSpec, imu_x_m: float) -> DriveSpec:
-    from dataclasses import replace
-
-    return replace(spec, sensors=(*spec.sensors, ("imu_x_m", imu_x_m)))
 
 
 def _series(channel: SensorChannel, start_ns: int, *names: str) -> Series:

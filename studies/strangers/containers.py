@@ -6,9 +6,10 @@ import json
 import re
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.signals import IntArray
+from studies.mcap_logs import Message, write_log
 from studies.strangers import buses, tables
 
 
@@ -112,62 +114,43 @@ def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tu
         with scratch.open("rb") as stream:
             for _, channel, message in make_reader(stream).iter_messages():
                 topic, data = by_name[channel.topic], message.data
-                yield (
-                    topic,
-                    message.log_time,
-                    message.publish_time,
-                    bytes(store.cdr_to_ros1(data, topic.type_name)) if ros1 else data,
-                )
+                data = bytes(store.cdr_to_ros1(data, topic.type_name)) if ros1 else data
+                yield topic, message.log_time, message.publish_time, data
     finally:
         scratch.unlink()
+
+
+def _copied(topics: Sequence[Topic], path: Path, writer: Any, *, ros1: bool) -> Path:
+    """Write the messages of topics with a writer of rosbags."""
+    store = _store(ros1)
+    with writer:
+        connections = {t.name: writer.add_connection(t.name, t.type_name, typestore=store) for t in topics}
+        for topic, arrival, _, data in _messages(topics, path, ros1=ros1):
+            writer.write(connections[topic.name], arrival, data)
+    return path
 
 
 def _rosbag1(topics: Sequence[Topic], path: Path) -> Path:
     from rosbags.rosbag1 import Writer
 
     path = path.with_suffix(".bag")
-    store = _store(True)
-    with Writer(path) as writer:
-        connections = {t.name: writer.add_connection(t.name, t.type_name, typestore=store) for t in topics}
-        for topic, arrival, _, data in _messages(topics, path, ros1=True):
-            writer.write(connections[topic.name], arrival, data)
-    return path
+    return _copied(topics, path, Writer(path), ros1=True)
 
 
 def _mcap_ros1(topics: Sequence[Topic], path: Path) -> Path:
-    path = path.with_suffix(".mcap")
-    with McapLogWriter(path, profile="ros1") as writer:
-        ids = {
-            t.name: writer.add_channel(
-                ChannelRecord(
-                    -1,
-                    t.name,
-                    "ros1",
-                    t.type_name.replace("/msg/", "/"),
-                    "ros1msg",
-                    definition(t.type_name, ros1=True).encode(),
-                )
-            )
-            for t in topics
-        }
-        raws = [
-            RawMessage(ids[t.name], arrival, stamp, i, data)
-            for i, (t, arrival, stamp, data) in enumerate(_messages(topics, path, ros1=True))
-        ]
-        writer.write([], [block_of(raws)])
-    return path
+    texts = {t.name: definition(t.type_name, ros1=True).encode() for t in topics}
+    encoded = (
+        Message(arrival, stamp, t.name, data, "ros1", (t.type_name.replace("/msg/", "/"), "ros1msg", texts[t.name]))
+        for t, arrival, stamp, data in _messages(topics, path, ros1=True)
+    )
+    return write_log(path.with_suffix(".mcap"), encoded, "ros1")
 
 
 def _rosbag2(topics: Sequence[Topic], path: Path, plugin: str = "SQLITE3") -> Path:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     shutil.rmtree(path, ignore_errors=True)
-    store = _store(False)
-    with Writer(path, version=9, storage_plugin=StoragePlugin[plugin]) as writer:
-        connections = {t.name: writer.add_connection(t.name, t.type_name, typestore=store) for t in topics}
-        for topic, arrival, _, data in _messages(topics, path, ros1=False):
-            writer.write(connections[topic.name], arrival, data)
-    return path
+    return _copied(topics, path, Writer(path, version=9, storage_plugin=StoragePlugin[plugin]), ros1=False)
 
 
 def _rosbag2_bare(topics: Sequence[Topic], path: Path) -> Path:
@@ -189,17 +172,10 @@ def _rows(topic: Topic) -> Iterator[tuple[int, int, dict[str, Any]]]:
     for i, (arrival, stamp) in enumerate(zip(topic.arrival_ns.tolist(), topic.stamps_ns.tolist(), strict=True)):
         row: dict[str, Any] = {}
         for path, value in topic.constants.items():
-            _put(row, path, value)
+            tables.nested(row, path, value)
         for path, column in columns.items():
-            _put(row, path, column[i])
+            tables.nested(row, path, column[i])
         yield arrival, stamp, row
-
-
-def _put(row: dict[str, Any], path: str, value: Any) -> None:
-    *parents, leaf = path.split(".")
-    for name in parents:
-        row = row.setdefault(name, {})
-    row[leaf] = value
 
 
 def _json_schema(value: Any) -> dict[str, Any]:
@@ -210,43 +186,26 @@ def _json_schema(value: Any) -> dict[str, Any]:
     return {"type": "string" if isinstance(value, str) else "number"}
 
 
-def _raw_mcap(
-    topics: Sequence[Topic], path: Path, encoding: str, schema: Callable[[Topic], tuple[str, bytes]]
-) -> tuple[McapLogWriter, dict[str, int]]:
-    writer = McapLogWriter(path, profile="")
-    ids = {}
-    for t in topics:
-        schema_encoding, data = schema(t)
-        name = t.type_name if schema_encoding else ""
-        ids[t.name] = writer.add_channel(ChannelRecord(-1, t.name, encoding, name, schema_encoding, data))
-    return writer, ids
-
-
 def _json(topics: Sequence[Topic], path: Path, *, bare: bool = False) -> Path:
-    path = path.with_suffix(".mcap")
+    def encoded(topic: Topic) -> Iterator[Message]:
+        schema = "", "", b""
+        for i, (arrival, stamp, row) in enumerate(_rows(topic)):
+            if not bare and not i:
+                schema = topic.type_name, "jsonschema", json.dumps(_json_schema(row)).encode()
+            yield Message(arrival, stamp, topic.name, json.dumps(row).encode(), "json", schema)
 
-    def schema(topic: Topic) -> tuple[str, bytes]:
-        first = next(_rows(topic), None)
-        return ("", b"") if bare or first is None else ("jsonschema", json.dumps(_json_schema(first[2])).encode())
+    return _by_time(path, map(encoded, topics))
 
-    writer, ids = _raw_mcap(topics, path, "json", schema)
-    with writer:
-        raws = [
-            RawMessage(ids[t.name], arrival, stamp, i, json.dumps(row).encode())
-            for t in topics
-            for i, (arrival, stamp, row) in enumerate(_rows(t))
-        ]
-        writer.write([], [block_of(sorted(raws, key=lambda r: r.log_time_ns))])
-    return path
+
+def _by_time(path: Path, messages: Iterable[Iterable[Message]]) -> Path:
+    """Write the messages of topics by their arrival."""
+    return write_log(path.with_suffix(".mcap"), sorted(chain.from_iterable(messages), key=lambda m: m.log_time_ns))
 
 
 def _protobuf(topics: Sequence[Topic], path: Path) -> Path:
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-    path = path.with_suffix(".mcap")
-    makers: dict[str, Callable[..., Any]] = {}
-
-    def schema(topic: Topic) -> tuple[str, bytes]:
+    def encoded(topic: Topic) -> Iterator[Message]:
         package, _, name = topic.type_name.rpartition(".")
         files = descriptor_pb2.FileDescriptorSet()
         file = files.file.add(name=f"{name}.proto", package=package, syntax="proto3")
@@ -254,18 +213,12 @@ def _protobuf(topics: Sequence[Topic], path: Path) -> Path:
         _add_message(file.message_type.add(name=name), topic.type_name, example)
         pool = descriptor_pool.DescriptorPool()
         pool.Add(files.file[0])
-        makers[topic.name] = message_factory.GetMessageClass(pool.FindMessageTypeByName(topic.type_name))
-        return "protobuf", files.SerializeToString()
+        kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(topic.type_name))
+        schema = topic.type_name, "protobuf", files.SerializeToString()
+        for arrival, stamp, row in _rows(topic):
+            yield Message(arrival, stamp, topic.name, kind(**row).SerializeToString(), "protobuf", schema)
 
-    writer, ids = _raw_mcap(topics, path, "protobuf", schema)
-    with writer:
-        raws = [
-            RawMessage(ids[t.name], arrival, stamp, i, makers[t.name](**row).SerializeToString())
-            for t in topics
-            for i, (arrival, stamp, row) in enumerate(_rows(t))
-        ]
-        writer.write([], [block_of(sorted(raws, key=lambda r: r.log_time_ns))])
-    return path
+    return _by_time(path, map(encoded, topics))
 
 
 def _add_message(message: Any, full_name: str, example: Mapping[str, Any]) -> None:
@@ -286,12 +239,12 @@ _WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
     "mcap": _mcap,
     "mcap-ros1": _mcap_ros1,
     "mcap-json": _json,
-    "mcap-json-bare": lambda topics, path: _json(topics, path, bare=True),
+    "mcap-json-bare": partial(_json, bare=True),
     "mcap-protobuf": _protobuf,
     "rosbag1": _rosbag1,
     "rosbag2": _rosbag2,
     "rosbag2-bare": _rosbag2_bare,
-    "rosbag2-mcap": lambda topics, path: _rosbag2(topics, path, "MCAP"),
+    "rosbag2-mcap": partial(_rosbag2, plugin="MCAP"),
     **dict(tables.writers()),
     **dict(buses.writers()),
 }

@@ -8,28 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pdhef_logtool.records.signals import FloatArray
 from studies.strangers import recordings
 from studies.strangers.cars import Car, Series, drive
 from studies.strangers.containers import Topic
-from studies.strangers.recordings import DEG, DOWN, G_M_S2, KMH, Recording, answers, message
+from studies.strangers.recordings import DEG, DOWN, G_M_S2, KMH, SCORING, Recording, answers, message
 from truthsim.recording import quaternion
 
 #: Patterns of messages that name a cause.
-CAUSES = {
-    # An IMU with axes that differ from the axes of the car.
-    "MOUNTING": r"mount|rotat|upside|z-down|z down|lies|imu[^.;]{0,60}(turned|tilt)|(turned|tilt)[^.;]{0,60}imu",
-    "UNITS": r"unit|degree|deg/s|\bdeg\b|km/h|\bg\b|factor|scale|57\.|9\.8|3\.6",
-    "SIGNS": r"sign|negat|opposite|mirror",
-}
+CAUSES: dict[str, str] = SCORING["causes"]
 
 
 def rotation(axis: tuple[float, float, float], angle_rad: float) -> FloatArray:
-    """Return the matrix of a rotation about an axis (Rodrigues)."""
-    x, y, z = np.array(axis) / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * cross @ cross)
+    """Return the matrix of a rotation about an axis."""
+    return np.asarray(Rotation.from_rotvec(angle_rad * np.array(axis) / np.linalg.norm(axis)).as_matrix())
 
 
 _NUMPY = ("clip", "cos", "cumsum", "diag", "floor", "gradient", "maximum", "pi", "rint", "sin", "sqrt", "stack", "tan")
@@ -111,6 +105,23 @@ def layouts(*groups: str) -> Iterator[Recording]:
             page=page.strip("-"),
             cause=cause,
             at_fault=frozenset(about.get("fault", "").split()),
+        )
+
+
+def mountings() -> Iterator[Recording]:
+    """Yield 24 logs with an IMU rotated in steps of 90 degrees; the first has the axes of the car."""
+    car, turns = drive("short"), np.rint(Rotation.create_group("O").as_matrix())
+    for i, turn in enumerate(sorted(turns, key=np.trace, reverse=True)):
+        yield Recording(
+            name=f"mounting-{i:02}",
+            kind="mounting-90",
+            group="fault",
+            what="IMU turned in steps of 90 degrees, all 24 ways",
+            container="mcap",
+            topics=recordings.road_car(car, imu=recordings.imu(car.force.times(turn), car.rate.times(turn))),
+            right=answers(car, "imu", "steer", "speed", "truth", "truth rate"),
+            cause=CAUSES["MOUNTING"] if i else "",
+            at_fault=frozenset({"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"} if i else ()),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +20,8 @@ GROUPS = {
     "recording": "third-party recordings",
 }
 #: Groups with sound and excited logs: checks may neither fail nor stay undecided.
-SOUND = ("layout", "held-out", "recorders", "contact")
+HELD_OUT = ("held-out", "recorders", "contact")
+SOUND = ("layout", *HELD_OUT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +39,8 @@ class Result:
     name: str
     group: str
     what: str
-    page: str
     items: Mapping[str, str]
+    page: str = ""
     wrong: Mapping[str, str] = field(default_factory=dict)
     verdicts: Mapping[str, str] = field(default_factory=dict)
     silent: tuple[str, ...] = ()
@@ -47,14 +49,14 @@ class Result:
     named: bool | None = None
     said: str = ""
 
-    @property
-    def present(self) -> int:
-        """Number of items."""
-        return len(self.items)
-
     def count(self, outcome: str) -> int:
         """Return how many items ended so."""
         return sum(1 for o in self.items.values() if o == outcome)
+
+    @property
+    def undecided(self) -> list[str]:
+        """Right items of which a check is undecided."""
+        return [item for item, verdict in self.verdicts.items() if verdict == "undecided"]
 
     def as_json(self) -> dict[str, Any]:
         """Values that are stored for later comparison."""
@@ -89,16 +91,9 @@ def page(results: Sequence[Result], remark: str) -> str:
     ----------
     results : one a kind. remark : text below the score.
     """
-    generated = [r for r in results if r.group != "recording"]
-    others = [r for r in results if r.group == "recording"]
-    counts = f"{len(generated)} generated logs and {len(others)} third-party recordings"
-    parts = [
-        template(__file__, counts=counts),
-        "## Score\n",
-        _score(results),
-        _remarks(results),
-        remark,
-    ]
+    others = sum(r.group == "recording" for r in results)
+    counts = f"{len(results) - others} generated logs and {others} third-party recordings"
+    parts = [template(__file__, counts=counts), "## Score\n", _score(results), _remarks(results), remark]
     for group, title in GROUPS.items():
         rows = [r for r in results if r.group == group]
         if rows:
@@ -108,38 +103,19 @@ def page(results: Sequence[Result], remark: str) -> str:
 
 
 def _score(results: Sequence[Result]) -> str:
+    counted = {title: [r for r in results if r.group == group] for group, title in GROUPS.items()}
+    counted["all except held-out layouts"] = [r for r in results if r.group not in HELD_OUT]
     rows = []
-    for group, title in GROUPS.items():
-        here = [r for r in results if r.group == group]
-        if here:
-            rows.append(_score_row(title, here))
-    total = [r for r in results if r.group not in ("held-out", "recorders", "contact")]
-    rows.append(_score_row("all except held-out layouts", total))
+    for title, of in counted.items():
+        outcomes = Counter(outcome for r in of for outcome in r.items.values())
+        planted = [r.named for r in of if r.named is not None]
+        cells = [str(len(of)), str(outcomes.total())]
+        cells += [f"{outcomes['right']} ({100.0 * outcomes['right'] / max(outcomes.total(), 1):.0f} %)"]
+        cells += [str(outcomes[outcome]) for outcome in ("missing", "wrong, reported", "wrong, not reported")]
+        cells += [f"{sum(planted)} of {len(planted)}" if planted else "–"]
+        rows += [[title, *cells]] if of else []
     head = ["logs", "count", "items", "right", "missing", "wrong, reported", "wrong, not reported", "causes named"]
     return table(head, rows, right_from=1) + "\n"
-
-
-def _score_row(title: str, rows: Sequence[Result]) -> list[str]:
-    items = sum(r.present for r in rows)
-    planted = [r.named for r in rows if r.named is not None]
-
-    def share(count: int, of: int) -> str:
-        return f"{count} ({100.0 * count / of:.0f} %)" if of else "–"
-
-    return [
-        title,
-        str(len(rows)),
-        str(items),
-        share(_sum(rows, "right"), items),
-        str(_sum(rows, "missing")),
-        str(_sum(rows, "wrong, reported")),
-        str(_sum(rows, "wrong, not reported")),
-        f"{sum(planted)} of {len(planted)}" if planted else "–",
-    ]
-
-
-def _sum(rows: Iterable[Result], outcome: str) -> int:
-    return sum(r.count(outcome) for r in rows)
 
 
 def _remarks(results: Sequence[Result]) -> str:
@@ -159,23 +135,20 @@ def _logs(rows: Sequence[Result]) -> str:
         other = [f"{item}: {outcome}" for item, outcome in r.items.items() if outcome != "right"]
         named = {None: "", True: "yes", False: "**no**"}[r.named]
         what = f"[{r.what}]({r.page})" if r.page else r.what
-        return [r.name, what, f"{r.count('right')} of {r.present}", "; ".join(other), named]
+        return [r.name, what, f"{r.count('right')} of {len(r.items)}", "; ".join(other), named]
 
     return table(["log", "content", "right", "other", "cause named"], map(cells, rows)) + "\n"
 
 
 def _wrong(results: Sequence[Result]) -> str:
     lines = []
-    checks: list[tuple[str, Callable[[Result], Iterable[str]]]] = [
-        ("wrong, not reported", lambda r: r.silent),
-        ("failed check on a right channel", lambda r: r.alarms),
-        (
-            "undecided check on a right channel",
-            lambda r: (i for i, v in r.verdicts.items() if v == "undecided" and r.group in SOUND),
-        ),
-        ("cause not named", lambda r: ("",) if r.named is False else ()),
-    ]
-    for title, of in checks:
+    checks: dict[str, Callable[[Result], Iterable[str]]] = {
+        "wrong, not reported": lambda r: r.silent,
+        "failed check on a right channel": lambda r: r.alarms,
+        "undecided check on a right channel": lambda r: r.undecided if r.group in SOUND else (),
+        "cause not named": lambda r: ("",) if r.named is False else (),
+    }
+    for title, of in checks.items():
         for r in results:
             lines += [f"- {r.name}: {title}{': ' + what if what else ''}" for what in of(r)]
     return "\n".join(lines) + "\n" if lines else "None.\n"

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import WHEELS, FloatArray
+from studies.pages import read_toml
 from studies.strangers.cars import Car, Series
 from studies.strangers.containers import Topic
 from truthsim.recording import quaternion
@@ -20,57 +22,42 @@ KMH = 1.0 / 3.6
 #: Turns forward, left, up into forward, right, down and back.
 DOWN: FloatArray = np.diag([1.0, -1.0, -1.0])
 
+SCORING = read_toml(Path(__file__).with_name("scoring.toml"))
 #: Scored items: a part of a log that a person can find in it, and the channels that it may be mapped to.
-ITEMS: dict[str, tuple[str, ...]] = {
-    "steering": ("steer_rad", "steering_wheel_rad"),
-    "ax": ("ax_m_s2",),
-    "ay": ("ay_m_s2",),
-    "yaw rate": ("yaw_rate_rad_s",),
-    "speed": ("speed_m_s",),
-    "wheel speeds": tuple(f"wheel_speed_{w}_{unit}" for unit in ("m_s", "rad_s") for w in WHEELS),
-    "ground truth: velocity": (
-        "truth.vx_m_s",
-        "truth.vy_m_s",
-        "truth.sideslip_rad",
-        "truth.enu_velocity_m_s",
-        "truth.ecef_velocity_m_s",
-    ),
-    "ground truth: yaw rate": ("truth.yaw_rate_rad_s",),
-    "position": ("truth.lat_deg", "truth.lon_deg", "gnss_latitude_deg", "gnss_longitude_deg"),
-    "course": ("truth.course_rad", "gnss_course_rad", "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"),
-    "heading": ("truth.yaw_rad", "gnss_heading_rad"),
-}
-#: Items of a navigation system, scored only where a layout names them.
-NAVIGATION = ("position", "course", "heading")
+ITEMS: dict[str, list[str]] = SCORING["items"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recording:
-    """A log of our own making.
+class Expected:
+    """What the tool must find in a log.
 
     Attributes
     ----------
-    name : of the log; logs of one ``kind`` count as one.
-    group : ``fault``, ``layout`` or ``held-out`` (built last, run once).
-    what : description in one line.
+    name : of the log. what : description in one line. page : where the layout is documented.
+    group : ``fault``, ``layout``, ``recording`` or ``held-out`` (built last, run once).
     right : by channel (``truth.`` before ground truth) the expected series, any one of them.
     allowed : channels that may be mapped, and are not missed: an INS that is no ground truth, a second source.
     cause : pattern of a message that names the cause; empty for a log without a fault.
     at_fault : channels with the fault; of all others no check may fail.
-    page : where the layout is documented.
     """
 
     name: str
     group: str
     what: str
-    container: str
-    topics: tuple[Topic, ...]
-    right: Mapping[str, tuple[Series, ...]]
+    right: Mapping[str, Sequence[Series]]
+    allowed: Mapping[str, Sequence[Series]] = field(default_factory=dict)
     cause: str = ""
     at_fault: frozenset[str] = frozenset()
-    kind: str = ""
     page: str = ""
-    allowed: Mapping[str, tuple[Series, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording(Expected):
+    """A log of our own making; logs of one ``kind`` count as one."""
+
+    container: str = "mcap"
+    topics: tuple[Topic, ...] = ()
+    kind: str = ""
 
     @property
     def counted_as(self) -> str:

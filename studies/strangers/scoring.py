@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,36 +18,21 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import fit_clocks, read_signals
+from pdhef_logtool.mapping import SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import POSITIONS, Channel, FloatArray
 from pdhef_logtool.runs.inspection.report import inspect_drive_log
+from studies.pages import ROOT, read_toml
 from studies.strangers.cars import Series
-from studies.strangers.recordings import ITEMS, NAVIGATION
+from studies.strangers.page import Result
+from studies.strangers.recordings import ITEMS, SCORING, Expected
 
 #: Values are compared as means over so long: noise and a late stamp of a few milliseconds count little.
 BIN_S = 0.25
 #: Two channels agree when they differ by less than this share of the right one's rms, or by the floor of its unit.
 SHARE = 0.04
-FLOORS: dict[str, float] = {
-    "steer_rad": 0.002,
-    "steering_wheel_rad": 0.03,
-    "ax_m_s2": 0.12,
-    "ay_m_s2": 0.12,
-    "yaw_rate_rad_s": 0.004,
-    "speed_m_s": 0.15,
-    "rad_s": 0.5,
-    "m_s": 0.15,
-    "truth.vx_m_s": 0.15,
-    "truth.vy_m_s": 0.02,
-    "truth.sideslip_rad": 0.001,
-    "truth.enu_velocity_m_s": 0.15,
-    "truth.ecef_velocity_m_s": 0.15,
-    "truth.yaw_rate_rad_s": 0.004,
-    **dict.fromkeys(("truth.lat_deg", "truth.lon_deg", "gnss_latitude_deg", "gnss_longitude_deg"), 1e-4),
-    **dict.fromkeys(("truth.course_rad", "gnss_course_rad", "truth.yaw_rad", "gnss_heading_rad"), 0.05),
-}
+FLOORS: dict[str, float] = {name: group["floor"] for group in SCORING["floors"] for name in group["channels"]}
 WEAK_SHARE = 0.6
 #: Largest constant (m/s²) that counts as accelerometer bias: it cannot be distinguished from a tilt of two degrees.
 BIAS_M_S2 = 0.3
@@ -78,33 +63,6 @@ class Told:
         bad = [c for c in self.checks if c["verdict"] != "passed"]
         said = [f"{c['name']} {c['subject']}: {c.get('evidence', '')} {c.get('remedy', '')}" for c in bad]
         return "\n".join([*said, *self.doubts, self.error])
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One item of one log.
-
-    ``verdict`` is ``right``, ``wrong`` or ``missing``; ``told`` whether a failed or undecided check or a doubt names
-    a wrong one; ``checked`` the verdicts of the checks on its channels; ``what`` the mapped sources;
-    ``doubted`` whether a sentence doubts it.
-    """
-
-    item: str
-    verdict: str
-    told: bool
-    checked: frozenset[str]
-    what: str
-    doubted: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Score:
-    """Outcome of one log: its findings, the failed checks on right channels, whether the cause was named."""
-
-    findings: tuple[Finding, ...]
-    false_alarms: tuple[str, ...]
-    cause_named: bool | None
-    told: Told
 
 
 # ------------------------------------------------------------------------------------------------ messages of the tool
@@ -143,10 +101,14 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
     error = error or refused_run
     messages = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
-    clocks = fit_clocks(log, inspection.mapping, log.start_ns, log.end_ns)
-    read = read_signals(log, inspection.mapping, clocks, log.start_ns, log.end_ns)
-    channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
-    return inspection.mapping, messages, channels
+    return inspection.mapping, messages, _channels(log, inspection.mapping)
+
+
+def _channels(log: DriveLog, mapping: SignalMapping) -> dict[str, Channel]:
+    """Return the channels of a log by a mapping."""
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    read = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    return read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
 
 
 def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
@@ -157,15 +119,6 @@ def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
             return [asdict(check) for check in getattr(drive, "checks", ())], ""
     except PdhefError as error:
         return [], str(error)
-
-
-def read_answers(path: Path, mapping: SignalMapping) -> dict[str, tuple[Series, ...]]:
-    """Return the right channels of a recording by a mapping that a person wrote."""
-    with closing(open_log(path)) as log:
-        clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-        read = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
-    channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
-    return {n: (Series(c.stamps_ns, c.arrival_ns, c.values),) for n, c in channels.items() if len(c)}
 
 
 # ------------------------------------------------------------------------------------------------ by value
@@ -240,28 +193,19 @@ def bias_of(name: str) -> float:
 # ------------------------------------------------------------------------------------------------ the score
 
 
-def score_log(
-    path: Path,
-    right: Mapping[str, Sequence[Series]],
-    *,
-    allowed: Mapping[str, Sequence[Series]] | None = None,
-    cause: str = "",
-    at_fault: Iterable[str] = (),
-    start_ns: int | None = None,
-) -> Score:
+def score_log(path: Path, expected: Expected, start_ns: int | None = None) -> Result:
     """Let the tool map a log and compare the mapping with the right answers.
+
+    A channel of :data:`ITEMS` that is neither right nor allowed is wrong.
 
     Parameters
     ----------
-    right : expected series by channel. A channel of :data:`ITEMS` that is neither here nor allowed is wrong.
-    allowed : channels that may also be mapped, and do not count as missing.
-    cause : pattern that a message must match; empty without a cause.
-    at_fault : channels for which checks may fail despite a right mapping.
     start_ns : zero of the clock of a log with times relative to its start.
     """
+    right = expected.right
     mapping, messages, channels = look(path)
     sources = {} if mapping is None else _sources(mapping)
-    fitting = {**(allowed or {}), **right}
+    fitting = {**expected.allowed, **right}
     first = min((int(c.arrival_ns[0]) for c in channels.values() if len(c)), default=None)
     if start_ns is not None and first is not None and first < RELATIVE_NS + FEWEST_WEEKS_NS:
         # A clock without a date counts from its own zero, such as the start of a GPS week.
@@ -271,35 +215,38 @@ def score_log(
         name: any(agrees(channel, series, floor_of(name), bias_of(name)) for series in fitting.get(name, ()))
         for name, channel in channels.items()
     }
-    findings = []
+    items, wrong, verdicts, doubted, silent = dict[str, str](), dict[str, str](), dict[str, str](), [], []
     for item, names in ITEMS.items():
         mapped = [n for n in names if n in channels]
         present = any(n in right for n in names)
-        if item in NAVIGATION and not present:
+        if item in SCORING["only_if_named"] and not present:
             continue
-        if not mapped:
-            if present:
-                findings.append(Finding(item, "missing", True, frozenset(), ""))
-            continue
-        wrong = [n for n in mapped if not is_right[n]]
-        checked = frozenset(c["verdict"] for c in messages.checks if c["subject"] in mapped)
-        what = ", ".join(f"{n} = {sources[n]}" for n in (wrong or mapped) if n in sources)
-        if wrong:
-            findings.append(Finding(item, "wrong", all(_is_told(n, sources, messages) for n in wrong), checked, what))
+        bad = [n for n in mapped if not is_right[n]]
+        if bad:
+            is_told = all(_is_told(n, sources, messages) for n in bad)
+            items[item] = "wrong, reported" if is_told else "wrong, not reported"
+            wrong[item] = ", ".join(f"{n} = {sources[n]}" for n in bad if n in sources)
+            silent += [] if is_told else [f"{item} ({wrong[item]})"]
+        elif present and mapped:
+            items[item] = "right"
+            checked = {c["verdict"] for c in messages.checks if c["subject"] in mapped}
+            verdicts[item] = next((v for v in ("failed", "undecided", "passed") if v in checked), "none")
+            doubted += [item] if any(_is_doubted(n, sources.get(n, ""), messages) for n in mapped) else []
         elif present:
-            doubted = any(_is_doubted(n, sources.get(n, ""), messages) for n in mapped)
-            findings.append(Finding(item, "right", True, checked, what, doubted))
-    blamed = set(at_fault)
-    false_alarms = tuple(
+            items[item] = "missing"
+    alarms = tuple(
         f"{c['name']} ({c['subject']}): {c.get('evidence', '')}"
         for c in messages.checks
         if c["verdict"] == "failed"
         and is_right.get(c["subject"], False)
-        and c["subject"] not in blamed
+        and c["subject"] not in expected.at_fault
         and not c["name"].endswith(".corrected")  # the correction made it right
     )
-    named = bool(re.search(cause, messages.text, re.IGNORECASE)) if cause else None
-    return Score(tuple(findings), false_alarms, named, messages)
+    named = bool(re.search(expected.cause, messages.text, re.IGNORECASE)) if expected.cause else None
+    return Result(
+        expected.name, expected.group, expected.what, items, expected.page, wrong, verdicts, tuple(silent),
+        tuple(doubted), alarms, named, messages.text,
+    )  # fmt: skip
 
 
 def _sources(mapping: SignalMapping) -> dict[str, str]:
@@ -323,3 +270,71 @@ def _is_doubted(name: str, source: str, messages: Told) -> bool:
     topic = source.partition(".")[0]
     named = [part for part in (name.removeprefix("truth."), source, topic) if part]
     return any(_DOUBT.search(d) and any(part in d for part in named) for d in messages.doubts)
+
+
+# ------------------------------------------------------------------------------------------------ recordings of others
+
+SHARED = ROOT.parent / "shared"
+ANSWERS = Path(__file__).with_name("answers.toml")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Right sources of one recording by channel (alternatives), sources that are also allowed, and faulty channels."""
+
+    file: str
+    right: dict[str, tuple[SignalSource, ...]]
+    allowed: dict[str, tuple[SignalSource, ...]]
+    at_fault: frozenset[str]
+
+    @property
+    def path(self) -> Path:
+        """Where the recording lies, if it is there."""
+        return SHARED / self.file
+
+    def expected(self) -> Expected:
+        """Read the right and the allowed channels."""
+        right, allowed = (_read(self.path, sources) for sources in (self.right, self.allowed))
+        return Expected(self.file, "recording", "", right, allowed, at_fault=self.at_fault)
+
+
+def load_answers() -> Iterator[Answer]:
+    """Yield all of them, whether the recordings are there or not."""
+    for file, table in read_toml(ANSWERS).items():
+        if "same_as" not in table:
+            allowed, at_fault = _alternatives(table.get("allowed", {})), frozenset(table.get("at_fault", ()))
+            yield Answer(file, _alternatives(table), allowed, at_fault)
+
+
+def answered_files() -> frozenset[str]:
+    """Return the recordings that somebody has looked at."""
+    return frozenset(read_toml(ANSWERS))
+
+
+def _alternatives(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:
+    sources_by_name = {}
+    for name, given in table.items():
+        if name not in ("allowed", "at_fault"):
+            texts = given if isinstance(given, list) else [given]
+            sources_by_name[name] = tuple(_source(name.removeprefix("truth."), *text.split()) for text in texts)
+    return sources_by_name
+
+
+def _source(name: str, topic: str, field: str, scale: str = "1", offset: str = "0") -> SignalSource:
+    return SignalSource(name, topic, field, scale=float(scale), offset=float(offset))
+
+
+def _read(path: Path, sources: dict[str, tuple[SignalSource, ...]]) -> dict[str, tuple[Series, ...]]:
+    """Return the channels of a recording, several where a channel has alternative sources."""
+    series: dict[str, tuple[Series, ...]] = {}
+    with closing(open_log(path)) as log:
+        for turn in range(max(map(len, sources.values()), default=0)):
+            signals, truth = dict[str, SignalSource](), dict[str, SignalSource]()
+            for name, alternatives in sources.items():
+                if turn < len(alternatives):
+                    section = truth if name.startswith("truth.") else signals
+                    section[name.removeprefix("truth.")] = alternatives[turn]
+            for name, c in _channels(log, SignalMapping(signals=signals, truth=truth)).items():
+                if len(c):
+                    series[name] = (*series.get(name, ()), Series(c.stamps_ns, c.arrival_ns, c.values))
+    return series

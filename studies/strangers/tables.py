@@ -1,4 +1,4 @@
-"""Topics as columns into files of tables: texts (``dialects.toml``), VBO, Parquet, MAT and MDF.
+"""Topics as columns into files of tables: text (``dialects.toml``), MAT, JSON, HDF5 (``documents.toml``), Parquet, MDF.
 
 A field is named as its column, with the unit in brackets: ``Lateral Acc. [g]``.
 """
@@ -7,24 +7,27 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import IntArray
+from studies.pages import read_toml
 
 if TYPE_CHECKING:
     from studies.strangers.containers import Topic
 
 #: GPS time is ahead of UTC by 18 leap seconds, and began 315964800 s after 1970.
 _GPS_NS, _WEEK_NS, _DAY_NS = (18 - 315_964_800) * 10**9, 604_800 * 10**9, 86_400 * 10**9
-#: Text files, documented in their file.
-_DIALECTS = tomllib.loads(Path(__file__).with_name("dialects.toml").read_text(encoding="utf-8"))
+#: Text files and files of nested tables, documented in their files.
+_DIALECTS, _DOCUMENTS = (read_toml(Path(__file__).with_name(f"{name}.toml")) for name in ("dialects", "documents"))
 
 
 def _columns(topics: Sequence[Topic]) -> tuple[IntArray, dict[str, NDArray[np.float64]]]:
@@ -39,21 +42,18 @@ def _columns(topics: Sequence[Topic]) -> tuple[IntArray, dict[str, NDArray[np.fl
     return stamps, columns
 
 
-def _split(title: str) -> tuple[str, str]:
-    name, _, unit = title.partition(" [")
-    return name, unit.rstrip("]")
-
-
 def _times(stamp: int, start: int, i: int) -> dict[str, Any]:
     """Return the spellings of a time in ns, by the names of ``dialects.toml``."""
     at = dt.datetime.fromtimestamp(stamp // 10**9, tz=dt.UTC) + dt.timedelta(microseconds=stamp % 10**9 // 1000)
     week, tow = divmod(stamp + _GPS_NS, _WEEK_NS)
+    day_s = stamp % _DAY_NS / 1e9
     since = {"s": 1e9, "ms": 1e6, "us": 1e3}
     units = {"": 1e9, "_ms": 1e6, "_us": 1e3}
     return {
         "i": i, "at": at, "second": stamp // 10**9, "milli": at.microsecond // 1000, "micro": at.microsecond,
         "nano": stamp % 10**9, "week": week, "tow": tow / 1e9, "fine": (stamp - start) // 100_000,
-        "day": stamp % _DAY_NS / 1e9, "days": stamp / _DAY_NS, "unix_ns": stamp,
+        "day": day_s, "days": stamp / _DAY_NS, "unix_ns": stamp,
+        "clock": day_s // 3600 * 1e4 + day_s % 3600 // 60 * 1e2 + day_s % 60,
         **{name: (stamp - start) / ns for name, ns in since.items()},
         **{f"unix{name}": stamp / ns for name, ns in units.items()},
     }  # fmt: skip
@@ -67,22 +67,24 @@ def _text(dialect: str, path: Path, topics: Sequence[Topic]) -> None:
     cells = {f"{key}s": [p[key] for p in parts] for key in ("title", "source", "group")}
     cells |= {f"{key}s": [form[key].format(**p) for p in parts] for key in ("name", "unit")}
     cells["numbers"] = [str(i) for i in range(12, 12 + len(titles))]
-    cells["channels"] = [form["channel"].format(number=i, **p) for i, p in enumerate(parts, 1)]
+    lines_of = {
+        "channels": [form["channel"].format(number=i, **p) for i, p in enumerate(parts, 1)],
+        "modules": [p["unit"] for p in parts if p["unit"].strip()],
+    }
     start = min(int(t.arrival_ns[0]) for t in topics)
-    above = {
-        name: ("\n" if name == "channels" else form["separator"]).join(row) for name, row in cells.items()
-    } | _times(start, start, 0)
-    rows = {"table": _table_rows, "samples": _sample_rows}.get(form["rows"], _value_rows)(form, topics, start)
+    above = {name: form["separator"].join(row) for name, row in cells.items()} | _times(start, start, 0)
+    above |= {name: "\n".join(lines) for name, lines in lines_of.items()}
+    rows = _ROWS[form["rows"]](form, topics, start)
     rows = (row.replace(".", form["decimal"]) for row in rows)
-    lines = [*(line.format(**above) for line in form["head"]), *rows, *form["tail"], ""]
-    path.write_bytes(form["newline"].join(lines).encode(form["encoding"]))
+    text = "\n".join([*(line.format(**above) for line in form["head"]), *rows, *form["tail"], ""])
+    path.write_bytes(text.replace("\n", form["newline"]).encode(form["encoding"]))
 
 
 def _parts(title: str) -> dict[str, str]:
     """Return the parts of a title: ``name [unit|source]`` or ``group|name``."""
-    name, unit = _split(title)
+    name, _, unit = title.partition(" [")
     group, _, name = name.rpartition("|")
-    unit, _, source = unit.partition("|")
+    unit, _, source = unit.rstrip("]").partition("|")
     return {"title": title, "name": name, "unit": unit, "source": source, "group": group}
 
 
@@ -100,8 +102,15 @@ def _table_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> It
 
 
 def _value_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
-    rows = sorted(_long_rows(topics), key=lambda row: row[1] if form["rows"] == "series" else "")
+    for i, (stamp, name, value, unit) in enumerate(_long_rows(topics)):
+        yield form["row"].format(name=name, value=value, unit=unit, **_times(stamp, start, i))
+
+
+def _series_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
+    rows = sorted(_long_rows(topics), key=lambda row: row[1])
     for i, (stamp, name, value, unit) in enumerate(rows):
+        if not i or name != rows[i - 1][1]:
+            yield from (line.format(name=name, unit=unit) for line in form["above"])
         yield form["row"].format(name=name, value=value, unit=unit, **_times(stamp, start, i))
 
 
@@ -113,321 +122,114 @@ def _sample_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> I
         yield form["row"].format(topic=topic.name.strip("/"), fields=fields, **_times(stamp, start, i))
 
 
-def _own_times(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a measurement tool's export: each device's columns follow a column of its own times."""
-    start = min(int(t.arrival_ns[0]) for t in topics)
-    columns = []
-    for topic in topics:
-        columns.append(["time [s]", *(f"{(s - start) / 1e9:.4f}" for s in topic.arrival_ns.tolist())])
-        columns += [[title, *(f"{v:.6g}" for v in values.tolist())] for title, values in topic.fields.items()]
-    length = max(map(len, columns))
-    rows = zip(*([*column, *[""] * (length - len(column))] for column in columns), strict=True)
-    path.write_text("\n".join([*map(";".join, rows), ""]), encoding="utf-8")
-
-
-def _blocks(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a race data program's export: a block of times and values for each signal, one below the other."""
-    lines = ["PiToolboxVersionedASCIIDataSet", "Version\t2", "", "{OutingInformation}", "CarName\tcar 3"]
-    for seconds, name, unit, values in _signals(topics):
-        lines += ["", "{ChannelBlock}", f"Time\t{name}[{unit}]"]
-        lines += [f"{at:.3f}\t{v:.6g}" for at, v in zip(seconds.tolist(), values.tolist(), strict=True)]
-    path.write_bytes("\r\n".join([*lines, ""]).encode("cp1252"))
-
-
-def _stamps(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a workshop tester's log: groups side by side, each with a column of its own times."""
-    start = min(int(t.arrival_ns[0]) for t in topics)
-    columns = [["", "", "", "Marker"]]
+def _side_by_side(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
+    """Yield the rows of groups side by side: a column of times, and the columns of their values."""
+    columns = [form["margin"]] if form["margin"] else []
     for number, topic in enumerate(topics):
-        times = [f"{(s - start) / 1e9:.2f}" for s in topic.arrival_ns.tolist()]
-        columns.append([f"Group {'ABC'[number]}:", "", "TIME", "STAMP", *times])
-        for i, (title, values) in enumerate(topic.fields.items(), 1):
-            name, unit = _split(title)
-            above = [f"'{number + 4:03d}" if i == 1 else "", name, "", f" {unit}"]
-            columns.append([*above, *(f"{v:.2f}" for v in values.tolist())])
+        group = {"letter": "ABC"[number], "number": f"'{number + 4:03d}"}
+        times = (form["clock"][0].format(**_times(stamp, start, 0)) for stamp in topic.arrival_ns.tolist())
+        columns.append([*(cell.format(**group) for cell in form["times"]), *times])
+        for title, values in topic.fields.items():
+            above = [cell.format(**_parts(title) | group) for cell in form["above"]]
+            columns.append([*above, *(form["number"].format(value=v) for v in values.tolist())])
+            group["number"] = ""  # only above the first column of a group
     length = max(map(len, columns))
-    rows = zip(*([*column, *[""] * (length - len(column))] for column in columns), strict=True)
-    head = ["Monday,24,November,2025,14:05:12:00125", "1K0 907 379 AC,ESP MK60EC1  H31 0121"]
-    path.write_text("\n".join([*head, *map(",".join, rows), ""]), encoding="latin-1")
+    padded = ([*column, *[""] * (length - len(column))] for column in columns)
+    yield from map(form["separator"].join, zip(*padded, strict=True))
+
+
+_ROWS: dict[str, Callable[[dict[str, Any], Sequence[Topic], int], Iterator[str]]] = {
+    "table": _table_rows, "samples": _sample_rows, "values": _value_rows, "series": _series_rows,
+    "columns": _side_by_side,
+}  # fmt: skip
 
 
 def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     """Return a row for each value: time in ns, signal, value, unit."""
     rows = [
-        (stamp, *_split(title)[:1], value, _split(title)[1])
+        (stamp, parts["name"], value, parts["unit"])
         for topic in topics
-        for title, values in topic.fields.items()
+        for parts, values in ((_parts(title), values) for title, values in topic.fields.items())
         for stamp, value in zip(topic.arrival_ns.tolist(), values.tolist(), strict=True)
     ]
     return sorted(rows)
 
 
-def _measures_parquet(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a fleet's events: a row for each value, in the column of its type."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    stamps, names, values, _ = (list(column) for column in zip(*_long_rows(topics), strict=True))
-    table = {"eventId": ["7f"] * len(names), "vehicleName": ["car-7"] * len(names), "name": names}
-    table |= {"time": [stamp // 10**6 for stamp in stamps], "measure_value_BOOLEAN": [None] * len(names)}
-    pq.write_table(pa.table({**table, "measure_value_DOUBLE": values}), path)
+# ------------------------------------------------------------------------------------------------ nested tables
 
 
-def _long_parquet(path: Path, topics: Sequence[Topic]) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    stamps, names, values, units = (list(column) for column in zip(*_long_rows(topics), strict=True))
-    clock = pa.array(np.array(stamps, "datetime64[ns]"))
-    table = {"signal_name": pa.array(names).dictionary_encode(), "time": clock, "value": values, "unit": units}
-    pq.write_table(pa.table(table), path)
-
-
-def _nested_parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    rows: list[dict[str, Any]] = [{"event_time": stamp // 1000} for stamp in stamps.tolist()]
-    for title, values in columns.items():
-        *parents, leaf = title.split(".")
-        for row, value in zip(rows, values.tolist(), strict=True):
-            for parent in parents:
-                row = row.setdefault(parent, {})
-            row[leaf] = None if np.isnan(value) else value
-    table = pa.Table.from_pylist(rows)
-    clock = table.column("event_time").cast(pa.timestamp("us", "UTC"))
-    pq.write_table(table.set_column(0, "event_time", clock), path)
-
-
-def _vbo(path: Path, stamps: IntArray, columns: dict[str, Any], fewer: int = 0) -> None:
-    """Write the columns of one topic: titles with units belong to input modules, and come last.
-
-    ``fewer`` units than modules are written.
-    """
-    titles = list(columns)
-    modules = [_split(t) for t in titles if "[" in t]
-    named = [t for t in titles if "[" not in t]
-    day = stamps % (86_400 * 10**9) / 1e9
-    clock = day // 3600 * 1e4 + day % 3600 // 60 * 1e2 + day % 60
-    created = dt.datetime.fromtimestamp(int(stamps[0] // 10**9), tz=dt.UTC)
-    header = ["satellites", "time", *named, *(name for name, _ in modules)]
-    lines = [f"File created on {created:%d/%m/%Y @ %H:%M}", "", "[header]", *header, "", "[channel units]"]
-    lines += [*(unit for _, unit in modules[: len(modules) - fewer]), "", "[comments]", "", "[data]"]
-    table = np.stack([columns[t] for t in [*named, *(t for t in titles if "[" in t)]], axis=1)
-    lines += [
-        f"012 {t:010.3f} " + " ".join(f"{v:+.8E}" for v in row)
-        for t, row in zip(clock.tolist(), table.tolist(), strict=True)
-    ]
-    path.write_bytes("\r\n".join([*lines, ""]).encode("latin-1"))
-
-
-def _mat(path: Path, topics: Sequence[Topic]) -> None:
-    from scipy.io import savemat
-
-    structs: dict[str, Any] = {}
-    for topic in topics:
-        structs[topic.name.strip("/")] = {"time": topic.arrival_ns * 1e-9, **topic.fields}
-    savemat(path, structs)
-
-
-def _mat_runs(path: Path, topics: Sequence[Topic]) -> None:
-    """Write several runs: a struct for each, with the topics ``/RUN/DEVICE`` as structs of vectors."""
-    from scipy.io import savemat
-
-    runs: dict[str, dict[str, Any]] = {}
-    for topic in topics:
-        _, run, device = topic.name.split("/")
-        seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
-        runs.setdefault(run, {})[device] = {"time": seconds, **topic.fields}
-    savemat(path, runs)
-
-
-def _signals(topics: Sequence[Topic]) -> Iterator[tuple[NDArray[np.float64], str, str, NDArray[np.float64]]]:
-    """Yield times in s since the first one, name, unit and values of each signal."""
+def _signals(topics: Sequence[Topic]) -> Iterator[dict[str, Any]]:
+    """Yield the texts and columns of each signal, as ``documents.toml`` names them."""
     start = topics[0].arrival_ns[0]
-    for topic in topics:
-        yield from (((topic.arrival_ns - start) * 1e-9, *_split(title), v) for title, v in topic.fields.items())
-
-
-def _mat_series(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a struct for each signal, as MATLAB's timeseries become."""
-    from scipy.io import savemat
-
-    series = {n: {"Name": n, "Time": s, "Data": v, "DataInfo": {"Units": u}} for s, n, u, v in _signals(topics)}
-    savemat(path, {"data": series})
-
-
-def _mat_pairs(path: Path, topics: Sequence[Topic]) -> None:
-    """Write two vectors for each signal, its values and its times."""
-    from scipy.io import savemat
-
-    vectors: dict[str, Any] = {"Sample_rate": 100.0, "Start_time": "2025/11/24 14:05:12.125"}
-    for seconds, name, _, values in _signals(topics):
-        vectors |= {f"Data1_time_{name}": seconds, f"Data1_{name}": values}
-    savemat(path, vectors)
-
-
-def _mat_quantities(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a struct of quantities, each with data, unit and number of states, as a simulator's reader returns them."""
-    from scipy.io import savemat
-
-    quantities = {n: {"data": v, "unit": u, "nstates": 0.0} for _, n, u, v in _signals(topics)}
-    seconds = next(_signals(topics))[0]
-    savemat(path, {"data": {"Time": {"data": seconds, "unit": "s", "nstates": 0.0}, **quantities}})
-
-
-def _mat_columns(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a matrix of times and values for each signal."""
-    from scipy.io import savemat
-
-    savemat(path, {name: np.stack([seconds, values], 1) for seconds, name, _, values in _signals(topics)})
-
-
-def _mat_names(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a matrix, and the names and units of its columns as cells."""
-    from scipy.io import savemat
-
-    seconds, columns = next(_signals(topics))[0], [*_signals(topics)]
-    cells = {"names": ["Time", *(n for _, n, _, _ in columns)], "units": ["s", *(u for _, _, u, _ in columns)]}
-    table = {"data": np.stack([seconds, *(v for *_, v in columns)], 1)}
-    savemat(path, table | {key: np.array(texts, dtype=object) for key, texts in cells.items()})
-
-
-def _mat_values(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a struct for each channel with its times, values and units."""
-    from scipy.io import savemat
-
-    savemat(path, {n: {"Time": s, "Value": v, "Units": u} for s, n, u, v in _signals(topics)})
-
-
-def _mat_recorder(path: Path, topics: Sequence[Topic]) -> None:
-    """Write one struct with axes X and signals Y, as a real-time recorder exports."""
-    from scipy.io import savemat
-
-    record: dict[str, Any] = {"X": [], "Y": [], "Description": {"General": "recorder"}}
-    for number, topic in enumerate(topics, 1):
-        seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
-        record["X"].append({"Name": f"t{number}", "Data": seconds, "Unit": "s"})
+    for index, topic in enumerate(topics):
+        ns = topic.arrival_ns
+        seconds = (ns - start) * 1e-9
+        run, _, device = topic.name.strip("/").partition("/")
+        of_topic = {
+            "topic": topic.name.strip("/"), "run": run, "device": device, "number": index + 1, "index": index,
+            "axis": index + 1.0,
+            "clock": ns * 1e-9, "stamps": ns, "us": ns // 1000, "ms": ns // 10**6, "seconds": seconds,
+            "rate": round(1.0 / float(np.median(np.diff(seconds))), 3), "start_ms": int(start // 10**6),
+        }  # fmt: skip
         for title, values in topic.fields.items():
-            name, unit = _split(title)
-            record["Y"].append({"Name": name, "Data": values, "Unit": unit, "XIndex": float(number)})
-    savemat(path, {"rec1_001": record})
+            pairs = {"pairs": np.stack([seconds, values], 1), "us_pairs": np.stack([ns // 1000, values], 1)}
+            yield of_topic | _parts(title) | pairs | {"values": values, "column": values.reshape(-1, 1)}
 
 
-def _mat_scope(path: Path, topics: Sequence[Topic]) -> None:
-    """Write what a scope logged: a struct for each topic, with the time and a struct array of signals."""
+#: Columns of several signals.
+_OF_SEVERAL: dict[str, Callable[[Sequence[Mapping[str, Any]]], Any]] = {
+    "table": lambda signals: np.stack([signals[0]["seconds"], *(s["values"] for s in signals)], 1),
+    "frame": lambda signals: np.stack([s["values"] for s in signals], 1),
+    "labels": lambda signals: np.array([s["title"] for s in signals], "S"),
+    "rows": lambda signals: pl.DataFrame(
+        {s["title"]: s["values"] for s in signals} | {"timestamp": signals[0]["ms"]}
+    ).to_dicts(),
+}
+
+
+def _filled(template: Any, signals: Sequence[Mapping[str, Any]]) -> Any:
+    """Return the document of a template for signals."""
+    if isinstance(template, str):
+        column = template[1:]
+        if template[:1] != "@":
+            return template.format(**signals[0])
+        return _OF_SEVERAL[column](signals) if column in _OF_SEVERAL else signals[0][column]
+    if not isinstance(template, dict):
+        return template
+    made: dict[str, Any] = {}
+    for key, name in dict.fromkeys((key, key.format(**signal)) for signal in signals for key in template):
+        made[name] = _filled(template[key], [s for s in signals if key.format(**s) == name])
+    entries, first = list(made.values()), next(iter(made))
+    if first.startswith("()"):
+        return np.array([tuple(entry.values()) for entry in entries], [(name, object) for name in entries[0]])
+    return np.array(entries, object) if first.startswith("[]") else made
+
+
+def _write_mat(path: Path, document: dict[str, Any]) -> None:
     from scipy.io import savemat
 
-    kind = [("values", object), ("dimensions", object), ("label", object)]
-    scopes = {}
-    for topic in topics:
-        signals = [(values.reshape(-1, 1), 1.0, title) for title, values in topic.fields.items()]
-        seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
-        scopes[topic.name.strip("/")] = {
-            "time": seconds,
-            "signals": np.array(signals, kind),
-            "blockName": "model/Scope",
-        }
-    savemat(path, scopes)
+    savemat(path, document)
 
 
-def _json_lists(path: Path, topics: Sequence[Topic]) -> None:
-    """Write one document: a list of objects for each topic, with times in ms."""
-    document: dict[str, Any] = {"rideID": "7f", "startTime": int(topics[0].arrival_ns[0] // 10**6)}
-    for topic in topics:
-        columns = zip(*(values.tolist() for values in topic.fields.values()), strict=True)
-        document[topic.name.strip("/")] = [
-            {**dict(zip(topic.fields, row, strict=True)), "timestamp": stamp // 10**6}
-            for stamp, row in zip(topic.arrival_ns.tolist(), columns, strict=True)
-        ]
-    path.write_text(json.dumps(document), encoding="utf-8")
+def _write_json(path: Path, document: dict[str, Any]) -> None:
+    path.write_text(json.dumps(document, default=lambda array: array.tolist()), encoding="utf-8")
 
 
-def _mat_groups(path: Path, topics: Sequence[Topic]) -> None:
-    """Write vectors named by the data groups of a measurement file, and those of their masters."""
-    from scipy.io import savemat
-
-    vectors: dict[str, Any] = {}
-    for i, topic in enumerate(topics):
-        vectors[f"DGM{i}_time"] = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
-        vectors |= {f"DG{i}_{name}": values for name, values in topic.fields.items()}
-    savemat(path, vectors)
-
-
-def _json_signals(path: Path, topics: Sequence[Topic]) -> None:
-    """Write one document: for each signal its unit, and pairs of a time in µs and a value."""
-    signals = {
-        _split(title)[0]: {"unit": _split(title)[1] or None, "values": np.stack([t.arrival_ns // 1000, v], 1).tolist()}
-        for t in topics
-        for title, v in t.fields.items()
-    }
-    path.write_text(json.dumps(signals), encoding="utf-8")
-
-
-def _json_channels(path: Path, topics: Sequence[Topic]) -> None:
-    """Write one document: a list of channels with name, unit, rate and data."""
-    rates = ((round(1.0 / float(np.median(np.diff(s))), 3), n, u, v) for s, n, u, v in _signals(topics))
-    channels = [{"name": n, "unit": u, "samplerate": rate, "data": v.tolist()} for rate, n, u, v in rates]
-    meta = {"vehicle": "car 3", "start": "2025-11-24T14:05:12.125Z"}
-    path.write_text(json.dumps({"meta": meta, "channels": channels}), encoding="utf-8")
-
-
-def _json_columns(path: Path, topics: Sequence[Topic]) -> None:
-    """Write one document: an object for each topic, with a list for each column."""
-    start = topics[0].arrival_ns[0]
-    columns = {
-        t.name.strip("/"): {
-            "time": ((t.arrival_ns - start) * 1e-9).tolist(),
-            **{n: v.tolist() for n, v in t.fields.items()},
-        }
-        for t in topics
-    }
-    path.write_text(json.dumps(columns), encoding="utf-8")
-
-
-def _hdf5(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a group for each topic: a dataset of times in ns, and datasets with their units as attributes."""
+def _write_hdf5(path: Path, document: dict[str, Any]) -> None:
     import h5py
 
-    with h5py.File(path, "w") as file:
-        for topic in topics:
-            group = file.create_group(topic.name.strip("/"))
-            group["timestamp"] = topic.arrival_ns
-            for title, values in topic.fields.items():
-                name, unit = _split(title)
-                group.create_dataset(name, data=values, compression="gzip").attrs["unit"] = unit
-
-
-def _hdf5_frame(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a data frame in the fixed format: names, index, and blocks of values."""
-    import h5py
+    def put(group: Any, entries: dict[str, Any]) -> None:
+        for name, value in entries.items():
+            if not isinstance(value, dict):
+                group[name] = value
+            elif "=" in value:
+                attributes = {key: text for key, text in value.items() if key != "="}
+                group.create_dataset(name, data=value["="], compression="gzip").attrs.update(attributes)
+            else:
+                put(group.create_group(name), value)
 
     with h5py.File(path, "w") as file:
-        names = np.array([name for topic in topics for name in topic.fields], "S")
-        frame = file.create_group("df")
-        frame["axis0"], frame["block0_items"] = names, names
-        frame["axis1"] = topics[0].arrival_ns * 1e-9
-        frame["block0_values"] = np.stack([v for topic in topics for v in topic.fields.values()], 1)
-
-
-def _hdf5_pairs(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a matrix of times and values for each signal, with its unit as an attribute."""
-    import h5py
-
-    with h5py.File(path, "w") as file:
-        for seconds, name, unit, values in _signals(topics):
-            file.create_dataset(f"channels/{name}", data=np.stack([seconds, values], 1)).attrs["unit"] = unit
-
-
-def _hdf5_signals(path: Path, topics: Sequence[Topic]) -> None:
-    """Write a group for each signal: its values, and their times in µs."""
-    import h5py
-
-    with h5py.File(path, "w") as file:
-        for topic in topics:
-            for title, values in topic.fields.items():
-                group = file.create_group(_split(title)[0])
-                group["timestamp"], group["data"] = topic.arrival_ns // 1000, values
+        put(file, document)
 
 
 def _mat_hdf5(path: Path, topics: Sequence[Topic]) -> None:
@@ -445,22 +247,55 @@ def _mat_hdf5(path: Path, topics: Sequence[Topic]) -> None:
         raw.write(head)
 
 
-def _parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+# ------------------------------------------------------------------------------------------------ Parquet and MDF
 
+
+def nested(row: dict[str, Any], path: str, value: Any) -> None:
+    """Put a value into a nested row at a dotted path."""
+    *parents, leaf = path.split(".")
+    for name in parents:
+        row = row.setdefault(name, {})
+    row[leaf] = value
+
+
+def _parquet(path: Path, topics: Sequence[Topic]) -> None:
+    stamps, columns = _columns(topics)
+    parts = [_parts(title) for title in columns]
     fields = [pa.field("t", pa.timestamp("ns"))]
-    split = [(_split(title), values) for title, values in columns.items()]
-    fields += [pa.field(name, pa.float64(), metadata={"unit": unit}) for (name, unit), _ in split]
-    arrays = [pa.array(stamps.astype("datetime64[ns]")), *(pa.array(values, from_pandas=True) for _, values in split)]
+    fields += [pa.field(p["name"], pa.float64(), metadata={"unit": p["unit"]}) for p in parts]
+    arrays = [pa.array(stamps.astype("datetime64[ns]")), *(pa.array(v, from_pandas=True) for v in columns.values())]
     pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), path)
 
 
-def _seconds_parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+def _seconds_parquet(path: Path, topics: Sequence[Topic]) -> None:
+    stamps, columns = _columns(topics)
     pq.write_table(pa.table({**columns, "timestamps": (stamps - stamps[0]) * 1e-9}), path)
+
+
+def _nested_parquet(path: Path, topics: Sequence[Topic]) -> None:
+    stamps, columns = _columns(topics)
+    rows: list[dict[str, Any]] = [{"event_time": stamp // 1000} for stamp in stamps.tolist()]
+    for title, values in columns.items():
+        for row, value in zip(rows, values.tolist(), strict=True):
+            nested(row, title, None if np.isnan(value) else value)
+    table = pa.Table.from_pylist(rows)
+    clock = table.column("event_time").cast(pa.timestamp("us", "UTC"))
+    pq.write_table(table.set_column(0, "event_time", clock), path)
+
+
+def _long_parquet(path: Path, topics: Sequence[Topic]) -> None:
+    stamps, names, values, units = (list(column) for column in zip(*_long_rows(topics), strict=True))
+    clock = pa.array(np.array(stamps, "datetime64[ns]"))
+    table = {"signal_name": pa.array(names).dictionary_encode(), "time": clock, "value": values, "unit": units}
+    pq.write_table(pa.table(table), path)
+
+
+def _measures_parquet(path: Path, topics: Sequence[Topic]) -> None:
+    """Write a fleet's events: a row for each value, in the column of its type."""
+    rows = pl.DataFrame(_long_rows(topics), ["stamp", "name", "value", "unit"], orient="row")
+    events = {"eventId": pl.lit("7f"), "vehicleName": pl.lit("car-7"), "name": pl.col("name")}
+    events |= {"time": pl.col("stamp") // 10**6, "measure_value_BOOLEAN": pl.lit(None, pl.Boolean)}
+    rows.select(**events, measure_value_DOUBLE="value").write_parquet(path)
 
 
 def _mdf(path: Path, topics: Sequence[Topic]) -> None:
@@ -472,61 +307,39 @@ def _mdf(path: Path, topics: Sequence[Topic]) -> None:
         file.start_time = dt.datetime.fromtimestamp(start // 10**9, tz=dt.UTC)
         for topic in topics:
             clock = (topic.arrival_ns - start) * 1e-9
-            named = ((_split(title), values) for title, values in topic.fields.items())
-            signals = [asammdf.Signal(v, clock, name=name, unit=unit) for (name, unit), v in named]
+            named = ((_parts(title), values) for title, values in topic.fields.items())
+            signals = [asammdf.Signal(v, clock, name=p["name"], unit=p["unit"]) for p, v in named]
             file.append(signals, comment=topic.name.strip("/"), common_timebase=True)
         file.save(path, overwrite=True)
 
 
-_TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]] = {
-    "parquet-nested": (".parquet", _nested_parquet),
-    "parquet": (".parquet", _parquet),
-    "parquet-seconds": (".parquet", _seconds_parquet),
-    "vbo": (".vbo", _vbo),
-    "vbo-fewer": (".vbo", partial(_vbo, fewer=1)),
-}
-_GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
-    **{n: (d.get("suffix", ".csv"), partial(_text, n)) for n, d in _DIALECTS.items()},
-    "csv-times": (".csv", _own_times),
-    "txt-blocks": (".txt", _blocks),
-    "csv-stamps": (".csv", _stamps),
-    "mat-quantities": (".mat", _mat_quantities),
-    "json-lists": (".json", _json_lists),
-    "parquet-long": (".parquet", _long_parquet),
-    "mat": (".mat", _mat),
-    "mat-runs": (".mat", _mat_runs),
-    "mat-series": (".mat", _mat_series),
-    "mat-recorder": (".mat", _mat_recorder),
+#: Suffix and writer of the document by the begin of a template's name.
+_KINDS = {"mat": (".mat", _write_mat), "json": (".json", _write_json), "hdf5": (".h5", _write_hdf5)}
+_PARQUET = {
+    "parquet": _parquet, "parquet-nested": _nested_parquet, "parquet-seconds": _seconds_parquet,
+    "parquet-long": _long_parquet, "parquet-measures": _measures_parquet,
+}  # fmt: skip
+_WRITERS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
+    **{name: (form.get("suffix", ".csv"), partial(_text, name)) for name, form in _DIALECTS.items()},
+    **{name: (".parquet", put) for name, put in _PARQUET.items()},
     "mat-7.3": (".mat", _mat_hdf5),
-    "mat-pairs": (".mat", _mat_pairs),
-    "mat-scope": (".mat", _mat_scope),
-    "mat-columns": (".mat", _mat_columns),
-    "mat-groups": (".mat", _mat_groups),
-    "json-signals": (".json", _json_signals),
-    "json-columns": (".json", _json_columns),
-    "json-channels": (".json", _json_channels),
-    "mat-values": (".mat", _mat_values),
-    "mat-names": (".mat", _mat_names),
-    "hdf5": (".h5", _hdf5),
-    "hdf5-signals": (".hdf5", _hdf5_signals),
-    "hdf5-frame": (".h5", _hdf5_frame),
-    "hdf5-pairs": (".h5", _hdf5_pairs),
-    "parquet-measures": (".parquet", _measures_parquet),
     "mdf": (".mf4", _mdf),
 }
 
 
+def _write(container: str, topics: Sequence[Topic], path: Path) -> Path:
+    if container in _DOCUMENTS:
+        suffix, put = _KINDS[container.partition("-")[0]]
+        template = dict(_DOCUMENTS[container])
+        suffix = template.pop("suffix", suffix)
+        put(path.with_suffix(suffix), _filled(template, list(_signals(topics))))
+    else:
+        suffix, write = _WRITERS[container]
+        write(path.with_suffix(suffix), topics)
+    return path.with_suffix(suffix)
+
+
 def writers() -> Iterator[tuple[str, Callable[[Sequence[Topic], Path], Path]]]:
     """Yield the containers and their writers, which return the path with the suffix."""
-    for name in (*_TABLES, *_GROUPS):
+    for name in (*_DOCUMENTS, *_WRITERS):
         yield name, partial(_write, name)
-
-
-def _write(container: str, topics: Sequence[Topic], path: Path) -> Path:
-    if container in _GROUPS:
-        suffix, put = _GROUPS[container]
-        put(path.with_suffix(suffix), topics)
-    else:
-        suffix, write = _TABLES[container]
-        write(path.with_suffix(suffix), *_columns(topics))
-    return path.with_suffix(suffix)

@@ -17,21 +17,22 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
+from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
 from studies.pages import DOCS, ROOT, fill, options, table, write
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
-from studies.torture.hours import write_hours
 from studies.torture.mutants import HANG_S, format_judge, log_judge
-from studies.torture.outside import measured
 from studies.torture.seeds import FORMATS
-from studies.torture.workers import NO_VERDICT, Verdict, judge, run_cases
+from studies.torture.workers import NO_VERDICT, Verdict, judge, measured, run_cases
 
+_IMU = "/imu/data"
+_TOPICS = (_IMU, "/vehicle/status/steering_status", "/vehicle/wheel_speeds", "/truth/perfect/odometry")
 _THREE = ("run", "--car", "saloon", "--annotate", "none", "--estimators", "zero,kinematic,phy-ukf")
 
 
@@ -46,10 +47,10 @@ def judged(given: argparse.Namespace, name: str) -> dict[str, Any]:
         "seed": seed,
         "wall_s": time.monotonic() - begin,
         "count": count,
-        "ends": dict(sorted(Counter(case.end for case in cases).items())),
-        "problems": [(case.number, case.problem[-800:]) for case in cases if case.problem],
-        "slowest_s": max((case.wall_s for case in cases), default=0.0),
-        "peak_bytes": max((case.peak_bytes for case in cases), default=0),
+        "ends": dict(sorted(Counter(case.end for case in cases.values()).items())),
+        "problems": [(number, case.problem[-800:]) for number, case in cases.items() if case.problem],
+        "slowest_s": max((case.costs.get("s", 0.0) for case in cases.values()), default=0.0),
+        "peak_bytes": max((int(case.costs.get("bytes", 0)) for case in cases.values()), default=0),
     }
 
 
@@ -66,6 +67,21 @@ def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdi
         collected.append({"name": name, "end": verdict.end, "problem": verdict.problem, **verdict.costs})
         _say(f"{part}: {name}: {verdict.end}{verdict.problem and ', WRONG: ' + verdict.problem}")
     return collected
+
+
+def write_hours(path: Path, hours: float) -> None:
+    """Write a log of the given hours: the sample road drive repeated, each time from the end of the last one."""
+    once = [m for m in messages(ROOT / "sample_logs" / "road.mcap") if m.topic in _TOPICS]
+    imu_ns = [m.log_time_ns for m in once if m.topic == _IMU]
+    lasts_ns = imu_ns[-1] - imu_ns[0] + 10_000_000
+
+    def repeated() -> Iterator[Message]:
+        for shift_ns in range(0, round(hours * 3600e9 / lasts_ns) * lasts_ns, lasts_ns):
+            for m in once:
+                at_ns, published_ns = m.log_time_ns + shift_ns, m.publish_time_ns + shift_ns
+                yield stamped(m, stamp_ns(m) + shift_ns)._replace(log_time_ns=at_ns, publish_time_ns=published_ns)
+
+    write_log(path, repeated(), "ros2")
 
 
 def long_log(hours: float, words: Sequence[str], folder: Path) -> Verdict:
@@ -168,14 +184,13 @@ def main() -> int:
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
+        former = json.loads(kept.read_text()) if kept.is_file() else None
         again = name == "formats" and given.format
-        if (again or not kept.is_file()) and (not parts or name in parts):
-            done = do()
-            if again and kept.is_file():
-                done = json.loads(kept.read_text()) | done
-            kept.write_text(json.dumps(done, indent=1))
-        if kept.is_file():
-            results[name] = json.loads(kept.read_text())
+        if (again or former is None) and (not parts or name in parts):
+            former = (former or {}) | do() if again else do()
+            kept.write_text(json.dumps(former, indent=1))
+        if former is not None:
+            results[name] = json.loads(json.dumps(former))
     if given.out.is_file():
         counts = f"--logs {given.logs} --count {given.count}"
         counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"

@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from studies.pages import ROOT
-from studies.torture.mutating import MAGIC, Record, join_bag, join_mcap
-from studies.torture.outside import measured
+from studies.torture.damage import ENDLESS_VIEW, MAGIC, Record, join_bag, join_mcap
 from studies.torture.seeds import SEEDS, START_NS
-from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Verdict, judge
+from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Verdict, judge, measured
 
 _NO_LOG, _EITHER, _SOUND, _ANY = (1,), (1, 3), (0, 3), (0, 1, 3)
 _PAST_NS = START_NS - 315_360_000 * 10**9
@@ -194,10 +193,6 @@ def _database(statement: str, folder: Path) -> Path:
     return path
 
 
-_ENDLESS = (
-    "DROP TABLE messages; CREATE VIEW messages AS WITH RECURSIVE r(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM r) "
-    "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM r"
-)
 _HUGE_ROW = (
     "CREATE TABLE rows AS SELECT * FROM messages; DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, "
     "topic_id INTEGER, timestamp INTEGER, data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL); "
@@ -301,7 +296,7 @@ BOMBS = (
     Bomb("20 GiB of nothing behind a header", _sparse, _EITHER),
     Bomb("metadata.yaml that unfolds to 10^11 names", partial(_metadata, _laughs()), (1, 2)),
     Bomb("metadata.yaml 3000 deep", partial(_metadata, "rosbag2_bagfile_information: " + "[" * 3000), (1, 2)),
-    Bomb("database whose messages are an endless view", partial(_database, _ENDLESS), _EITHER),
+    Bomb("database whose messages are an endless view", partial(_database, ENDLESS_VIEW), _EITHER),
     Bomb("database whose rows are 900 MB of nothing each", partial(_database, _HUGE_ROW), _EITHER),
 )
 

@@ -11,11 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from studies.torture.mutating import mutant
-from studies.torture.outside import measured
+from studies.torture.damage import mutant, table_mutant
 from studies.torture.seeds import FORMATS, table_seeds, write_seeds
-from studies.torture.table_damage import table_mutant
-from studies.torture.workers import LIMIT_BYTES, Verdict, command, judge
+from studies.torture.workers import LIMIT_BYTES, Verdict, command, judge, measured
 
 RUN_EVERY = 100
 _RUN = ("--car", "saloon", "--estimators", "zero,kinematic,phy-ukf")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -26,6 +28,9 @@ _OWN = {
 }
 
 
+_SCHEMA = Path(__file__).with_name("state.schema.json").read_bytes().strip()
+
+
 @dataclass(frozen=True, slots=True)
 class Message:
     """One message: topic, ROS 2 type, time, payload as CDR and as plain values."""
@@ -37,46 +42,38 @@ class Message:
     values: dict[str, Any]
 
 
-def messages() -> list[Message]:
-    """Return a car that turns: IMU, odometry as ground truth, and an unknown type."""
+def messages() -> Iterator[Message]:
+    """Yield a car that turns: IMU, odometry as ground truth, and an unknown type."""
     store = _store("LATEST")
-    types = store.types
+    # Zeros, and texts of length 1: of frame_id, and of child_frame_id behind it.
+    texts = b"\0\1\0\0" + bytes(8) + b"\1" + bytes(7)
+    imu = store.deserialize_cdr(texts.ljust(316, b"\0"), "sensor_msgs/msg/Imu")
+    odometry = store.deserialize_cdr((texts + b"\1").ljust(708, b"\0"), "nav_msgs/msg/Odometry")
+    imu.orientation.w = odometry.pose.pose.orientation.w = 1.0
+    odometry.child_frame_id, odometry.header = "base", imu.header
+    imu.header.frame_id = "base"
     steering_type, speed_type = _OWN
-    written = []
     for i in range(int(_RATE_HZ * _SECONDS)):
         stamp_ns, t = START_NS + i * 1_000_000_000 // _RATE_HZ, i / _RATE_HZ
+        seconds, nanoseconds = divmod(stamp_ns, 10**9)
         rate, speed = 0.3 * np.sin(3.0 * t), 15.0
-        stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
-        vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
-        zeros9, zeros36 = np.zeros(9), np.zeros(36)
-        level = quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
-        imu = types["sensor_msgs/msg/Imu"](
-            header, level, zeros9, vector(0.0, 0.0, rate), zeros9, vector(0.1, speed * rate, 9.81), zeros9
-        )
-        pose = types["geometry_msgs/msg/PoseWithCovariance"](
-            types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](speed * t, 0.0, 0.0), level), zeros36
-        )
-        twist = types["geometry_msgs/msg/TwistWithCovariance"](
-            types["geometry_msgs/msg/Twist"](vector(speed, 0.1, 0.0), vector(0.0, 0.0, rate)), zeros36
-        )
-        odometry = types["nav_msgs/msg/Odometry"](header, "base", pose, twist)
-        steering = 0.02 * np.sin(3.0 * t)
-        angle = types[steering_type](steering, np.full(4, speed), np.arange(i % 5, dtype=np.uint8), "ok")
-        plain = {
-            "stamp": {"sec": stamp_ns // 10**9, "nsec": stamp_ns % 10**9},
-            "speed": speed,
-            "rate": rate,
-            "wheels": [speed] * 4,
-        }
+        imu.header.stamp.sec, imu.header.stamp.nanosec = seconds, nanoseconds
+        acceleration, twist = imu.linear_acceleration, odometry.twist.twist
+        acceleration.x, acceleration.y, acceleration.z = 0.1, speed * rate, 9.81
+        twist.linear.x, twist.linear.y = speed, 0.1
+        imu.angular_velocity.z = twist.angular.z = rate
+        odometry.pose.pose.position.x = speed * t
+        spare = np.arange(i % 5, dtype=np.uint8)
+        angle = store.types[steering_type](0.02 * np.sin(3.0 * t), np.full(4, speed), spare, "ok")
+        stamp = {"sec": seconds, "nsec": nanoseconds}
+        plain = {"stamp": stamp, "speed": speed, "rate": rate, "wheels": [speed] * 4}
         for topic, name, message in (
             ("/imu/data", "sensor_msgs/msg/Imu", imu),
             ("/rtk/odometry", "nav_msgs/msg/Odometry", odometry),
             ("/vehicle/steering", steering_type, angle),
-            ("/vehicle/speed", speed_type, types[speed_type](header, speed)),
+            ("/vehicle/speed", speed_type, store.types[speed_type](imu.header, speed)),
         ):
-            written.append(Message(topic, name, stamp_ns, bytes(store.serialize_cdr(message, name)), plain))
-    return written
+            yield Message(topic, name, stamp_ns, bytes(store.serialize_cdr(message, name)), plain)
 
 
 def _store(release: str) -> Any:
@@ -100,7 +97,7 @@ def _mcap(encoding: str, path: Path, **options: Any) -> None:
         for m in messages():
             payload, schema = m.cdr, (m.type_name, "ros2msg", _definition(m.type_name))
             if encoding == "json":
-                payload, schema = json.dumps(m.values).encode(), ("State", "jsonschema", json.dumps(_SCHEMA).encode())
+                payload, schema = json.dumps(m.values).encode(), ("State", "jsonschema", _SCHEMA)
             elif encoding == "protobuf":
                 payload, schema = _protobuf(m.values), ("car.State", "protobuf", _descriptors())
             yield mcap_logs.Message(m.time_ns, m.time_ns, m.topic, payload, encoding, schema)
@@ -112,29 +109,11 @@ def _mcap(encoding: str, path: Path, **options: Any) -> None:
     mcap_logs.write_log(path, encoded(), "ros2" if encoding == "cdr" else "", notes, chunk_size=12_000, **options)
 
 
-_SCHEMA = {
-    "type": "object",
-    "properties": {
-        "stamp": {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}},
-        "speed": {"type": "number"},
-        "rate": {"type": "number"},
-        "wheels": {"type": "array", "items": {"type": "number"}},
-    },
-}
-
-
 def _descriptors() -> bytes:
-    from google.protobuf import descriptor_pb2
+    from google.protobuf import descriptor_pb2, text_format
 
-    files = descriptor_pb2.FileDescriptorSet()
-    file = files.file.add(name="state.proto", package="car", syntax="proto3")
-    wheel = file.message_type.add(name="Wheel")
-    wheel.field.add(name="speed", number=1, type=1, label=1)
-    state = file.message_type.add(name="State")
-    state.field.add(name="speed", number=1, type=1, label=1)
-    state.field.add(name="rate", number=2, type=1, label=1)
-    state.field.add(name="wheels", number=3, type=11, label=3, type_name=".car.Wheel")
-    return bytes(files.SerializeToString())
+    text = Path(__file__).with_name("state.txtpb").read_text(encoding="utf-8")
+    return bytes(text_format.Parse(text, descriptor_pb2.FileDescriptorSet()).SerializeToString())
 
 
 def _protobuf(values: dict[str, Any]) -> bytes:
@@ -150,36 +129,33 @@ def _protobuf(values: dict[str, Any]) -> bytes:
     return bytes(message.SerializeToString())
 
 
+def _copied(writer: Any, store: Any, *, ros1: bool) -> None:
+    """Write all messages with a writer of rosbags."""
+    newest, connections = _store("LATEST"), dict[str, Any]()
+    with writer:
+        for m in messages():
+            if m.topic not in connections:
+                connections[m.topic] = writer.add_connection(m.topic, m.type_name, typestore=store)
+            data = newest.cdr_to_ros1(m.cdr, m.type_name) if ros1 else m.cdr
+            writer.write(connections[m.topic], m.time_ns, data)
+
+
 def _bag(compression: str, path: Path) -> None:
     from rosbags.rosbag1 import Writer
 
-    store, newest = _store("ROS1_NOETIC"), _store("LATEST")
     writer = Writer(path)
     writer.chunk_threshold = 12_000
     if compression:
         writer.set_compression(writer.CompressionFormat[compression])
-    with writer:
-        connections: dict[str, Any] = {}
-        for m in messages():
-            if m.topic not in connections:
-                connections[m.topic] = writer.add_connection(m.topic, m.type_name, typestore=store)
-            writer.write(connections[m.topic], m.time_ns, newest.cdr_to_ros1(m.cdr, m.type_name))
+    _copied(writer, _store("ROS1_NOETIC"), ros1=True)
 
 
 def _database(path: Path) -> None:
-    import shutil
-    import tempfile
-
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    store = _store("LATEST")
     with tempfile.TemporaryDirectory() as folder:
-        with Writer(Path(folder) / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-            connections: dict[str, Any] = {}
-            for m in messages():
-                if m.topic not in connections:
-                    connections[m.topic] = writer.add_connection(m.topic, m.type_name, typestore=store)
-                writer.write(connections[m.topic], m.time_ns, m.cdr)
+        writer = Writer(Path(folder) / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3)
+        _copied(writer, _store("LATEST"), ros1=False)
         shutil.copyfile(Path(folder) / "bag" / "bag.db3", path)
 
 

@@ -17,7 +17,7 @@ from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.workers.supervisor import Tell
-from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
+from studies.torture.crashes import contents, faults, kill_many, kill_run, leftovers
 from tests.command_line import called
 from tests.failing_writes import failing_writes
 from tests.runs.stub_drives import stub_drive

@@ -16,12 +16,11 @@ from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.can_frames import decoded_frames
 from pdhef_logtool.records.signals import Channel
 from studies.strangers.__main__ import score_recording
-from studies.strangers.answers import Answer, load_answers
 from studies.strangers.cars import Series, drive
 from studies.strangers.containers import Topic, write
 from studies.strangers.layouts import layout
 from studies.strangers.recordings import answers, imu, road_car, scalar
-from studies.strangers.scoring import agrees
+from studies.strangers.scoring import Answer, agrees, load_answers
 from tests.mcap_files import copied, mcap_writer
 
 _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
@@ -109,9 +108,8 @@ _QUICK = ("data/drives/comma2k19_segment.mcap", "data/drives/lunda_v40", "data/d
 
 @pytest.mark.parametrize("answer", [a for a in load_answers() if a.file in _QUICK], ids=lambda a: a.file)
 def test_answers_are_found_in_their_recordings(answer: Answer, shared_dir: Path) -> None:
-    right, allowed = answer.series()
-    assert set(right) == set(answer.right)
-    assert set(allowed) == set(answer.allowed)
+    expected = answer.expected()
+    assert (set(expected.right), set(expected.allowed)) == (set(answer.right), set(answer.allowed))
 
 
 def _topics(names: tuple[str, str]) -> list[Topic]:

@@ -14,9 +14,8 @@ import pytest
 from pdhef_logtool.estimators.hybrid_paper import CHOSEN, Constants
 from studies.gates.tool import Tool
 from studies.pages import DOCS, RESULTS, ROOT
-from studies.paper.comparison import improvement, spread
 from studies.paper.constants import FILE
-from studies.paper.experiment import FIRST_NOISE_SEED, A, B, Experiment, run_experiment
+from studies.paper.experiment import FIRST_NOISE_SEED, A, B, Experiment, improvement, run_experiment, spread
 from studies.paper.page import write_page
 
 pytestmark = pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.torture import crashes, outside
+from studies.torture import crashes, workers
 from studies.torture.bombs import BOMBS, Bomb, judge_bomb
 from studies.torture.mutants import format_judge, log_judge
 from studies.torture.workers import Ended, judge
@@ -35,11 +35,11 @@ def test_a_bomb_ends_in_time_with_its_exit_code(bomb: Bomb, tmp_path: Path, monk
 
 
 def test_what_a_command_leaves_or_takes_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def harmful(command: str, log: str, *_: str, cwd: Path, env: dict[str, str], limit_s: float) -> outside.Process:
+    def harmful(command: str, log: str, *_: str, cwd: Path, env: dict[str, str], limit_s: float) -> workers.Process:
         assert (command, Path(log).name, limit_s) == ("inspect", "drive.csv", 60.0)
         (cwd / "formula_was_run").touch()
         Path(env["TMPDIR"], "copy").touch()
-        return outside.Process(0, "Traceback", "Traceback", 61.0, 2 << 30, late=True, left=True)
+        return workers.Process(0, "Traceback", "Traceback", 61.0, 2 << 30, late=True, left=True)
 
     monkeypatch.setattr("studies.torture.mutants.measured", harmful)
     problem = format_judge(tmp_path, "csv", 1)(1).problem
@@ -55,9 +55,9 @@ def test_what_outlives_a_command_or_its_limit_is_ended(
     def shell(*_: str, **options: object) -> subprocess.Popen[bytes]:
         return subprocess.Popen(["sh", "-c", script], start_new_session=True, **options)  # type: ignore[call-overload,no-any-return]
 
-    monkeypatch.setattr(outside, "start", shell)
-    monkeypatch.setattr(outside, "END_S", 0.5 if left else 60.0)
-    process = outside.measured(limit_s=1.0 if late else 600.0)
+    monkeypatch.setattr(workers, "start", shell)
+    monkeypatch.setattr(workers, "END_S", 0.5 if left else 60.0)
+    process = workers.measured(limit_s=1.0 if late else 600.0)
     assert (process.late, process.left, process.code) == (late, left, -signal.SIGKILL if late else 3)
 
 
