@@ -70,7 +70,7 @@ class Tool:
 
     def mapping(self, log: Path) -> dict[str, Any]:
         """Return the mapping that the tool recognises."""
-        file = self.work / "mappings" / f"{log.parent.name}-{log.stem}.toml"
+        file = self.work / "mappings" / f"{log.parent.parent.name}-{log.parent.name}-{log.stem}.toml"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.unlink(missing_ok=True)
         self.json("inspect", log, "--write-mapping", file)
