@@ -145,6 +145,7 @@ def test_sensors_show_a_model_car_without_a_vehicle_file_and_its_model_belongs_t
     mapping.write_text("".join(map(table.format, columns)))
     with read_drive(log, Car.load(), load_mapping(mapping)) as drive:
         assert drive.car.vehicle.wheelbase_m == pytest.approx(0.4, abs=0.01)
+        assert drive.car.vehicle.name == "model car of 0.4 m"
         assert any("the default car is scaled" in note for note in drive.notes)
         model = DriveModel.of(drive).file
     with read_drive(log, Car.load(), load_mapping(mapping), ReadOptions(model=OFF)) as drive:
