@@ -16,7 +16,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, SHORTEST_ROAD_CAR_M, VehicleParameters, default_vehicle
 
 #: Share of the static weight on the front axle of a passenger car, if the file gives none. 0.63 for front-wheel drive,
 #: 0.50 for rear-engined and sports cars.
@@ -98,7 +98,7 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
 def assumed_car(wheelbase_m: float) -> VehicleParameters:
     """Return the car that is assumed without a vehicle file: a model of this size, otherwise the default sedan."""
     sedan = default_vehicle()
-    if not 0.15 <= wheelbase_m < 1.2:  # road cars are longer
+    if not 0.15 <= wheelbase_m < SHORTEST_ROAD_CAR_M:
         return sedan
     # The power is that of 1:10 and 1:5 models; sideslip depends on forces over mass.
     mass_kg = sedan.mass_kg * (wheelbase_m / sedan.wheelbase_m) ** 2.5

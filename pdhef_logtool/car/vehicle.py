@@ -38,6 +38,8 @@ SensorTime = Annotated[float, Field(gt=0, le=30)]
 
 #: Remedy for a wrong entry.
 REMEDY = "see docs/formats.md for every entry and its unit"
+#: Cars with a shorter wheelbase are models.
+SHORTEST_ROAD_CAR_M = 1.2
 #: Shape factor of a tyre with ``cornering_stiffness_n_per_rad`` (typical lateral C, Pacejka 2012).
 STIFFNESS_TYRE_SHAPE = 1.35
 
@@ -251,7 +253,8 @@ class VehicleParameters(Record):
             # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 2 scales it with friction; the curve
             # must be plausible at friction 1 or at the file's.
             slopes = tuple(self.cornering_stiffness_n_per_rad(front, mu) / load for mu in (1.0, self.assumed_friction))
-            yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, 0.5, 100.0
+            least = 0.5 if length < SHORTEST_ROAD_CAR_M else 2.0  # model cars slide on smooth floors
+            yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, least, 100.0
         # From a kart, with a track as long as the wheelbase, to a coach with a third of it.
         yield "track over wheelbase", "track_m", (self.track_m / length,), 0.15, 1.5
         # A laden truck: 2.2 m over 3.5 m.

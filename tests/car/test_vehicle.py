@@ -152,6 +152,8 @@ def test_a_wrong_entry_is_named(tmp_path, old, new, named):
         ("cornering_stiffness_n_per_rad", 10.0, "cornering stiffness over static load of the rear axle in 1/rad is 18"),
         # N per degree instead of N per radian
         ("cornering_stiffness_n_per_rad", 0.0175, "cornering stiffness over static load of the rear axle in 1/rad"),
+        # As soft as those of a model car.
+        ("cornering_stiffness_n_per_rad", 0.08, "cornering stiffness over static load of the rear axle in 1/rad"),
         ("cg_to_front_axle_m", 10.0, "I_z / (m l_f l_r)"),
         ("track_m", 0.1, "track over wheelbase"),
         ("cg_height_m", 6.0, "height of the CG over wheelbase"),
