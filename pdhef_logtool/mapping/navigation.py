@@ -18,11 +18,12 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.candidates import HYPOTHESES, MOST, Field, anchors_of
+from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
-from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen, fit, ratio
+from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen, fit
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_velocity
-from pdhef_logtool.mapping.naming import Meaning, meaning_among, words_of
+from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
@@ -31,8 +32,8 @@ from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
 MOVING_M_S = 3.0
 #: Median difference from the course: below NEAR_RAD for the right convention, above FAR_RAD for all others.
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
-#: Positions by quantity.
-_PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
+#: Quantities of a position.
+_PLACES = ("latitude", "longitude")
 #: Largest plausible extent of a log, and least latitude in rad: simulators begin at 0.
 WIDEST_DEG, FROM_ORIGIN_RAD = 10.0, 0.1
 #: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
@@ -41,9 +42,9 @@ _CONVENTIONS = tuple(
     for sense, sign, angle in (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
     for unit, factor in (("degrees", math.radians(1.0)), ("radians", 1.0))
 )
-#: Tolerance of the ratio of a speed to that from positions; speed over ground over that along the path if the axes are
+#: Speed over ground over that along the path if the axes are
 #: the earth's; share of the time that a body moves ahead.
-NEAR_PATH, SAME_STEPS, AHEAD_SHARE = 0.08, (0.7, 1.4), 0.6
+SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
 #: Least share of its y axis in a path: along the x axis, velocities over ground and of the body are equal.
 ACROSS_SHARE = 0.1
 #: Axes of the x and y of a velocity; empty if the drive does not show them, "not ahead" if they are not the body's.
@@ -186,88 +187,56 @@ def receiver_signals(
 
 
 class _Instrument:
-    """A topic with the fields of a navigation system or receiver by their names."""
+    """The named fields of a topic that may be a navigation system or a receiver."""
 
-    def __init__(self, log: DriveLog, topic: TopicInfo) -> None:
-        self.log, self.topic, self.fields = log, topic.name, log.fields(topic.name, quiet=True)
-        self.stamp = stamp_path_of(self.fields)
-        numbers = (f for f in self.fields if f.kind == "number")
-        there = {f.path for f in self.fields}
-        named = ((f.path, meaning_among(topic.name, topic.type_name, f.path, f.unit, there)) for f in numbers)
-        self.meanings = {path: meaning for path, meaning in named if meaning is not None}
-        first = {m.quantity: path for path, m in reversed(self.meanings.items())}
-        self.place_paths = {name: first[q] for name, q in _PLACES.items() if q in first}
-        self.named_velocities = [*_horizontal(self.meanings)]
-        angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
-        self.angles = {path: meaning for meaning, path in angles}
+    def __init__(self, fields: Fields, topic: str) -> None:
+        self.pieces = fields.pieces
+        self.fields = [f for f in fields.candidates if f.topic.name == topic]
+        places = [next(iter(self.of(quantity)), None) for quantity in _PLACES]
+        self.places = [f for f in places if f is not None]
+        reach = [f.seen.largest for f in self.places if f.meaning.scale is None]
+        # As degrees, usual places in radians would be in the Gulf of Guinea.
+        if len(reach) == len(_PLACES) and FROM_ORIGIN_RAD < reach[0] <= math.pi / 2.0 and reach[1] <= math.pi:
+            for item in self.places:
+                item.factors = (("rad", math.degrees(1.0)),)
+        structs: dict[str, dict[str, Field]] = {}
+        for item in self.of("over ground"):
+            structs.setdefault(item.path.rpartition(".")[0], {}).setdefault(item.meaning.part, item)
+        sides = [v for v in structs.values() if {"n", "e"} <= set(v)]
+        #: Velocities over ground that a car can have, by direction.
+        self.velocities = [v for v in sides if all(f.seen.largest * f.scale <= MOST["speed"] for f in v.values())]
 
-    def source(self, name: str, path: str, scale: float = 1.0, offset: float = 0.0) -> SignalSource:
-        """Return a field of the topic as a source."""
-        return SignalSource(name, self.topic, path, self.stamp, scale, offset)
-
-    @cached_property
-    def places(self) -> dict[str, SignalSource]:
-        """Latitude and longitude in degrees; as degrees, usual ones in radians would be in the Gulf of Guinea."""
-        reach = [self.seen[p].largest for p in self.place_paths.values() if p in self.seen]
-        is_small = len(reach) == len(_PLACES) and FROM_ORIGIN_RAD < reach[0] <= math.pi / 2.0 and reach[1] <= math.pi
-        usual = math.degrees(1.0) if is_small else 1.0
-        return {n: self.source(n, p, self.meanings[p].scale or usual) for n, p in self.place_paths.items()}
-
-    @cached_property
-    def seen(self) -> dict[str, Seen]:
-        """Values of velocities, angles and positions in a few pieces of the log, by path."""
-        paths = [*(p for v in self.named_velocities for p in v.values()), *self.angles]
-        paths += [p for p, m in self.meanings.items() if m.quantity == "speed"]
-        paths += self.place_paths.values()
-        return {path: seen for (_, path), seen in self.pieces.read((self.topic, p) for p in paths).items()}
-
-    @cached_property
-    def velocities(self) -> list[dict[str, str]]:
-        """Velocities over ground that a car can have in the unit of their names, or else in m/s, by direction."""
-        reach = {p: self.seen[p].largest * (m.scale or 1.0) for p, m in self.meanings.items() if p in self.seen}
-        return [v for v in self.named_velocities if not any(reach.get(p, 0.0) > MOST["speed"] for p in v.values())]
-
-    @cached_property
-    def pieces(self) -> Pieces:
-        """The pieces of the log."""
-        return Pieces(self.log)
+    def of(self, quantity: str) -> list[Field]:
+        """Return the fields of a quantity."""
+        return [f for f in self.fields if f.meaning.quantity == quantity]
 
     @property
     def has_place(self) -> bool:
         """Return whether there are degrees of latitude and longitude of a moving car."""
-        limits = zip(_PLACES, (90.0, 180.0), strict=True)
-        its = ((self.places.get(n), most) for n, most in limits)
-        return all(s is not None and _is_place(self.seen.get(s.paths[0]), most, s.scale) for s, most in its)
-
-    @property
-    def course(self) -> FloatArray:
-        """Direction of the path, counter-clockwise from east, rad [M]; NaN at low speed."""
-        nothing = np.full(len(self.pieces.starts) * self.pieces.cells_a_piece, np.nan)
-        return nothing if self.along is None else _direction(*self.along)
+        limits = zip(self.places, (90.0, 180.0), strict=False)
+        return len(self.places) == len(_PLACES) and all(_is_place(f, most) for f, most in limits)
 
     @cached_property
-    def along(self) -> tuple[FloatArray, FloatArray] | None:
-        """Velocity north and east along the positions, m/s [M]; None without positions."""
-        read = {(self.topic, path): seen for path, seen in self.seen.items()}
-        return path_velocity(_on_path(self.pieces, anchors_of(self.log, [*self.places.values()], read)))
-
-    def unit_on_path(self, speed: str) -> float | None:
-        """Return the unit in which a speed is that along the positions; None if it is not, or without positions."""
-        seen = self.seen.get(speed)
-        times = ratio(np.hypot(*self.along), seen.cells, SLOW_M_S) if self.along and seen else None
-        return next((u for _, u in HYPOTHESES["speed"] if times is not None and abs(times / u - 1.0) < NEAR_PATH), None)
+    def course(self) -> FloatArray | None:
+        """Direction of the path, counter-clockwise from east, rad [M], NaN at low speed; None without positions."""
+        velocity = path_velocity(Fields(self.pieces, {}, [], self.places)) if self.has_place else None
+        return None if velocity is None else _direction(*velocity)
 
     @property
     def over_ground(self) -> list[SignalSource]:
         """Velocity east and north over ground; empty without one."""
-        if not self.velocities:
-            return []
-        paths = [self.velocities[0][side] for side in "en"]
-        unit = self.meanings[paths[1]].scale or 1.0
-        return [self.source(name, path, unit) for name, path in zip((_EAST, _NORTH), paths, strict=True)]
+        sides = zip((_EAST, _NORTH), "en", strict=True) if self.velocities else ()
+        return [_source(name, self.velocities[0][side]) for name, side in sides]
 
 
-def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool = False) -> NavigationTruth | None:
+def _source(name: str, item: Field, scale: float | None = None, offset: float = 0.0) -> SignalSource:
+    """Return a field as the source of a quantity."""
+    return SignalSource(name, item.topic.name, item.path, item.stamp, item.scale if scale is None else scale, offset)
+
+
+def navigation_truth(
+    log: DriveLog, fields: Fields, topics: Sequence[TopicInfo], *, whole: bool = False
+) -> NavigationTruth | None:
     """Return the ground truth of the topic with most quantities of position, velocity and heading, or None.
 
     Parameters
@@ -275,62 +244,56 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
     topics : of navigation systems and references with undocumented types.
     whole : whether only a velocity with a heading counts.
     """
-    truths = [truth for t in topics if (truth := _truth_of(_Instrument(log, t))) is not None]
+    truths = [truth for t in topics if (truth := _truth_of(log, t.name, _Instrument(fields, t.name))) is not None]
     truths = [t for t in truths if not whole or {"enu_velocity_m_s", "yaw_rad"} <= set(t[0])]
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
-def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
+def named_gnss(fields: Fields, topic: str) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
     A velocity must agree with the path, if there is one. A heading that is the
     direction of the path is a course.
     """
-    its = _Instrument(log, topic)
-    if len(its.place_paths) < len(_PLACES):
+    its = _Instrument(fields, topic)
+    if len(its.places) < len(_PLACES):
         return {s.name: s for s in its.over_ground}
-    if not its.has_place:
+    if its.course is None:
         return {}
-    sources = [replace(its.places[n], name=name) for n, name in zip(_PLACES, GNSS_POSITION, strict=True)]
-    sides = [its.seen.get(s.paths[0]) for s in its.over_ground]
-    east, north = (None if s is None else s.cells for s in sides) if sides else (None, None)
-    if east is not None and north is not None and _median_off(np.arctan2(north, east) - its.course) < NEAR_RAD:
+    sources = [_source(name, item) for item, name in zip(its.places, GNSS_POSITION, strict=True)]
+    velocity = its.velocities[0] if its.velocities else None
+    if velocity and _median_off(np.arctan2(velocity["n"].si, velocity["e"].si) - its.course) < NEAR_RAD:
         sources += its.over_ground
     else:
-        sources += _speed_and_course(its)
+        sources += _speed_and_course(its, its.course)
     return {source.name: source for source in sources}
 
 
-def _speed_and_course(its: _Instrument) -> Iterator[SignalSource]:
+def _speed_and_course(its: _Instrument, course: FloatArray) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
-    speeds = ((p, m.scale or its.unit_on_path(p)) for p, m in its.meanings.items() if m.quantity == "speed")
-    speed, unit = next(((path, unit) for path, unit in speeds if unit is not None), ("", 0.0))
-    if not speed:
-        return
-    for path, meaning in its.angles.items():
-        convention = _convention(its.seen.get(path), its.course, meaning.scale)
+    speed = next((f for f in its.of("speed") if f.unit_known), None)
+    for item in (*its.of("course"), *its.of("heading")) if speed is not None else ():
+        convention = _convention(item, course)
         if convention is not None and convention[1] < 0.0:  # a course over ground is clockwise from north by definition
-            yield its.source("gnss_course_rad", path, *convention[1:])
-            yield its.source("gnss_speed_m_s", speed, unit)
+            yield _source("gnss_course_rad", item, *convention[1:])
+            yield _source("gnss_speed_m_s", speed)
             return
 
 
-def _truth_of(its: _Instrument) -> NavigationTruth | None:
-    truth = {s.name: s for s in (*_enu_velocities(its), *_ecef_vectors(its))}
-    course = None
+def _truth_of(log: DriveLog, topic: str, its: _Instrument) -> NavigationTruth | None:
+    truth = {s.name: s for s in (*_enu_velocities(its), *_ecef_vectors(topic, log.fields(topic, quiet=True)))}
+    course = its.course
     if its.has_place:
-        truth |= its.places
-        course = its.course
-    if velocity := truth.get("enu_velocity_m_s"):
-        east, north = (its.seen.get(path) for path in velocity.paths[:2])
-        course = None if east is None or north is None else _direction(north.cells, east.cells)
-    note = f"ground truth comes from {its.topic}, by the names of its fields"
-    for path in (p for p, m in its.angles.items() if m.quantity == "heading"):
-        convention = _convention(its.seen.get(path), course, its.angles[path].scale)
+        truth |= {name: _source(name, item) for name, item in zip(("lat_deg", "lon_deg"), its.places, strict=True)}
+    if "enu_velocity_m_s" in truth:
+        course = _direction(its.velocities[0]["n"].si, its.velocities[0]["e"].si)
+    note = f"ground truth comes from {topic}, by the names of its fields"
+    for item in its.of("heading") if course is not None else ():
+        convention = _convention(item, course)
         if convention is not None:
             words, scale, offset = convention
-            truth["yaw_rad"] = its.source("yaw_rad", path, scale, offset)
-            note += f"; {path} is in {words}, which agrees with the course over ground"
+            truth["yaw_rad"] = _source("yaw_rad", item, scale, offset)
+            note += f"; {item.path} is in {words}, which agrees with the course over ground"
             break
     useful = {"enu_velocity_m_s", "ecef_velocity_m_s", "ecef_position_m", "lat_deg"} & set(truth)
     return (truth, note) if useful else None
@@ -338,32 +301,24 @@ def _truth_of(its: _Instrument) -> NavigationTruth | None:
 
 def _enu_velocities(its: _Instrument) -> Iterator[SignalSource]:
     """Yield the first velocity east, north, up (or down) by the field names of one struct."""
-    for paths_of in its.velocities:
-        if vertical := next((s for s in "ud" if s in paths_of), ""):
-            paths = (paths_of["e"], paths_of["n"], paths_of[vertical])
-            factor = its.meanings[paths[0]].scale or 1.0
-            scale = (factor, factor, factor if vertical == "u" else -factor)
-            yield SignalSource("enu_velocity_m_s", its.topic, paths, its.stamp, scale)
+    for sides in its.velocities:
+        if vertical := next((s for s in "ud" if s in sides), ""):
+            axes = [sides[side] for side in ("e", "n", vertical)]
+            scale = (1.0, 1.0, 1.0 if vertical == "u" else -1.0)
+            paths = tuple(f.path for f in axes)
+            factors = tuple(f.scale * sign for f, sign in zip(axes, scale, strict=True))
+            yield SignalSource("enu_velocity_m_s", axes[0].topic.name, paths, axes[0].stamp, factors)
             return
 
 
-def _horizontal(meanings: Mapping[str, Meaning]) -> Iterator[dict[str, str]]:
-    """Yield by struct the paths of a velocity over ground with at least north and east, by direction."""
-    structs: dict[str, dict[str, str]] = {}
-    for path, meaning in meanings.items():
-        if meaning.quantity == "over ground":
-            structs.setdefault(path.rpartition(".")[0], {}).setdefault(meaning.part, path)
-    yield from (paths_of for paths_of in structs.values() if {"n", "e"} <= set(paths_of))
-
-
-def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
+def _ecef_vectors(topic: str, fields: tuple[FieldInfo, ...]) -> Iterator[SignalSource]:
     """Yield the arrays of three in ECEF that are a position or a velocity by name, in the order of the fields."""
-    paths = dict.fromkeys(f.path for f in its.fields)
+    paths = dict.fromkeys(f.path for f in fields)
     for base in dict.fromkeys(p.removesuffix("[0]") for p in paths if p.endswith("[0]") and "ecef" in p.lower()):
         words = set(words_of(base))
         name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
         if f"{base}[2]" in paths and f"{base}[3]" not in paths and words & {"velocity", "vel", "position", "pos"}:
-            yield SignalSource(name, its.topic, tuple(f"{base}[{i}]" for i in range(3)), its.stamp)
+            yield SignalSource(name, topic, tuple(f"{base}[{i}]" for i in range(3)), stamp_path_of(fields))
 
 
 def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
@@ -373,29 +328,25 @@ def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
     return math.copysign(float(SAME_STEPS[0] < abs(slope) < SAME_STEPS[1]), slope)
 
 
-def _is_place(seen: Seen | None, most: float, scale: float | tuple[float, ...]) -> bool:
-    """Return whether values times ``scale`` can be degrees of latitude or longitude of a moving car."""
-    if seen is None or not seen.changes or not isinstance(scale, float) or not 0.01 < seen.largest * scale <= most:
+def _is_place(item: Field, most: float) -> bool:
+    """Return whether values can be degrees of latitude or longitude of a moving car."""
+    if not item.seen.changes or not 0.01 < item.seen.largest * item.scale <= most:
         return False
-    return float(np.nanmax(seen.cells) - np.nanmin(seen.cells)) * scale < WIDEST_DEG
+    return float(np.nanmax(item.seen.cells) - np.nanmin(item.seen.cells)) * item.scale < WIDEST_DEG
 
 
 def _direction(north: FloatArray, east: FloatArray) -> FloatArray:
     return np.where(np.hypot(north, east) > MOVING_M_S, np.arctan2(north, east), np.nan)
 
 
-def _convention(seen: Seen | None, course: FloatArray | None, unit: float | None) -> tuple[str, float, float] | None:
+def _convention(item: Field, course: FloatArray) -> tuple[str, float, float] | None:
     """Return the convention in which a heading matches the course; None unless exactly one matches.
 
-    Parameters
-    ----------
-    unit : radians per unit of the name; None without one: values beyond one turn in radians are then degrees.
+    Without a unit in the name, values beyond one turn in radians are degrees.
     """
-    if seen is None or course is None:
-        return None
-    unit = unit or (math.radians(1.0) if seen.largest > 2.1 * math.pi else 1.0)
+    unit = item.meaning.scale or (math.radians(1.0) if item.seen.largest > 2.1 * math.pi else 1.0)
     conventions = [c for c in _CONVENTIONS if math.isclose(abs(c[1]), unit)]
-    off = [_off(seen, course, scale, angle) for _, scale, angle in conventions]
+    off = [_median_off(scale * item.seen.cells + angle - course) for _, scale, angle in conventions]
     if len(off) < 2 or not (min(off) < NEAR_RAD and FAR_RAD < max(off) < math.inf):
         return None
     return conventions[int(np.argmin(off))]
@@ -406,8 +357,3 @@ def _median_off(angles: FloatArray) -> float:
     away = np.abs(np.angle(np.exp(1j * angles)))
     away = away[np.isfinite(away)]
     return float(np.median(away)) if away.shape[0] >= FEWEST_CELLS else math.inf
-
-
-def _off(seen: Seen, course: FloatArray, scale: float, angle: float) -> float:
-    """Return the median difference of an angle ``scale * raw + angle`` from the course, rad; infinite if unknown."""
-    return _median_off(scale * seen.cells + angle - course)

@@ -14,6 +14,7 @@ from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.evidence import Pieces, Seen
+from pdhef_logtool.mapping.fields import Fields
 from pdhef_logtool.mapping.joints import is_joints, joint_names
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command, words_of
@@ -181,9 +182,9 @@ def auto_map(
     unusable = ((t, vendors.of(t.type_name).left_out) for t in topics)
     draft.notes += [f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {why}" for t, why in unusable if why]
     weighed = _weigh_the_rest(draft, topics, vendors)
-    _map_navigation(draft, topics, vendors)
+    _map_navigation(draft, topics, vendors, weighed.fields)
     _fall_back(draft, topics)
-    _map_gnss(draft, topics, vendors)
+    _map_gnss(draft, topics, vendors, weighed.fields)
     _speed_of_receiver(draft)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
     mapping = replace(mapping, checks=tuple(weighed.checks), open_signs=weighed.open_signs)
@@ -303,27 +304,29 @@ def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendo
     draft.replace_truth(whole[chosen.name])
 
 
-def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
+def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, fields: Fields) -> None:
     """Take ground truth from a navigation system by the names of its vectors, if there is at most a position so far."""
     if set(draft.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
         return
     unknown = [t for t in topics if not _is_well_known(t) and not vendors.of(t.type_name).fields]
     # A table has no topic with the name of an instrument: velocity north and east with a heading are those of an INS.
-    truth = navigation.navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
-    truth = truth or navigation.navigation_truth(draft.log, [t for t in unknown if _role(t) == "sensor"], whole=True)
+    instruments = [t for t in unknown if _role(t) in ("navigation", "truth")]
+    tables = [t for t in unknown if _role(t) == "sensor"]
+    truth = navigation.navigation_truth(draft.log, fields, instruments)
+    truth = truth or navigation.navigation_truth(draft.log, fields, tables, whole=True)
     if truth is None or (draft.truth and len(truth[0]) <= len(draft.truth)):
         return
     draft.replace_truth(truth[0])
     draft.notes.append(truth[1])
 
 
-def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
+def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, named: Fields) -> None:
     """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
     draft.signals |= navigation.gnss_signals(draft.signals, draft.truth)
     is_ins = navigation.has_heading(draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values() if is_ins}
     others = [t for t in topics if not _named(t, "truth") and _device(t.name) not in instruments]
-    receivers = list(_receivers(draft, others, vendors))
+    receivers = list(_receivers(draft, others, vendors, named))
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
@@ -333,14 +336,14 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
-def _receivers(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Iterator[_Sources]:
+def _receivers(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, named: Fields) -> Iterator[_Sources]:
     """Yield the signals of each receiver."""
     for topic in topics:
         fields = () if type_of(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
         if fields:
             signals = navigation.receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
-            signals = navigation.named_gnss(draft.log, topic) if by_name else signals
+            signals = navigation.named_gnss(named, topic.name) if by_name else signals
             if signals:
                 yield signals
 
