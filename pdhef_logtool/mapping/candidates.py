@@ -207,7 +207,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         there = {f.path for f in fields}
         no_values = _no_values(topic, fields)
         for info in (f for f in fields if f.path not in no_values):
-            if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or is_command(info.path):
+            if not _is_column(info) or is_command(info.path):
                 continue
             if its := documented.entries(info.path):
                 results += [(topic, role, replace(info, path=p), entry.meaning, True) for p, entry in its.items()]
@@ -217,60 +217,50 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     return results
 
 
+def _is_column(info: FieldInfo) -> bool:
+    """Return whether a field has one number, or one array of numbers, a message."""
+    return info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
+
+
 def proposed_fields(
-    log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], mapped: Sequence[SignalSource]
-) -> Iterator[Named]:
-    """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives."""
-    meanings = [*(n[3] for n in named if n[1] != "command"), *(meaning_of_signal(s.name) for s in mapped)]
-    there = {(m.quantity, part) for m in meanings for part in (m.part, "any")}
+    log: DriveLog, pieces: Pieces, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], known: list[Field]
+) -> Iterator[Field]:
+    """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives.
+
+    ``known``: fields with a quantity, mapped or by name.
+    """
+    known = [f for f in known if f.role != "command"]
+    there = {(f.meaning.quantity, part) for f in known for part in (f.meaning.part, "any")}
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
-    sensors = {t.name: t for t, role in topics if role == "sensor"}
-    sensors = {n: t for n, t in sensors.items() if not holds_frames(n, log.fields(n, quiet=True))}
-    columns = _compared(log, [*sensors], named, mapped) if wanted else {}
-    if all(role is not None for _, role in columns.values()):
-        return
-    pieces = Pieces(log)
-    read = {key: seen for key, seen in pieces.read(columns).items() if seen.changes}
-    given = [columns.get(key) or columns[key[0], key[1].partition("[")[0]] for key in read]
-    compared = [Column(seen, *its) for seen, its in zip(read.values(), given, strict=True)]
+    by_name = {(topic.name, info.path) for topic, _, info, _, _ in named}
+    open_fields: dict[tuple[str, str], tuple[TopicInfo, FieldInfo, Units]] = {}
+    for topic in [t for t, role in topics if role == "sensor"] if wanted else ():
+        fields = log.fields(topic.name, quiet=True)
+        for info in () if holds_frames(topic.name, fields) else filter(_is_column, fields):
+            if (units := _units_without_name(info)) and (topic.name, info.path) not in by_name:
+                open_fields[topic.name, info.path.removesuffix("[]")] = topic, info, units
+    sides = [column for role in ROLES for column in _named_column(known, role)]
+    read = pieces.read([*open_fields][: MOST_PROPOSED - len(sides)])
+    others = []
+    for (name, path), seen in read.items():
+        topic, info, units = open_fields.get((name, path)) or open_fields[name, path.partition("[")[0]]
+        others += [(topic, replace(info, path=path), Column(seen, units))] if seen.changes else []
+    columns = [*sides, *(column for _, _, column in others)]
     why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
-    for place, (quantity, part, unit) in propose(pieces, compared, wanted).items():
-        topic_name, path = [*read][place]
-        scale = dict(given[place][0][quantity]).get(unit)
+    for place, (quantity, part, unit) in propose(pieces, columns, wanted).items() if others else ():
+        topic, info, column = others[place - len(sides)]
+        scale = dict(column.units[quantity]).get(unit)
         meaning = Meaning(quantity, part, PROPOSED, unit if scale else "", scale, why)
-        yield sensors[topic_name], "sensor", FieldInfo(path, "number"), meaning, False
+        yield _field_of(log.fields(topic.name, quiet=True), topic, "sensor", info, meaning, column.seen)
 
 
-def _compared(
-    log: DriveLog, topics: Sequence[str], named: Sequence[Named], mapped: Sequence[SignalSource]
-) -> dict[tuple[str, str], tuple[Units, tuple[str, str] | None]]:
-    """Return units and quantity by name, or None, of the fields that take part in a comparison, by topic and path."""
-    columns: dict[tuple[str, str], tuple[Units, tuple[str, str] | None]] = {**dict(_named_columns(named))}
-    by_name = {(n[0].name, n[2].path) for n in named}
-    for topic, info in ((t, info) for t in topics for info in log.fields(t, quiet=True)):
-        is_column = info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
-        units = _units_without_name(info) if is_column and (topic, info.path) not in by_name else {}
-        if units and len(columns) < MOST_PROPOSED:
-            columns[topic, info.path.removesuffix("[]")] = units, None
-    for source in mapped:
-        if isinstance(source.scale, float):
-            its = meaning_of_signal(source.name)
-            units = {its.quantity: (("", abs(source.scale)),)}
-            columns[source.topic, source.paths[0]] = units, (its.quantity, its.part)
-    return columns
-
-
-def _named_columns(named: Sequence[Named]) -> Iterator[tuple[tuple[str, str], tuple[Units, tuple[str, str]]]]:
-    """Yield the field named as each of :data:`ROLES` with its units; a wheel speed replaces a missing speed."""
-    usable = [n for n in named if n[1] != "command" and not n[4] and "[]" not in n[2].path]
-    for role in ROLES:
-        its = [n for n in usable if n[3].quantity == role[0] and n[3].part in (role[1], "")]
-        its = its or [n for n in usable if role[0] == "speed" and n[3].quantity == "wheel speed"]
-        if its:
-            topic, _, info, meaning, _ = max(its, key=lambda n: n[3].strength)
-            units = HYPOTHESES[meaning.quantity] if meaning.scale is None else ((meaning.unit, meaning.scale),)
-            yield (topic.name, info.path), ({role[0]: units}, role)
+def _named_column(known: Sequence[Field], role: tuple[str, str]) -> Iterator[Column]:
+    """Yield the surest field of one of :data:`ROLES`; a wheel speed replaces a missing speed."""
+    its = [f for f in known if f.meaning.quantity == role[0] and f.meaning.part in (role[1], "")]
+    its = its or [f for f in known if role[0] == "speed" and f.meaning.quantity == "wheel speed"]
+    for item in sorted(its, key=lambda f: -f.meaning.strength)[:1]:
+        yield Column(item.seen, {role[0]: item.units}, role)
 
 
 def _units_without_name(info: FieldInfo) -> Units:
@@ -335,25 +325,43 @@ def _weighable(
             continue
         if role == "sensor" and {"gps", "gnss", "ins", "rtk"} & set(words_of(name)):
             role = "navigation"
-        factors = _factors(its, seen)
-        if its.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
-            its = replace(its, quantity="wheel rate")
-            factors = _factors(its, seen)
-        item = Field(topic, name, its, role, stamp_of(fields, name), seen, factors)
-        if documented:
-            _document(item, vendors.of(topic.type_name).fields[info.path])
-        elif its.scale is not None:
-            item.unit_known = True
-            item.reasons.append(f"unit {naming.UNIT_TEXTS.get(its.unit, its.unit)}")
-        if its.strength < LEAST_NAMED:
-            item.doubts.append("its values alone identify it")
-        if _may_be_share(item, info):
-            item.is_weak = _is_control(item, info, fields)
-            item.doubts.append("it may be a share of the largest angle, which needs a scale")
-        if item.is_downward and not documented:
-            item.sign = -1.0
-            item.reasons.append("positive downward by its name")
-        yield item
+        entry = vendors.of(topic.type_name).fields[info.path] if documented else None
+        yield _field_of(fields, topic, role, replace(info, path=name), its, seen, entry)
+
+
+def _field_of(
+    fields: tuple[FieldInfo, ...],
+    topic: TopicInfo,
+    role: Role,
+    info: FieldInfo,
+    meaning: Meaning,
+    seen: Seen,
+    entry: VendorField | None = None,
+) -> Field:
+    """Return a field with its possible units and what its name or documentation (``entry``) leaves open."""
+    factors = _factors(meaning, seen)
+    if meaning.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
+        meaning = replace(meaning, quantity="wheel rate")
+        factors = _factors(meaning, seen)
+    item = Field(topic, info.path, meaning, role, stamp_of(fields, info.path), seen, factors)
+    if entry is not None:
+        item.fixed = item.unit_known = True
+        item.section = entry.section
+        item.factors = ((entry.unit, abs(entry.scale)),)
+        item.sign, item.offset = math.copysign(1.0, entry.scale), entry.offset
+        item.reasons.append(f"documented: {entry.page}")
+    elif meaning.scale is not None:
+        item.unit_known = True
+        item.reasons.append(f"unit {naming.UNIT_TEXTS.get(meaning.unit, meaning.unit)}")
+    if meaning.strength < LEAST_NAMED:
+        item.doubts.append("its values alone identify it")
+    if _may_be_share(item, info):
+        item.is_weak = _is_control(item, info, fields)
+        item.doubts.append("it may be a share of the largest angle, which needs a scale")
+    if item.is_downward and entry is None:
+        item.sign = -1.0
+        item.reasons.append("positive downward by its name")
+    return item
 
 
 def _may_be_share(item: Field, info: FieldInfo) -> bool:
@@ -368,14 +376,6 @@ def _is_control(item: Field, info: FieldInfo, fields: tuple[FieldInfo, ...]) -> 
     struct, places = item.path.rpartition(".")[0], (f.path.rpartition(".") for f in fields)
     beside = {word for place, _, leaf in places if place == struct for word in words_of(leaf)}
     return info.code == "i1" or bool({"throttle", "brake", "gas"} & beside)
-
-
-def _document(item: Field, entry: VendorField) -> None:
-    item.fixed = item.unit_known = True
-    item.section = entry.section
-    item.factors = ((entry.unit, abs(entry.scale)),)
-    item.sign, item.offset = math.copysign(1.0, entry.scale), entry.offset
-    item.reasons.append(f"documented: {entry.page}")
 
 
 def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Field]:

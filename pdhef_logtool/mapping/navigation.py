@@ -272,7 +272,9 @@ def named_gnss(fields: Fields, topic: str) -> dict[str, SignalSource]:
 def _speed_and_course(its: _Instrument, course: FloatArray) -> Iterator[SignalSource]:
     """Yield the first speed with a unit and the first angle that is the path's course, if both exist."""
     speed = next((f for f in its.of("speed") if f.unit_known), None)
-    for item in (*its.of("course"), *its.of("heading")) if speed is not None else ():
+    if speed is None:
+        return
+    for item in (*its.of("course"), *its.of("heading")):
         convention = _convention(item, course)
         if convention is not None and convention[1] < 0.0:  # a course over ground is clockwise from north by definition
             yield _source("gnss_course_rad", item, *convention[1:])
@@ -288,7 +290,7 @@ def _truth_of(log: DriveLog, topic: str, its: _Instrument) -> NavigationTruth | 
     if "enu_velocity_m_s" in truth:
         course = _direction(its.velocities[0]["n"].si, its.velocities[0]["e"].si)
     note = f"ground truth comes from {topic}, by the names of its fields"
-    for item in its.of("heading") if course is not None else ():
+    for item in its.of("heading"):
         convention = _convention(item, course)
         if convention is not None:
             words, scale, offset = convention
@@ -339,11 +341,13 @@ def _direction(north: FloatArray, east: FloatArray) -> FloatArray:
     return np.where(np.hypot(north, east) > MOVING_M_S, np.arctan2(north, east), np.nan)
 
 
-def _convention(item: Field, course: FloatArray) -> tuple[str, float, float] | None:
+def _convention(item: Field, course: FloatArray | None) -> tuple[str, float, float] | None:
     """Return the convention in which a heading matches the course; None unless exactly one matches.
 
     Without a unit in the name, values beyond one turn in radians are degrees.
     """
+    if course is None:
+        return None
     unit = item.meaning.scale or (math.radians(1.0) if item.seen.largest > 2.1 * math.pi else 1.0)
     conventions = [c for c in _CONVENTIONS if math.isclose(abs(c[1]), unit)]
     off = [_median_off(scale * item.seen.cells + angle - course) for _, scale, angle in conventions]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -183,9 +183,9 @@ def auto_map(
     draft.notes += [f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {why}" for t, why in unusable if why]
     weighed = _weigh_the_rest(draft, topics, vendors)
     _map_navigation(draft, topics, vendors, weighed.fields)
-    _fall_back(draft, topics)
+    _map_yaw_rate_of_twist(draft, topics)
     _map_gnss(draft, topics, vendors, weighed.fields)
-    _speed_of_receiver(draft)
+    _map_speed_over_ground(draft, topics)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
     mapping = replace(mapping, checks=tuple(weighed.checks), open_signs=weighed.open_signs)
     candidates = weighed.candidates
@@ -408,56 +408,43 @@ def _role(topic: TopicInfo) -> Role:
     return "navigation" if navigates else "sensor"
 
 
-def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Without a sensor, take the yaw rate from an odometry and the speed from navigation or a twist, with a note."""
-    twists = [t for t in topics if type_of(t) in TWIST_FIELDS]
-    twists = [t for t in twists if not (_named(t, "truth") or is_command(t.name))]
-    if "yaw_rate_rad_s" not in draft.signals:
-        odometries = [t for t in twists if not _is_truth(t) and _named(t, "vehicle")]
-        paths = {t: _twist(t, "angular", "z") for t in odometries if not _named(t, "estimate")}
-        paths |= {t: "heading_rate" for t in topics if type_of(t) in _FIELDS["speed"]}
-        turning = [t for t, path in paths.items() if _span(draft.values(t.name, path)) > 0.0]
-        chosen = draft.choose("yaw rate", turning, lambda _: (), "the first of its kind")
-        if chosen is not None:
-            draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, paths[chosen])
-            draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
-    if draft.signals and not has_speed(draft.signals):
-        _speed_of_navigation(draft, topics)
-
-
-def _speed_of_receiver(draft: _Draft) -> None:
-    """Take the speed as the length of a receiver's velocity if no other source gives one."""
-    velocity = [draft.signals.get(f"gnss_velocity_{n}_m_s") for n in ("east", "north")]
-    paths = tuple(s.field for s in velocity if s is not None and isinstance(s.field, str))
-    scales = tuple(s.scale for s in velocity if s is not None and isinstance(s.scale, float))
-    if has_speed(draft.signals) or velocity[0] is None or len(paths) < len(velocity) or len({*scales}) != 1:
+def _map_yaw_rate_of_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
+    """Without a sensor, take the yaw rate from an odometry of the vehicle or a velocity report, with a note."""
+    if "yaw_rate_rad_s" in draft.signals:
         return
-    source = replace(velocity[0], name="speed_m_s", field=paths, scale=scales, combine="norm")
-    draft.signals["speed_m_s"] = source
-    draft.notes.append(f"speed_m_s comes from {source.topic}: it is {navigation.NEVER_NEGATIVE}")
-    draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
+    twists = [t for t in topics if type_of(t) in TWIST_FIELDS and _named(t, "vehicle") and not is_command(t.name)]
+    odometries = [t for t in twists if not (_is_truth(t) or _named(t, "estimate"))]
+    paths = {t: _twist(t, "angular", "z") for t in odometries}
+    paths |= {t: "heading_rate" for t in topics if type_of(t) in _FIELDS["speed"]}
+    turning = [t for t, path in paths.items() if _span(draft.values(t.name, path)) > 0.0]
+    chosen = draft.choose("yaw rate", turning, lambda _: (), "the first of its kind")
+    if chosen is not None:
+        draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, paths[chosen])
+        draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
 
 
-def has_speed(signals: Collection[str]) -> bool:
-    """Return whether signals contain a speed or wheel speeds."""
-    return any(n.startswith(("speed_m_s", "wheel_speed_")) for n in signals)
-
-
-def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take the speed of a navigation system that is also the ground truth."""
+def _map_speed_over_ground(draft: _Draft, topics: list[TopicInfo]) -> None:
+    """Without another speed, take that of a navigation system that is ground truth, or of a receiver, with a note."""
+    if not draft.signals or any(n.startswith(("speed_m_s", "wheel_speed_")) for n in draft.signals):
+        return
     names = ("vx_m_s", "enu_velocity_m_s", "ecef_velocity_m_s")
     truth = next((draft.truth[n] for n in names if n in draft.truth), None)
-    source = None if truth is None else next((t for t in topics if t.name == truth.topic), None)
-    if truth is None or source is None:
+    topic = next((t for t in topics if truth is not None and t.name == truth.topic), None)
+    role = "" if topic is None else "truth" if _is_well_known(topic) and _role(topic) == "sensor" else _role(topic)
+    sides = [s for n in ("east", "north") if (s := draft.signals.get(f"gnss_velocity_{n}_m_s")) is not None]
+    scales = tuple(s.scale for s in sides if isinstance(s.scale, float))
+    if truth is not None and role in ("navigation", "sensor"):
+        source = replace(truth, name="speed_m_s") if truth.name == "vx_m_s" else navigation.length_of(truth)
+        why = ", which is also the ground truth, as nothing else gives a speed: the estimator's input is the true speed"
+    elif len(scales) == 2:
+        paths = tuple(path for s in sides for path in s.paths)
+        source, why = replace(sides[0], name="speed_m_s", field=paths, scale=scales, combine="norm"), ""
+    else:
         return
-    if _role(source) != "navigation" and (_role(source) != "sensor" or _is_well_known(source)):
-        return
-    forward = truth.name == "vx_m_s"
-    draft.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else navigation.length_of(truth)
-    draft.notes.append(
-        f"speed_m_s comes from {source.name}, which is also the ground truth, as no other source gives a speed: "
-        "the estimator's input is the true speed" + ("" if forward else f"; it is {navigation.NEVER_NEGATIVE}")
-    )
+    why += f"; it is {navigation.NEVER_NEGATIVE}" if source.combine == "norm" else ""
+    draft.signals["speed_m_s"] = source
+    draft.notes.append(f"speed_m_s comes from {source.topic}{why}")
+    draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
 
 
 def type_of(topic: TopicInfo) -> str:

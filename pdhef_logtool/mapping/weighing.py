@@ -92,14 +92,14 @@ def weigh(
     topics : topics that may contain candidates, with their kinds of data.
     signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
     """
-    topics = topics if log.end_ns > log.start_ns else []
-    named = named_fields(log, topics, vendors)
-    named += proposed_fields(log, topics, named, [*signals.values()])
-    if not named:
+    if not topics or log.end_ns <= log.start_ns:
         return Weighing(Fields(Pieces(log), {}, [], []))
+    named = named_fields(log, topics, vendors)
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
     pieces, weighable = look(log, named, vendors, [*signals.values(), *true])
     anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
+    known = [*anchors.values(), *(f for f in weighable if not f.anchor)]
+    weighable += proposed_fields(log, pieces, topics, named, known)
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
