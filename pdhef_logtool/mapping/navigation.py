@@ -34,8 +34,8 @@ MOVING_M_S = 3.0
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 #: Quantities of a position.
 _PLACES = ("latitude", "longitude")
-#: Largest plausible extent of a log, and least latitude in rad: simulators begin at 0.
-WIDEST_DEG, FROM_ORIGIN_RAD = 10.0, 0.1
+#: Largest plausible extent of a log.
+WIDEST_DEG = 10.0
 #: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
 _CONVENTIONS = tuple(
     (f"{unit} {sense}", sign * factor, angle)
@@ -194,11 +194,6 @@ class _Instrument:
         self.fields = [f for f in fields.candidates if f.topic.name == topic]
         places = [next(iter(self.of(quantity)), None) for quantity in _PLACES]
         self.places = [f for f in places if f is not None]
-        reach = [f.seen.largest for f in self.places if f.meaning.scale is None]
-        # As degrees, usual places in radians would be in the Gulf of Guinea.
-        if len(reach) == len(_PLACES) and FROM_ORIGIN_RAD < reach[0] <= math.pi / 2.0 and reach[1] <= math.pi:
-            for item in self.places:
-                item.factors = (("rad", math.degrees(1.0)),)
         structs: dict[str, dict[str, Field]] = {}
         for item in self.of("over ground"):
             structs.setdefault(item.path.rpartition(".")[0], {}).setdefault(item.meaning.part, item)

@@ -23,7 +23,6 @@ from pdhef_logtool.mapping.candidates import (
     anchor_of,
     look,
     named_fields,
-    place_of,
     proposed_fields,
     triad_of,
 )
@@ -58,8 +57,6 @@ _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: Correlation with speeding up below which an acceleration is along another axis.
 FOLLOWS = 0.5
-#: Speed over that over ground below which it is vertical.
-VERTICAL = 0.2
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -105,7 +102,6 @@ def weigh(
     decide_units(fields)
     weighing = Weighing(fields, anchor_of("vx_m_s", weighable))
     weighing.drop_vectors_over_ground()
-    weighing.drop_vertical_speeds()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     weighing.choose_signals(set(signals))
@@ -141,7 +137,8 @@ class Weighing:
         wheels = any(n.startswith("wheel_speed") for n in have)
         for name in _SENSORS:
             if name not in have and not (wheels and name == "speed_m_s"):
-                self._take(name, [f for f in usable if name in names_of(f.meaning.quantity, f.meaning.part)])
+                fields = (f for f in usable if name in names_of(f.meaning.quantity, f.meaning.part))
+                self._choose([(f.score, name, f) for f in fields])
         self._turn_level()
         if not wheels:
             self._wheels(usable)
@@ -157,11 +154,9 @@ class Weighing:
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"acceleration", "rate", "speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
-        usable = [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
-        elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
         for item in usable:
-            item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
-        return usable
+            item.bonus -= 0.2 * (item.topic.name == self.truth_from)
+        return [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
 
     def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
@@ -169,8 +164,7 @@ class Weighing:
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
             is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
-            if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
-                self._turn_down(y)
+            if axes == "body" or (is_named and not axes):
                 continue
             self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y)]
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
@@ -182,25 +176,6 @@ class Weighing:
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
 
-    def drop_vertical_speeds(self) -> None:
-        """Leave out speeds that are small against the velocity over ground of their message."""
-        for side in (*self.fields.open("over ground"), *self.taken.values()):
-            speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
-            for item in [f for f in speeds if f.seen.largest < VERTICAL * side.seen.largest]:
-                self.fields.candidates.remove(item)
-
-    def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
-        """Return whether another speed is the length of x and y, and not x."""
-        speeds = [f.si for f in self.fields.open("speed") if f is not x]
-        return any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
-
-    def _turn_down(self, y: Field) -> None:
-        """Turn the y of a body's velocity to the left if the accelerometer beside it has gravity along -z."""
-        down = [f for f in self.fields.candidates if f.has_gravity and f.sign < 0.0 and f.path.rstrip("]")[-1] in "zZ2"]
-        if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
-            y.sign = -1.0
-            y.doubts.append("its device has axes forward, right, down, as gravity shows")
-
     def _vectors(self) -> Iterator[tuple[Field, Field]]:
         """Yield the x and y of velocities that change."""
         for y in self.fields.candidates:
@@ -208,16 +183,22 @@ class Weighing:
                 beside = (f for f in self.fields.candidates if f.meaning.part == "x" and triad_of(f) == triad_of(y))
                 yield from ((x, y) for x in [f for f in beside if f.meaning.quantity == "speed" and f.seen.changes][:1])
 
-    def _take(self, name: str, candidates: Sequence[Field]) -> None:
+    def _choose(self, judged: Sequence[tuple[float, str, Field]]) -> None:
+        """Select the field with the highest score for its signal (score, signal, field), and record its rivals."""
+
         # A speed before the x of a velocity, which is ahead in some axes only; what is constant last.
-        ordered = sorted(candidates, key=lambda f: (-f.score, f.meaning.part, -f.topic.messages, f.topic.name, f.path))
-        good = [f for f in ordered if f.score >= LEAST_SCORE]
+        def rank(judgement: tuple[float, str, Field]) -> tuple[object, ...]:
+            score, _, f = judgement
+            return -score, f.meaning.part, f.seen.is_off_centre, -f.topic.messages, f.topic.name, f.path
+
+        good = sorted((j for j in judged if j[0] >= LEAST_SCORE), key=rank)
         if not good:
             return
-        best = good[0]
-        self._choose(name, best, [f for f in good[1:] if f.score > best.score - 0.1 and not agree(best.si, f.si)])
+        score, name, best = good[0]
+        near = [f for s, n, f in good[1:] if s > score - 0.1 and n == name and not agree(best.si, f.si)]
+        self._select(name, best, near)
 
-    def _choose(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
+    def _select(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
         """Select a field for a signal, and record its rivals."""
         self.taken[name] = best
         if rivals:
@@ -256,9 +237,14 @@ class Weighing:
         times, sigma, by = self._per_turning(mean), BY_DRIVING, "a_y ≈ v r"
         if speed is not None:
             times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
-        likely = [u for u in WHEEL_UNITS if first.meaning.quantity in ("wheel speed", u.quantity)]
-        best, reasons, doubt = _unit_of_wheels(likely, times, sigma, by)
-        if times is not None and not (doubt or speed is None or speed.unit_known):
+        times = times if times is not None and times > 0.0 else 0.0
+        units = [u for u in WHEEL_UNITS if first.meaning.quantity in ("wheel speed", u.quantity)]
+        best, *others = _likely(units, times, sigma, POSSIBLE) if times else units[:1]
+        reasons = [f"{times:.4g} of it is 1 m/s by {by}"] if times else []
+        doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
+        if not times:
+            doubt = f"the unit of the wheel speeds is not given, and no speed to compare with; taken as {best.name}"
+        elif not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
         for item in wheels:
             item.factors = ((best.name, best.factor / (USUAL_RADIUS_M if best.spread else 1.0)),)
@@ -289,20 +275,14 @@ class Weighing:
                 continue
             relation = None if curvature is None else fit(self.fields.pieces.smooth(item.seen.cells), curvature)
             name, follows = self._steering_kind(item, relation)
-            if (score := item.score + 0.3 * follows) >= LEAST_SCORE:
-                judged.append((score, name, item))
-        if not judged:
-            return
-        judged.sort(key=lambda j: (-j[0], j[2].seen.is_off_centre, -j[2].topic.messages, j[2].topic.name, j[2].path))
-        _, name, best = judged[0]
-        near = [f for score, n, f in judged[1:] if score > judged[0][0] - 0.1 and n == name]
-        self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
+            judged.append((item.score + 0.3 * follows, name, item))
+        self._choose(judged)
 
     def _steer_by_command(self) -> None:
         """Without a measured angle, take a documented command, or one whose ratio to the curvature is an angle's."""
         commands = [f for f in self.fields.candidates if f.role == "command" and f.meaning.quantity == "steering"]
         if measured := [n for n in self.taken if n.startswith("steer")]:
-            self._choose(measured[0], self.taken[measured[0]], [f for f in commands if f.fixed])
+            self._select(measured[0], self.taken[measured[0]], [f for f in commands if f.fixed])
             return
         for item in commands:
             item.bonus -= 0.3
@@ -358,9 +338,7 @@ class Weighing:
         if not self.truth_from:
             return
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
-        documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
-        # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
-        self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
+        self.true = _truth_of([f for f in its if f.fixed]) or _truth_of(its)
         if not self.true:
             return
         self._head()
@@ -458,8 +436,7 @@ def _share_axis(first: Field, second: Field) -> bool:
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
     """Return the ground truth quantities of one topic; empty without sideslip, lateral velocity or a position."""
     truth: dict[str, Field] = {}
-    along = {"lng", "long", "longitudinal", "forward"}
-    for item in sorted(candidates, key=lambda f: (-f.score, along.isdisjoint(words_of(f.path)))):
+    for item in sorted(candidates, key=lambda f: -f.score):
         name = _truth_name(item)
         if name and item.seen.changes:
             truth.setdefault(name, item)
@@ -477,10 +454,7 @@ def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
         if item.meaning.quantity in ("wheel speed", "wheel rate") and item.meaning.part in WHEELS:
             key = (item.topic.name, item.path.rpartition(".")[0], item.meaning.quantity)
             sets.setdefault(key, {}).setdefault(item.meaning.part, item)
-    apart: dict[str, Field] = {}
-    for group in sets.values():
-        if len(group) == 1:
-            apart = group | apart
+    apart = {corner: f for group in sets.values() if len(group) == 1 for corner, f in group.items()}
     complete = [g for g in sets.values() if len(g) >= 2]
     return max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
 
@@ -511,16 +485,6 @@ def truth_topic(weighable: Sequence[Field]) -> str:
         if worth > best[0] and (fields[0].role != "sensor" or worth >= 1.5 or fields[0].fixed):
             best = (worth, name)
     return best[1]
-
-
-def _unit_of_wheels(units: Sequence[Unit], times: float | None, sigma: float, by: str) -> tuple[Unit, list[str], str]:
-    """Return the likeliest unit of wheel speeds if ``times`` of it are 1 m/s, the reasons and the doubt."""
-    if times is None or not times > 0.0:
-        unit = units[0].name
-        return units[0], [], f"the unit of the wheel speeds is not given, and no speed to compare with; taken as {unit}"
-    best, *others = _likely(units, times, sigma, POSSIBLE)
-    doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
-    return best, [f"{times:.4g} of it is 1 m/s by {by}"], doubt
 
 
 def _likely(units: Sequence[Unit], gain: float, sigma: float, least: float, broken: float = 0.01) -> Sequence[Unit]:

@@ -164,70 +164,52 @@ numbers = st.floats(allow_nan=False, allow_infinity=False)
 nonzero = numbers.filter(lambda x: x != 0.0)
 
 
-@st.composite
-def sources(draw: st.DrawFn, name: str, index: int) -> SignalSource:
-    width = VECTOR_COLUMNS.get(name, 1)
-
-    def entries(element: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
-        return element if width == 1 else element | st.tuples(*[element] * width)
-
-    low, high = sorted(draw(st.tuples(numbers, numbers).filter(lambda x: x[0] != x[1])))
-    return SignalSource(
-        name=name,
-        # One topic a source: that fields and clocks do not contradict one another is tested above.
-        topic=f"/{index}" + draw(texts),
-        field=draw(entries(texts)),  # type: ignore[arg-type]
-        stamp=draw(texts),
-        scale=draw(entries(nonzero)),  # type: ignore[arg-type]
-        offset=draw(entries(numbers)),  # type: ignore[arg-type]
-        latency_s=draw(numbers),
-        valid_min=draw(st.sampled_from([None, low])),
-        valid_max=draw(st.sampled_from([None, high])),
-        stamp_unit=draw(st.sampled_from(["ros", "s", "ms", "us", "ns"])),
-        clock=draw(st.sampled_from(["utc", "device"])),
-    )
+LIMITS = st.none() | numbers
 
 
-@st.composite
-def mappings(draw: st.DrawFn) -> Mapping:
-    exclusive = {"steering_wheel_rad"} | {n for n in SIGNAL_UNITS if n.endswith("rad_s") and n.startswith("wheel")}
-    signal_names = draw(st.lists(st.sampled_from(sorted(set(SIGNAL_UNITS) - exclusive)), unique=True, max_size=5))
-    truth_names = draw(st.lists(st.sampled_from(sorted(TRUTH_UNITS)), unique=True, max_size=4))
-    quality = None
-    if draw(st.booleans()):
-        quality = QualityGate(
-            topic="/gate" + draw(texts),
-            field=draw(texts),
-            min=draw(st.sampled_from([None, -1.5])),
-            max=draw(st.sampled_from([None, 4.0])),
-            values=tuple(draw(st.lists(numbers, min_size=1, max_size=3))),
-            stamp=draw(texts),
-            latency_s=draw(numbers),
-        )
-    return Mapping(
-        signals={n: draw(sources(n, i)) for i, n in enumerate(signal_names)},
-        truth={n: draw(sources(n, 100 + i)) for i, n in enumerate(truth_names)},
-        quality=quality,
-    )
+def sources(names: list[str], prefix: str) -> st.SearchStrategy[dict[str, SignalSource]]:
+    """Return sources by name, each of its own topic: contradictions of fields and clocks are tested above."""
+
+    def source(name: str) -> st.SearchStrategy[SignalSource]:
+        width = VECTOR_COLUMNS.get(name, 1)
+
+        def entries(element: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
+            return element if width == 1 else element | st.tuples(*[element] * width)
+
+        built = st.builds(
+            SignalSource, st.just(name), texts.map(lambda text: f"/{prefix}{name}{text}"), entries(texts), texts,
+            entries(nonzero), entries(numbers), numbers, LIMITS, LIMITS,
+            st.sampled_from(["ros", "s", "ms", "us", "ns"]), st.sampled_from(["utc", "device"]),
+        )  # fmt: skip
+        return built.filter(lambda s: None in (s.valid_min, s.valid_max) or s.valid_min < s.valid_max)
+
+    return st.fixed_dictionaries({}, optional={name: source(name) for name in names})
+
+
+EXCLUSIVE = {"steering_wheel_rad"} | {n for n in SIGNAL_UNITS if n.endswith("rad_s") and n.startswith("wheel")}
+GATES = st.builds(
+    QualityGate, texts.map(lambda text: f"/gate{text}"), texts, min=st.sampled_from([None, -1.5]),
+    max=st.sampled_from([None, 4.0]), values=st.lists(numbers, min_size=1, max_size=3).map(tuple), stamp=texts,
+    latency_s=numbers,
+)  # fmt: skip
+MAPPINGS = st.builds(
+    Mapping,
+    signals=sources(sorted(set(SIGNAL_UNITS) - EXCLUSIVE), "s"),
+    truth=sources(sorted(TRUTH_UNITS), "t"),
+    quality=st.none() | GATES,
+    origin=st.just("file"),
+    notes=st.just(()),
+)
 
 
 @pytest.mark.slow
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(mapping=mappings(), comment=texts)
+@given(mapping=MAPPINGS, comment=texts)
 def test_what_is_written_loads_back(tmp_path_factory: pytest.TempPathFactory, mapping: Mapping, comment: str) -> None:
-    clean = {
-        "signals": {n: s for n, s in mapping.signals.items() if not _device_without_stamp(s)},
-        "truth": {n: s for n, s in mapping.truth.items() if not _device_without_stamp(s)},
-    }
-    mapping = Mapping(signals=clean["signals"], truth=clean["truth"], quality=mapping.quality)
     text = mapping_to_toml(mapping, comments={"": comment, "ax_m_s2": comment, "vx_m_s": comment})
     path = tmp_path_factory.mktemp("toml") / "m.toml"
     path.write_text(text, encoding="utf-8", newline="")
     assert load_mapping(path) == mapping
-
-
-def _device_without_stamp(source: SignalSource) -> bool:
-    return source.clock == "device" and source.stamp in ("log_time", "publish_time")
 
 
 def test_missing_signals_stand_ready_as_comments(tmp_path: Path) -> None:
