@@ -149,13 +149,11 @@ class Weighing:
             self._tell(name, item)
 
     def _usable(self) -> list[Field]:
-        """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
+        """Return candidates for signals; estimates of a quantity that no sensor gives are included."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation")]
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"acceleration", "rate", "speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
-        for item in usable:
-            item.bonus -= 0.2 * (item.topic.name == self.truth_from)
         return [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
 
     def drop_vectors_over_ground(self) -> None:
@@ -164,7 +162,7 @@ class Weighing:
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
             is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
-            if axes == "body" or (is_named and not axes):
+            if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
                 continue
             self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y)]
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
@@ -175,6 +173,11 @@ class Weighing:
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
+
+    def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
+        """Return whether another speed is the length of x and y, and not x."""
+        speeds = [f.si for f in self.fields.open("speed") if f is not x]
+        return any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
 
     def _vectors(self) -> Iterator[tuple[Field, Field]]:
         """Yield the x and y of velocities that change."""
