@@ -295,19 +295,19 @@ def mapping_to_toml(
     if mapping.recorder:
         lines += ["", "[recorder]", *(f"{_toml(topic)} = {_toml(kind)}" for topic, kind in mapping.recorder)]
     if mapping.can is not None:
-        lines += ["", *_can_lines(mapping.can)]
+        lines += ["", "[can]", *_lines(mapping.can)]
     for section, sources, units in (("signals", mapping.signals, SIGNAL_UNITS), ("truth", mapping.truth, TRUTH_UNITS)):
         for name in (n for n in units if n in sources):
             lines += ["", *_comment(notes.get(f"{section}.{name}", notes.get(name, "")))]
-            lines += [_header(section, name, 32), *_source_lines(sources[name])]
+            lines += [_header(section, name, 32), *_lines(sources[name])]
             lines += _alternative_lines(section, name, alternatives)
     for estimator, sources in mapping.estimates.items():
         for name in (n for n in ESTIMATE_UNITS if n in sources):
             lines += ["", f"[estimates.{_toml(estimator)}.{name}]  # {ESTIMATE_UNITS[name]}"]
-            lines += _source_lines(sources[name])
+            lines += _lines(sources[name])
     if mapping.quality is not None:
         lines += ["", *_comment(notes.get("truth_quality", "Ground truth is used where this condition is met."))]
-        lines += ["[truth_quality]", *_gate_lines(mapping.quality)]
+        lines += ["[truth_quality]", *_lines(mapping.quality)]
     lines += _missing_lines(mapping, notes, alternatives)
     return "\n".join(lines) + "\n"
 
@@ -357,7 +357,7 @@ def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate])
         lines += ["#", *_comment(f"Instead, score {candidate.score:.2f}: {candidate.reason}{doubt}")]
         lines += [
             f"# [{section}.{candidate.source.name}]  # {unit}",
-            *(f"# {x}" for x in _source_lines(candidate.source)),
+            *(f"# {x}" for x in _lines(candidate.source)),
         ]
     return lines
 
@@ -374,35 +374,10 @@ def missing_signals(mapping: Mapping) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _source_lines(source: SignalSource) -> list[str]:
-    names = ("stamp", "scale", "offset", "latency_s", "valid_min", "valid_max", "stamp_unit", "clock", "combine")
-    lines = _lines(source, names, always=("scale",))
-    return [f"topic = {_toml(source.topic)}", f"field = {_toml(source.field)}", *lines]
-
-
-def _gate_lines(gate: QualityGate) -> list[str]:
-    names = ("stamp", "min", "max", "values", "latency_s", "stamp_unit", "clock")
-    return [f"topic = {_toml(gate.topic)}", f"field = {_toml(gate.field)}", *_lines(gate, names)]
-
-
-def _can_lines(can: CanSettings) -> list[str]:
-    files = tuple(path.absolute().as_posix() if path.exists() else path.name for path in can.dbc)
-    names = ("id_field", "data_field", "length_field", "extended_field", "bus_field", "data_encoding")
-    lines = ["[can]", f"dbc = {_toml(files)}", *_lines(can, names)]
-    if can.bus is not None:
-        lines.append(f"bus = {can.bus}")
-    if can.id_mask != CanSettings(()).id_mask:
-        lines.append(f"id_mask = {can.id_mask:#x}")
-    return lines
-
-
-def _lines(
-    record: SignalSource | QualityGate | CanSettings, names: Sequence[str], always: tuple[str, ...] = ()
-) -> list[str]:
-    """Return the entries of these names that differ from the defaults."""
-    default = {f.name: f.default for f in fields(record)}
-    values = {n: getattr(record, n) for n in names}
-    return [f"{n} = {_toml(v)}" for n, v in values.items() if n in always or v != default[n]]
+def _lines(record: SignalSource | QualityGate | CanSettings) -> list[str]:
+    """Return the entries of a table that differ from the defaults, and the scale."""
+    entries = ((f.name, getattr(record, f.name), f.default) for f in fields(record) if f.name != "name")
+    return [f"{name} = {_toml(value)}" for name, value, default in entries if value != default or name == "scale"]
 
 
 def entries_of(source: SignalSource, *names: str) -> str:
@@ -410,12 +385,16 @@ def entries_of(source: SignalSource, *names: str) -> str:
     return ", ".join(f"{name} = {_toml(getattr(source, name))}" for name in names)
 
 
-def _toml(value: str | float | tuple[str, ...] | tuple[float, ...]) -> str:
+def _toml(value: str | float | Path | tuple[str, ...] | tuple[float, ...] | tuple[Path, ...]) -> str:
+    if isinstance(value, Path):
+        value = value.absolute().as_posix() if value.exists() else value.name
     if isinstance(value, str):
         # A JSON string is a TOML basic string, except that TOML requires DEL to be escaped.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, tuple):
         return "[" + ", ".join(_toml(v) for v in value) + "]"
+    if isinstance(value, int):
+        return str(value)
     number = float(value)
     if not math.isfinite(number):
         raise MappingError(expected="finite numbers in a mapping", got=repr(value), where="mapping")
