@@ -225,6 +225,10 @@ def _by_gravity(fields: Fields) -> None:
             is_gravity = abs(size * axes["z"].scale / G_M_S2 - 1.0) < NEAR_1_G and abs(means[up]) > UPRIGHT * size
             if len(means) > 1 and is_gravity:
                 _turn(fields, axes, f"{'-' if means[up] < 0.0 else '+'}{up}")
+    # Beside an accelerometer, an acceleration without gravity is computed from it, or is of the earth's axes.
+    sensing = {item.topic.name for item in fields.candidates if item.has_gravity}
+    for item in (f for f in fields.candidates if f.topic.name in sensing and not f.has_gravity):
+        item.bonus -= 0.2 * (item.meaning.quantity == "acceleration" and item.is_axis)
 
 
 def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:

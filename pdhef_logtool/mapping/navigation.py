@@ -187,11 +187,11 @@ def receiver_signals(
 
 
 class _Instrument:
-    """The named fields of a topic that may be a navigation system or a receiver."""
+    """The fields of a topic, by their names, that may be a navigation system or a receiver."""
 
     def __init__(self, fields: Fields, topic: str) -> None:
         self.pieces = fields.pieces
-        self.fields = [f for f in fields.candidates if f.topic.name == topic]
+        self.fields = [f for f in fields.candidates if f.topic.name == topic and not f.fixed]
         places = [next(iter(self.of(quantity)), None) for quantity in _PLACES]
         self.places = [f for f in places if f is not None]
         structs: dict[str, dict[str, Field]] = {}

@@ -603,12 +603,16 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     if axes == "not ahead":
         why = "the type's convention is the body frame, although x is mostly not the direction of travel"
         draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
+    imus = [t.name for t in draft.log.topics if type_of(t) in IMU_TYPES and _device(t.name) == _device(chosen.name)]
+    down = any(_mean(draft.values(imu, _GRAVITY_PATHS[2])) < -0.5 for imu in imus)  # m/s² or g
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
         values = draft.values(chosen.name, full)
         filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
         if draft.is_given(chosen.name, full) and not filler:
-            draft.take(draft.truth, name, chosen.name, full)
+            draft.take(draft.truth, name, chosen.name, full, -1.0 if down and axis != "x" else 1.0)
+    if down:
+        draft.doubt("ground-truth velocity", (chosen.name,), chosen.name, "z of its IMU is downward, as gravity shows")
     return chosen
 
 
@@ -628,6 +632,9 @@ def _take_earth_velocity(draft: _Draft, chosen: TopicInfo, axes: str, *, is_body
     scale = (1.0, 1.0, -1.0) if is_down else 1.0
     name, stamp = "enu_velocity_m_s", draft.stamp(chosen.name)
     draft.truth[name] = SignalSource(name, chosen.name, paths, stamp, scale)
+    rates = draft.values(chosen.name, _twist(chosen, "angular", "z"))
+    if is_body and _span(rates) > 0.0:
+        draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
     return chosen
 
 

@@ -23,6 +23,7 @@ from pdhef_logtool.mapping.candidates import (
     anchor_of,
     look,
     named_fields,
+    place_of,
     proposed_fields,
     triad_of,
 )
@@ -163,6 +164,7 @@ class Weighing:
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
             is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
             if (axes == "body" or (is_named and not axes)) and not self._is_horizontal_speed(x, y):
+                self._turn_down(y)
                 continue
             self.fields.candidates = [f for f in self.fields.candidates if f not in (x, y)]
             note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
@@ -178,6 +180,13 @@ class Weighing:
         """Return whether another speed is the length of x and y, and not x."""
         speeds = [f.si for f in self.fields.open("speed") if f is not x]
         return any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
+
+    def _turn_down(self, y: Field) -> None:
+        """Turn the y of a body's velocity to the left if the accelerometer beside it has gravity along -z."""
+        down = [f for f in self.fields.candidates if f.has_gravity and f.sign < 0.0 and f.path.rstrip("]")[-1] in "zZ2"]
+        if any(f.meaning.part == "z" and place_of(f) == place_of(y) for f in down):
+            y.sign = -1.0
+            y.doubts.append("its device has axes forward, right, down, as gravity shows")
 
     def _vectors(self) -> Iterator[tuple[Field, Field]]:
         """Yield the x and y of velocities that change."""
@@ -341,7 +350,9 @@ class Weighing:
         if not self.truth_from:
             return
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
-        self.true = _truth_of([f for f in its if f.fixed]) or _truth_of(its)
+        documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
+        # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
+        self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
         if not self.true:
             return
         self._head()
@@ -439,7 +450,8 @@ def _share_axis(first: Field, second: Field) -> bool:
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
     """Return the ground truth quantities of one topic; empty without sideslip, lateral velocity or a position."""
     truth: dict[str, Field] = {}
-    for item in sorted(candidates, key=lambda f: -f.score):
+    along = {"lng", "long", "longitudinal", "forward"}
+    for item in sorted(candidates, key=lambda f: (-f.score, along.isdisjoint(words_of(f.path)))):
         name = _truth_name(item)
         if name and item.seen.changes:
             truth.setdefault(name, item)
