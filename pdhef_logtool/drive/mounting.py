@@ -120,16 +120,11 @@ def _siblings(paths: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
         a, b, c = (f"{index[1]}{start + i}{index[3]}" for i in range(3))
         yield a, b, c
     leaf = path.rfind(".") + 1
-    for word in _RATE_WORDS:
-        position = path.lower().find(word, leaf)
-        if position >= 0:
-            written = [w.capitalize() if path[position].isupper() else w for w in _RATE_WORDS]
-            a, b, c = (path[:position] + w + path[position + len(word) :] for w in written)
-            yield a, b, c
-    for position in range(len(path) - 1, leaf - 1, -1):
-        if path[position] in "xyzXYZ":
-            axes = "XYZ" if path[position].isupper() else "xyz"
-            a, b, c = (path[:position] + axis + path[position + 1 :] for axis in axes)
+    for words in (_RATE_WORDS, ("x", "y", "z")):
+        for match in reversed([*re.finditer("|".join(words), path[leaf:], re.IGNORECASE)]):
+            start, end = (leaf + place for place in match.span())
+            written = (w.capitalize() if path[start].isupper() else w for w in words)
+            a, b, c = (path[:start] + w + path[end:] for w in written)
             yield a, b, c
 
 
