@@ -223,24 +223,18 @@ def _is_column(info: FieldInfo) -> bool:
 
 
 def proposed_fields(
-    log: DriveLog, pieces: Pieces, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], known: list[Field]
+    log: DriveLog, pieces: Pieces, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], fields: list[Field]
 ) -> Iterator[Field]:
     """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives.
 
-    ``known``: fields with a quantity, mapped or by name.
+    ``fields`` have a quantity, mapped or by name.
     """
-    known = [f for f in known if f.role != "command"]
-    there = {(f.meaning.quantity, part) for f in known for part in (f.meaning.part, "any")}
+    measured = [f for f in fields if f.role != "command"]
+    there = {(f.meaning.quantity, part) for f in measured for part in (f.meaning.part, "any")}
     wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
     wanted += [] if ("steering", "any") in there else [("steering", "")]
-    by_name = {(topic.name, info.path) for topic, _, info, _, _ in named}
-    open_fields: dict[tuple[str, str], tuple[TopicInfo, FieldInfo, Units]] = {}
-    for topic in [t for t, role in topics if role == "sensor"] if wanted else ():
-        fields = log.fields(topic.name, quiet=True)
-        for info in () if holds_frames(topic.name, fields) else filter(_is_column, fields):
-            if (units := _units_without_name(info)) and (topic.name, info.path) not in by_name:
-                open_fields[topic.name, info.path.removesuffix("[]")] = topic, info, units
-    sides = [column for role in ROLES for column in _named_column(known, role)]
+    open_fields = _open_fields(log, topics, named) if wanted else {}
+    sides = [column for role in ROLES for column in _named_column(measured, role)]
     read = pieces.read([*open_fields][: MOST_PROPOSED - len(sides)])
     others = []
     for (name, path), seen in read.items():
@@ -255,10 +249,24 @@ def proposed_fields(
         yield _field_of(log.fields(topic.name, quiet=True), topic, "sensor", info, meaning, column.seen)
 
 
-def _named_column(known: Sequence[Field], role: tuple[str, str]) -> Iterator[Column]:
+def _open_fields(
+    log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]
+) -> dict[tuple[str, str], tuple[TopicInfo, FieldInfo, Units]]:
+    """Return the sensors' fields without a meaning, with their possible units, by topic and path."""
+    by_name = {(topic.name, info.path) for topic, _, info, _, _ in named}
+    open_fields = {}
+    for topic in (t for t, role in topics if role == "sensor"):
+        fields = log.fields(topic.name, quiet=True)
+        for info in () if holds_frames(topic.name, fields) else filter(_is_column, fields):
+            if (units := _units_without_name(info)) and (topic.name, info.path) not in by_name:
+                open_fields[topic.name, info.path.removesuffix("[]")] = topic, info, units
+    return open_fields
+
+
+def _named_column(fields: Sequence[Field], role: tuple[str, str]) -> Iterator[Column]:
     """Yield the surest field of one of :data:`ROLES`; a wheel speed replaces a missing speed."""
-    its = [f for f in known if f.meaning.quantity == role[0] and f.meaning.part in (role[1], "")]
-    its = its or [f for f in known if role[0] == "speed" and f.meaning.quantity == "wheel speed"]
+    its = [f for f in fields if f.meaning.quantity == role[0] and f.meaning.part in (role[1], "")]
+    its = its or [f for f in fields if role[0] == "speed" and f.meaning.quantity == "wheel speed"]
     for item in sorted(its, key=lambda f: -f.meaning.strength)[:1]:
         yield Column(item.seen, {role[0]: item.units}, role)
 
