@@ -79,6 +79,11 @@ def _unglued(piece: str) -> list[str]:
     return best[-1] or [piece]
 
 
+def tags_of(name: str) -> frozenset[str]:
+    """Return the words of a name without a meaning, such as the name of an instrument."""
+    return frozenset(w for w in words_of(name) if len(w) > 1 and (w not in _WHOLE or w in _WORDS["instruments"]))
+
+
 @dataclass(frozen=True, slots=True)
 class Meaning:
     """Quantity of a field according to its name.

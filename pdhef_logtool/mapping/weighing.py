@@ -7,7 +7,7 @@ or a sign; an open point becomes an undecided check with a remedy.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,7 +42,7 @@ from pdhef_logtool.mapping.fields import (
     path_velocity,
     posterior,
 )
-from pdhef_logtool.mapping.naming import words_of
+from pdhef_logtool.mapping.naming import tags_of, words_of
 from pdhef_logtool.mapping.navigation import axes_of, has_heading
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, names_of
@@ -105,6 +105,9 @@ def weigh(
     weighing.drop_vectors_over_ground()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
+    its = [f for f in may_be_true if f.topic.name == weighing.truth_from and _truth_name(f) in _SLIP and f.seen.changes]
+    ordered = sorted(its, key=lambda f: (f.role != "truth", f.role != "navigation", -f.score))
+    weighing.slip = next(iter(ordered), None)
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
     return weighing
@@ -116,14 +119,15 @@ class Weighing:
 
     Attributes
     ----------
-    true_speed : of mapped ground truth. truth_from : topic of other ground truth. taken, true : selected fields by
-        signal and by ground-truth quantity.
+    true_speed : of mapped ground truth. truth_from, slip : topic of other ground truth, and its lateral velocity.
+    taken, true : selected fields by signal and by ground-truth quantity.
     rivals : fields of a signal with nearly the same score. checks : undecided points.
     """
 
     fields: Fields
     true_speed: Field | None = None
     truth_from: str = ""
+    slip: Field | None = None
     taken: dict[str, Field] = field(default_factory=dict)
     true: dict[str, Field] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -155,7 +159,19 @@ class Weighing:
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"acceleration", "rate", "speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
-        return [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
+        usable = [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
+        # Sensors of the ground truth's instrument rank below others.
+        kinships = [(f.meaning.quantity, f.meaning.part, self._kinship(f)) for f in usable]
+        for item, (*meant, kinship) in zip(usable, kinships, strict=True):
+            item.bonus -= 0.2 * any(meant == other and kinship > less for *other, less in kinships)
+        return usable
+
+    def _kinship(self, item: Field) -> int:
+        """Return how many words show that a field is of the instrument that measures the lateral velocity."""
+        slip = self.slip
+        if slip is None or item.topic.name != slip.topic.name:
+            return 0
+        return 1 + len(tags_of(item.path) & tags_of(slip.path))
 
     def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
@@ -350,7 +366,7 @@ class Weighing:
         if not self.truth_from:
             return
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
-        documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
+        documented, named = (_truth_of(fields, self._kinship) for fields in ([f for f in its if f.fixed], its))
         # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
         self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
         if not self.true:
@@ -429,11 +445,14 @@ def _share_axis(first: Field, second: Field) -> bool:
     return first.topic.name == second.topic.name and bool(set.intersection(*axes)) and not (first.fixed or second.fixed)
 
 
-def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
-    """Return the ground truth quantities of one topic; empty without sideslip, lateral velocity or a position."""
+def _truth_of(candidates: Sequence[Field], kinship: Callable[[Field], int]) -> dict[str, Field]:
+    """Return the ground truth quantities of one topic; empty without sideslip, lateral velocity or a position.
+
+    Fields of one instrument are preferred (``kinship``).
+    """
     truth: dict[str, Field] = {}
     along = {"lng", "long", "longitudinal", "forward"}
-    for item in sorted(candidates, key=lambda f: (-f.score, along.isdisjoint(words_of(f.path)))):
+    for item in sorted(candidates, key=lambda f: (-kinship(f), -f.score, along.isdisjoint(words_of(f.path)))):
         name = _truth_name(item)
         if name and item.seen.changes:
             truth.setdefault(name, item)
