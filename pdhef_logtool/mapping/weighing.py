@@ -167,11 +167,12 @@ class Weighing:
         return usable
 
     def _kinship(self, item: Field) -> int:
-        """Return how many words show that a field is of the instrument that measures the lateral velocity."""
+        """Return how far the words of a field show the instrument that measures the lateral velocity."""
         slip = self.slip
         if slip is None or item.topic.name != slip.topic.name:
-            return 0
-        return 1 + len(tags_of(item.path) & tags_of(slip.path))
+            return -9
+        own, its = tags_of(item.path), tags_of(slip.path)
+        return len(own & its) - len(own - its)
 
     def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""

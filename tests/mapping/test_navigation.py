@@ -47,12 +47,14 @@ def of_table(**columns: np.ndarray) -> AutoMapping:
 
 
 @pytest.mark.parametrize(
-    "name", ["truth_{}", "{}_gt", "rtk_{}", "ins_{}", "oxts_{}", "{}_rt3000", "kistler_{}", "true_{}"]
+    "name", ["{}", "truth_{}", "{}_gt", "rtk_{}", "ins_{}", "oxts_{}", "{}_rt3000", "kistler_{}", "true_{}"]
 )
 def test_a_table_of_two_instruments(name: str) -> None:
     """Sideslip and the words beside its name show the ground truth's instrument; the other columns are the car's."""
     truth = {name.format("vx"): V, name.format("vy"): 0.3 * RATE, name.format("yaw_rate"): 1.001 * RATE}
-    mapping = of_table(speed=V, accel_y=V * RATE, yaw_rate=RATE, steer=2.9 * RATE / V, **truth).mapping
+    own = {"speed": V, "accel_y": V * RATE, "yaw_rate": RATE, "steer": 2.9 * RATE / V}
+    own = {f"can_{n}": column for n, column in own.items()} if name == "{}" else own
+    mapping = of_table(**own, **truth).mapping
     assert {str(s.field) for s in mapping.truth.values()} == set(truth)
     assert {str(s.field) for s in mapping.signals.values()}.isdisjoint(truth)
     assert {"speed_m_s", "ay_m_s2", "yaw_rate_rad_s"} <= mapping.signals.keys()
