@@ -171,8 +171,8 @@ class Weighing:
         slip = self.slip
         if slip is None or item.topic.name != slip.topic.name:
             return -9
-        own, its = tags_of(item.path), tags_of(slip.path)
-        return len(own & its) - len(own - its)
+        tags, others = tags_of(item.path), tags_of(slip.path)
+        return len(tags & others) - len(tags - others)
 
     def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
