@@ -198,14 +198,10 @@ class CarFit:
     def refusal(self, theta: FloatArray) -> tuple[str, bool]:
         """Return why a fit is rejected, its error is too large or the car slides, and whether it slides."""
         rms = self.rms(theta)
-        for name, column, row in (
-            ("yaw rate", equations.YAW_RATE, equations.OF_RATE),
-            ("lateral acceleration", equations.AY, equations.OF_AY),
-        ):
-            measured = self._columns[column, self._driving.settled]
-            share = rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
-            modelled = self._out[row, self._kept]
-            gain = float(modelled @ self._columns[column, self._kept]) / max(float(modelled @ modelled), 1e-9)
+        measured, modelled = (of[:, self._kept] for of in (self._columns[equations.YAW_RATE :], self._out))
+        for row, name in ((equations.OF_RATE, "yaw rate"), (equations.OF_AY, "lateral acceleration")):
+            share = rms[row] / max(float(np.sqrt(np.mean(measured[row] ** 2))), 1e-9)
+            gain = float(modelled[row] @ measured[row]) / max(float(modelled[row] @ modelled[row]), 1e-9)
             is_noise = 1.0 / LARGEST_GAIN < gain < LARGEST_GAIN
             if share > LARGEST_SHARE and rms[row] > ERROR_STD[row] and not is_noise:
                 return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible", False
