@@ -17,8 +17,8 @@ from studies.gates.tool import Tool
 from studies.pages import ROOT, page_options, write
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
-from studies.paper.page import PAGE_FIGURES, write_page
-from studies.paper.results import document, gather
+from studies.paper.page import write_page
+from studies.paper.results import gather
 
 #: Results of this command and of the constants, in the folder of results.
 STORED = ("results.json", "constants.json")
@@ -28,8 +28,8 @@ def render(results: Path, docs: Path) -> None:
     """Write the page from the stored results and figures of a folder."""
     stored, constants = (json.loads((results / n).read_text(encoding="utf-8")) for n in STORED)
     (docs / "paper").mkdir(parents=True, exist_ok=True)
-    for name in PAGE_FIGURES:
-        shutil.copyfile(results / name, docs / "paper" / name)
+    for picture in results.glob("*.png"):
+        shutil.copyfile(picture, docs / "paper" / picture.name)
     write(docs / "paper.md", write_page(stored, constants))
 
 
@@ -40,9 +40,9 @@ def main() -> int:
     given = parser.parse_args()
     if not given.stored:
         seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + given.noise_seeds)
-        results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)
-        draw(results, given.results)
-        write(given.results / STORED[0], json.dumps(document(results), indent=1, allow_nan=False) + "\n")
+        experiment, results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)
+        draw(experiment, results, given.results)
+        write(given.results / STORED[0], json.dumps(results, indent=1, allow_nan=False) + "\n")
     render(given.results, given.out)
     return 0
 

@@ -1,10 +1,10 @@
-"""Quantities of Figures 10, 19 to 21 and 23: residuals, adaptation of R, residual gain, time of a step."""
+"""Figures of the paper beside the errors: residuals, adaptation of R, residual gain, time of a step."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,42 +14,17 @@ from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.network.residuals import residual_rows
-from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.runs.estimating import estimate_drive
 from studies.paper.experiment import GRAVITY_M_S2, Experiment, time_s, valid
 
-#: Rows of the residual, with their units.
-RESIDUAL_ROWS = (("v_y", "m/s²"), ("yaw rate", "rad/s²"))
 
+def residual_fit(whole: WholeDrive, car: Car) -> dict[str, list[float]]:
+    """Compare the residual of a drive with the output of the paper's network, features as in service.
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ResidualFit:
-    """Residual rates of a drive, rows as in ``RESIDUAL_ROWS``, at the samples that count.
-
-    Attributes
-    ----------
-    time_s : [N]. target : [N, 2], residual of the nominal model at the true state with the measured steering.
-    output : [N, 2], output of the network. step_s : median step.
+    ``explained``: share of the residual's mean square that the output explains (1 − mean square error / mean square),
+    of v_y and of the yaw rate. ``yaw_rate_increment_rad_s``: smallest and largest over one step (Eq 18).
     """
-
-    time_s: FloatArray
-    target: FloatArray
-    output: FloatArray
-    step_s: float
-
-    def explained(self, row: int) -> float:
-        """Share of the target's mean square that the output explains (1 − mean square error / mean square)."""
-        error = self.output[:, row] - self.target[:, row]
-        return float(1.0 - np.mean(error**2) / np.mean(self.target[:, row] ** 2))
-
-    def increments(self, row: int) -> tuple[float, float]:
-        """Smallest and largest increment over one step that the network gave (Eq 18)."""
-        return float(self.output[:, row].min() * self.step_s), float(self.output[:, row].max() * self.step_s)
-
-
-def residual_fit(whole: WholeDrive, car: Car) -> ResidualFit:
-    """Compare the residual of a drive with the output of the paper's network, features as in service."""
     assert isinstance(car.network, ModelBundle)
     assert car.network.paper_network is not None and whole.truth is not None
     network, period_s = car.network.paper_network, whole.plan.alignment.grid_period_s
@@ -57,25 +32,20 @@ def residual_fit(whole: WholeDrive, car: Car) -> ResidualFit:
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
     output, _ = network.run(rows.features, starts, None)
     use = rows.weight > 0.0
-    time_s = (rows.stamps_ns[use] - rows.stamps_ns[0]) * 1e-9
-    target = rows.targets[use] / rows.step_s[use, None]
-    return ResidualFit(time_s, target, output[use], float(np.median(rows.step_s[use])))
+    target, output, step_s = rows.targets[use] / rows.step_s[use, None], output[use], np.median(rows.step_s[use])
+    explained = 1.0 - np.mean((output - target) ** 2, axis=0) / np.mean(target**2, axis=0)
+    increments = step_s * output[:, 1]
+    return {
+        "explained": explained.tolist(),
+        "yaw_rate_increment_rad_s": [float(increments.min()), float(increments.max())],
+    }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrustCurve:
-    """β over |a_y|: samples, and the median with the 10 and 90 % points in bins of equal width."""
+def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> dict[str, Any] | None:
+    """Return the median of β of a scheme in bins of the true |a_y| of equal width, and its mean.
 
-    ay_g: FloatArray
-    trust: FloatArray
-    centre_g: FloatArray
-    median: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> TrustCurve | None:
-    """Return β of a scheme over the true |a_y|; None where the scheme did not run or has a constant gain."""
+    None where the scheme did not run or has a constant gain.
+    """
     track = experiment.track(scenario, scheme)
     if track is None:
         return None
@@ -88,9 +58,11 @@ def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 
     edges = np.linspace(0.0, ay.max(), bins + 1)
     place = np.clip(np.digitize(ay, edges) - 1, 0, bins - 1)
     filled = [i for i in range(bins) if np.count_nonzero(place == i) >= 5]
-    points = np.array([np.percentile(trust[place == i], [10.0, 50.0, 90.0]) for i in filled])
-    centre = 0.5 * (edges[1:] + edges[:-1])[filled]
-    return TrustCurve(ay, trust, centre, points[:, 1], points[:, 0], points[:, 2])
+    return {
+        "centre_g": (0.5 * (edges[1:] + edges[:-1])[filled]).tolist(),
+        "median": [float(np.median(trust[place == i])) for i in filled],
+        "mean": float(trust.mean()),
+    }
 
 
 def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float]) -> dict[str, float] | None:

@@ -1,10 +1,10 @@
-"""Everything that the page and the pictures need, gathered once, and as one JSON document."""
+"""Everything that the page and the pictures need, as one JSON document."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import polars as pl
@@ -27,48 +27,12 @@ from studies.paper.experiment import (
     run_experiment,
     spread,
 )  # fmt: skip
-from studies.paper.probes import ResidualFit, TrustCurve, inflation, residual_fit, step_times, trust_curve
+from studies.paper.probes import inflation, residual_fit, step_times, trust_curve
 from studies.paper.schemes import ESP, PAIRS
 
 SCENARIOS = (A, B, BURST)
 #: Schemes with a variable gain or factor on R.
 ADAPTIVE = ("pd-hef-paper", "pd-hef")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Results:
-    """Results of the experiment.
-
-    Attributes
-    ----------
-    fits : of the paper's network by scenario. curves : β over |a_y| by scenario and scheme.
-    inflations, times : of R, and processor times, by scheme.
-    """
-
-    experiment: Experiment
-    car: Car
-    fits: Mapping[str, ResidualFit]
-    curves: Mapping[str, Mapping[str, TrustCurve]]
-    inflations: Mapping[str, dict[str, float]]
-    times: Mapping[str, dict[str, float]]
-
-    @property
-    def losses(self) -> dict[str, list[float]]:
-        """Losses of the shipped paper's network by epoch."""
-        history = pl.read_parquet(SHIPPED_CARS["saloon"] / NETWORK_FOLDER / PAPER_FOLDER / HISTORY_FILE)
-        return {name: history[name].to_list() for name in ("train_loss", "validation_loss")}
-
-
-def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> Results:
-    """Run the whole experiment."""
-    experiment = run_experiment(tool, scenarios=SCENARIOS, noise_seeds=noise_seeds)
-    drives = {s.name: read_log(experiment.logs[s.name], on_the_road(car, s.friction)) for s in (A, B)}
-    fits = {name: residual_fit(whole, car) for name, whole in drives.items()}
-    curves = {s.name: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s.name, n)) is not None} for s in (A, B)}
-    inflations = {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None}
-    names = [n for n in experiment.ran if not n.endswith(ESP)]
-    times = step_times(drives[B.name], on_the_road(car, B.friction), names)
-    return Results(experiment, car, fits, curves, inflations, times)
 
 
 def _plain(value: Any) -> Any:
@@ -82,13 +46,19 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def document(r: Results) -> dict[str, Any]:
-    """Return all results for ``results.json``; the same but for ``step_time_us`` when made again."""
-    metrics, scenarios, network = r.experiment.metrics, [s.name for s in SCENARIOS], r.car.network
+def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> tuple[Experiment, dict[str, Any]]:
+    """Run the whole experiment; return it and all results for ``results.json``.
+
+    They are the same, but for ``step_time_us``, when they are computed again.
+    """
+    experiment = run_experiment(tool, scenarios=SCENARIOS, noise_seeds=noise_seeds)
+    metrics, scenarios, network = experiment.metrics, [s.name for s in SCENARIOS], car.network
+    drives = {s.name: read_log(experiment.logs[s.name], on_the_road(car, s.friction)) for s in (A, B)}
+    history = pl.read_parquet(SHIPPED_CARS["saloon"] / NETWORK_FOLDER / PAPER_FOLDER / HISTORY_FILE)
     summary = {
         scenario: {
             scheme: {f: of for f in FIGURES if (of := spread(metrics, scenario, scheme, f)) is not None}
-            for scheme in r.experiment.ran
+            for scheme in experiment.ran
         }
         for scenario in scenarios
     }
@@ -98,36 +68,23 @@ def document(r: Results) -> dict[str, Any]:
         for s, b in PAIRS
         if (gain := improvement(metrics, scenario, s, b)) is not None
     ]
-    residuals = {
-        scenario: {
-            "explained": [fit.explained(0), fit.explained(1)],
-            "yaw_rate_increment_rad_s": list(fit.increments(1)),
-        }
-        for scenario, fit in r.fits.items()
-    }
-    trust = {
-        scenario: {
-            scheme: {"centre_g": c.centre_g.tolist(), "median": c.median.tolist(), "mean": float(c.trust.mean())}
-            for scheme, c in curves.items()
-        }
-        for scenario, curves in r.curves.items()
-    }
-    plain: dict[str, Any] = _plain(
+    timed = [n for n in experiment.ran if not n.endswith(ESP)]
+    results: dict[str, Any] = _plain(
         {
             "made_by": "python -m studies.paper",
             "scenarios": [{**asdict(s), "speed_km_h": s.speed_km_h, "friction": s.friction} for s in SCENARIOS],
-            "vehicle": {"name": r.car.vehicle.name, "sha256": r.car.physics_sha256},
+            "vehicle": {"name": car.vehicle.name, "sha256": car.physics_sha256},
             "networks": [n.sha256 for n in (network, network and network.paper_network) if n is not None],
-            "losses": r.losses,
+            "losses": {name: history[name].to_list() for name in ("train_loss", "validation_loss")},
             "versions": tool_versions(),
             "summary": summary,
             "improvements": gains,
-            "residuals": residuals,
-            "trust": trust,
-            "r_factor": r.inflations,
-            "drives": r.experiment.facts,
+            "residuals": {name: residual_fit(whole, car) for name, whole in drives.items()},
+            "trust": {s: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s, n)) is not None} for s in drives},
+            "r_factor": {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None},
+            "drives": experiment.facts,
             "runs": metrics.to_dicts(),
-            "step_time_us": r.times,
+            "step_time_us": step_times(drives[B.name], on_the_road(car, B.friction), timed),
         }
     )
-    return plain
+    return experiment, results
