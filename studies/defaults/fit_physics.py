@@ -1,9 +1,10 @@
-"""Fit ``physics`` of the shipped car: its parts, values and noise, on five minutes of simulated driving.
+"""Fit ``physics`` of the shipped car: its values and noise, on five minutes of simulated driving.
 
     python -m studies.defaults.fit_physics [-o FOLDER] [--work out/fit-physics] [--jobs 2]
 
 The drives last 12.5 s, like the training drives of networks, with true friction and exact ground truth. The paper's
-scenarios, with their different speeds and friction, are excluded. All other values come from the vehicle file.
+scenarios, with their different speeds and friction, are excluded. All other values come from the vehicle file. All
+parts of the model are on: without one of them, the error on other drives was higher (docs/method.md#identification).
 
 In normalised parameters θ (distance from the prior in its standard deviations) the cost is
 
@@ -25,7 +26,7 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -74,6 +75,8 @@ MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
 #: Width of the tyres' priors about the axle-force fit, as a share of the widths about a vehicle file.
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
+#: Biases are states, as those of a drive: a mean over few drives would be no property of the car.
+PARTS = PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))
 Theta = dict[str, float]
 #: Start values of θ. The noise cost has two valleys: clean sensors, and a filter with a low gain on a_y.
 STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
@@ -88,7 +91,6 @@ class Prior:
     std: float
     log: bool = False
     low: float | None = None
-    tuning: bool = False  # belongs to the filter, not to the car: never put back to its prior
 
     def value(self, theta: float) -> float:
         """Return the parameter at a normalised distance from the prior."""
@@ -96,12 +98,9 @@ class Prior:
         return value if self.low is None else max(value, self.low)
 
 
-def make_priors(
-    start: VehicleParameters, parts: PhysicsParts, samples: AxleSamples, usable_s: float
-) -> tuple[Prior, ...]:
+def make_priors(start: VehicleParameters, samples: AxleSamples, usable_s: float) -> tuple[Prior, ...]:
     """Return the priors of docs/method.md#identification about a vehicle file."""
-    mu, gradient, sensors = start.assumed_friction, start.roll_gradient_rad_per_m_s2, start.sensors
-    priors = []
+    mu, priors = start.assumed_friction, []
     for axle, front, slip, force in (
         ("front", True, samples.front_slip_rad, samples.front_force_n),
         ("rear", False, samples.rear_slip_rad, samples.rear_force_n),
@@ -116,44 +115,32 @@ def make_priors(
             Prior(f"{axle} peak force", curve.peak_n, peak_std, log=True),
             Prior(f"{axle} shape", curve.shape, shape_std, low=1.0),
         ]
-    is_observable = gradient > 0.001
     priors += [
         Prior("yaw inertia", start.yaw_inertia_kg_m2, 0.20, log=True),
-        Prior("roll gradient", gradient, 0.3, log=True)
-        if is_observable
-        else Prior("roll gradient", 0.004, 0.004, low=0.0),
+        Prior("roll gradient", start.roll_gradient_rad_per_m_s2, 0.3, log=True),
+        Prior("relaxation length", start.relaxation_length_m or 0.5, 0.4, log=True),
+        Prior("load sensitivity", start.load_sensitivity, 0.1, low=0.0),
+        Prior("roll frequency", start.roll_frequency_rad_s, 0.3, log=True),
+        Prior("roll damping", start.roll_damping, 0.4, log=True),
+        Prior("CG over roll axis", 0.7 * start.cg_height_m, 0.2, low=0.0),
     ]
-    if not parts.biases:  # as states they are those of a drive: a mean over few drives would be no property of the car
-        priors += [
-            Prior("steering offset", start.steer_offset_rad, math.radians(0.2)),
-            Prior("a_y bias", sensors.ay_bias_m_s2, 0.10),
-            Prior("yaw rate bias", sensors.yaw_rate_bias_rad_s, 0.002),
-        ]
-    if parts.lag:
-        priors.append(Prior("relaxation length", start.relaxation_length_m or 0.5, 0.4, log=True))
-    if parts.load_transfer:
-        priors.append(Prior("load sensitivity", start.load_sensitivity, 0.1, low=0.0))
-    if parts.roll:
-        priors += [
-            Prior("roll frequency", start.roll_frequency_rad_s, 0.3, log=True),
-            Prior("roll damping", start.roll_damping, 0.4, log=True),
-            Prior("CG over roll axis", 0.7 * start.cg_height_m, 0.2, low=0.0),
-        ]
     noises = {
         "q v_y": PHYSICS_Q_STD[1], "q yaw rate": PHYSICS_Q_STD[2], "q a_x bias": 0.03, "q axle force": PHYSICS_Q_STD[4],
-        "r a_y": max(0.3, sensors.ay_std_m_s2), "r yaw rate": sensors.yaw_rate_std_rad_s,
+        "r a_y": max(0.3, start.sensors.ay_std_m_s2), "r yaw rate": start.sensors.yaw_rate_std_rad_s,
     }  # fmt: skip
-    return (*priors, *(Prior(name, mean, NOISE_LOG_STD, log=True, tuning=True) for name, mean in noises.items()))
+    return (*priors, *(Prior(name, mean, NOISE_LOG_STD, log=True) for name, mean in noises.items()))
 
 
-_OF_PARTS = {
+#: Entries of the vehicle file by parameter.
+_ENTRIES = {
+    "yaw inertia": "yaw_inertia_kg_m2", "roll gradient": "roll_gradient_rad_per_m_s2",
     "relaxation length": "relaxation_length_m", "load sensitivity": "load_sensitivity", "roll damping": "roll_damping",
     "roll frequency": "roll_frequency_rad_s", "CG over roll axis": "cg_over_roll_axis_m",
 }  # fmt: skip
 
 
 def build_car(
-    start: VehicleParameters, parts: PhysicsParts, priors: Sequence[Prior], theta: FloatArray, *, digits: int = 17
+    start: VehicleParameters, priors: Sequence[Prior], theta: FloatArray, *, digits: int = 17
 ) -> tuple[VehicleParameters, FilterNoise]:
     """Return the vehicle file with the parameters at ``theta``, and the noise of ``physics`` that belongs to them."""
 
@@ -168,17 +155,8 @@ def build_car(
         b = rounded(v[f"{axle} cornering stiffness"] / (shape * peak))
         return AxleTyre(B=b, C=shape, D_n=rounded(peak / mu), E=0.0, reference_friction=mu)
 
-    update = {
-        "yaw_inertia_kg_m2": v["yaw inertia"],
-        "roll_gradient_rad_per_m_s2": v["roll gradient"],
-        "friction": mu,
-        "tyres": Tyres(front=tyre("front"), rear=tyre("rear")),
-        "physics": parts,
-    }
-    if "a_y bias" in v:
-        biases = {"ay_bias_m_s2": v["a_y bias"], "yaw_rate_bias_rad_s": v["yaw rate bias"]}
-        update |= {"steer_offset_rad": v["steering offset"], "sensors": start.sensors.model_copy(update=biases)}
-    update |= {entry: v[name] for name, entry in _OF_PARTS.items() if name in v}
+    update: dict[str, object] = {entry: v[name] for name, entry in _ENTRIES.items()}
+    update |= {"friction": mu, "tyres": Tyres(front=tyre("front"), rear=tyre("rear")), "physics": PARTS}
     noise = FilterNoise(
         q_std=(PHYSICS_Q_STD[0], v["q v_y"], v["q yaw rate"], v["q a_x bias"], v["q axle force"], v["q axle force"]),
         r_std={"ay_m_s2": v["r a_y"], "yaw_rate_rad_s": v["r yaw rate"], "speed_m_s": start.sensors.speed_std_m_s},
@@ -237,12 +215,11 @@ class PhysicsFit:
 def fit_physics(
     drives: Sequence[FitDrive],
     start: VehicleParameters,
-    parts: PhysicsParts,
     *,
     starts: Sequence[Theta] = STARTS,
     iterations: int = MAX_ITERATIONS,
 ) -> PhysicsFit:
-    """Fit the parameters and noise of ``physics`` with the given parts to drives with ground truth.
+    """Fit the parameters and noise of ``physics`` to drives with ground truth.
 
     Parameters
     ----------
@@ -250,10 +227,10 @@ def fit_physics(
     """
     usable_s = sum(usable_seconds(d, start) for d in drives)
     samples = axle_samples(drives, start)
-    priors = make_priors(start, parts, samples, usable_s)
+    priors = make_priors(start, samples, usable_s)
 
     def errors(theta: FloatArray) -> list[DriveError]:
-        return drive_errors(drives, start, *build_car(start, parts, priors, theta))
+        return drive_errors(drives, start, *build_car(start, priors, theta))
 
     limits = {"derivative_step": DERIVATIVE_STEP, "max_step": MAX_STEP}
     firsts = [np.array([first.get(p.name, 0.0) for p in priors]) for first in starts]
@@ -263,7 +240,7 @@ def fit_physics(
     ]
     theta, normal, _, errors_of_drives = min(ends, key=lambda end: end.cost)
     std = np.sqrt(np.diag(np.linalg.inv(normal)))
-    vehicle, noise = build_car(start, parts, priors, theta, digits=6)
+    vehicle, noise = build_car(start, priors, theta, digits=6)
     squares = sum(float(np.sum(d.error**2)) for d in errors_of_drives)
     rms = math.degrees(math.sqrt(squares / max(1, sum(d.counted for d in errors_of_drives))))
     return PhysicsFit(vehicle, noise, priors, theta, std, rms)
@@ -303,69 +280,6 @@ def scaled_errors(there: Sequence[DriveError], here: Sequence[DriveError]) -> Fl
         weight = math.sqrt(now.seconds / CORRELATION_S / max(now.counted, 1))
         parts.append(weight * np.clip(d.error, -ROBUST * s, ROBUST * s) / s)
     return np.concatenate([*parts, [_nis_residual(there)]])
-
-
-#: Parts in the order of the removal trials, starting with the least certain.
-ORDER = ("braking", "force_scale", "bank", "biases", "load_transfer", "roll", "lag")
-#: A part stays if driving that its fits have not seen is worse by this share without it, on average over the folds.
-LEAST_GAIN = 0.01
-#: Steps of a fit that only states whether a part is worth having; it starts where the one with the part ended.
-TRIAL_ITERATIONS = 8
-#: Driving to fit, and driving to score.
-Fold = tuple[Sequence[FitDrive], Sequence[FitDrive]]
-Progress = Callable[[str, float], None]
-
-
-def choose_parts(
-    folds: Sequence[Fold], start: VehicleParameters, progress: Progress = lambda _text, _share: None
-) -> tuple[PhysicsParts, list[str]]:
-    """Choose the parts by driving that their fits have not seen: each stays only with evidence.
-
-    Parts are removed one after the other, starting from all parts: some are useful only together, such as the roll
-    and the load transfer that it delays. The remaining parts must score better than the model without parts.
-    """
-    theta: list[Sequence[Theta]] = [STARTS for _ in folds]
-    tried: list[str] = []
-
-    def scored(parts: PhysicsParts, iterations: int) -> tuple[FloatArray, list[Sequence[Theta]]]:
-        """Return the logarithm of the RMS on the held-out half of each fold, and θ there."""
-        scores: list[float] = []
-        ends: list[Sequence[Theta]] = []
-        for (fit, held_out), starts in zip(folds, theta, strict=True):
-            result = fit_physics(fit, start, parts, starts=starts, iterations=iterations)
-            errors = drive_errors(held_out, start, result.vehicle, result.noise)
-            logs = sum(e.seconds * math.log(e.rms**2 + FLOOR_RAD**2) for e in errors)
-            scores.append(0.5 * logs / sum(e.seconds for e in errors))
-            ends.append(({p.name: float(t) for p, t in zip(result.priors, result.theta, strict=True)},))
-        held = tuple(round(float(x), 4) for x in np.degrees(np.exp(scores)))
-        tried.append(f"{', '.join(parts.names) or 'static'}: {held}")
-        return np.array(scores), ends
-
-    none, parts = PhysicsParts(), PhysicsParts(**dict.fromkeys(ORDER, True))
-    static, _ = scored(none, MAX_ITERATIONS)
-    best, theta = scored(parts, MAX_ITERATIONS)
-    for number, name in enumerate(ORDER):
-        progress(f"is {name.replace('_', ' ')} worth having", (number + 2) / (len(ORDER) + 2))
-        fewer = parts.model_copy(update={name: False})
-        scores, ends = scored(fewer, TRIAL_ITERATIONS)
-        if (scores - best).mean() <= LEAST_GAIN:
-            parts, best, theta = fewer, scores, ends
-            tried[-1] += " taken"
-    return (none if (static - best).mean() <= LEAST_GAIN else parts), tried
-
-
-def find_physics(
-    drives: Sequence[FitDrive], start: VehicleParameters, progress: Progress
-) -> tuple[PhysicsFit, list[str]]:
-    """Identify ``physics`` of a car on drives with ground truth; also return the trials.
-
-    The parts of the model are chosen by cross-validation between two halves of the drives.
-    """
-    usable = [d for d in drives if usable_seconds(d, start) > 0.0]
-    halves = usable[::2], usable[1::2]
-    parts, tried = choose_parts([halves, halves[::-1]], start, lambda text, x: progress(text, 0.7 * x))
-    progress("fitting the physics filter's sideslip to the ground truth", 0.7)
-    return fit_physics(drives, start, parts), tried
 
 
 # ------------------------------------------------------------------------------------------------ the shipped car
@@ -409,14 +323,10 @@ def main(arguments: list[str] | None = None) -> int:
         drives.append(FitDrive(read.name, read.signals, read.truth))
         learnt_on.append(LearntOn(name=read.name, sha256=entry["sha256"], end_s=entry["duration_s"]))
 
-    def say(text: str, share: float) -> None:
-        print(f"{100 * share:3.0f} % {text}", flush=True)
-
-    result, tried = find_physics(drives, car.vehicle, say)
+    result = fit_physics(drives, car.vehicle)
     # The smoother uses the filter's noise: the network predicts most of the model residual.
     physics = FittedPhysics(values=result.vehicle, noise=result.noise, smoothing=(1.0, 1.0))
     print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
-    print(*tried, sep="\n")
     part = Fit(physics_sha256=physics_sha256(car.vehicle), physics=physics, drives=tuple(learnt_on))
     (given.output / FIT_FILE).write_text(part_toml(part, HEAD), encoding="utf-8")
     return 0
