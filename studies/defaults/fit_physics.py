@@ -2,6 +2,10 @@
 
     python -m studies.defaults.fit_physics [-o FOLDER] [--work out/fit-physics] [--jobs 2]
 
+First come axle slip angles and lateral forces from ground truth, with a magic formula through them: F_yf cos δ + F_yr =
+m a_y and l_f F_yf cos δ − l_r F_yr = I_z ṙ give both axle forces; the slip angles follow from the true velocity (Eq 3,
+4). The fit is least squares with priors (docs/method.md#identification).
+
 The drives last 12.5 s, like the training drives of networks, with true friction and exact ground truth. The paper's
 scenarios, with their different speeds and friction, are excluded. All other values come from the vehicle file. All
 parts of the model are on: without one of them, the error on other drives was higher (docs/method.md#identification).
@@ -31,36 +35,41 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from pdhef_logtool.car.car import FIT_FILE, SHIPPED_CARS, Car
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedPhysics, LearntOn, physics_sha256
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, correct_signals
 from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import Tell
-from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, PosteriorSteps, physics_filter
-from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, physics_filter
+from pdhef_logtool.evaluation.smoothing import smooth
+from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.model.descent import descend
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from studies.defaults.axle_forces import (
-    PEAK_LOG_STD,
-    SHAPE,
-    SHAPE_STD,
-    STIFFNESS_LOG_STD,
-    AxleCurve,
-    AxleSamples,
-    FitDrive,
-    axle_samples,
-    fit_axle,
-    sampled_errors,
-    signals_of,
-    usable_seconds,
-)
 from studies.pages import options
+
+#: Error samples that fits use; more only cost time.
+FIT_RATE_HZ = 20.0
+#: Forces are smoothed without phase; accelerometers on real cars show the road above this.
+SMOOTHING_HZ = 2.0
+#: 1-sigma of the priors on log stiffness, log peak force, shape (docs/method.md#identification).
+STIFFNESS_LOG_STD = 0.25
+PEAK_LOG_STD = 0.10
+SHAPE_STD = 0.10
+SHAPE = 1.35
+#: A peak below this multiple of the largest force that was seen is no peak.
+PEAK_OVER_SEEN = 1.1
+#: Standard deviation of an axle force about the curve, per kg of the car's mass.
+FORCE_STD_N_PER_KG = 0.35
+
+#: Usable where the true speed is above this multiple of the low-speed limit, and where the car does not spin or drift.
+SPEED_FACTOR, MAX_SIDESLIP_RAD = 2.0, math.radians(8.0)
+
 
 #: Correlation time of the errors, s; settling time of the filter, excluded from the error, s.
 CORRELATION_S, SETTLE_S = 1.0, 2.0
@@ -80,6 +89,122 @@ PARTS = PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))
 Theta = dict[str, float]
 #: Start values of θ. The noise cost has two valleys: clean sensors, and a filter with a low gain on a_y.
 STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitDrive:
+    """A drive, or a part of it: signals [N] without any correction of a vehicle file, and ground truth [N]."""
+
+    name: str
+    signals: Signals
+    truth: StateTrack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxleSamples:
+    """Slip angle [N] in rad and lateral force [N] in N of both axles, from ground truth."""
+
+    front_slip_rad: FloatArray
+    front_force_n: FloatArray
+    rear_slip_rad: FloatArray
+    rear_force_n: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class AxleCurve:
+    """Magic formula of one axle with E = 0: stiffness N/rad, peak N, shape C."""
+
+    stiffness_n_per_rad: float
+    peak_n: float
+    shape: float
+
+    def force_n(self, slip_rad: FloatArray) -> FloatArray:
+        """Return D sin(C atan(B α)) with B = stiffness/(C D)."""
+        b = self.stiffness_n_per_rad / (self.shape * self.peak_n)
+        return self.peak_n * np.sin(self.shape * np.arctan(b * slip_rad))
+
+
+def usable_stamps(signals: Signals, truth: StateTrack, vehicle: VehicleParameters) -> BoolArray:
+    """Return where ground truth and signals can be learned from, [N]."""
+    is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s)
+    moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
+    tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
+    use: BoolArray = is_complete & moving & tame & np.isfinite(signals.steer_rad)
+    return use
+
+
+def period_s(drive: FitDrive) -> float:
+    """Return the usual time from one stamp to the next."""
+    stamps = drive.signals.stamps_ns
+    return float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.01
+
+
+def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
+    """Return how long a drive can be used for identification."""
+    return float(np.count_nonzero(usable_stamps(drive.signals, drive.truth, vehicle))) * period_s(drive)
+
+
+def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> AxleSamples:
+    """Return slip angles and forces of all usable stamps of all drives, smoothed to ``SMOOTHING_HZ``.
+
+    At known friction they are those at the vehicle file's, for tyres that keep their stiffness: one curve of force over
+    friction by slip over friction.
+    """
+    columns: list[tuple[FloatArray, ...]] = []
+    lf, lr = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
+    for drive in drives:
+        use = usable_stamps(drive.signals, drive.truth, vehicle)
+        stamps = drive.signals.stamps_ns
+
+        def smoothed(values: FloatArray, use: BoolArray = use, stamps: FloatArray = stamps) -> FloatArray:  # type: ignore[assignment]
+            return smooth(stamps, np.where(use, values, np.nan), SMOOTHING_HZ)  # type: ignore[arg-type]
+
+        truth = drive.truth
+        vx, vy, r = smoothed(truth.vx_m_s), smoothed(truth.vy_m_s), smoothed(truth.yaw_rate_rad_s)
+        ay, steer = smoothed(truth.ay_m_s2), smoothed(drive.signals.steer_rad)
+        r_dot = vy_dot = np.full(len(stamps), np.nan)
+        if len(stamps) > 2:
+            r_dot, vy_dot = (np.gradient(x, stamps * 1e-9 - stamps[0] * 1e-9) for x in (r, vy))
+        if not np.isfinite(ay).any():  # no specific force is known: a flat road
+            ay = vy_dot + vx * r
+        total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
+        front = (lr * total + moment) / (lf + lr) / np.cos(steer)
+        rear = (lf * total - moment) / (lf + lr)
+        friction = drive.signals.friction
+        grip = np.where(np.isfinite(friction), friction / vehicle.assumed_friction, 1.0)
+        slips = (steer - np.arctan((vy + lf * r) / vx), -np.arctan((vy - lr * r) / vx))
+        columns.append((slips[0] / grip, front / grip, slips[1] / grip, rear / grip))
+    joined = [np.concatenate(c) for c in zip(*columns, strict=True)]
+    good = np.isfinite(np.sum(joined, axis=0))
+    return AxleSamples(*(c[good] for c in joined))
+
+
+def fit_axle(
+    slip_rad: FloatArray, force_n: FloatArray, *, prior: AxleCurve, mass_kg: float, independent: float
+) -> AxleCurve:
+    """Fit a curve to slip and force, both [N], with priors about ``prior``.
+
+    Parameters
+    ----------
+    independent : how many independent samples the N neighbouring ones are worth.
+    """
+    if slip_rad.size < 10:
+        return prior
+    step = max(1, slip_rad.size // 4000)
+    slip, force = slip_rad[::step], force_n[::step]
+    weight = np.sqrt(independent / slip.size) / (FORCE_STD_N_PER_KG * mass_kg)
+    seen = float(np.percentile(np.abs(force), 99.5))
+    peak0 = max(prior.peak_n, PEAK_OVER_SEEN * seen)
+    origin = np.array([np.log(prior.stiffness_n_per_rad), np.log(peak0), prior.shape])
+    std = np.array([STIFFNESS_LOG_STD, PEAK_LOG_STD, SHAPE_STD])
+
+    def residuals(theta: FloatArray) -> FloatArray:
+        curve = AxleCurve(float(np.exp(theta[0])), float(np.exp(theta[1])), float(theta[2]))
+        return np.concatenate([weight * (curve.force_n(slip) - force), (theta - origin) / std])
+
+    low = np.array([-np.inf, np.log(PEAK_OVER_SEEN * seen) - 1e-9, 1.0])
+    fit = least_squares(residuals, origin, bounds=(low, [np.inf, np.inf, 1.9]), loss="linear")
+    return AxleCurve(float(np.exp(fit.x[0])), float(np.exp(fit.x[1])), float(fit.x[2]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,19 +291,12 @@ def build_car(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveError:
-    """Sideslip errors of a drive by :func:`~.axle_forces.sampled_errors`; mean normalized innovation squared."""
+    """Sideslip errors of a drive in rad at :data:`FIT_RATE_HZ`, 0 where they do not count, and the mean NIS."""
 
     error: FloatArray
     counted: int
     seconds: float
     nis: float
-
-    @classmethod
-    def of(cls, drive: FitDrive, start: VehicleParameters, steps: PosteriorSteps, nis: float) -> DriveError:
-        """Return the errors of a filter's steps on a drive."""
-        error, use, each_s = sampled_errors(drive, start, steps, SETTLE_S)
-        counted = int(np.count_nonzero(use))
-        return cls(error, counted, counted * each_s, nis)
 
     @property
     def rms(self) -> float:
@@ -190,13 +308,18 @@ def drive_errors(
     drives: Sequence[FitDrive], start: VehicleParameters, vehicle: VehicleParameters, noise: FilterNoise
 ) -> list[DriveError]:
     """Return the errors of ``physics`` on drives."""
-    estimator = physics_filter(vehicle, noise)
-    errors = []
+    estimator, errors = physics_filter(vehicle, noise), []
     for drive in drives:
-        steps, _ = estimator.run(signals_of(drive, start, vehicle), None)
+        steps, _ = estimator.run(correct_signals(drive.signals, vehicle), None)
         has_innovation = steps.nis_dof > 0
         nis = float(np.minimum(steps.nis[has_innovation], 50.0).sum() / max(steps.nis_dof[has_innovation].sum(), 1.0))
-        errors.append(DriveError.of(drive, start, steps, max(nis, 1e-3)))
+        every, stamps = max(1, round(1.0 / (FIT_RATE_HZ * period_s(drive)))), drive.signals.stamps_ns
+        error = wrap_angle(np.arctan2(steps.x[:, 1], steps.x[:, 0]) - drive.truth.sideslip_rad)
+        use = usable_stamps(drive.signals, drive.truth, start) & steps.valid & np.isfinite(error)
+        use &= (stamps - stamps[0]) * 1e-9 > SETTLE_S
+        counted = int(np.count_nonzero(use[::every]))
+        seconds = counted * every * period_s(drive)
+        errors.append(DriveError(np.where(use, error, 0.0)[::every], counted, seconds, max(nis, 1e-3)))
     return errors
 
 
@@ -285,10 +408,9 @@ def scaled_errors(there: Sequence[DriveError], here: Sequence[DriveError]) -> Fl
 # ------------------------------------------------------------------------------------------------ the shipped car
 
 SEED, DRIVES = 5000, 24
+#: Friction is that of the simulator.
+MAPPING = Path(__file__).with_name("true_friction.toml")
 HEAD = "Written by python -m studies.defaults.fit_physics; [filter] by studies.defaults.train_default."
-
-
-_FRICTION = SignalSource("friction", "/truth/perfect/state", "friction")
 
 
 def read_drive(path: Path, car: Car) -> reading.WholeDrive:
@@ -296,11 +418,7 @@ def read_drive(path: Path, car: Car) -> reading.WholeDrive:
 
     The exact ground truth has the clock of the sensors, so that no latency is estimated: a stuck gyro would bend it.
     """
-
-    def with_true_friction(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
-        return replace(mapping, signals={**mapping.signals, "friction": _FRICTION})
-
-    with reading.read_drive(path, car, options=ReadOptions(friction=None), adjust=with_true_friction) as drive:
+    with reading.read_drive(path, car, load_mapping(MAPPING), ReadOptions(friction=None)) as drive:
         drive.plan = replace(drive.plan, latency=None)
         return drive.whole()
 

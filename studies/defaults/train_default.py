@@ -47,13 +47,6 @@ PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
 #: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
 PAPER_WINDOWS: dict[str, Any] = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
 TRIALS = 64
-MAPPING = """# Recognised types, and the friction that the simulator drove on.
-fill_recognised = true
-
-[signals.friction]
-topic = "/truth/perfect/state"
-field = "friction"
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +78,13 @@ class Training:
 
 
 def simulate(t: Training) -> None:
-    """Write the vehicle file, the mapping and the drives."""
+    """Write the vehicle file and the drives."""
     t.work.mkdir(parents=True, exist_ok=True)
     t.car.mkdir(parents=True, exist_ok=True)
     text = part_toml(read_vehicle_file(SAMPLE_VEHICLE).vehicle, "Written by python -m studies.defaults.train_default.")
     (t.car / VEHICLE_FILE).write_text(f"{text}\n[network]\ngain = {GAIN}\n", encoding="utf-8")
     if t.seed:
         shutil.copyfile(HOME / FIT_FILE, t.car / FIT_FILE)
-    (t.work / "mapping.toml").write_text(MAPPING, encoding="utf-8")
     what = ("--count", t.drives, "--seed", SEED, "--vehicles", "default", "--jobs", t.jobs)
     pdhef("simulate", "suite", *what, "-o", t.work / "one_car")
     paper_drives.write_drives(t.work / PAPER_DRIVES, count=min(t.drives, paper_drives.COUNT), processes=t.jobs)

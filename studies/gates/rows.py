@@ -117,24 +117,6 @@ QUICK_DRIVES = ("gti_pole_aa.mcap", "v40_slalom.mcap", "f1tenth_xray_0.bag")
 
 # ------------------------------------------------------------------------------------------------ simulated reference
 
-#: Manoeuvre, km/h, friction, longest duration (s) of the drives of the reference.
-REFERENCE_DRIVES: dict[str, tuple[str, float, float, float | None]] = {
-    name: (entry["manoeuvre"], entry["speed_km_h"], 0.85, entry.get("duration_s"))
-    for name, entry in _TABLES["reference_drives"].items()
-}
-
-
-def simulated_log(
-    tool: Tool, name: str, spec: tuple[str, float, float, float | None], seed: int, *, steering_wheel: bool = False
-) -> Path:
-    """Simulate a drive of the saloon and return its log; ``steering_wheel``: the log has this angle."""
-    stem = f"{name.replace(' ', '-')}-{seed}"
-    if (log := tool.work / "logs" / f"{stem}.mcap").is_file():
-        return log
-    manoeuvre, speed, friction, duration_s = spec
-    drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
-    return tool.log(stem, drive, steering_wheel=steering_wheel)
-
 
 def bare_vehicle() -> dict[str, Any]:
     """Return the vehicle file of the saloon without its validation data."""
@@ -143,7 +125,8 @@ def bare_vehicle() -> dict[str, Any]:
 
 def reference(name: str, tool: Tool) -> Figures:
     """Run the reference and the filters on a simulated drive."""
-    log = simulated_log(tool, name, REFERENCE_DRIVES[name], 3)
+    drive = simulate_drive(**_TABLES["reference_drives"][name], friction=0.85, seed=3)
+    log = tool.log(f"{name.replace(' ', '-')}-3", drive)
     car = write_toml(tool.work / "cars" / "saloon.toml", bare_vehicle())
     names = "zero,kinematic,open-loop,phy-ukf,physics"
     run = tool.run(f"reference-{log.stem}", log, "--car", car, "--reference", "on", "--estimators", names)
@@ -152,17 +135,15 @@ def reference(name: str, tool: Tool) -> Figures:
 
 # ------------------------------------------------------------------------------------------------ ±
 
-PLUS_MINUS_DRIVES = tuple((name, km_h, 0.85, duration_s) for name, km_h, duration_s in DRIVEN)
-
 
 def plus_minus(seeds: range, tool: Tool) -> Figures:
     """Return the RMS normalized error of the estimated parameters of the saloon with wrong vehicle files."""
     right, scores = bare_vehicle(), dict[str, list[float]]()
     true = true_values(right, SensorNoise().imu_x_m)
     for seed in seeds:
-        log = simulated_log(
-            tool, "plus-minus", PLUS_MINUS_DRIVES[seed % len(PLUS_MINUS_DRIVES)], seed, steering_wheel=True
-        )
+        manoeuvre, speed, duration_s = DRIVEN[seed % len(DRIVEN)]
+        drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=0.85, seed=seed, duration_s=duration_s)
+        log = tool.log(f"plus-minus-{seed}", drive, steering_wheel=True)
         car = write_toml(tool.work / "cars" / f"wrong-{seed}.toml", wrong_file(right, np.random.default_rng(seed)))
         run = tool.run(f"plus-minus-{seed}", log, "--car", car, "--keep", "estimates", "--estimators", "zero,physics")
         (report,) = reports(run).values()
@@ -313,7 +294,7 @@ def all_rows() -> Iterator[GateRow]:
     """
     for name, measure in {"exit codes": exit_codes, "options": options, "files and keys": files_and_keys}.items():
         yield GateRow("contract", name, measure, quick=True)
-    for name in REFERENCE_DRIVES:
+    for name in _TABLES["reference_drives"]:
         yield GateRow("reference", name, partial(reference, name), quick=name == "double lane change")
     recorded_drives = [d for d in PEER_DRIVES if (DRIVES / d.log).exists()]
     for d in recorded_drives:

@@ -13,8 +13,16 @@ from reference_car import FRONT_TYRE, REAR_TYRE, Drive, drive, keep, slalom, wit
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.records.tracks import make_track
-from studies.defaults.axle_forces import AxleCurve, FitDrive, axle_samples, fit_axle
-from studies.defaults.fit_physics import STARTS, build_car, drive_errors, fit_physics
+from studies.defaults.fit_physics import (
+    STARTS,
+    AxleCurve,
+    FitDrive,
+    axle_samples,
+    build_car,
+    drive_errors,
+    fit_axle,
+    fit_physics,
+)
 
 CAR = default_vehicle().model_copy(
     update={
