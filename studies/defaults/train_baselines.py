@@ -1,7 +1,5 @@
 """Train the baselines ``pure-lstm`` and ``linear-regression`` on a dataset of ``pdhef extract --filter phy-ukf``.
 
-    python -m studies.defaults.train_baselines DATASET -o NETWORK [--seed 0] [--epochs 40]
-
 Drives, split, rows and recipe are those of the residual network; only the target differs. The regression is ordinary
 least squares of the true sideslip on low-passed features (:mod:`pdhef_logtool.residual_model.linear_model`).
 """
@@ -9,26 +7,23 @@ least squares of the true sideslip on low-passed features (:mod:`pdhef_logtool.r
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
+from pdhef_logtool.learning.network.dataset import Dataset
 from pdhef_logtool.learning.network.train_command import Recipe, gap_free_runs, train_on, weights_of
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import (
     LATERAL_VELOCITY,
     LINEAR_REGRESSION_FILE,
-    NOMINAL_MODEL,
     PURE_LSTM_FOLDER,
 )
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
-from studies.pages import options
 
 #: Features of the baselines.
 NOMINAL_FEATURES = FEATURES[:10]
@@ -50,21 +45,13 @@ class SideslipSequence:
     sideslip_rad: FloatArray
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Train both baselines into ``NETWORK/baselines``."""
-    parser = options("defaults.train_baselines", __doc__)
-    parser.add_argument("dataset", type=Path)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the network")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--epochs", type=int, default=EPOCHS)
-    given = parser.parse_args(arguments)
-    data = read_dataset(given.dataset, NOMINAL_MODEL)
-    file: Path = given.output / LINEAR_REGRESSION_FILE
+def train_baselines(data: Dataset, network: Path) -> None:
+    """Train both baselines into ``network``/``baselines``."""
+    file = network / LINEAR_REGRESSION_FILE
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(fit_dataset(data, NOMINAL_FEATURES).to_json(), encoding="utf-8")
-    recipe = Recipe(NOMINAL_FEATURES, odd=False, target=LATERAL_VELOCITY, seed=given.seed, epochs=given.epochs)
-    train_on(data, given.output / PURE_LSTM_FOLDER, recipe, progress=lambda text, _share: print(text, flush=True))
-    return 0
+    recipe = Recipe(NOMINAL_FEATURES, odd=False, target=LATERAL_VELOCITY, epochs=EPOCHS)
+    train_on(data, network / PURE_LSTM_FOLDER, recipe, progress=lambda text, _: print(text, flush=True))
 
 
 def fit_dataset(data: Dataset, names: tuple[str, ...]) -> LinearModel:
@@ -138,7 +125,3 @@ def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
                 dt_s=np.concatenate([[np.nan], np.diff(rows.stamps_ns[part]) * 1e-9]),
                 sideslip_rad=np.where(used, np.arctan2(vy, vx), np.nan),
             )
-
-
-if __name__ == "__main__":
-    sys.exit(main())
