@@ -12,7 +12,6 @@ repository.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ import polars as pl
 from pdhef_logtool import PdhefError, __version__
 from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool
-from studies.pages import INDEPENDENT, ROOT, number, page_options, table, update, write, write_toml
+from studies.pages import INDEPENDENT, ROOT, number, page_options, read_json, table, update, write_json, write_toml
 from studies.pictures import save, subplots
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
@@ -77,7 +76,7 @@ def runs_of(tool: Tool, row: str, given: argparse.Namespace) -> Iterator[Path]:
         yield tool.run(f"{row}-{given.seed}-{given.drives}", *logs, *common, *row_inputs(tool, row, logs[0], assume))
         return
     for log in sorted(INDEPENDENT.glob("*.parquet")):
-        friction = json.loads(log.with_suffix(".json").read_text(encoding="utf-8"))["mu"]
+        friction = read_json(log.with_suffix(".json"))["mu"]
         given_files = ("--mapping", INDEPENDENT_MAPPING, "--friction", str(friction))
         yield tool.run(f"{row}-{log.stem}", log, *common, *given_files)
 
@@ -104,7 +103,7 @@ def run(given: argparse.Namespace) -> None:
     given.results.mkdir(parents=True, exist_ok=True)
     metrics = pl.concat(frames).select(COLUMNS).filter(kept)
     metrics.write_parquet(given.results / "metrics.parquet", compression="zstd", compression_level=19)
-    write(given.results / "facts.json", json.dumps(facts, indent=1) + "\n")
+    write_json(given.results / "facts.json", facts)
 
 
 # ------------------------------------------------------------------------------------------------ the page
@@ -135,7 +134,7 @@ def verdict(low: float, high: float) -> str:
 
 def write_page(out: Path, folder: Path) -> None:
     """Render the page and its two figures from the results in a folder; drives without a scored sample do not count."""
-    facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
+    facts = read_json(folder / "facts.json")
     sideslip = pl.col("signal").cast(pl.String) == "sideslip_rad"
     metrics = pl.read_parquet(folder / "metrics.parquet").filter(sideslip, segment="all")
     errors = metrics.filter(metric="rmse").pivot("estimator", index=["row", "drive"], values="value").sort("drive")

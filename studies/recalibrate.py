@@ -12,7 +12,6 @@ The stamp files are in ``out/recalibrate``. ``--evidence``: only the stages that
 from __future__ import annotations
 
 import ast
-import json
 import os
 import shlex
 import shutil
@@ -26,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.storage.documents import digest
-from studies.pages import ROOT, options, read_toml, table, write
+from studies.pages import ROOT, options, read_json, read_toml, table, write_json
 
 STAMPS = Path("out") / "recalibrate"
 TABLE = Path(__file__).with_suffix(".toml")
@@ -95,7 +94,7 @@ class Recalibration:
     def stamp(self, stage: Stage) -> dict[str, Any]:
         """Return command, inputs and duration of the last start of a stage; empty before the first."""
         file = self.root / STAMPS / f"{stage.name}.json"
-        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        return read_json(file) if file.is_file() else {}
 
     def inputs(self, stage: Stage) -> dict[str, str]:
         """Return what decides the outputs of a stage: its command and the digest of its inputs."""
@@ -124,7 +123,7 @@ class Recalibration:
         if before | begun != before:
             for folder in stage.work:
                 shutil.rmtree(self.root / folder, ignore_errors=True)
-        write(self.root / STAMPS / f"{stage.name}.json", json.dumps(begun))
+        write_json(self.root / STAMPS / f"{stage.name}.json", begun)
         print(f"{stage.name}: {stage.command}", flush=True)
         words = [sys.executable if word == "python" else word for word in shlex.split(stage.command)]
         ended = subprocess.run(words, cwd=self.root, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False)
@@ -133,8 +132,8 @@ class Recalibration:
         if missing := [o for o in stage.outputs if not (self.root / o).exists()]:
             print(f"{stage.name}: expected {', '.join(missing)}, got no such file", file=sys.stderr)
             return 1
-        taken_s = round(time.monotonic() - start, 1)
-        write(self.root / STAMPS / f"{stage.name}.json", json.dumps(begun | {"duration_s": taken_s}))
+        ended_s = {"duration_s": round(time.monotonic() - start, 1)}
+        write_json(self.root / STAMPS / f"{stage.name}.json", begun | ended_s)
         return 0
 
     def listed(self) -> str:

@@ -379,7 +379,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="parts of the names of cases")
     given = parser.parse_args(arguments)
     file = given.results / STORED
-    stored: dict[str, Figures] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    stored: dict[str, Figures] = pages.read_json(file) if file.is_file() else {}
     source = input_digest(ROOT, [f"{folder}/**/*.py" for folder in ("pdhef_logtool", "truthsim", "studies")])
     tool = Tool(ROOT, given.work.resolve())
     for case in () if given.stored else cases():
@@ -390,7 +390,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         print(case.name, file=sys.stderr)
         stored[case.name] = {"key": key, **figures(case, tool)}
-        pages.write(file, json.dumps(stored, indent=1) + "\n")
+        pages.write_json(file, stored)
     pages.update(given.out, "reference.md", blocks(stored))
     return 0
 

@@ -26,7 +26,6 @@ The single filter here has force scale and bank as states; in operation they are
 
 from __future__ import annotations
 
-import json
 import math
 import subprocess
 import sys
@@ -51,7 +50,7 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from studies.pages import options
+from studies.pages import options, read_json
 
 #: Error samples that fits use; more only cost time.
 FIT_RATE_HZ = 20.0
@@ -433,7 +432,7 @@ def main(arguments: list[str] | None = None) -> int:
     simulate = ("simulate", "suite", "--count", str(DRIVES), "--seed", str(SEED), "--jobs", str(given.jobs))
     subprocess.run([sys.executable, "-m", "pdhef_logtool", *simulate, "-o", str(given.work)], check=True)
     car = Car.load(given.output, network=NO_MODEL)
-    drawn = json.loads((given.work / "manifest.json").read_text(encoding="utf-8"))["drives"]
+    drawn = read_json(given.work / "manifest.json")["drives"]
     drives, learnt_on = [], []
     for entry in drawn:
         read = read_drive(given.work / entry["file"], Car(car.vehicle))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import subprocess
@@ -20,7 +19,7 @@ from studies.calibration import DRIVEN, errors_over_sd, true_values, wrong_file
 from studies.conditions import row_inputs, row_logs
 from studies.gates.tool import Tool, commands_and_options, coverage_percent, reports, sideslip_rmse_deg
 from studies.mapping_mistakes import VERDICTS, outcomes
-from studies.pages import DRIVES, ROOT, SAMPLE_VEHICLE, read_toml, write_toml
+from studies.pages import DRIVES, ROOT, SAMPLE_VEHICLE, read_json, read_toml, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.torture.seeds import FORMATS, RECORDINGS
 from truthsim.conditions import ROWS
@@ -178,7 +177,7 @@ def written(file: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any
     """Return a JSON document that a module has written; raises RuntimeError if it has not."""
     if not file.is_file():
         raise RuntimeError(done.stderr[-2000:])
-    document: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    document: dict[str, Any] = read_json(file)
     return document
 
 
@@ -249,7 +248,7 @@ def files_and_keys(tool: Tool) -> Figures:
     for table in (output / "metrics.parquet", log / "estimates.parquet"):
         names |= {f"{table.name} {column}" for column in pl.read_parquet_schema(table)}
     for file, depth in ((output / "run.json", 1), (log / "report.json", 2)):
-        names |= {f"{file.name} {key}" for key in keys(json.loads(file.read_text(encoding="utf-8")), depth)}
+        names |= {f"{file.name} {key}" for key in keys(read_json(file), depth)}
     inspected = tool.json("inspect", SAMPLES / "dlc.mcap")
     names |= {f"inspect --json {key}" for key in keys(inspected, 1)}
     names |= {f"inspect --json topics[].{key}" for key in inspected["topics"][0]}

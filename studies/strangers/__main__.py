@@ -8,7 +8,6 @@ layouts that were built last: its groups, by default ``held-out``. Exit code 1: 
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 from collections import Counter
@@ -16,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from studies.pages import DOCS, RESULTS, ROOT, options, read_toml, write
+from studies.pages import DOCS, RESULTS, ROOT, options, read_json, read_toml, write, write_json
 from studies.strangers.containers import write as write_log
 from studies.strangers.layouts import layouts, mountings
 from studies.strangers.page import OUTCOMES, Result, merged, page
@@ -61,7 +60,7 @@ def first_run() -> str:
     for name, what in FIRST_RUNS.items():
         file = RESULTS / "third_party_logs" / f"{name}_first_run.json"
         if file.is_file():
-            logs = json.loads(file.read_text(encoding="utf-8"))
+            logs = read_json(file)
             ends = Counter(outcome for log in logs.values() for outcome in log["items"].values())
             rest = ", ".join(f"{ends[outcome]} {outcome.replace(', ', ' and ')}" for outcome in OUTCOMES[:3])
             said += (
@@ -79,7 +78,7 @@ def others_without_answers() -> str:
     answered = answered_files()
     channels = {name for names in ITEMS.values() for name in names}
     mapped_files, count = [], 0
-    for entry in json.loads(catalogue.read_text(encoding="utf-8")):
+    for entry in read_json(catalogue):
         file = f"reader_corpus/{entry['file']}"
         if entry["expected"] != "ok" or file in answered or "/conformance/" in file:
             continue
@@ -121,7 +120,7 @@ def main() -> int:
         remark = first_run() + ("" if last else "Without the held-out layouts.\n\n")
         write(given.out, page(results, remark + others_without_answers()))
     if given.keep:
-        write(given.keep, json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True) + "\n")
+        write_json(given.keep, {r.name: r.as_json() for r in sorted(results, key=lambda r: r.name)})
     return 1 if any(r.count("wrong, not reported") for r in results) else 0
 
 

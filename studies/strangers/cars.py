@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,7 +11,6 @@ import numpy as np
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from studies.pages import read_toml
 from truthsim.batch import DriveSpec
-from truthsim.sensors import SensorChannel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,39 +93,33 @@ class Car:
 
 
 _DRIVES = read_toml(Path(__file__).with_name("drives.toml"))
+#: Channel of the simulator and its columns, by the name in :class:`Car`.
+_SENSORS = {
+    "force": ("imu", "ax_m_s2", "ay_m_s2", "az_m_s2"),
+    "rate": ("imu", "roll_rate_rad_s", "pitch_rate_rad_s", "yaw_rate_rad_s"),
+    "steer": ("steering", "steer_rad"),
+    "steering_wheel": ("steering", "steering_wheel_rad"),
+    "wheels": ("wheels", "fl_m_s", "fr_m_s", "rl_m_s", "rr_m_s"),
+    "position": ("rtk", "x_m", "y_m", "z_m"),
+    "attitude": ("rtk", "roll_rad", "pitch_rad", "yaw_rad"),
+    "body_velocity": ("rtk", "vx_m_s", "vy_m_s"),
+    "yaw_rate": ("rtk", "yaw_rate_rad_s"),
+    "fix": ("fix", "lat_deg", "lon_deg", "alt_m"),
+}
 
 
 @lru_cache(maxsize=16)
 def drive(name: str, imu_x_m: float = 0.0) -> Car:
     """Drive one of ``drives.toml``, with the IMU ``imu_x_m`` before the centre of gravity."""
     made = DriveSpec(**_DRIVES[name], sensors=(("imu_x_m", imu_x_m),)).simulate()
-    start = made.start_ns
-    channels = made.channels
-    ins = channels["rtk"]
-    yaw = ins.fields["yaw_rad"]
-    v_x, v_y = ins.fields["vx_m_s"], ins.fields["vy_m_s"]
-    enu = {"e": v_x * np.cos(yaw) - v_y * np.sin(yaw), "n": v_x * np.sin(yaw) + v_y * np.cos(yaw)}
-    return Car(
-        force=_series(channels["imu"], start, "ax_m_s2", "ay_m_s2", "az_m_s2"),
-        rate=_series(channels["imu"], start, "roll_rate_rad_s", "pitch_rate_rad_s", "yaw_rate_rad_s"),
-        steer=_series(channels["steering"], start, "steer_rad")[0],
-        steering_wheel=_series(channels["steering"], start, "steering_wheel_rad")[0],
-        wheels=_series(channels["wheels"], start, "fl_m_s", "fr_m_s", "rl_m_s", "rr_m_s"),
-        ratio=made.vehicle.steering_ratio,
-        wheel_radius_m=made.vehicle.wheel_radius_m,
-        position=_series(ins, start, "x_m", "y_m", "z_m"),
-        velocity=_stacked(ins, start, enu),
-        attitude=_series(ins, start, "roll_rad", "pitch_rad", "yaw_rad"),
-        body_velocity=_series(ins, start, "vx_m_s", "vy_m_s"),
-        yaw_rate=_series(ins, start, "yaw_rate_rad_s")[0],
-        fix=_series(channels["fix"], start, "lat_deg", "lon_deg", "alt_m"),
-    )
-
-
-def _series(channel: SensorChannel, start_ns: int, *names: str) -> Series:
-    return _stacked(channel, start_ns, {name: channel.fields[name] for name in names})
-
-
-def _stacked(channel: SensorChannel, start_ns: int, columns: Mapping[str, FloatArray]) -> Series:
-    values = np.stack(list(columns.values()), axis=1)
-    return Series(channel.stamps_ns(start_ns), channel.arrival_ns(start_ns), values)
+    read: dict[str, Series] = {}
+    for sensor, (channel_name, *names) in _SENSORS.items():
+        channel = made.channels[channel_name]
+        values = np.stack([channel.fields[n] for n in names], axis=1)
+        series = Series(channel.stamps_ns(made.start_ns), channel.arrival_ns(made.start_ns), values)
+        read[sensor] = series if len(names) > 1 else series[0]
+    body, yaw = read["body_velocity"], read["attitude"].values[:, 2]
+    v_x, v_y = body.values.T
+    enu = np.stack([v_x * np.cos(yaw) - v_y * np.sin(yaw), v_x * np.sin(yaw) + v_y * np.cos(yaw)], axis=1)
+    velocity = Series(body.stamps_ns, body.arrival_ns, enu)
+    return Car(**read, velocity=velocity, ratio=made.vehicle.steering_ratio, wheel_radius_m=made.vehicle.wheel_radius_m)

@@ -69,6 +69,10 @@ def write(topics: Sequence[Topic], path: Path, container: str) -> Path:
         ``rosbag1``, ``rosbag2`` (sqlite3), ``rosbag2-bare`` (without message definitions, as up to Humble),
         ``rosbag2-mcap``, or one of the files of ``tables.py``.
     """
+    if container in tables.WRITERS:
+        suffix, put = tables.WRITERS[container]
+        put(path.with_suffix(suffix), topics)
+        return path.with_suffix(suffix)
     return _WRITERS[container](topics, path)
 
 
@@ -245,6 +249,5 @@ _WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
     "rosbag2": _rosbag2,
     "rosbag2-bare": _rosbag2_bare,
     "rosbag2-mcap": partial(_rosbag2, plugin="MCAP"),
-    **dict(tables.writers()),
-    **dict(buses.writers()),
+    **{f"can-{kind}": partial(buses.write, kind) for kind in ("blf", "asc", "mdf", "mcap")},
 }

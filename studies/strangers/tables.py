@@ -313,33 +313,27 @@ def _mdf(path: Path, topics: Sequence[Topic]) -> None:
         file.save(path, overwrite=True)
 
 
-#: Suffix and writer of the document by the begin of a template's name.
+#: Suffix and writer of a document by the begin of a template's name.
 _KINDS = {"mat": (".mat", _write_mat), "json": (".json", _write_json), "hdf5": (".h5", _write_hdf5)}
-_PARQUET = {
-    "parquet": _parquet, "parquet-nested": _nested_parquet, "parquet-seconds": _seconds_parquet,
-    "parquet-long": _long_parquet, "parquet-measures": _measures_parquet,
-}  # fmt: skip
-_WRITERS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
+
+
+def _document(name: str, path: Path, topics: Sequence[Topic]) -> None:
+    template = {key: entry for key, entry in _DOCUMENTS[name].items() if key != "suffix"}
+    _KINDS[name.partition("-")[0]][1](path, _filled(template, list(_signals(topics))))
+
+
+#: Suffix and writer of each container.
+WRITERS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     **{name: (form.get("suffix", ".csv"), partial(_text, name)) for name, form in _DIALECTS.items()},
-    **{name: (".parquet", put) for name, put in _PARQUET.items()},
+    **{
+        name: (form.get("suffix", _KINDS[name.partition("-")[0]][0]), partial(_document, name))
+        for name, form in _DOCUMENTS.items()
+    },
+    "parquet": (".parquet", _parquet),
+    "parquet-nested": (".parquet", _nested_parquet),
+    "parquet-seconds": (".parquet", _seconds_parquet),
+    "parquet-long": (".parquet", _long_parquet),
+    "parquet-measures": (".parquet", _measures_parquet),
     "mat-7.3": (".mat", _mat_hdf5),
     "mdf": (".mf4", _mdf),
 }
-
-
-def _write(container: str, topics: Sequence[Topic], path: Path) -> Path:
-    if container in _DOCUMENTS:
-        suffix, put = _KINDS[container.partition("-")[0]]
-        template = dict(_DOCUMENTS[container])
-        suffix = template.pop("suffix", suffix)
-        put(path.with_suffix(suffix), _filled(template, list(_signals(topics))))
-    else:
-        suffix, write = _WRITERS[container]
-        write(path.with_suffix(suffix), topics)
-    return path.with_suffix(suffix)
-
-
-def writers() -> Iterator[tuple[str, Callable[[Sequence[Topic], Path], Path]]]:
-    """Yield the containers and their writers, which return the path with the suffix."""
-    for name in (*_DOCUMENTS, *_WRITERS):
-        yield name, partial(_write, name)

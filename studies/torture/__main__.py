@@ -12,7 +12,6 @@ something ended as it should not.
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
 import time
@@ -24,7 +23,7 @@ from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
 from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
-from studies.pages import DOCS, ROOT, fill, options, table, write
+from studies.pages import DOCS, ROOT, fill, options, read_json, table, write, write_json
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
 from studies.torture.mutants import HANG_S, format_judge, log_judge
@@ -184,13 +183,11 @@ def main() -> int:
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
-        former = json.loads(kept.read_text()) if kept.is_file() else None
         again = name == "formats" and given.format
-        if (again or former is None) and (not parts or name in parts):
-            former = (former or {}) | do() if again else do()
-            kept.write_text(json.dumps(former, indent=1))
-        if former is not None:
-            results[name] = json.loads(json.dumps(former))
+        if (again or not kept.is_file()) and (not parts or name in parts):
+            write_json(kept, (read_json(kept) if again and kept.is_file() else {}) | do() if again else do())
+        if kept.is_file():
+            results[name] = read_json(kept)
     if given.out.is_file():
         counts = f"--logs {given.logs} --count {given.count}"
         counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"

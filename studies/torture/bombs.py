@@ -16,6 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
+import zstandard
+
 from studies.pages import ROOT
 from studies.torture.damage import ENDLESS_VIEW, MAGIC, Record, join_bag, join_mcap
 from studies.torture.seeds import SEEDS, START_NS
@@ -73,14 +76,10 @@ def _typed(name: bytes, encoding: bytes, schema: bytes, wire: bytes, payload: by
 
 
 def _zeros_zstd(size: int) -> bytes:
-    import zstandard
-
     return _zeros(zstandard.ZstdCompressor(level=3).compressobj(size=size), size)
 
 
 def _zeros_lz4(size: int) -> bytes:
-    import lz4.frame
-
     with lz4.frame.LZ4FrameCompressor() as compressor:
         return bytes(compressor.begin()) + _zeros(compressor, size)
 
