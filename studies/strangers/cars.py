@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -46,50 +47,28 @@ class Series:
         return Series(clock.stamps_ns, clock.arrival_ns, read if self.values.ndim == 2 else read[:, 0])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Car:
-    """One drive of one car.
+    """One drive of one car. Each sensor and each quantity is an attribute, too.
 
-    Attributes
-    ----------
     force, rate : specific force (m/s², with gravity) and angular rate (rad/s) of the IMU, forward, left, up, [N, 3].
     steer, steering_wheel : road-wheel angle and angle of the steering wheel, rad, left positive.
-    wheels : speeds of fl, fr, rl, rr, m/s, [N, 4]. ratio, wheel_radius_m : of steering and wheels.
+    wheels, wheel_rates : of fl, fr, rl, rr, m/s and rad/s, [N, 4]. speed : mean of the rear wheels, m/s.
     position, velocity, attitude : of GNSS/INS: east, north, up (m); east, north (m/s); roll, pitch, yaw (rad, ENU).
+    east, north, ground_speed : of the velocity, m/s. course, signed_course, heading : clockwise from north, degrees.
     body_velocity : forward and left, m/s, [N, 2]. yaw_rate : rad/s. fix : latitude, longitude (deg), height (m).
+    sideslip : of the GNSS/INS, rad; 0 where the car hardly moves. roll, pitch, yaw, lat, lon, alt : as above.
     """
 
-    force: Series
-    rate: Series
-    steer: Series
-    steering_wheel: Series
-    wheels: Series
     ratio: float
     wheel_radius_m: float
-    position: Series
-    velocity: Series
-    attitude: Series
-    body_velocity: Series
-    yaw_rate: Series
-    fix: Series
+    sensors: Mapping[str, Series]
 
-    @property
-    def speed(self) -> Series:
-        """Mean of the rear wheels, m/s."""
-        return self.wheels.times(np.array([[0.0, 0.0, 0.5, 0.5]]))[0]
-
-    @property
-    def ground_speed(self) -> Series:
-        """Speed over ground as GNSS gives it, m/s."""
-        v = self.velocity
-        return Series(v.stamps_ns, v.arrival_ns, np.hypot(v.values[:, 0], v.values[:, 1]))
-
-    @property
-    def sideslip(self) -> Series:
-        """Sideslip of the GNSS/INS, rad; 0 where the car hardly moves."""
-        v = self.body_velocity
-        moves = v.values[:, 0] > 1.0
-        return Series(v.stamps_ns, v.arrival_ns, np.where(moves, np.arctan2(v.values[:, 1], v.values[:, 0]), 0.0))
+    def __getattr__(self, name: str) -> Series:
+        """Return a sensor or a quantity."""
+        if name not in self.sensors:
+            raise AttributeError(name)
+        return self.sensors[name]
 
 
 _DRIVES = read_toml(Path(__file__).with_name("drives.toml"))
@@ -118,8 +97,25 @@ def drive(name: str, imu_x_m: float = 0.0) -> Car:
         values = np.stack([channel.fields[n] for n in names], axis=1)
         series = Series(channel.stamps_ns(made.start_ns), channel.arrival_ns(made.start_ns), values)
         read[sensor] = series if len(names) > 1 else series[0]
-    body, yaw = read["body_velocity"], read["attitude"].values[:, 2]
+    body, attitude = read["body_velocity"], read["attitude"]
     v_x, v_y = body.values.T
-    enu = np.stack([v_x * np.cos(yaw) - v_y * np.sin(yaw), v_x * np.sin(yaw) + v_y * np.cos(yaw)], axis=1)
-    velocity = Series(body.stamps_ns, body.arrival_ns, enu)
-    return Car(**read, velocity=velocity, ratio=made.vehicle.steering_ratio, wheel_radius_m=made.vehicle.wheel_radius_m)
+    yaw = attitude.values[:, 2]
+    east, north = v_x * np.cos(yaw) - v_y * np.sin(yaw), v_x * np.sin(yaw) + v_y * np.cos(yaw)
+    course = np.arctan2(east, north) / np.radians(1.0)
+    of_body = {
+        "velocity": np.stack([east, north], axis=1),
+        "east": east,
+        "north": north,
+        "ground_speed": np.hypot(east, north),
+        "signed_course": course,
+        "course": course % 360.0,
+        "sideslip": np.where(v_x > 1.0, np.arctan2(v_y, v_x), 0.0),
+        "heading": (90.0 - yaw / np.radians(1.0)) % 360.0,
+    }
+    read |= {name: Series(body.stamps_ns, body.arrival_ns, values) for name, values in of_body.items()}
+    read |= {name: attitude[i] for i, name in enumerate(("roll", "pitch", "yaw"))}
+    read |= {name: read["fix"][i] for i, name in enumerate(("lat", "lon", "alt"))}
+    wheels = read["wheels"]
+    read["speed"] = wheels.times(np.array([[0.0, 0.0, 0.5, 0.5]]))[0]
+    read["wheel_rates"] = Series(wheels.stamps_ns, wheels.arrival_ns, wheels.values / made.vehicle.wheel_radius_m)
+    return Car(made.vehicle.steering_ratio, made.vehicle.wheel_radius_m, read)

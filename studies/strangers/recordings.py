@@ -76,7 +76,6 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
         car.velocity.arrival_ns,
         np.column_stack([car.velocity.values, car.speed.along(car.velocity).values * 0]),
     )
-    rates = car.wheels.times(1.0 / car.wheel_radius_m)
     yaw_rates = (car.rate[2], car.yaw_rate)
     # All quantities accepted as speed: rims, the body's forward velocity, the speed over ground.
     speeds = (car.speed, car.body_velocity[0], car.ground_speed)
@@ -88,7 +87,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
         "steering wheel": {"steering_wheel_rad": (car.steering_wheel,)},
         "speed": {"speed_m_s": speeds},
         "wheels": {f"wheel_speed_{w}_m_s": (car.wheels[i],) for i, w in enumerate(WHEELS)},
-        "wheel rates": {f"wheel_speed_{w}_rad_s": (rates[i],) for i, w in enumerate(WHEELS)},
+        "wheel rates": {f"wheel_speed_{w}_rad_s": (car.wheel_rates[i],) for i, w in enumerate(WHEELS)},
         "truth": {
             "truth.vx_m_s": speeds,
             "truth.vy_m_s": (car.body_velocity[1],),
