@@ -1,6 +1,6 @@
 """Regenerate everything that is derived from the sources: shipped vehicle files, cars, networks, evidence pages.
 
-    python -m studies.recalibrate [--list] [--only STAGE ...] [--evidence]
+    python -m studies.recalibrate [--only STAGE ...] [--evidence]
 
 The stages run in the order of ``recalibrate.toml``. A stage is skipped if its outputs exist and its command and
 the digest of its inputs have not changed since its last completion. After a failure or an interruption, the same
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.storage.documents import digest
-from studies.pages import ROOT, options, read_json, read_toml, table, write_json
+from studies.pages import ROOT, options, read_json, read_toml, write_json
 
 STAMPS = Path("out") / "recalibrate"
 TABLE = Path(__file__).with_suffix(".toml")
@@ -136,28 +136,17 @@ class Recalibration:
         write_json(self.root / STAMPS / f"{stage.name}.json", begun | ended_s)
         return 0
 
-    def listed(self) -> str:
-        """Return a table of the stages: duration, state and command."""
-        states = ["no" if self.is_complete(stage) else "yes" for stage in self.stages]
-        body = [[s.name, s.duration, state, s.command] for s, state in zip(self.stages, states, strict=True)]
-        return table("stage, duration, to do, command", body)
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """List or run the stages."""
+    """Run the stages."""
     parser = options("recalibrate", __doc__)
-    parser.add_argument("--list", action="store_true", help="print the stages and run none")
     stages = load_stages()
     parser.add_argument("--only", nargs="+", choices=[s.name for s in stages], metavar="STAGE", help="run these alone")
     parser.add_argument("--evidence", action="store_true", help="run the stages that write pages of docs alone")
     given = parser.parse_args(arguments)
     if given.evidence:
         given.only = [s.name for s in stages if any(output.startswith("docs/") for output in s.outputs)]
-    recalibration = Recalibration(ROOT, stages)
-    if given.list:
-        print(recalibration.listed())
-        return 0
-    return recalibration.run(given.only or ())
+    return Recalibration(ROOT, stages).run(given.only or ())
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ least squares of the true sideslip on low-passed features (:mod:`pdhef_logtool.r
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,11 +15,7 @@ import numpy as np
 from pdhef_logtool.learning.network.dataset import Dataset
 from pdhef_logtool.learning.network.train_command import Recipe, gap_free_runs, train_on, weights_of
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.bundle import (
-    LATERAL_VELOCITY,
-    LINEAR_REGRESSION_FILE,
-    PURE_LSTM_FOLDER,
-)
+from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
@@ -55,16 +50,10 @@ def train_baselines(data: Dataset, network: Path) -> None:
 
 
 def fit_dataset(data: Dataset, names: tuple[str, ...]) -> LinearModel:
-    """Return the regression of the training drives, with its errors on all splits."""
-    splits = {s: list(_sequences(data, s)) for s in ("train", "validation", "test")}
-    model = fit_linear(splits["train"], names)
-    provenance = {
-        "dataset_sha256": data.sha256,
-        "vehicle": data.vehicle_name,
-        "training_sequences": len(splits["train"]),
-        "sideslip_rmse_deg": {s: _rmse_deg(model, rows) for s, rows in splits.items()},
-    }
-    return replace(model, provenance=provenance)
+    """Return the regression of the training drives."""
+    sequences = list(_training_sequences(data))
+    about = {"dataset_sha256": data.sha256, "vehicle": data.vehicle_name, "training_sequences": len(sequences)}
+    return replace(fit_linear(sequences, names), provenance=about)
 
 
 def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) -> LinearModel:
@@ -76,7 +65,9 @@ def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) ->
     inputs, targets = [], []
     for s in sequences:
         used = np.isfinite(s.sideslip_rad)
-        inputs.append(_smooth(s.features[:, columns], s.dt_s, LOW_PASS_HZ)[used])
+        smooth = np.empty((len(s.dt_s), len(columns)))
+        low_pass(np.ascontiguousarray(s.features[:, columns]), s.dt_s, LOW_PASS_HZ, np.zeros(len(columns)), smooth)
+        inputs.append(smooth[used])
         targets.append(s.sideslip_rad[used])
     rows = np.concatenate(inputs)
     mean, std = rows.mean(axis=0), rows.std(axis=0)
@@ -94,26 +85,10 @@ def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) ->
     )
 
 
-def _smooth(values: FloatArray, dt_s: FloatArray, corner_hz: float) -> FloatArray:
-    out = np.empty_like(values)
-    low_pass(np.ascontiguousarray(values), dt_s, corner_hz, np.zeros(values.shape[1]), out)
-    return out
-
-
-def _rmse_deg(model: LinearModel, sequences: Sequence[SideslipSequence]) -> float | None:
-    square, count = 0.0, 0
-    for s in sequences:
-        error = _smooth(model.sideslip_rad(s.features)[:, None], s.dt_s, model.low_pass_hz)[:, 0] - s.sideslip_rad
-        used = np.isfinite(error)
-        square += float(np.sum(error[used] ** 2))
-        count += int(used.sum())
-    return math.degrees(math.sqrt(square / count)) if count else None
-
-
-def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
-    """Yield the runs of a split, with the network's rows where ground truth is above the low-speed blend."""
+def _training_sequences(data: Dataset) -> Iterable[SideslipSequence]:
+    """Yield the runs of the training drives; rows are the network's, with ground truth above the low-speed blend."""
     for drive in data.drives:
-        if drive.entry["split"] != split:
+        if drive.entry["split"] != "train":
             continue
         slowest = data.vehicle(drive).low_speed_blend_m_s
         rows = drive.load()

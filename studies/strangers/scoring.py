@@ -19,7 +19,6 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, fit_clocks, read_signals
-from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import POSITIONS, Channel, FloatArray
 from pdhef_logtool.runs.inspection.report import inspect_drive_log
@@ -68,40 +67,28 @@ class Told:
 # ------------------------------------------------------------------------------------------------ messages of the tool
 
 
-def _databases(path: Path) -> Path | None:
-    """Return the folder of a log with its DBC files, which a person gives as ``--set msgs=``."""
-    return path if path.is_dir() and any(path.glob("*.dbc")) else None
-
-
 def look(path: Path) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
     """Let the tool read a log on its own; return its mapping, its messages, and its channels."""
+    # A person gives the folder of the DBC files as --set msgs=.
+    msgs = path if path.is_dir() and any(path.glob("*.dbc")) else None
     try:
-        with closing(open_log(path, msgs=_databases(path))) as log:
-            return _look(log)
+        with closing(open_log(path, msgs=msgs)) as log:
+            inspection = inspect_drive_log(log)
+            channels = _channels(log, inspection.mapping)
     except PdhefError as error:
         return None, Told((), (), str(error)), {}
-
-
-def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
-    said: list[str] = []
-    error = ""
-    try:
-        chosen = choose_mapping(log, None, prefer_truth="perfect")
-        said += [*map(str, chosen.ambiguities), *chosen.mapping.notes]
-    except PdhefError as refused:
-        error = str(refused)
-    inspection = inspect_drive_log(log)
-    document = inspection.to_dict()
-    warnings = document.get("warnings") or []
-    said += [w["message"] for w in warnings]
+    document, refused_run = inspection.to_dict(), ""
+    checks, warnings = list(document.get("checks") or ()), document.get("warnings") or []
+    said = [w["message"] for w in warnings]
     said += [*map(str, inspection.ambiguities), *inspection.notes, *(f"missing: {name}" for name in inspection.missing)]
     suspects = frozenset(name for w in warnings for name in (w["suspects"] or w["signals"]))
-    checks = list(document.get("checks") or ())
-    more, refused_run = _checks_of_a_run(Path(str(log.path)))
-    checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
-    error = error or refused_run
-    messages = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
-    return inspection.mapping, messages, _channels(log, inspection.mapping)
+    try:
+        with read_drive(path, Car.load("saloon"), options=ReadOptions(msgs=msgs), require_sensors=False) as drive:
+            more = [asdict(check) for check in getattr(drive, "checks", ())]
+            checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
+    except PdhefError as error:
+        refused_run = str(error)
+    return inspection.mapping, Told(tuple(checks), tuple(said), refused_run, suspects), channels
 
 
 def _channels(log: DriveLog, mapping: SignalMapping) -> dict[str, Channel]:
@@ -109,16 +96,6 @@ def _channels(log: DriveLog, mapping: SignalMapping) -> dict[str, Channel]:
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     read = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
     return read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
-
-
-def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
-    """Return the checks that ``pdhef run`` would show, and why it would not run."""
-    try:
-        options = ReadOptions(msgs=_databases(path))
-        with read_drive(path, Car.load("saloon"), options=options, require_sensors=False) as drive:
-            return [asdict(check) for check in getattr(drive, "checks", ())], ""
-    except PdhefError as error:
-        return [], str(error)
 
 
 # ------------------------------------------------------------------------------------------------ by value
