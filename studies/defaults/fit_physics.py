@@ -27,7 +27,6 @@ The single filter here has force scale and bank as states; in operation they are
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -50,7 +49,8 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from studies.pages import options, read_json
+from studies.pages import options
+from truthsim.suite import write_suite
 
 #: Error samples that fits use; more only cost time.
 FIT_RATE_HZ = 20.0
@@ -429,12 +429,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--work", type=Path, default=Path("out/fit-physics"), help="logs; kept")
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args(arguments)
-    simulate = ("simulate", "suite", "--count", str(DRIVES), "--seed", str(SEED), "--jobs", str(given.jobs))
-    subprocess.run([sys.executable, "-m", "pdhef_logtool", *simulate, "-o", str(given.work)], check=True)
     car = Car.load(given.output, network=NO_MODEL)
-    drawn = read_json(given.work / "manifest.json")["drives"]
     drives, learnt_on = [], []
-    for entry in drawn:
+    for entry in write_suite(given.work, count=DRIVES, seed=SEED, processes=given.jobs)["drives"]:
         read = read_drive(given.work / entry["file"], Car(car.vehicle))
         assert read.truth is not None
         drives.append(FitDrive(read.name, read.signals, read.truth))

@@ -35,6 +35,7 @@ from studies.defaults import fit_physics, paper_drives
 from studies.defaults.noise import tune
 from studies.defaults.train_baselines import train_baselines
 from studies.pages import SAMPLE_VEHICLE, options
+from truthsim.suite import write_suite
 
 HOME = SHIPPED_CARS["saloon"]
 #: Seed of the drives. The condition table, the paper and the tests use other seeds.
@@ -55,8 +56,7 @@ def simulate(t: Namespace) -> None:
     t.output.mkdir(parents=True, exist_ok=True)
     text = part_toml(read_vehicle_file(SAMPLE_VEHICLE).vehicle, "Written by python -m studies.defaults.train_default.")
     (t.output / VEHICLE_FILE).write_text(f"{text}\n[network]\ngain = {GAIN}\n", encoding="utf-8")
-    what = ("--count", t.drives, "--seed", SEED, "--vehicles", "default", "--jobs", t.jobs)
-    pdhef("simulate", "suite", *what, "-o", t.work / "one_car")
+    write_suite(t.work / "one_car", count=t.drives, seed=SEED, processes=t.jobs)
     paper_drives.write_drives(t.work / PAPER_DRIVES, count=min(t.drives, paper_drives.COUNT), processes=t.jobs)
 
 
@@ -77,8 +77,13 @@ def extract(t: Namespace) -> None:
     """Extract residuals: the paper's network and the baselines have the nominal model, as the paper has it."""
     sets = [(t.work / "one_car", t.work / model, model) for model in MODELS]
     for drives, residuals, model in (*sets, (t.work / PAPER_DRIVES, t.work / PAPER_RESIDUALS, NOMINAL_MODEL)):
-        given = ("--car", t.output, "--mapping", fit_physics.MAPPING, "--filter", model)
-        pdhef("extract", drives, *given, "-o", residuals, "--jobs", t.jobs, "--resume")
+        given = ("--car", t.output, "--mapping", fit_physics.MAPPING, "--filter", model, "--jobs", t.jobs, "--resume")
+        words = ("pdhef_logtool", "extract", drives, *given, "-o", residuals)
+        if subprocess.run([sys.executable, "-m", *map(str, words)], check=False).returncode not in (
+            EXIT_OK,
+            EXIT_PARTIAL,
+        ):
+            raise SystemExit(f"failed: {words}")
 
 
 def train(t: Namespace) -> None:
@@ -121,14 +126,6 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"[{(time.monotonic() - began) / 60.0:5.1f} min] {name}: {step.__doc__}", flush=True)
             step(given)
     return 0
-
-
-def pdhef(*words: object) -> None:
-    """Run one command of the tool; a failure ends the program."""
-    command = [sys.executable, "-m", "pdhef_logtool", *map(str, words)]
-    done = subprocess.run(command, stdout=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False)
-    if done.returncode not in (EXIT_OK, EXIT_PARTIAL):
-        raise SystemExit(f"failed ({done.returncode}): {command}")
 
 
 if __name__ == "__main__":
