@@ -20,7 +20,7 @@ from studies.strangers.containers import write as write_log
 from studies.strangers.layouts import layouts, mountings
 from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
-from studies.strangers.scoring import SHARED, answered_files, load_answers, look, score_log
+from studies.strangers.scoring import ANSWERS, SHARED, look, other_recording, score_log
 
 #: First results of held-out layouts, present and former.
 FIRST_RUNS: dict[str, str] = read_toml(Path(__file__).with_name("first_runs.toml"))
@@ -40,7 +40,7 @@ def score_own(recordings: Sequence[Recording], folder: Path) -> Iterator[tuple[s
     """Yield the kind and the result of every log of our own."""
     for recording in recordings:
         print(recording.name, file=sys.stderr)
-        yield recording.counted_as, score_recording(recording, folder)
+        yield recording.kind or recording.name, score_recording(recording, folder)
 
 
 def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
@@ -48,10 +48,10 @@ def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
     if not SHARED.is_dir():
         print(f"{SHARED} is not there: recordings of others are left out", file=sys.stderr)
         return
-    for answer in load_answers():
-        if _wanted(answer.file, only) and answer.path.exists():
-            print(answer.file, file=sys.stderr)
-            yield answer.file, score_log(answer.path, answer.expected())
+    for file, table in ANSWERS.items():
+        if "same_as" not in table and _wanted(file, only) and (SHARED / file).exists():
+            print(file, file=sys.stderr)
+            yield file, score_log(SHARED / file, other_recording(file))
 
 
 def first_run() -> str:
@@ -75,12 +75,11 @@ def others_without_answers() -> str:
     catalogue = SHARED / "reader_corpus" / "CATALOG.json"
     if not catalogue.is_file():
         return ""
-    answered = answered_files()
     channels = {name for names in ITEMS.values() for name in names}
     mapped_files, count = [], 0
     for entry in read_json(catalogue):
         file = f"reader_corpus/{entry['file']}"
-        if entry["expected"] != "ok" or file in answered or "/conformance/" in file:
+        if entry["expected"] != "ok" or file in ANSWERS or "/conformance/" in file:
             continue
         count += 1
         _, _, mapped = look(SHARED / file)
@@ -120,12 +119,12 @@ def main() -> int:
         remark = first_run() + ("" if last else "Without the held-out layouts.\n\n")
         write(given.out, page(results, remark + others_without_answers()))
     if given.keep:
-        write_json(given.keep, {r.name: r.as_json() for r in sorted(results, key=lambda r: r.name)})
+        write_json(given.keep, {r.log.name: r.as_json() for r in sorted(results, key=lambda r: r.log.name)})
     return 1 if any(r.count("wrong, not reported") for r in results) else 0
 
 
 def _show(result: Result) -> None:
-    print(f"== {result.name}: {result.what}")
+    print(f"== {result.log.name}: {result.log.what}")
     for item, outcome in result.items.items():
         print(f"   {item}: {outcome} {result.wrong.get(item, '')} {result.verdicts.get(item, '')}".rstrip())
     if result.named is not None:

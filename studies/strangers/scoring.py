@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.pages import ROOT, read_toml
 from studies.strangers.cars import Series
 from studies.strangers.page import Result
-from studies.strangers.recordings import ITEMS, SCORING, Expected
+from studies.strangers.recordings import ITEMS, SCORING, Recording
 
 #: Values are compared as means over so long: noise and a late stamp of a few milliseconds count little.
 BIN_S = 0.25
@@ -170,7 +170,7 @@ def bias_of(name: str) -> float:
 # ------------------------------------------------------------------------------------------------ the score
 
 
-def score_log(path: Path, expected: Expected, start_ns: int | None = None) -> Result:
+def score_log(path: Path, expected: Recording, start_ns: int | None = None) -> Result:
     """Let the tool map a log and compare the mapping with the right answers.
 
     A channel of :data:`ITEMS` that is neither right nor allowed is wrong.
@@ -220,10 +220,8 @@ def score_log(path: Path, expected: Expected, start_ns: int | None = None) -> Re
         and not c["name"].endswith(".corrected")  # the correction made it right
     )
     named = bool(re.search(expected.cause, messages.text, re.IGNORECASE)) if expected.cause else None
-    return Result(
-        expected.name, expected.group, expected.what, items, expected.page, wrong, verdicts, tuple(silent),
-        tuple(doubted), alarms, named, messages.text,
-    )  # fmt: skip
+    found = tuple(silent), tuple(doubted), alarms, named, messages.text
+    return Result(replace(expected, right={}, allowed={}, topics=()), items, wrong, verdicts, *found)
 
 
 def _sources(mapping: SignalMapping) -> dict[str, str]:
@@ -252,65 +250,33 @@ def _is_doubted(name: str, source: str, messages: Told) -> bool:
 # ------------------------------------------------------------------------------------------------ recordings of others
 
 SHARED = ROOT.parent / "shared"
-ANSWERS = Path(__file__).with_name("answers.toml")
+#: Right sources of recordings by channel (alternatives), sources that are also ``allowed``, and channels ``at_fault``.
+ANSWERS = read_toml(Path(__file__).with_name("answers.toml"))
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """Right sources of one recording by channel (alternatives), sources that are also allowed, and faulty channels."""
-
-    file: str
-    right: dict[str, tuple[SignalSource, ...]]
-    allowed: dict[str, tuple[SignalSource, ...]]
-    at_fault: frozenset[str]
-
-    @property
-    def path(self) -> Path:
-        """Where the recording lies, if it is there."""
-        return SHARED / self.file
-
-    def expected(self) -> Expected:
-        """Read the right and the allowed channels."""
-        right, allowed = (_read(self.path, sources) for sources in (self.right, self.allowed))
-        return Expected(self.file, "recording", "", right, allowed, at_fault=self.at_fault)
-
-
-def load_answers() -> Iterator[Answer]:
-    """Yield all of them, whether the recordings are there or not."""
-    for file, table in read_toml(ANSWERS).items():
-        if "same_as" not in table:
-            allowed, at_fault = _alternatives(table.get("allowed", {})), frozenset(table.get("at_fault", ()))
-            yield Answer(file, _alternatives(table), allowed, at_fault)
-
-
-def answered_files() -> frozenset[str]:
-    """Return the recordings that somebody has looked at."""
-    return frozenset(read_toml(ANSWERS))
-
-
-def _alternatives(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:
-    sources_by_name = {}
-    for name, given in table.items():
-        if name not in ("allowed", "at_fault"):
-            texts = given if isinstance(given, list) else [given]
-            sources_by_name[name] = tuple(_source(name.removeprefix("truth."), *text.split()) for text in texts)
-    return sources_by_name
+def other_recording(file: str) -> Recording:
+    """Read a recording of others: its right and its allowed channels."""
+    table = dict(ANSWERS[file])
+    sources, at_fault = table.pop("allowed", {}), frozenset(table.pop("at_fault", ()))
+    right, allowed = (_read(SHARED / file, given) for given in (table, sources))
+    return Recording(file, "recording", "", right, allowed, at_fault=at_fault)
 
 
 def _source(name: str, topic: str, field: str, scale: str = "1", offset: str = "0") -> SignalSource:
     return SignalSource(name, topic, field, scale=float(scale), offset=float(offset))
 
 
-def _read(path: Path, sources: dict[str, tuple[SignalSource, ...]]) -> dict[str, tuple[Series, ...]]:
+def _read(path: Path, table: Mapping[str, str | list[str]]) -> dict[str, tuple[Series, ...]]:
     """Return the channels of a recording, several where a channel has alternative sources."""
+    alternatives = {name: given if isinstance(given, list) else [given] for name, given in table.items()}
     series: dict[str, tuple[Series, ...]] = {}
     with closing(open_log(path)) as log:
-        for turn in range(max(map(len, sources.values()), default=0)):
+        for turn in range(max(map(len, alternatives.values()), default=0)):
             signals, truth = dict[str, SignalSource](), dict[str, SignalSource]()
-            for name, alternatives in sources.items():
-                if turn < len(alternatives):
-                    section = truth if name.startswith("truth.") else signals
-                    section[name.removeprefix("truth.")] = alternatives[turn]
+            for name, texts in alternatives.items():
+                if turn < len(texts):
+                    bare = name.removeprefix("truth.")
+                    (signals if bare == name else truth)[bare] = _source(bare, *texts[turn].split())
             for name, c in _channels(log, SignalMapping(signals=signals, truth=truth)).items():
                 if len(c):
                     series[name] = (*series.get(name, ()), Series(c.stamps_ns, c.arrival_ns, c.values))
