@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.signals import IntArray
-from studies.mcap_logs import Message, write_log
+from studies.mcap_logs import Message, messages, write_log
 from studies.strangers import buses, tables
 
 
@@ -109,17 +109,14 @@ def _joints(writer: McapLogWriter, topic: Topic) -> Iterator[RawMessage]:
 
 def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tuple[Topic, int, int, bytes]]:
     """Yield topic, arrival, stamp and the bytes of every message, in CDR or as ROS 1 has them, as they arrive."""
-    from mcap.reader import make_reader
-
     by_name = {t.name: t for t in topics}
     scratch = _mcap(topics, path.with_name(f".{path.stem}-scratch"))
     store = _store(False)
     try:
-        with scratch.open("rb") as stream:
-            for _, channel, message in make_reader(stream).iter_messages():
-                topic, data = by_name[channel.topic], message.data
-                data = bytes(store.cdr_to_ros1(data, topic.type_name)) if ros1 else data
-                yield topic, message.log_time, message.publish_time, data
+        for m in messages(scratch):
+            topic = by_name[m.topic]
+            data = bytes(store.cdr_to_ros1(m.data, topic.type_name)) if ros1 else m.data
+            yield topic, m.log_time_ns, m.publish_time_ns, data
     finally:
         scratch.unlink()
 
@@ -201,9 +198,9 @@ def _json(topics: Sequence[Topic], path: Path, *, bare: bool = False) -> Path:
     return _by_time(path, map(encoded, topics))
 
 
-def _by_time(path: Path, messages: Iterable[Iterable[Message]]) -> Path:
+def _by_time(path: Path, of_topics: Iterable[Iterable[Message]]) -> Path:
     """Write the messages of topics by their arrival."""
-    return write_log(path.with_suffix(".mcap"), sorted(chain.from_iterable(messages), key=lambda m: m.log_time_ns))
+    return write_log(path.with_suffix(".mcap"), sorted(chain.from_iterable(of_topics), key=lambda m: m.log_time_ns))
 
 
 def _protobuf(topics: Sequence[Topic], path: Path) -> Path:

@@ -102,12 +102,8 @@ def _table_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> It
 
 
 def _value_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
-    for i, (stamp, name, value, unit) in enumerate(_long_rows(topics)):
-        yield form["row"].format(name=name, value=value, unit=unit, **_times(stamp, start, i))
-
-
-def _series_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
-    rows = sorted(_long_rows(topics), key=lambda row: row[1])
+    """Yield a row for each value; in a series, signal after signal."""
+    rows = sorted(_long_rows(topics), key=lambda row: row[1]) if form["rows"] == "series" else _long_rows(topics)
     for i, (stamp, name, value, unit) in enumerate(rows):
         if not i or name != rows[i - 1][1]:
             yield from (line.format(name=name, unit=unit) for line in form["above"])
@@ -139,7 +135,7 @@ def _side_by_side(form: dict[str, Any], topics: Sequence[Topic], start: int) -> 
 
 
 _ROWS: dict[str, Callable[[dict[str, Any], Sequence[Topic], int], Iterator[str]]] = {
-    "table": _table_rows, "samples": _sample_rows, "values": _value_rows, "series": _series_rows,
+    "table": _table_rows, "samples": _sample_rows, "values": _value_rows, "series": _value_rows,
     "columns": _side_by_side,
 }  # fmt: skip
 

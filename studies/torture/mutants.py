@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from studies.mcap_logs import messages
 from studies.torture.damage import mutant, table_mutant
 from studies.torture.seeds import FORMATS, table_seeds, write_seeds
 from studies.torture.workers import LIMIT_BYTES, Verdict, command, judge, measured
@@ -103,14 +104,7 @@ def judge_mutant(work: Path, name: str, seeds: Sequence[bytes], seed: int, canar
         problems += [f"{process.peak_bytes >> 20} MiB"] if process.peak_bytes > LIMIT_BYTES else []
         problems += ["left a process"] if process.left else []
         problems += [f"left {path.name}" for place in places for path in place.iterdir()]
-        problems += ["contains another file"] if out.is_file() and _has_canary(out) else []
+        problems += ["contains another file"] if out.is_file() and any(_CANARY in m.data for m in messages(out)) else []
         return Verdict(verdict.end, "; ".join(problems), {"s": process.wall_s, "bytes": process.peak_bytes})
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _has_canary(path: Path) -> bool:
-    from mcap.reader import make_reader
-
-    with path.open("rb") as file:
-        return any(_CANARY in message.data for _, _, message in make_reader(file).iter_messages())
