@@ -69,8 +69,8 @@ def row_inputs(tool: Tool, name: str, log: Path, assume: dict[str, Any]) -> list
 
 def runs_of(tool: Tool, row: str, given: argparse.Namespace) -> Iterator[Path]:
     """Run the estimators on the drives of a row and yield the output folders."""
-    network = [] if given.network is None else ["--network", given.network]
-    common = ["--car", given.car, *network, "--estimators", given.estimators, "--keep", "metrics", "--jobs", given.jobs]
+    common = ["--car", given.car, "--estimators", ",".join(ESTIMATORS), "--keep", "metrics", "--jobs", given.jobs]
+    common += [] if given.network is None else ["--network", given.network]
     if row != INDEPENDENT_ROW:
         logs, assume = row_logs(given.work, row, given.drives, given.seed, given.jobs)
         yield tool.run(f"{row}-{given.seed}-{given.drives}", *logs, *common, *row_inputs(tool, row, logs[0], assume))
@@ -98,7 +98,7 @@ def run(given: argparse.Namespace) -> None:
         "car": given.car,
         "version": __version__,
         "rows": {r.name: r.description for r in ROWS} | {INDEPENDENT_ROW: "runs of another simulator, true friction"},
-        "order": given.estimators.split(","),
+        "order": ESTIMATORS,
     }
     given.results.mkdir(parents=True, exist_ok=True)
     metrics = pl.concat(frames).select(COLUMNS).filter(kept)
@@ -209,7 +209,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = page_options("conditions", __doc__)
     parser.add_argument("--car", default="saloon")
     parser.add_argument("--network", type=Path, help="instead of the car's")
-    parser.add_argument("--estimators", default=",".join(ESTIMATORS))
     all_rows = (*ROW_NAMES, INDEPENDENT_ROW)
     parser.add_argument("--rows", nargs="+", choices=all_rows, default=all_rows, metavar="ROW", help="all by default")
     parser.add_argument("--drives", type=int, default=10, help="drives a row")

@@ -21,11 +21,34 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool, estimates
-from studies.paper.schemes import ESP, SCHEMES
+from studies.pages import read_toml
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import MANOEUVRES
 
+#: Published values, documented in their file.
+PUBLISHED = read_toml(Path(__file__).with_name("published.toml"))
+
+#: End of the names of schemes without wheel speed, the paper's sensor set.
+ESP = ", esp"
+
+#: All schemes that belong in the tables (docs/method.md#evaluation).
+SCHEMES = (
+    "zero", "zero:no-lateral", "kinematic", "open-loop", "linear-regression", "phy-ukf", "phy-ukf:tuned", "physics",
+    "pure-lstm", "pd-hef-paper", "pd-hef:fixed-r", "pd-hef",
+    *(f"{name}{ESP}" for name in ("phy-ukf", "physics", "pd-hef-paper", "pd-hef")),
+)  # fmt: skip
+
+#: Our hybrid filter, the paper's, and the paper's three in the order in which the time histories draw them.
+HYBRID, PAPER = "pd-hef", "pd-hef-paper"
+DRAWN = ("phy-ukf", "pure-lstm", HYBRID)
+#: Scheme and baseline of the improvements.
+PAIRS = (
+    *((HYBRID, b) for b in ("phy-ukf", "physics", PAPER, "phy-ukf:tuned", "linear-regression", "pure-lstm")),
+    (PAPER, "phy-ukf"),
+    (f"{HYBRID}{ESP}", f"phy-ukf{ESP}"),
+    (f"{PAPER}{ESP}", f"phy-ukf{ESP}"),
+)
 GRAVITY_M_S2 = 9.80665
 #: Sensor errors of the reported drives. No training or tuning set has these seeds: sample logs have seeds of one digit,
 #: the sets of the shipped car are drawn from seeds 1000 to 4000.

@@ -10,8 +10,7 @@ import numpy as np
 
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.geometry import wrap_angle
-from studies.paper.experiment import A, B, Experiment, time_s, valid
-from studies.paper.schemes import DRAWN, PUBLISHED
+from studies.paper.experiment import DRAWN, PUBLISHED, A, B, Experiment, time_s, valid
 from studies.pictures import STYLE, save, subplots
 
 COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}

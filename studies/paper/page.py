@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from studies.pages import table, template
-from studies.paper.schemes import HYBRID, PAPER, PUBLISHED, SCHEMES
+from studies.paper.experiment import HYBRID, PAPER, PUBLISHED, SCHEMES
 from truthsim.sensors import SensorNoise
 
 #: Rows of the sensitivity, with the symbols of the page.

@@ -26,8 +26,7 @@ from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.estimating import estimate_drive
 from studies.gates.tool import Tool
 from studies.paper import experiment as paper
-from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B, Experiment, improvement, spread
-from studies.paper.schemes import ESP, PAIRS
+from studies.paper.experiment import BURST, BURST_S, ESP, PAIRS, A, B, Experiment, improvement, spread
 
 SCENARIOS = (A, B, BURST)
 #: Schemes with a variable gain or factor on R.
@@ -64,7 +63,7 @@ def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 
     track = experiment.track(scenario, scheme)
     if track is None:
         return None
-    ay = np.abs(experiment.truth(scenario)["ay_m_s2"].to_numpy()) / GRAVITY_M_S2
+    ay = np.abs(experiment.truth(scenario)["ay_m_s2"].to_numpy()) / paper.GRAVITY_M_S2
     trust = paper.valid(track, "network_trust")
     use = np.isfinite(trust) & np.isfinite(ay)
     ay, trust = ay[use], trust[use]

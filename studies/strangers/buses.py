@@ -9,13 +9,11 @@ import datetime as dt
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.records import Attachment
 
-if TYPE_CHECKING:
-    from studies.strangers.containers import Topic
+from studies.strangers.cars import Topic
 
 #: Time in ns, bus, identifier and bytes of a frame.
 _Frame = tuple[int, int, int, bytes]

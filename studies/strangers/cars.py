@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from studies.pages import read_toml
@@ -45,6 +47,18 @@ class Series:
         columns = self.values if self.values.ndim == 2 else self.values[:, None]
         read = np.stack([np.interp(clock_s - clock_s[0], have - clock_s[0], column) for column in columns.T], axis=1)
         return Series(clock.stamps_ns, clock.arrival_ns, read if self.values.ndim == 2 else read[:, 0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topic:
+    """One topic: columns by dotted path ([N], [N, k] for an array or a vector struct, int64 ns for a ROS time)."""
+
+    name: str
+    type_name: str
+    stamps_ns: IntArray
+    arrival_ns: IntArray
+    fields: Mapping[str, NDArray[Any]]
+    constants: Mapping[str, str | float | Sequence[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,31 +7,16 @@ import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
-from pdhef_logtool.records.signals import IntArray
 from studies.mcap_logs import Message, messages, write_log
 from studies.strangers import buses, tables
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Topic:
-    """One topic: columns by dotted path ([N], [N, k] for an array or a vector struct, int64 ns for a ROS time)."""
-
-    name: str
-    type_name: str
-    stamps_ns: IntArray
-    arrival_ns: IntArray
-    fields: Mapping[str, NDArray[Any]]
-    constants: Mapping[str, str | float | Sequence[float]] = field(default_factory=dict)
+from studies.strangers.cars import Topic as Topic
 
 
 @lru_cache(maxsize=2)

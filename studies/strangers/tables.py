@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import IntArray
 from studies.pages import read_toml
-
-if TYPE_CHECKING:
-    from studies.strangers.containers import Topic
+from studies.strangers.cars import Topic
 
 #: GPS time is ahead of UTC by 18 leap seconds, and began 315964800 s after 1970.
 _GPS_NS, _WEEK_NS, _DAY_NS = (18 - 315_964_800) * 10**9, 604_800 * 10**9, 86_400 * 10**9
