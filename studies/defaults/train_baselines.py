@@ -44,16 +44,12 @@ def train_baselines(data: Dataset, network: Path) -> None:
     """Train both baselines into ``network``/``baselines``."""
     file = network / LINEAR_REGRESSION_FILE
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(fit_dataset(data, NOMINAL_FEATURES).to_json(), encoding="utf-8")
-    recipe = Recipe(NOMINAL_FEATURES, odd=False, target=LATERAL_VELOCITY, epochs=EPOCHS)
-    train_on(data, network / PURE_LSTM_FOLDER, recipe, progress=lambda text, _: print(text, flush=True))
-
-
-def fit_dataset(data: Dataset, names: tuple[str, ...]) -> LinearModel:
-    """Return the regression of the training drives."""
     sequences = list(_training_sequences(data))
     about = {"dataset_sha256": data.sha256, "vehicle": data.vehicle_name, "training_sequences": len(sequences)}
-    return replace(fit_linear(sequences, names), provenance=about)
+    model = replace(fit_linear(sequences, NOMINAL_FEATURES), provenance=about)
+    file.write_text(model.to_json(), encoding="utf-8")
+    recipe = Recipe(NOMINAL_FEATURES, odd=False, target=LATERAL_VELOCITY, epochs=EPOCHS)
+    train_on(data, network / PURE_LSTM_FOLDER, recipe, progress=lambda text, _: print(text, flush=True))
 
 
 def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) -> LinearModel:

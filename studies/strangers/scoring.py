@@ -101,8 +101,10 @@ def _channels(log: DriveLog, mapping: SignalMapping) -> dict[str, Channel]:
 # ------------------------------------------------------------------------------------------------ by value
 
 
-def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> bool:
+def agrees(channel: Channel, right: Series, name: str) -> bool:
     """Return whether a channel has the values of a series, but for noise, a few milliseconds and a bias."""
+    floor = FLOORS.get(name, FLOORS["rad_s" if name.endswith("rad_s") else "m_s"])
+    bias = BIAS_M_S2 if name in ("ax_m_s2", "ay_m_s2") else 0.0
     if not len(channel) or not len(right.stamps_ns):
         return False
     if channel.name.endswith(("course_rad", "yaw_rad", "heading_rad")):
@@ -157,16 +159,6 @@ def _means(at_ns: Any, values: FloatArray, width: int, count: int) -> FloatArray
         return np.stack(sums, axis=1) / hits[:, None]
 
 
-def floor_of(name: str) -> float:
-    """Return the least difference that counts for a channel."""
-    return FLOORS.get(name, FLOORS["rad_s" if name.endswith("rad_s") else "m_s"])
-
-
-def bias_of(name: str) -> float:
-    """Return the constant difference that does not count for a channel."""
-    return BIAS_M_S2 if name in ("ax_m_s2", "ay_m_s2") else 0.0
-
-
 # ------------------------------------------------------------------------------------------------ the score
 
 
@@ -189,7 +181,7 @@ def score_log(path: Path, expected: Recording, start_ns: int | None = None) -> R
         shift = (RELATIVE_NS if first < RELATIVE_NS + 10**12 else first) - start_ns
         fitting = {n: [s.late(shift * 1e-9) for s in series] for n, series in fitting.items()}
     is_right = {
-        name: any(agrees(channel, series, floor_of(name), bias_of(name)) for series in fitting.get(name, ()))
+        name: any(agrees(channel, series, name) for series in fitting.get(name, ()))
         for name, channel in channels.items()
     }
     items, wrong, verdicts, doubted, silent = dict[str, str](), dict[str, str](), dict[str, str](), [], []

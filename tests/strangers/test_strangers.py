@@ -49,7 +49,7 @@ def _channel(values: np.ndarray, shift_ns: int = 0) -> Channel:
 )
 def test_values_decide_whether_a_channel_is_right(values: np.ndarray, shift_ns: int, right: bool) -> None:
     channel = _channel(values, shift_ns) if values.size else Channel("a", "1", "", _NS[:0], _NS[:0], values)
-    assert agrees(channel, Series(_NS, _NS, _WAVE), 0.01) is right
+    assert agrees(channel, Series(_NS, _NS, _WAVE), "yaw_rate_rad_s") is right
 
 
 _MCAP = ("mcap", "mcap-json", "mcap-json-bare", "mcap-ros1", "mcap-protobuf")
