@@ -134,13 +134,7 @@ def usable_stamps(signals: Signals, truth: StateTrack, vehicle: VehicleParameter
 
 def period_s(drive: FitDrive) -> float:
     """Return the usual time from one stamp to the next."""
-    stamps = drive.signals.stamps_ns
-    return float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.01
-
-
-def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
-    """Return how long a drive can be used for identification."""
-    return float(np.count_nonzero(usable_stamps(drive.signals, drive.truth, vehicle))) * period_s(drive)
+    return float(np.median(np.diff(drive.signals.stamps_ns))) * 1e-9
 
 
 def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> AxleSamples:
@@ -161,11 +155,7 @@ def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> Axle
         truth = drive.truth
         vx, vy, r = smoothed(truth.vx_m_s), smoothed(truth.vy_m_s), smoothed(truth.yaw_rate_rad_s)
         ay, steer = smoothed(truth.ay_m_s2), smoothed(drive.signals.steer_rad)
-        r_dot = vy_dot = np.full(len(stamps), np.nan)
-        if len(stamps) > 2:
-            r_dot, vy_dot = (np.gradient(x, stamps * 1e-9 - stamps[0] * 1e-9) for x in (r, vy))
-        if not np.isfinite(ay).any():  # no specific force is known: a flat road
-            ay = vy_dot + vx * r
+        r_dot = np.gradient(r, stamps * 1e-9 - stamps[0] * 1e-9)
         total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
         front = (lr * total + moment) / (lf + lr) / np.cos(steer)
         rear = (lf * total - moment) / (lf + lr)
@@ -187,8 +177,6 @@ def fit_axle(
     ----------
     independent : how many independent samples the N neighbouring ones are worth.
     """
-    if slip_rad.size < 10:
-        return prior
     step = max(1, slip_rad.size // 4000)
     slip, force = slip_rad[::step], force_n[::step]
     weight = np.sqrt(independent / slip.size) / (FORCE_STD_N_PER_KG * mass_kg)
@@ -229,8 +217,7 @@ def make_priors(start: VehicleParameters, samples: AxleSamples, usable_s: float)
         ("front", True, samples.front_slip_rad, samples.front_force_n),
         ("rear", False, samples.rear_slip_rad, samples.rear_force_n),
     ):
-        seen = float(np.percentile(np.abs(force), 99.5)) if force.size else 0.0
-        peak = max(start.magic_formula(front, mu)[2], seen)
+        peak = max(start.magic_formula(front, mu)[2], float(np.percentile(np.abs(force), 99.5)))
         file_curve = AxleCurve(start.cornering_stiffness_n_per_rad(front, mu), peak, SHAPE)
         curve = fit_axle(slip, force, prior=file_curve, mass_kg=start.mass_kg, independent=usable_s / CORRELATION_S)
         stiffness_std, peak_std, shape_std = (AXLE_FIT_SHARE * s for s in (STIFFNESS_LOG_STD, PEAK_LOG_STD, SHAPE_STD))
@@ -347,7 +334,7 @@ def fit_physics(
     ----------
     starts : where to start, θ by the parameter's name; the best end counts.
     """
-    usable_s = sum(usable_seconds(d, start) for d in drives)
+    usable_s = sum(float(np.count_nonzero(usable_stamps(d.signals, d.truth, start))) * period_s(d) for d in drives)
     samples = axle_samples(drives, start)
     priors = make_priors(start, samples, usable_s)
 
