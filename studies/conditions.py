@@ -138,14 +138,12 @@ def write_page(out: Path, folder: Path) -> None:
     sideslip = pl.col("signal").cast(pl.String) == "sideslip_rad"
     metrics = pl.read_parquet(folder / "metrics.parquet").filter(sideslip, segment="all")
     errors = metrics.filter(metric="rmse").pivot("estimator", index=["row", "drive"], values="value").sort("drive")
-    names = [n for n in facts["order"] if n in errors.columns]
     rows = [r for r in facts["rows"] if r in set(errors["row"])]
-    rmse = {r: {n: np.degrees(errors.filter(row=r)[n].to_numpy()) for n in names} for r in rows}
-    references = [r for r in REFERENCES if r in names] if SUBJECT in names else []
-    ratios = {o: np.array([ratio_of_medians(rmse[r][SUBJECT], rmse[r][o]) for r in rows]) for o in references}
-    spans = {n: np.array([np.nanpercentile(rmse[r][n], [10, 50, 90]) for r in rows]) for n in names}
-    drawn = {n: spans[n] for n in DRAWN if n in spans}
-    others = {n: span for n, span in spans.items() if n not in drawn}
+    rmse = {r: {n: np.degrees(errors.filter(row=r)[n].to_numpy()) for n in facts["order"]} for r in rows}
+    ratios = {o: np.array([ratio_of_medians(rmse[r][SUBJECT], rmse[r][o]) for r in rows]) for o in REFERENCES}
+    spans = {n: np.array([np.nanpercentile(rmse[r][n], [10, 50, 90]) for r in rows]) for n in facts["order"]}
+    drawn = {n: spans[n] for n in DRAWN}
+    others = {n: span for n, span in spans.items() if n not in DRAWN}
     pictures = out / "conditions"
     pictures.mkdir(parents=True, exist_ok=True)
     label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"

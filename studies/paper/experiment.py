@@ -123,11 +123,10 @@ class Experiment:
         """Return the ground truth of the first noise seed."""
         return self.tracks[scenario].filter(estimator="truth").sort("stamp_ns")
 
-    def track(self, scenario: str, scheme: str) -> pl.DataFrame | None:
-        """Return the estimate of a scheme at the stamps of the ground truth; None if it did not run."""
+    def track(self, scenario: str, scheme: str) -> pl.DataFrame:
+        """Return the estimate of a scheme at the stamps of the ground truth."""
         own = self.tracks[scenario].filter(estimator=scheme)
-        stamps = self.truth(scenario).select("stamp_ns")
-        return stamps.join(own, on="stamp_ns", how="left", maintain_order="left") if len(own) else None
+        return self.truth(scenario).select("stamp_ns").join(own, on="stamp_ns", how="left", maintain_order="left")
 
 
 def valid(track: pl.DataFrame, column: str) -> FloatArray:
@@ -225,16 +224,14 @@ def spread(metrics: pl.DataFrame, scenario: str, scheme: str, figure: str) -> di
     return {"median": float(np.median(values)), "low": min(values), "high": max(values), "n": len(values)}
 
 
-def improvement(metrics: pl.DataFrame, scenario: str, scheme: str, baseline: str) -> dict[str, Any] | None:
-    """Return the relative reduction of the sideslip RMSE, pooled over the seeds; None if a scheme is missing.
+def improvement(metrics: pl.DataFrame, scenario: str, scheme: str, baseline: str) -> dict[str, Any]:
+    """Return the relative reduction of the sideslip RMSE, pooled over the seeds.
 
     Its bounds are those of a bootstrap in which seeds are drawn in pairs; NaN with fewer than two.
     """
     of = metrics.filter(scenario=scenario, figure="sideslip_deg")
     ours, theirs = (of.filter(scheme=name).select("noise_seed", "value") for name in (scheme, baseline))
     both = ours.join(theirs, on="noise_seed", suffix="_baseline").sort("noise_seed")
-    if both.is_empty():
-        return None
     squares = both.select("value", "value_baseline").to_numpy() ** 2
 
     def share(sums: np.ndarray) -> np.ndarray:

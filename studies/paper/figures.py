@@ -58,12 +58,10 @@ def sideslip(path: Path, experiment: Experiment, scenario: str) -> None:
     states, errors = axes[:, 0]
     states.plot(at_s, np.degrees(real), color=COLOURS["truth"], linewidth=3.0, label="truth")
     for scheme in DRAWN:
-        if (track := experiment.track(scenario, scheme)) is not None:
-            value = valid(track, "sideslip_rad")
-            dashes = DASHES.get(scheme, "-")
-            states.plot(at_s, np.degrees(value), color=COLOURS[scheme], linestyle=dashes, label=scheme)
-            error = np.degrees(np.abs(wrap_angle(value - real)))
-            errors.plot(at_s, error, color=COLOURS[scheme], linewidth=0.9)  # noise in dashes cannot be read
+        value, colour = valid(experiment.track(scenario, scheme), "sideslip_rad"), COLOURS[scheme]
+        states.plot(at_s, np.degrees(value), color=colour, linestyle=DASHES.get(scheme, "-"), label=scheme)
+        # Noise in dashes cannot be read.
+        errors.plot(at_s, np.degrees(np.abs(wrap_angle(value - real))), color=colour, linewidth=0.9)
     states.set(ylabel="sideslip, deg")
     errors.set(xlabel="time, s", ylabel="absolute error, deg", ylim=(0.0, None))
     _legend_above(states)

@@ -58,13 +58,10 @@ def residual_fit(whole: WholeDrive, car: Car) -> dict[str, list[float]]:
 def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> dict[str, Any] | None:
     """Return the median of β of a scheme in bins of the true |a_y| of equal width, and its mean.
 
-    None where the scheme did not run or has a constant gain.
+    None for a constant gain.
     """
-    track = experiment.track(scenario, scheme)
-    if track is None:
-        return None
     ay = np.abs(experiment.truth(scenario)["ay_m_s2"].to_numpy()) / paper.GRAVITY_M_S2
-    trust = paper.valid(track, "network_trust")
+    trust = paper.valid(experiment.track(scenario, scheme), "network_trust")
     use = np.isfinite(trust) & np.isfinite(ay)
     ay, trust = ay[use], trust[use]
     if not ay.size or np.ptp(trust) < 1e-9:
@@ -82,10 +79,9 @@ def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 
 def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float]) -> dict[str, float] | None:
     """Return the factor on R: median before the burst, without its first half second, and largest within.
 
-    None if the scheme did not run or its R is constant.
+    None if its R is constant.
     """
-    if (track := experiment.track("A-burst", scheme)) is None:
-        return None
+    track = experiment.track(BURST.name, scheme)
     scale, at_s = paper.valid(track, "r_scale"), paper.time_s(track)
     before, within = (
         scale[(at_s > low) & (at_s < high) & np.isfinite(scale)] for low, high in ((0.5, burst_s[0]), burst_s)
@@ -147,10 +143,9 @@ def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> tuple[Experim
         for scenario in scenarios
     }
     gains = [
-        {"scenario": scenario, "scheme": s, "baseline": b, **gain}
+        {"scenario": scenario, "scheme": s, "baseline": b, **improvement(metrics, scenario, s, b)}
         for scenario in scenarios
         for s, b in PAIRS
-        if (gain := improvement(metrics, scenario, s, b)) is not None
     ]
     timed = [n for n in experiment.ran if not n.endswith(ESP)]
     results: dict[str, Any] = _plain(
