@@ -28,6 +28,7 @@ FIRST_RUNS: dict[str, str] = read_toml(Path(__file__).with_name("first_runs.toml
 
 def score_recording(recording: Recording, folder: Path) -> Result:
     """Write a log of our own, score it, and remove it."""
+    print(recording.name, file=sys.stderr)
     path = write_log(recording.topics, folder / recording.name, recording.container)
     start_ns = min((int(t.arrival_ns[0]) for t in recording.topics if len(t.arrival_ns)), default=None)
     try:
@@ -36,14 +37,7 @@ def score_recording(recording: Recording, folder: Path) -> Result:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def score_own(recordings: Sequence[Recording], folder: Path) -> Iterator[tuple[str, Result]]:
-    """Yield the kind and the result of every log of our own."""
-    for recording in recordings:
-        print(recording.name, file=sys.stderr)
-        yield recording.kind or recording.name, score_recording(recording, folder)
-
-
-def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
+def score_others(only: Sequence[str]) -> Iterator[Result]:
     """Yield the results of third-party recordings, if available."""
     if not SHARED.is_dir():
         print(f"{SHARED} is not there: recordings of others are left out", file=sys.stderr)
@@ -51,7 +45,7 @@ def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
     for file, table in ANSWERS.items():
         if "same_as" not in table and _wanted(file, only) and (SHARED / file).exists():
             print(file, file=sys.stderr)
-            yield file, score_log(SHARED / file, other_recording(file))
+            yield score_log(SHARED / file, other_recording(file))
 
 
 def first_run() -> str:
@@ -109,8 +103,8 @@ def main() -> int:
     made = chain(mountings(), layouts("fault", "layout", *last))
     recordings = [r for r in made if _wanted(r.name, given.only)]
     kinds: dict[str, list[Result]] = {}
-    for kind, result in chain(score_own(recordings, given.work), score_others(given.only)):
-        kinds.setdefault(kind, []).append(result)
+    for result in chain((score_recording(r, given.work) for r in recordings), score_others(given.only)):
+        kinds.setdefault(result.log.kind or result.log.name, []).append(result)
     results = [merged(logs) for logs in kinds.values()]
     if given.only:
         for result in chain.from_iterable(kinds.values()):
