@@ -85,8 +85,8 @@ AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
 #: Sideslip error in degrees of fits to one half of the drives on the other half, and in turn: 0.0591, 0.0706; static
 #: model 0.1333, 0.1679; without braking 0.0626, 0.0712, force scale 0.0638, 0.0811, bank 0.0701, 0.0730, biases 0.0616,
-#: 0.0771, load transfer 0.0590, 0.0758, roll 0.0697, 0.0852, lag 0.0584, 0.0747. Biases are states, as those of a drive:
-#: a mean over few drives would be no property of the car.
+#: 0.0771, load transfer 0.0590, 0.0758, roll 0.0697, 0.0852, lag 0.0584, 0.0747. Biases are states, as those of a
+#: drive: a mean over few drives would be no property of the car.
 PARTS = PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))
 Theta = dict[str, float]
 #: Start values of θ. The noise cost has two valleys: clean sensors, and a filter with a low gain on a_y.
