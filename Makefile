@@ -138,7 +138,7 @@ gates-quick: $(VENV)/installed-dev $(VENV)/compiled
 gates-freeze: $(VENV)/installed-dev $(VENV)/compiled
 	$(GATES) --freeze $$(git rev-parse --short=8 HEAD)
 
-# List the stages and durations: python -m studies.recalibrate --list. Run some: make recalibrate ONLY="fit intervals".
+# The stages and durations are in studies/recalibrate.toml. Run some: make recalibrate ONLY="fit extract".
 recalibrate: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.recalibrate $(if $(ONLY),--only $(ONLY))
 

@@ -12,7 +12,6 @@ repository.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ import polars as pl
 from pdhef_logtool import PdhefError, __version__
 from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool
-from studies.pages import INDEPENDENT, ROOT, number, page_options, table, update, write, write_toml
+from studies.pages import INDEPENDENT, ROOT, number, page_options, read_json, table, update, write_json, write_toml
 from studies.pictures import save, subplots
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
@@ -70,14 +69,14 @@ def row_inputs(tool: Tool, name: str, log: Path, assume: dict[str, Any]) -> list
 
 def runs_of(tool: Tool, row: str, given: argparse.Namespace) -> Iterator[Path]:
     """Run the estimators on the drives of a row and yield the output folders."""
-    network = [] if given.network is None else ["--network", given.network]
-    common = ["--car", given.car, *network, "--estimators", given.estimators, "--keep", "metrics", "--jobs", given.jobs]
+    common = ["--car", given.car, "--estimators", ",".join(ESTIMATORS), "--keep", "metrics", "--jobs", given.jobs]
+    common += [] if given.network is None else ["--network", given.network]
     if row != INDEPENDENT_ROW:
         logs, assume = row_logs(given.work, row, given.drives, given.seed, given.jobs)
         yield tool.run(f"{row}-{given.seed}-{given.drives}", *logs, *common, *row_inputs(tool, row, logs[0], assume))
         return
     for log in sorted(INDEPENDENT.glob("*.parquet")):
-        friction = json.loads(log.with_suffix(".json").read_text(encoding="utf-8"))["mu"]
+        friction = read_json(log.with_suffix(".json"))["mu"]
         given_files = ("--mapping", INDEPENDENT_MAPPING, "--friction", str(friction))
         yield tool.run(f"{row}-{log.stem}", log, *common, *given_files)
 
@@ -99,12 +98,12 @@ def run(given: argparse.Namespace) -> None:
         "car": given.car,
         "version": __version__,
         "rows": {r.name: r.description for r in ROWS} | {INDEPENDENT_ROW: "runs of another simulator, true friction"},
-        "order": given.estimators.split(","),
+        "order": ESTIMATORS,
     }
     given.results.mkdir(parents=True, exist_ok=True)
     metrics = pl.concat(frames).select(COLUMNS).filter(kept)
     metrics.write_parquet(given.results / "metrics.parquet", compression="zstd", compression_level=19)
-    write(given.results / "facts.json", json.dumps(facts, indent=1) + "\n")
+    write_json(given.results / "facts.json", facts)
 
 
 # ------------------------------------------------------------------------------------------------ the page
@@ -135,18 +134,16 @@ def verdict(low: float, high: float) -> str:
 
 def write_page(out: Path, folder: Path) -> None:
     """Render the page and its two figures from the results in a folder; drives without a scored sample do not count."""
-    facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
+    facts = read_json(folder / "facts.json")
     sideslip = pl.col("signal").cast(pl.String) == "sideslip_rad"
     metrics = pl.read_parquet(folder / "metrics.parquet").filter(sideslip, segment="all")
     errors = metrics.filter(metric="rmse").pivot("estimator", index=["row", "drive"], values="value").sort("drive")
-    names = [n for n in facts["order"] if n in errors.columns]
     rows = [r for r in facts["rows"] if r in set(errors["row"])]
-    rmse = {r: {n: np.degrees(errors.filter(row=r)[n].to_numpy()) for n in names} for r in rows}
-    references = [r for r in REFERENCES if r in names] if SUBJECT in names else []
-    ratios = {o: np.array([ratio_of_medians(rmse[r][SUBJECT], rmse[r][o]) for r in rows]) for o in references}
-    spans = {n: np.array([np.nanpercentile(rmse[r][n], [10, 50, 90]) for r in rows]) for n in names}
-    drawn = {n: spans[n] for n in DRAWN if n in spans}
-    others = {n: span for n, span in spans.items() if n not in drawn}
+    rmse = {r: {n: np.degrees(errors.filter(row=r)[n].to_numpy()) for n in facts["order"]} for r in rows}
+    ratios = {o: np.array([ratio_of_medians(rmse[r][SUBJECT], rmse[r][o]) for r in rows]) for o in REFERENCES}
+    spans = {n: np.array([np.nanpercentile(rmse[r][n], [10, 50, 90]) for r in rows]) for n in facts["order"]}
+    drawn = {n: spans[n] for n in DRAWN}
+    others = {n: span for n, span in spans.items() if n not in DRAWN}
     pictures = out / "conditions"
     pictures.mkdir(parents=True, exist_ok=True)
     label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"
@@ -210,7 +207,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = page_options("conditions", __doc__)
     parser.add_argument("--car", default="saloon")
     parser.add_argument("--network", type=Path, help="instead of the car's")
-    parser.add_argument("--estimators", default=",".join(ESTIMATORS))
     all_rows = (*ROW_NAMES, INDEPENDENT_ROW)
     parser.add_argument("--rows", nargs="+", choices=all_rows, default=all_rows, metavar="ROW", help="all by default")
     parser.add_argument("--drives", type=int, default=10, help="drives a row")

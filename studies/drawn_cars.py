@@ -11,16 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import Tyres, VehicleParameters
 from pdhef_logtool.records.errors import SimulationError
-from studies.defaults.fit_nominal_tyres import (
-    LINEAR_A_Y_M_S2,
-    axle_curves,
-    axle_loads_n,
-    fit_axle,
-    ramp,
-    roll_gradient_rad_per_m_s2,
-)
+from studies.defaults import fit_nominal_tyres as nominal
 from studies.pages import read_toml
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.sensors import SensorNoise
@@ -40,6 +33,10 @@ STEER_PLAY_RAD = (0.0, 0.003)
 LEVER_M, TRUTH_LEVER_M, TRUTH_HEADING_RAD = 0.15, 0.1, np.radians(0.3)
 #: Less understeer than this no maker sells: 0.5 degrees per g.
 LEAST_UNDERSTEER = np.radians(0.5) / GRAVITY_M_S2
+#: Entries of the vehicle file that are those of the simulated car.
+_MEASURED = (
+    "mass_kg", "yaw_inertia_kg_m2", "cg_to_front_axle_m", "cg_to_rear_axle_m", "track_m", "cg_height_m",
+)  # fmt: skip
 #: A ramp steer at this friction shows the axles' curves.
 FIT_FRICTION = 0.85
 
@@ -96,25 +93,19 @@ def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> Ve
     SimulationError
         The car cannot be driven through the ramp.
     """
-    motion = ramp(friction, car)
+    motion = nominal.ramp(friction, car)
     if not np.isfinite(motion.column("ay_m_s2")).all():
         raise SimulationError(expected="a finite ramp steer", got="NaN or infinity", where="fit of a vehicle file")
-    tyres, loads_n = {}, axle_loads_n(car)
-    for axle, (alpha, force) in axle_curves(motion, car).items():
+    tyres, loads_n = {}, nominal.axle_loads_n(car)
+    for axle, (alpha, force) in nominal.axle_curves(motion, car).items():
         # Beyond the peak the car slides in ever other ways; the curve is fitted up to it.
         whole = slice(0, int(np.argmax(force)) + 1)
-        fit = fit_axle(alpha[whole] / friction, force[whole] / friction, loads_n[axle])
-        tyres[axle] = AxleTyre(B=fit.B, C=fit.C, D_n=fit.D_n, E=fit.E, reference_friction=1.0)
-    linear_m_s2 = min(LINEAR_A_Y_M_S2, 0.5 * friction * GRAVITY_M_S2)
+        tyres[axle] = nominal.fit_axle(alpha[whole] / friction, force[whole] / friction, loads_n[axle])
+    linear_m_s2 = min(nominal.LINEAR_A_Y_M_S2, 0.5 * friction * GRAVITY_M_S2)
     return vehicle.model_copy(
         update={
-            "mass_kg": car.mass_kg,
-            "yaw_inertia_kg_m2": car.yaw_inertia_kg_m2,
-            "cg_to_front_axle_m": car.cg_to_front_axle_m,
-            "cg_to_rear_axle_m": car.cg_to_rear_axle_m,
-            "track_m": car.track_m,
-            "cg_height_m": car.cg_height_m,
-            "roll_gradient_rad_per_m_s2": roll_gradient_rad_per_m_s2(motion, linear_m_s2),
+            **{entry: getattr(car, entry) for entry in _MEASURED},
+            "roll_gradient_rad_per_m_s2": nominal.roll_gradient_rad_per_m_s2(motion, linear_m_s2),
             "tyres": Tyres(front=tyres["front"], rear=tyres["rear"]),
         }
     )

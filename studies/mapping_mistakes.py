@@ -8,7 +8,7 @@ if another signal fails instead, *silent* if its checks pass, and *open* if they
 
 from __future__ import annotations
 
-import json
+import copy
 import re
 import sys
 import tempfile
@@ -57,7 +57,7 @@ def subjects(mapping: dict[str, Any]) -> list[str]:
 
 def mistaken(mapping: dict[str, Any], subject: str, kind: str) -> dict[str, Any] | None:
     """Return a mapping file with a mistake; None if the log lacks the axis or the mistake has no effect."""
-    wrong: dict[str, Any] = json.loads(json.dumps(mapping))
+    wrong = copy.deepcopy(mapping)
     table, prefix = _place(subject)
     for name in [n for n in wrong[table] if n.startswith(prefix)]:
         source = wrong[table][name]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import re
 import tomllib
@@ -68,6 +69,16 @@ def write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, text.encode())
     print(path)
+
+
+def read_json(path: Path) -> Any:
+    """Return the document of a JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def write_json(path: Path, document: object) -> None:
+    """Write a document as JSON."""
+    write(path, json.dumps(document, indent=1) + "\n")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

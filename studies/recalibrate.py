@@ -1,6 +1,6 @@
 """Regenerate everything that is derived from the sources: shipped vehicle files, cars, networks, evidence pages.
 
-    python -m studies.recalibrate [--list] [--only STAGE ...] [--evidence]
+    python -m studies.recalibrate [--only STAGE ...] [--evidence]
 
 The stages run in the order of ``recalibrate.toml``. A stage is skipped if its outputs exist and its command and
 the digest of its inputs have not changed since its last completion. After a failure or an interruption, the same
@@ -12,7 +12,6 @@ The stamp files are in ``out/recalibrate``. ``--evidence``: only the stages that
 from __future__ import annotations
 
 import ast
-import json
 import os
 import shlex
 import shutil
@@ -26,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.storage.documents import digest
-from studies.pages import ROOT, options, read_toml, table
+from studies.pages import ROOT, options, read_json, read_toml, write_json
 
 STAMPS = Path("out") / "recalibrate"
 TABLE = Path(__file__).with_suffix(".toml")
@@ -66,19 +65,13 @@ def input_digest(root: Path, inputs: Sequence[str]) -> str:
 
 
 def _entries(root: Path, pattern: str) -> Iterator[tuple[str, str]]:
+    """Yield the files of a pattern with their digests; files outside the repository with their sizes."""
     for path in sorted(root.glob(pattern)):
-        files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-        for file in files:
+        for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
             if "__pycache__" not in file.parts:
-                yield os.path.relpath(file, root), _content(root, file)
-
-
-def _content(root: Path, file: Path) -> str:
-    """Return the size of a file outside the repository, and the digest of one inside."""
-    state = file.stat()
-    if not file.resolve().is_relative_to(root.resolve()):
-        return str(state.st_size)
-    return _file_digest(file, state.st_mtime_ns, state.st_size)
+                state, is_inside = file.stat(), file.resolve().is_relative_to(root.resolve())
+                content = _file_digest(file, state.st_mtime_ns, state.st_size) if is_inside else str(state.st_size)
+                yield os.path.relpath(file, root), content
 
 
 @cache
@@ -101,14 +94,17 @@ class Recalibration:
     def stamp(self, stage: Stage) -> dict[str, Any]:
         """Return command, inputs and duration of the last start of a stage; empty before the first."""
         file = self.root / STAMPS / f"{stage.name}.json"
-        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        return read_json(file) if file.is_file() else {}
+
+    def inputs(self, stage: Stage) -> dict[str, str]:
+        """Return what decides the outputs of a stage: its command and the digest of its inputs."""
+        return {"command": stage.command, "inputs": input_digest(self.root, stage.inputs)}
 
     def is_complete(self, stage: Stage) -> bool:
         """Return whether the stage is unchanged since its last completion."""
         stamp = self.stamp(stage)
-        now = {"command": stage.command, "inputs": input_digest(self.root, stage.inputs)}
-        same = all(stamp.get(key) == value for key, value in now.items())
-        return same and "duration_s" in stamp and all((self.root / o).exists() for o in stage.outputs)
+        is_same = "duration_s" in stamp and stamp | self.inputs(stage) == stamp
+        return is_same and all((self.root / o).exists() for o in stage.outputs)
 
     def run(self, only: Sequence[str] = ()) -> int:
         """Run the stages that are not complete, up to the first that fails; return its exit code, or 0."""
@@ -123,55 +119,34 @@ class Recalibration:
         return 0
 
     def _run(self, stage: Stage) -> int:
-        begun = {"command": stage.command, "inputs": input_digest(self.root, stage.inputs)}
-        before = self.stamp(stage)
-        if {key: before.get(key) for key in begun} != begun:
+        begun, before, start = self.inputs(stage), self.stamp(stage), time.monotonic()
+        if before | begun != before:
             for folder in stage.work:
                 shutil.rmtree(self.root / folder, ignore_errors=True)
-        self._write(stage, begun)
+        write_json(self.root / STAMPS / f"{stage.name}.json", begun)
         print(f"{stage.name}: {stage.command}", flush=True)
-        start = time.monotonic()
         words = [sys.executable if word == "python" else word for word in shlex.split(stage.command)]
         ended = subprocess.run(words, cwd=self.root, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False)
         if ended.returncode:
             return ended.returncode
-        missing = [o for o in stage.outputs if not (self.root / o).exists()]
-        if missing:
+        if missing := [o for o in stage.outputs if not (self.root / o).exists()]:
             print(f"{stage.name}: expected {', '.join(missing)}, got no such file", file=sys.stderr)
             return 1
-        self._write(stage, {**begun, "duration_s": round(time.monotonic() - start, 1)})
+        ended_s = {"duration_s": round(time.monotonic() - start, 1)}
+        write_json(self.root / STAMPS / f"{stage.name}.json", begun | ended_s)
         return 0
-
-    def _write(self, stage: Stage, stamp: dict[str, Any]) -> None:
-        file = self.root / STAMPS / f"{stage.name}.json"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(stamp, indent=1) + "\n", encoding="utf-8")
-
-    def listed(self) -> str:
-        """Return a table of the stages: duration as stated and of the last completion here, state and command."""
-        body = []
-        for stage in self.stages:
-            last = self.stamp(stage).get("duration_s")
-            here = "–" if last is None else f"{last:g} s"
-            body.append([stage.name, stage.duration, here, "no" if self.is_complete(stage) else "yes", stage.command])
-        return table(["stage", "duration", "last here", "to do", "command"], body)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """List or run the stages."""
+    """Run the stages."""
     parser = options("recalibrate", __doc__)
-    parser.add_argument("--list", action="store_true", help="print the stages and run none")
     stages = load_stages()
     parser.add_argument("--only", nargs="+", choices=[s.name for s in stages], metavar="STAGE", help="run these alone")
     parser.add_argument("--evidence", action="store_true", help="run the stages that write pages of docs alone")
     given = parser.parse_args(arguments)
     if given.evidence:
         given.only = [s.name for s in stages if any(output.startswith("docs/") for output in s.outputs)]
-    recalibration = Recalibration(ROOT, stages)
-    if given.list:
-        print(recalibration.listed())
-        return 0
-    return recalibration.run(given.only or ())
+    return Recalibration(ROOT, stages).run(given.only or ())
 
 
 if __name__ == "__main__":

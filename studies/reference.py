@@ -148,8 +148,8 @@ MADE_SOURCES = {
 }
 OUTAGE, MULTIPATH = "no GNSS from 20 to 40 s", "multipath of 0.5 m/s from 20 to 25 s"
 BIASED = "a_y + 0.5 m/s², yaw rate + 0.005 rad/s and 1 %"
-FAULTS = (OUTAGE, MULTIPATH, BIASED)
 WRONG_AXLE = "l_r wrong by 0.15 m"
+FAULTS = (OUTAGE, MULTIPATH, BIASED, WRONG_AXLE)
 #: Of simulated drives: the position of the accelerometer is not stated.
 MOVED_IMU, REAR_IMU = "accelerometer at the rear axle", (("imu_x_m", -1.71),)
 #: Of recorded drives with a receiver: the ground truth is the velocity of the antenna, at the position estimated by the
@@ -195,7 +195,7 @@ def cases() -> Iterator[Case]:
         for gnss in (NONE, MADE):
             yield Case(title, gnss, spec=spec)
     ((title, spec),) = _specs(_TABLES["road"]).items()
-    for fault in (*FAULTS, WRONG_AXLE):
+    for fault in FAULTS:
         for gnss in (MADE,) if fault in (OUTAGE, MULTIPATH) else (NONE, MADE):
             yield Case(title, gnss, spec=spec, fault=fault)
     for title in ("sine with dwell, 80 km/h", "fishhook, 70 km/h", "double lane change, 100 km/h"):
@@ -379,7 +379,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="parts of the names of cases")
     given = parser.parse_args(arguments)
     file = given.results / STORED
-    stored: dict[str, Figures] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    stored: dict[str, Figures] = pages.read_json(file) if file.is_file() else {}
     source = input_digest(ROOT, [f"{folder}/**/*.py" for folder in ("pdhef_logtool", "truthsim", "studies")])
     tool = Tool(ROOT, given.work.resolve())
     for case in () if given.stored else cases():
@@ -390,7 +390,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         print(case.name, file=sys.stderr)
         stored[case.name] = {"key": key, **figures(case, tool)}
-        pages.write(file, json.dumps(stored, indent=1) + "\n")
+        pages.write_json(file, stored)
     pages.update(given.out, "reference.md", blocks(stored))
     return 0
 

@@ -10,7 +10,6 @@ for a car taught by the sideslip reference in place of ground truth, if the refe
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -21,8 +20,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from studies import pages
 from studies.gates.tool import Tool, estimates
-from studies.pages import DRIVES, ROOT, number, page_options, read_toml, table, update, write, write_toml
+from studies.pages import DRIVES, ROOT, number, read_toml, table, write_toml
 from studies.peers.drives import FULL_SIZE, PEER_DRIVES, mapping_table, peer_drive, vehicle_table
 
 STORED = "pairs.json"
@@ -219,7 +219,7 @@ def mean(ratios: Sequence[float]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the pairs and write the page."""
-    parser = page_options("teaching", __doc__)
+    parser = pages.page_options("teaching", __doc__)
     parser.add_argument("--cars", nargs="+", choices=[c.name for c in CARS], default=[c.name for c in CARS])
     given = parser.parse_args(arguments)
     if not given.stored:
@@ -231,10 +231,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for result in pairs_of(Tool(ROOT, given.work.resolve()), car):
                 results.append(result)
                 print(pair_table([result]).splitlines()[-1], file=sys.stderr)
-        write(given.results / STORED, json.dumps(results, indent=1) + "\n")
-    stored = json.loads((given.results / STORED).read_text(encoding="utf-8"))
-    update(given.out, "README.md", {"teaching": readme_text(stored)})
-    update(given.out, "peers.md", {"pairs": pair_table(stored), "pairs_summary": summary(stored)})
+        pages.write_json(given.results / STORED, results)
+    stored = pages.read_json(given.results / STORED)
+    pages.update(given.out, "README.md", {"teaching": readme_text(stored)})
+    pages.update(given.out, "peers.md", {"pairs": pair_table(stored), "pairs_summary": summary(stored)})
     return 0
 
 

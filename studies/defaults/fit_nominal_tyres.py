@@ -14,12 +14,12 @@ other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from pdhef_logtool.car.vehicle import AxleTyre
 from pdhef_logtool.records.signals import FloatArray
 from studies.pages import options
 from truthsim.manoeuvres import GRAVITY_M_S2, MANOEUVRES, Request
@@ -41,18 +41,6 @@ SCALE = 2.5
 LINEAR_A_Y_M_S2 = 4.0
 
 
-@dataclass(frozen=True)
-class AxleFit:
-    """Magic formula of an axle at friction 1, and how well it fits."""
-
-    B: float
-    C: float
-    D_n: float
-    E: float
-    rms_n: float
-    peak_n: float
-
-
 def axle_curves(motion: Motion, car: Vehicle = CAR) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return slip angle (rad) and lateral force (N) of both axles over a motion."""
     lf, lr = car.cg_to_front_axle_m, car.cg_to_rear_axle_m
@@ -72,8 +60,8 @@ def magic_formula(alpha: FloatArray, b: float, c: float, d: float, e: float) -> 
     return np.asarray(d * np.sin(c * np.arctan(x - curvature * (x - np.arctan(x)))))
 
 
-def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleFit:
-    """Fit B, C, D, E to slip angle and force, both over friction, by least squares.
+def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleTyre:
+    """Fit a magic formula at friction 1 to slip angle and force, both over friction, by least squares.
 
     The rear axle of an understeering car never reaches its peak in a ramp: the static load bounds it.
     """
@@ -84,11 +72,10 @@ def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleFit:
         lambda p: (magic_formula(alpha, *p) - force) / top, start, bounds=bounds, x_scale=[10.0, 1.0, top, 1.0]
     )
     b, c, d, e = solution.x
-    error = magic_formula(alpha, b, c, d, e) - force
-    return AxleFit(b, c, d, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
+    return AxleTyre(B=b, C=c, D_n=d, E=1.0 - float(np.exp(e)), reference_friction=1.0)
 
 
-def fit_axles(motions: dict[float, Motion]) -> dict[str, AxleFit]:
+def fit_axles(motions: dict[float, Motion]) -> dict[str, AxleTyre]:
     """Fit both axles to one motion a friction."""
     curves = {friction: axle_curves(motion) for friction, motion in motions.items()}
     return {
@@ -123,7 +110,7 @@ def ramp(friction: float, car: Vehicle = CAR) -> Motion:
     return simulate_motion(manoeuvre.plan(request), friction, vehicle=car)
 
 
-def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, friction: float) -> str:
+def vehicle_text(motion: Motion, fits: dict[str, AxleTyre], *, name: str, friction: float) -> str:
     """Return a vehicle file."""
     tyres = "\n".join(
         f"[tyres.{axle}]\nB = {fit.B:.3f}\nC = {fit.C:.4f}\nD_n = {fit.D_n:.1f}\nE = {fit.E:.4f}\n"
@@ -137,11 +124,9 @@ def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, frictio
 
 
 def main(folder: Path) -> None:
-    """Fit, print how well, and write the vehicle files."""
+    """Fit, and write the vehicle files."""
     motions = {friction: ramp(friction) for _, friction in ROADS.values()}
     fits = fit_axles(motions)
-    for axle, fit in fits.items():
-        print(f"{axle}: {fit}")
     for file, (name, friction) in ROADS.items():
         text = vehicle_text(motions[max(motions)], fits, name=name, friction=friction)
         (folder / file).write_text(text, encoding="utf-8")

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import qmc
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise
@@ -25,7 +25,7 @@ from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import mapping_of
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 
@@ -50,13 +50,8 @@ HIGH = np.array([2.0, 1.0, 5.0, 0.05])
 Point = tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """One point and its objective in degrees."""
-
-    number: int
-    values: Point
-    objective_deg: float
+#: Objective in degrees, number of the trial, and point; the least one is the best.
+Trial = tuple[float, int, Point]
 
 
 def tune(logs: Iterable[LogInput], config: RunConfig, trials: int) -> dict[str, FilterNoise]:
@@ -75,13 +70,9 @@ def tune(logs: Iterable[LogInput], config: RunConfig, trials: int) -> dict[str, 
             [error_rad(run_estimator(estimator, s), truth, slow) for s, truth in given if truth is not None]
         )
 
-    best = min(search(objective, trials, SEED), key=_order)
-    print(f"{TUNED}: trial {best.number} of {trials}, {best.objective_deg:.4f}°", flush=True)
-    return {TUNED: filter_noise(best.values)}
-
-
-def _order(trial: Trial) -> tuple[float, int]:
-    return trial.objective_deg, trial.number
+    error_deg, number, best = min(search(objective, trials, SEED))
+    print(f"{TUNED}: trial {number} of {trials}, {error_deg:.4f}°", flush=True)
+    return {TUNED: filter_noise(best)}
 
 
 def filter_noise(values: Point) -> FilterNoise:
@@ -92,12 +83,6 @@ def filter_noise(values: Point) -> FilterNoise:
     )
 
 
-def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
-    """Return a mask [N]: sideslip of the ground truth available, speed above the low-speed limit."""
-    finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
-    return finite
-
-
 def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> float:
     """Return the sideslip RMSE of a drive as ``pdhef run`` scores it.
 
@@ -105,7 +90,7 @@ def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> 
     """
     error = signal_error(estimate, truth, "sideslip_rad", low_speed_m_s)
     error = error[np.isfinite(error)]
-    scorable = truth.sideslip_rad[scorable_stamps(truth, low_speed_m_s)]
+    scorable = truth.sideslip_rad[np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))]
     rms, zero = (float(np.sqrt(np.mean(x**2))) if x.size else math.nan for x in (error, scorable))
     if error.size == 0:
         return zero
@@ -124,8 +109,6 @@ def point(shares: FloatArray) -> Point:
 
 def search(objective: Callable[[Point], float], trials: int, seed: int) -> list[Trial]:
     """Return all trials; ``seed`` determines the Sobol scrambling and the local steps."""
-    from scipy.stats import qmc
-
     exploring = max(1, round(EXPLORING_SHARE * trials))
     sobol = qmc.Sobol(len(LOW), scramble=True, seed=seed).random_base2(max(0, (exploring - 1).bit_length()))
     width = np.geomspace(STEP_FIRST, STEP_LAST, trials - exploring) if trials > exploring else np.empty(0)
@@ -135,8 +118,8 @@ def search(objective: Callable[[Point], float], trials: int, seed: int) -> list[
         if number < exploring:
             shares = sobol[number]
         else:
-            centre = np.log(np.array(min(done, key=_order).values) / LOW) / np.log(HIGH / LOW)
+            centre = np.log(np.array(min(done)[2]) / LOW) / np.log(HIGH / LOW)
             shares = np.clip(centre + steps[number - exploring], 0.0, 1.0)
         values = point(shares)
-        done.append(Trial(number, values, objective(values)))
+        done.append((objective(values), number, values))
     return done

@@ -1,34 +1,24 @@
 """Train the baselines ``pure-lstm`` and ``linear-regression`` on a dataset of ``pdhef extract --filter phy-ukf``.
 
-    python -m studies.defaults.train_baselines DATASET -o NETWORK [--seed 0] [--epochs 40]
-
 Drives, split, rows and recipe are those of the residual network; only the target differs. The regression is ordinary
 least squares of the true sideslip on low-passed features (:mod:`pdhef_logtool.residual_model.linear_model`).
 """
 
 from __future__ import annotations
 
-import math
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
+from pdhef_logtool.learning.network.dataset import Dataset
 from pdhef_logtool.learning.network.train_command import Recipe, gap_free_runs, train_on, weights_of
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.bundle import (
-    LATERAL_VELOCITY,
-    LINEAR_REGRESSION_FILE,
-    NOMINAL_MODEL,
-    PURE_LSTM_FOLDER,
-)
+from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
-from studies.pages import options
 
 #: Features of the baselines.
 NOMINAL_FEATURES = FEATURES[:10]
@@ -50,34 +40,16 @@ class SideslipSequence:
     sideslip_rad: FloatArray
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Train both baselines into ``NETWORK/baselines``."""
-    parser = options("defaults.train_baselines", __doc__)
-    parser.add_argument("dataset", type=Path)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the network")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--epochs", type=int, default=EPOCHS)
-    given = parser.parse_args(arguments)
-    data = read_dataset(given.dataset, NOMINAL_MODEL)
-    file: Path = given.output / LINEAR_REGRESSION_FILE
+def train_baselines(data: Dataset, network: Path) -> None:
+    """Train both baselines into ``network``/``baselines``."""
+    file = network / LINEAR_REGRESSION_FILE
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(fit_dataset(data, NOMINAL_FEATURES).to_json(), encoding="utf-8")
-    recipe = Recipe(NOMINAL_FEATURES, odd=False, target=LATERAL_VELOCITY, seed=given.seed, epochs=given.epochs)
-    train_on(data, given.output / PURE_LSTM_FOLDER, recipe, progress=lambda text, _share: print(text, flush=True))
-    return 0
-
-
-def fit_dataset(data: Dataset, names: tuple[str, ...]) -> LinearModel:
-    """Return the regression of the training drives, with its errors on all splits."""
-    splits = {s: list(_sequences(data, s)) for s in ("train", "validation", "test")}
-    model = fit_linear(splits["train"], names)
-    provenance = {
-        "dataset_sha256": data.sha256,
-        "vehicle": data.vehicle_name,
-        "training_sequences": len(splits["train"]),
-        "sideslip_rmse_deg": {s: _rmse_deg(model, rows) for s, rows in splits.items()},
-    }
-    return replace(model, provenance=provenance)
+    sequences = list(_training_sequences(data))
+    about = {"dataset_sha256": data.sha256, "vehicle": data.vehicle_name, "training_sequences": len(sequences)}
+    model = replace(fit_linear(sequences, NOMINAL_FEATURES), provenance=about)
+    file.write_text(model.to_json(), encoding="utf-8")
+    recipe = Recipe(NOMINAL_FEATURES, odd=False, target=LATERAL_VELOCITY, epochs=EPOCHS)
+    train_on(data, network / PURE_LSTM_FOLDER, recipe, progress=lambda text, _: print(text, flush=True))
 
 
 def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) -> LinearModel:
@@ -89,7 +61,9 @@ def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) ->
     inputs, targets = [], []
     for s in sequences:
         used = np.isfinite(s.sideslip_rad)
-        inputs.append(_smooth(s.features[:, columns], s.dt_s, LOW_PASS_HZ)[used])
+        smooth = np.empty((len(s.dt_s), len(columns)))
+        low_pass(np.ascontiguousarray(s.features[:, columns]), s.dt_s, LOW_PASS_HZ, np.zeros(len(columns)), smooth)
+        inputs.append(smooth[used])
         targets.append(s.sideslip_rad[used])
     rows = np.concatenate(inputs)
     mean, std = rows.mean(axis=0), rows.std(axis=0)
@@ -107,26 +81,10 @@ def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) ->
     )
 
 
-def _smooth(values: FloatArray, dt_s: FloatArray, corner_hz: float) -> FloatArray:
-    out = np.empty_like(values)
-    low_pass(np.ascontiguousarray(values), dt_s, corner_hz, np.zeros(values.shape[1]), out)
-    return out
-
-
-def _rmse_deg(model: LinearModel, sequences: Sequence[SideslipSequence]) -> float | None:
-    square, count = 0.0, 0
-    for s in sequences:
-        error = _smooth(model.sideslip_rad(s.features)[:, None], s.dt_s, model.low_pass_hz)[:, 0] - s.sideslip_rad
-        used = np.isfinite(error)
-        square += float(np.sum(error[used] ** 2))
-        count += int(used.sum())
-    return math.degrees(math.sqrt(square / count)) if count else None
-
-
-def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
-    """Yield the runs of a split, with the network's rows where ground truth is above the low-speed blend."""
+def _training_sequences(data: Dataset) -> Iterable[SideslipSequence]:
+    """Yield the runs of the training drives; rows are the network's, with ground truth above the low-speed blend."""
     for drive in data.drives:
-        if drive.entry["split"] != split:
+        if drive.entry["split"] != "train":
             continue
         slowest = data.vehicle(drive).low_speed_blend_m_s
         rows = drive.load()
@@ -138,7 +96,3 @@ def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
                 dt_s=np.concatenate([[np.nan], np.diff(rows.stamps_ns[part]) * 1e-9]),
                 sideslip_rad=np.where(used, np.arctan2(vy, vx), np.nan),
             )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,12 +1,11 @@
 """Recompute the frozen figures of the tool and print those that moved; exit code 1 if one did.
 
-    python -m studies.gates [--quick] [--only TEXT ...]       [--tree FOLDER] [--jobs 2] [--work out/gates]
-                            [--freeze COMMIT]
+    python -m studies.gates [--quick] [--only TEXT ...] [--tree FOLDER] [--jobs 2] [--work out/gates] [--freeze COMMIT]
 
 ``studies/results/gates.csv`` has one figure in a line: gate, row, figure, value, unit, relative and absolute tolerance
 (the larger one counts), commit. A figure of a deleted feature is removed by hand. ``--freeze`` writes the values of the
-tree under test, for figures in the file and for rows missing from it. It saves row by row and resumes where it stopped;
-``--again`` also freezes rows that are of this commit already. The tool is used by its command line and its files only.
+tree under test, for figures in the file and for rows missing from it. It saves row by row and resumes where it stopped.
+The tool is used by its command line and its files only.
 """
 
 from __future__ import annotations
@@ -15,16 +14,16 @@ import math
 import shutil
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import polars as pl
 
-from studies.gates.rows import FULL, QUICK, Figure, Figures, GateRow, SkippedRowError, all_rows
+from studies.gates.rows import Figure, Figures, GateRow, all_rows
 from studies.gates.tool import Tool
 from studies.pages import RESULTS, ROOT, options
 
@@ -72,22 +71,54 @@ def moved(was: Figure, now: Figure | None) -> bool:
     return not abs(now.value - was.value) <= limit + 1e-5 * abs(was.value)
 
 
-def compare(row: GateRow, figures: Figures, frozen: dict[Key, Frozen]) -> list[str]:
-    """Return a line for each figure of a row that moved."""
-    lines = []
+def measure(tool: Tool, row: GateRow) -> tuple[Figures, str]:
+    """Return the figures of a row, and why there are none."""
+    begin = time.monotonic()
+    try:
+        figures = row.measure(tool)
+    except (OSError, RuntimeError, KeyError, ValueError, subprocess.SubprocessError) as error:
+        return {}, f"{row.gate}: {row.name}: {type(error).__name__}: {error}"
+    print(f"{row.gate}/{row.name}: {len(figures)} figures, {time.monotonic() - begin:.0f} s", file=sys.stderr)
+    return figures, ""
+
+
+def compare(row: GateRow, figures: Figures, frozen: dict[Key, Frozen]) -> Iterator[str]:
+    """Yield a line for each figure of a row that moved."""
     for (gate, name, figure), (was, _) in frozen.items():
         now = figures.get(figure)
         if (gate, name) == (row.gate, row.name) and moved(was, now):
             text = "absent" if now is None else f"{now.value:.5g}"
             share = "" if now is None or not was.value else f" ({100.0 * (now.value / was.value - 1.0):+.1f} %)"
-            lines.append(f"{gate}: {name}: {figure}: {was.value:.5g} -> {text} {was.unit}{share}")
-    return lines
+            yield f"{gate}: {name}: {figure}: {was.value:.5g} -> {text} {was.unit}{share}"
 
 
-def mean_ratio(pairs: Sequence[tuple[Figure, Figure]]) -> float:
-    """Return the geometric mean of new over frozen errors; errors below the absolute tolerance count as this."""
-    logs = [math.log(max(now.value, now.absolute) / max(was.value, was.absolute)) for was, now in pairs]
-    return math.exp(sum(logs) / len(logs))
+def freeze(row: GateRow, figures: Figures, frozen: dict[Key, Frozen], commit: str) -> None:
+    """Write the figures of a row that are in the file, or all of a row that is not."""
+    known = {key for key in frozen if key[:2] == (row.gate, row.name)}
+    for name, figure in figures.items():
+        key = (row.gate, row.name, name)
+        if not known or key in known:
+            frozen[key] = Frozen(figure, commit)
+    write(FILE, frozen)
+
+
+def means(measured: dict[tuple[str, str], Figures], frozen: dict[Key, Frozen]) -> Iterator[str]:
+    """Print the geometric mean of each gate's errors over the frozen ones; yield a line for each that moved.
+
+    Errors below the absolute tolerance count as this.
+    """
+    for gate in dict.fromkeys(gate for gate, _ in measured):
+        logs = [
+            math.log(max(now.value, now.absolute) / max(was.value, was.absolute))
+            for key, (was, _) in frozen.items()
+            if key[0] == gate and was.unit == "deg" and (now := measured.get(key[:2], {}).get(key[2]))
+        ]
+        if logs:
+            change = math.exp(sum(logs) / len(logs)) - 1.0
+            line = f"{gate}: geometric mean of {len(logs)} errors: {100.0 * change:+.2f} %"
+            print(line, file=sys.stderr)
+            if abs(change) > MEAN_TOLERANCE:
+                yield line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -99,89 +130,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "gates")
     parser.add_argument("--freeze", metavar="COMMIT", help="write the figures as those of this commit")
-    parser.add_argument("--again", action="store_true", help="freeze rows of this commit again")
     parser.add_argument("--list", action="store_true", help="print the rows")
     given = parser.parse_args(arguments)
-    rows = [r for r in all_rows() if (QUICK if given.quick else FULL) in r.sets]
+    rows = [r for r in all_rows() if r.quick or not given.quick]
     rows = [r for r in rows if not given.only or any(text in f"{r.gate}/{r.name}" for text in given.only)]
     if given.list:
         print("\n".join(f"{r.gate}/{r.name}" for r in rows))
         return 0
-    frozen = read(FILE)
-    if given.freeze and not given.again:
+    frozen, begin, tool = read(FILE), time.monotonic(), Tool(given.tree.resolve(), given.work.resolve())
+    if given.freeze:
         done = {key[:2] for key, value in frozen.items() if value.commit == given.freeze}
         rows = [r for r in rows if (r.gate, r.name) not in done]
-    return Session(Tool(given.tree.resolve(), given.work.resolve()), frozen, given.freeze).measure(rows, given.jobs)
-
-
-class Session:
-    """One call: the tool, the frozen and the measured figures."""
-
-    def __init__(self, tool: Tool, frozen: dict[Key, Frozen], commit: str | None) -> None:
-        self.tool, self.frozen, self.commit = tool, frozen, commit
-        self.lines: list[str] = []
-        self.measured: dict[tuple[str, str], Figures] = {}
-        self.lock = threading.Lock()
-
-    def measure(self, rows: Sequence[GateRow], jobs: int) -> int:
-        """Measure rows in threads and report; return the exit code."""
-        shutil.rmtree(self.tool.work, ignore_errors=True)
-        begin = time.monotonic()
-        with ThreadPoolExecutor(jobs) as pool:
-            list(pool.map(self.measure_row, rows))
-        skipped = len(rows) - len(self.measured)
-        self.lines += self.means()
-        print("\n".join(self.lines) or "no figure moved")
-        print(
-            f"{len(self.measured)} rows, {skipped} without figures, {time.monotonic() - begin:.0f} s", file=sys.stderr
-        )
-        return int(bool(self.lines) and not self.commit)
-
-    def measure_row(self, row: GateRow) -> None:
-        """Measure one row; freeze it or compare it."""
-        begin = time.monotonic()
-        try:
-            figures = row.measure(self.tool)
-        except SkippedRowError as reason:
-            print(f"{row.gate}/{row.name}: skipped: {reason}", file=sys.stderr)
-            return
-        except (OSError, RuntimeError, KeyError, ValueError, subprocess.SubprocessError) as error:
-            with self.lock:
-                self.lines.append(f"{row.gate}: {row.name}: {type(error).__name__}: {error}")
-            return
-        print(f"{row.gate}/{row.name}: {len(figures)} figures, {time.monotonic() - begin:.0f} s", file=sys.stderr)
-        with self.lock:
-            self.measured[row.gate, row.name] = figures
-            if self.commit:
-                self.freeze(row, figures, self.commit)
-            else:
-                self.lines += compare(row, figures, self.frozen)
-
-    def freeze(self, row: GateRow, figures: Figures, commit: str) -> None:
-        """Write the figures of a row that are in the file, or all of a row that is not."""
-        known = {key for key in self.frozen if key[:2] == (row.gate, row.name)}
-        for name, figure in figures.items():
-            key = (row.gate, row.name, name)
-            if not known or key in known:
-                self.frozen[key] = Frozen(figure, commit)
-        write(FILE, self.frozen)
-
-    def means(self) -> list[str]:
-        """Print the geometric mean of each gate's errors; return a line for each that moved."""
-        lines = []
-        for gate in dict.fromkeys(gate for gate, _ in self.measured):
-            pairs = [
-                (was.figure, self.measured[key[:2]][key[2]])
-                for key, was in self.frozen.items()
-                if key[0] == gate and was.figure.unit == "deg" and key[2] in self.measured.get(key[:2], {})
-            ]
-            if not pairs or self.commit:
+    shutil.rmtree(tool.work, ignore_errors=True)
+    measured, lines = dict[tuple[str, str], Figures](), list[str]()
+    with ThreadPoolExecutor(given.jobs) as pool:
+        for row, (figures, failure) in zip(rows, pool.map(partial(measure, tool), rows), strict=True):
+            if failure:
+                lines.append(failure)
                 continue
-            ratio = mean_ratio(pairs)
-            print(f"{gate}: geometric mean of {len(pairs)} errors: {100.0 * (ratio - 1.0):+.2f} %", file=sys.stderr)
-            if abs(ratio - 1.0) > MEAN_TOLERANCE:
-                lines.append(f"{gate}: geometric mean of {len(pairs)} errors: {100.0 * (ratio - 1.0):+.2f} %")
-        return lines
+            measured[row.gate, row.name] = figures
+            if given.freeze:
+                freeze(row, figures, frozen, given.freeze)
+            else:
+                lines += compare(row, figures, frozen)
+    lines += () if given.freeze else means(measured, frozen)
+    print("\n".join(lines) or "no figure moved")
+    print(f"{len(measured)} of {len(rows)} rows, {time.monotonic() - begin:.0f} s", file=sys.stderr)
+    return int(bool(lines) and not given.freeze)
 
 
 if __name__ == "__main__":

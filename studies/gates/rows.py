@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import subprocess
@@ -20,7 +19,7 @@ from studies.calibration import DRIVEN, errors_over_sd, true_values, wrong_file
 from studies.conditions import row_inputs, row_logs
 from studies.gates.tool import Tool, commands_and_options, coverage_percent, reports, sideslip_rmse_deg
 from studies.mapping_mistakes import VERDICTS, outcomes
-from studies.pages import DRIVES, ROOT, SAMPLE_VEHICLE, read_toml, write_toml
+from studies.pages import DRIVES, ROOT, SAMPLE_VEHICLE, read_json, read_toml, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.torture.seeds import FORMATS, RECORDINGS
 from truthsim.conditions import ROWS
@@ -29,7 +28,6 @@ from truthsim.sensors import SensorNoise
 
 SAMPLES = ROOT / "sample_logs"
 ESTIMATORS = "zero,kinematic,open-loop,linear-regression,phy-ukf,physics,pure-lstm,pd-hef-paper,pd-hef,pd-hef-smoothed"
-QUICK, FULL = "quick", "full"
 _TABLES = read_toml(Path(__file__).with_suffix(".toml"))
 
 
@@ -47,16 +45,12 @@ Figures = dict[str, Figure]
 
 @dataclass(frozen=True, slots=True)
 class GateRow:
-    """One row: ``measure`` returns its figures by name, ``sets`` are the sets of rows that contain it."""
+    """One row: ``measure`` returns its figures by name; ``quick``: whether the quick gates contain it."""
 
     gate: str
     name: str
-    sets: tuple[str, ...]
     measure: Callable[[Tool], Figures]
-
-
-class SkippedRowError(Exception):
-    """The row cannot be measured here."""
+    quick: bool = False
 
 
 def rmse_figures(run: Path, absolute_deg: float, coverage_of: str | None = None) -> Figures:
@@ -95,15 +89,12 @@ def condition(row: str, drives: int, tool: Tool) -> Figures:
 
 def recorded(drive: PeerDrive, receiver: bool, tool: Tool) -> Figures:
     """Run the estimators and the reference on a recorded drive with its published vehicle file."""
-    log = DRIVES / drive.log
-    if not log.exists():
-        raise SkippedRowError("needs ../shared/data beside the repository")
     name = f"{drive.log.partition('.')[0]}{'-gnss' if receiver else ''}"
     mapping = write_toml(tool.work / "mappings" / f"{name}.toml", mapping_table(drive, receiver=receiver))
     car = write_toml(tool.work / "cars" / f"{name}.toml", vehicle_table(drive))
     names = "zero,kinematic,open-loop,phy-ukf,physics,pd-hef"
     given = ("--car", car, "--mapping", mapping, "--keep", "estimates", "--reference", "on", "--estimators", names)
-    run = tool.run(f"recorded-{name}", log, *given)
+    run = tool.run(f"recorded-{name}", DRIVES / drive.log, *given)
     figures = rmse_figures(run, 0.01, "physics")
     (report,) = reports(run).values()
     return figures | parameter_figures(report)
@@ -125,24 +116,6 @@ QUICK_DRIVES = ("gti_pole_aa.mcap", "v40_slalom.mcap", "f1tenth_xray_0.bag")
 
 # ------------------------------------------------------------------------------------------------ simulated reference
 
-#: Manoeuvre, km/h, friction, longest duration (s) of the drives of the reference.
-REFERENCE_DRIVES: dict[str, tuple[str, float, float, float | None]] = {
-    name: (entry["manoeuvre"], entry["speed_km_h"], 0.85, entry.get("duration_s"))
-    for name, entry in _TABLES["reference_drives"].items()
-}
-
-
-def simulated_log(
-    tool: Tool, name: str, spec: tuple[str, float, float, float | None], seed: int, *, steering_wheel: bool = False
-) -> Path:
-    """Simulate a drive of the saloon and return its log; ``steering_wheel``: the log has this angle."""
-    stem = f"{name.replace(' ', '-')}-{seed}"
-    if (log := tool.work / "logs" / f"{stem}.mcap").is_file():
-        return log
-    manoeuvre, speed, friction, duration_s = spec
-    drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
-    return tool.log(stem, drive, steering_wheel=steering_wheel)
-
 
 def bare_vehicle() -> dict[str, Any]:
     """Return the vehicle file of the saloon without its validation data."""
@@ -151,7 +124,8 @@ def bare_vehicle() -> dict[str, Any]:
 
 def reference(name: str, tool: Tool) -> Figures:
     """Run the reference and the filters on a simulated drive."""
-    log = simulated_log(tool, name, REFERENCE_DRIVES[name], 3)
+    drive = simulate_drive(**_TABLES["reference_drives"][name], friction=0.85, seed=3)
+    log = tool.log(f"{name.replace(' ', '-')}-3", drive)
     car = write_toml(tool.work / "cars" / "saloon.toml", bare_vehicle())
     names = "zero,kinematic,open-loop,phy-ukf,physics"
     run = tool.run(f"reference-{log.stem}", log, "--car", car, "--reference", "on", "--estimators", names)
@@ -160,17 +134,15 @@ def reference(name: str, tool: Tool) -> Figures:
 
 # ------------------------------------------------------------------------------------------------ ±
 
-PLUS_MINUS_DRIVES = tuple((name, km_h, 0.85, duration_s) for name, km_h, duration_s in DRIVEN)
-
 
 def plus_minus(seeds: range, tool: Tool) -> Figures:
     """Return the RMS normalized error of the estimated parameters of the saloon with wrong vehicle files."""
     right, scores = bare_vehicle(), dict[str, list[float]]()
     true = true_values(right, SensorNoise().imu_x_m)
     for seed in seeds:
-        log = simulated_log(
-            tool, "plus-minus", PLUS_MINUS_DRIVES[seed % len(PLUS_MINUS_DRIVES)], seed, steering_wheel=True
-        )
+        manoeuvre, speed, duration_s = DRIVEN[seed % len(DRIVEN)]
+        drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=0.85, seed=seed, duration_s=duration_s)
+        log = tool.log(f"plus-minus-{seed}", drive, steering_wheel=True)
         car = write_toml(tool.work / "cars" / f"wrong-{seed}.toml", wrong_file(right, np.random.default_rng(seed)))
         run = tool.run(f"plus-minus-{seed}", log, "--car", car, "--keep", "estimates", "--estimators", "zero,physics")
         (report,) = reports(run).values()
@@ -205,7 +177,7 @@ def written(file: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any
     """Return a JSON document that a module has written; raises RuntimeError if it has not."""
     if not file.is_file():
         raise RuntimeError(done.stderr[-2000:])
-    document: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    document: dict[str, Any] = read_json(file)
     return document
 
 
@@ -276,7 +248,7 @@ def files_and_keys(tool: Tool) -> Figures:
     for table in (output / "metrics.parquet", log / "estimates.parquet"):
         names |= {f"{table.name} {column}" for column in pl.read_parquet_schema(table)}
     for file, depth in ((output / "run.json", 1), (log / "report.json", 2)):
-        names |= {f"{file.name} {key}" for key in keys(json.loads(file.read_text(encoding="utf-8")), depth)}
+        names |= {f"{file.name} {key}" for key in keys(read_json(file), depth)}
     inspected = tool.json("inspect", SAMPLES / "dlc.mcap")
     names |= {f"inspect --json {key}" for key in keys(inspected, 1)}
     names |= {f"inspect --json topics[].{key}" for key in inspected["topics"][0]}
@@ -314,34 +286,36 @@ def speed(benchmark: str, tool: Tool) -> Figures:
 _FEW_FORMATS = ("csv", "blf", *RECORDINGS)
 
 
-def all_rows() -> list[GateRow]:
-    """Return all rows in the order of the file; the fuzz tests, which take longest, are last."""
-    full, quick = (FULL,), (QUICK, FULL)
-    contract = {"exit codes": exit_codes, "options": options, "files and keys": files_and_keys}
-    sets = {name: quick if name in (*QUICK_DRIVES, "double lane change") else full
-            for name in (*REFERENCE_DRIVES, *(d.log for d in PEER_DRIVES))}  # fmt: skip
-    few_mistakes = _TABLES["few_mistakes"]
-    gnss = [d for d in PEER_DRIVES if d.log.startswith("v40_")]
-    counts = [(name, few) for name in FORMATS for few in (False, True) if not few or name in _FEW_FORMATS]
-    return [
-        *(GateRow("contract", name, quick, measure) for name, measure in contract.items()),
-        *(GateRow("reference", name, sets[name], partial(reference, name)) for name in REFERENCE_DRIVES),
-        *(GateRow("recorded drives", d.log, sets[d.log], partial(recorded, d, False)) for d in PEER_DRIVES),
-        *(GateRow("recorded drives", f"{d.log}, GNSS velocity", full, partial(recorded, d, True)) for d in gnss),
-        *(GateRow("conditions", row.name, full, partial(condition, row.name, 10)) for row in ROWS),
-        *(
-            GateRow("conditions", f"{n}, 2 drives", quick, partial(condition, n, 2))
-            for n in ("in-domain", "gyro-stuck")
-        ),
-        *(GateRow("speed", name, full, partial(speed, name)) for name in ("reading", "reading_mdf")),
-        GateRow("third-party logs", "all", full, partial(strangers, ())),
-        GateRow("third-party logs", "7 layouts", quick, partial(strangers, _TABLES["few_layouts"])),
-        GateRow("plus-minus", "20 cars", full, partial(plus_minus, range(20))),
-        GateRow("plus-minus", "1 car", quick, partial(plus_minus, range(2, 3))),
-        *(GateRow("mapping mistakes", log, full, partial(mistakes, log, ())) for log in ("dlc.mcap", "road.mcap")),
-        GateRow("mapping mistakes", "dlc.mcap, 6 mistakes", quick, partial(mistakes, "dlc.mcap", few_mistakes)),
-        *(
-            GateRow("fuzz", f"{n}, 3 mutants" if few else n, quick if few else full, partial(fuzz, n, 3 if few else 50))
-            for n, few in counts
-        ),
-    ]
+def all_rows() -> Iterator[GateRow]:
+    """Yield all rows in the order of the file; the fuzz tests, which take longest, are last.
+
+    Rows of recorded drives need ``../shared`` beside the repository.
+    """
+    for name, measure in {"exit codes": exit_codes, "options": options, "files and keys": files_and_keys}.items():
+        yield GateRow("contract", name, measure, quick=True)
+    for name in _TABLES["reference_drives"]:
+        yield GateRow("reference", name, partial(reference, name), quick=name == "double lane change")
+    recorded_drives = [d for d in PEER_DRIVES if (DRIVES / d.log).exists()]
+    for d in recorded_drives:
+        yield GateRow("recorded drives", d.log, partial(recorded, d, False), quick=d.log in QUICK_DRIVES)
+    for d in recorded_drives:
+        if d.log.startswith("v40_"):
+            yield GateRow("recorded drives", f"{d.log}, GNSS velocity", partial(recorded, d, True))
+    for row in ROWS:
+        yield GateRow("conditions", row.name, partial(condition, row.name, 10))
+    for name in ("in-domain", "gyro-stuck"):
+        yield GateRow("conditions", f"{name}, 2 drives", partial(condition, name, 2), quick=True)
+    for name in ("reading", "reading_mdf"):
+        yield GateRow("speed", name, partial(speed, name))
+    yield GateRow("third-party logs", "all", partial(strangers, ()))
+    yield GateRow("third-party logs", "7 layouts", partial(strangers, _TABLES["few_layouts"]), quick=True)
+    yield GateRow("plus-minus", "20 cars", partial(plus_minus, range(20)))
+    yield GateRow("plus-minus", "1 car", partial(plus_minus, range(2, 3)), quick=True)
+    for log in ("dlc.mcap", "road.mcap"):
+        yield GateRow("mapping mistakes", log, partial(mistakes, log, ()))
+    few_mistakes = partial(mistakes, "dlc.mcap", _TABLES["few_mistakes"])
+    yield GateRow("mapping mistakes", "dlc.mcap, 6 mistakes", few_mistakes, quick=True)
+    for name in FORMATS:
+        yield GateRow("fuzz", name, partial(fuzz, name, 50))
+        if name in _FEW_FORMATS:
+            yield GateRow("fuzz", f"{name}, 3 mutants", partial(fuzz, name, 3), quick=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from studies.pages import read_toml
+from studies.pages import read_json, read_toml
 from truthsim.drive import Drive, write_drive
 
 #: The longest time for one command, s.
@@ -99,7 +99,7 @@ def estimates(run: Path) -> pl.DataFrame:
 
 def reports(run: Path) -> dict[str, dict[str, Any]]:
     """Return the report.json of every log of a run by name."""
-    return {f.parent.name: json.loads(f.read_text(encoding="utf-8")) for f in sorted(run.glob("logs/*/report.json"))}
+    return {f.parent.name: read_json(f) for f in sorted(run.glob("logs/*/report.json"))}
 
 
 def commands_and_options(tool: Tool) -> dict[str, set[str]]:

@@ -10,7 +10,6 @@ vehicle file and the same mapped and aligned signals; ground truth is used for s
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -24,7 +23,7 @@ from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.options import OFF
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.tracks import StateTrack
-from studies.pages import DRIVES, page_options, update, write
+from studies.pages import DRIVES, page_options, read_json, update, write_json
 from studies.peers.drives import OFFSET, PEER_DRIVES, REFERENCE, PeerDrive, mapping_of, mapping_table, vehicle_of
 from studies.peers.page import CAUSAL, NO_FILE, SEDAN, blocks, estimator_table
 from studies.peers.scoring import Entry, scores
@@ -133,8 +132,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rows, parameters = recorded_scores(work)
         given.results.mkdir(parents=True, exist_ok=True)
         pl.DataFrame(rows).write_parquet(scored_file, compression="zstd")
-        write(parameters_file, json.dumps(parameters, indent=1) + "\n")
-    stored = pl.read_parquet(scored_file), json.loads(parameters_file.read_text(encoding="utf-8"))
+        write_json(parameters_file, parameters)
+    stored = pl.read_parquet(scored_file), read_json(parameters_file)
     update(given.out, "peers.md", blocks(*stored))
     return 0
 

@@ -8,7 +8,6 @@ layouts that were built last: its groups, by default ``held-out``. Exit code 1: 
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 from collections import Counter
@@ -16,12 +15,12 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from studies.pages import DOCS, RESULTS, ROOT, options, read_toml, write
+from studies.pages import DOCS, RESULTS, ROOT, options, read_json, read_toml, write, write_json
 from studies.strangers.containers import write as write_log
 from studies.strangers.layouts import layouts, mountings
 from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
-from studies.strangers.scoring import SHARED, answered_files, load_answers, look, score_log
+from studies.strangers.scoring import ANSWERS, SHARED, look, other_recording, score_log
 
 #: First results of held-out layouts, present and former.
 FIRST_RUNS: dict[str, str] = read_toml(Path(__file__).with_name("first_runs.toml"))
@@ -29,6 +28,7 @@ FIRST_RUNS: dict[str, str] = read_toml(Path(__file__).with_name("first_runs.toml
 
 def score_recording(recording: Recording, folder: Path) -> Result:
     """Write a log of our own, score it, and remove it."""
+    print(recording.name, file=sys.stderr)
     path = write_log(recording.topics, folder / recording.name, recording.container)
     start_ns = min((int(t.arrival_ns[0]) for t in recording.topics if len(t.arrival_ns)), default=None)
     try:
@@ -37,22 +37,15 @@ def score_recording(recording: Recording, folder: Path) -> Result:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def score_own(recordings: Sequence[Recording], folder: Path) -> Iterator[tuple[str, Result]]:
-    """Yield the kind and the result of every log of our own."""
-    for recording in recordings:
-        print(recording.name, file=sys.stderr)
-        yield recording.counted_as, score_recording(recording, folder)
-
-
-def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
+def score_others(only: Sequence[str]) -> Iterator[Result]:
     """Yield the results of third-party recordings, if available."""
     if not SHARED.is_dir():
         print(f"{SHARED} is not there: recordings of others are left out", file=sys.stderr)
         return
-    for answer in load_answers():
-        if _wanted(answer.file, only) and answer.path.exists():
-            print(answer.file, file=sys.stderr)
-            yield answer.file, score_log(answer.path, answer.expected())
+    for file, table in ANSWERS.items():
+        if "same_as" not in table and _wanted(file, only) and (SHARED / file).exists():
+            print(file, file=sys.stderr)
+            yield score_log(SHARED / file, other_recording(file))
 
 
 def first_run() -> str:
@@ -61,7 +54,7 @@ def first_run() -> str:
     for name, what in FIRST_RUNS.items():
         file = RESULTS / "third_party_logs" / f"{name}_first_run.json"
         if file.is_file():
-            logs = json.loads(file.read_text(encoding="utf-8"))
+            logs = read_json(file)
             ends = Counter(outcome for log in logs.values() for outcome in log["items"].values())
             rest = ", ".join(f"{ends[outcome]} {outcome.replace(', ', ' and ')}" for outcome in OUTCOMES[:3])
             said += (
@@ -76,12 +69,11 @@ def others_without_answers() -> str:
     catalogue = SHARED / "reader_corpus" / "CATALOG.json"
     if not catalogue.is_file():
         return ""
-    answered = answered_files()
     channels = {name for names in ITEMS.values() for name in names}
     mapped_files, count = [], 0
-    for entry in json.loads(catalogue.read_text(encoding="utf-8")):
+    for entry in read_json(catalogue):
         file = f"reader_corpus/{entry['file']}"
-        if entry["expected"] != "ok" or file in answered or "/conformance/" in file:
+        if entry["expected"] != "ok" or file in ANSWERS or "/conformance/" in file:
             continue
         count += 1
         _, _, mapped = look(SHARED / file)
@@ -111,8 +103,8 @@ def main() -> int:
     made = chain(mountings(), layouts("fault", "layout", *last))
     recordings = [r for r in made if _wanted(r.name, given.only)]
     kinds: dict[str, list[Result]] = {}
-    for kind, result in chain(score_own(recordings, given.work), score_others(given.only)):
-        kinds.setdefault(kind, []).append(result)
+    for result in chain((score_recording(r, given.work) for r in recordings), score_others(given.only)):
+        kinds.setdefault(result.log.kind or result.log.name, []).append(result)
     results = [merged(logs) for logs in kinds.values()]
     if given.only:
         for result in chain.from_iterable(kinds.values()):
@@ -121,12 +113,12 @@ def main() -> int:
         remark = first_run() + ("" if last else "Without the held-out layouts.\n\n")
         write(given.out, page(results, remark + others_without_answers()))
     if given.keep:
-        write(given.keep, json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True) + "\n")
+        write_json(given.keep, {r.log.name: r.as_json() for r in sorted(results, key=lambda r: r.log.name)})
     return 1 if any(r.count("wrong, not reported") for r in results) else 0
 
 
 def _show(result: Result) -> None:
-    print(f"== {result.name}: {result.what}")
+    print(f"== {result.log.name}: {result.log.what}")
     for item, outcome in result.items.items():
         print(f"   {item}: {outcome} {result.wrong.get(item, '')} {result.verdicts.get(item, '')}".rstrip())
     if result.named is not None:

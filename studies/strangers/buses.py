@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import datetime as dt
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.records import Attachment
 
-if TYPE_CHECKING:
-    from studies.strangers.containers import Topic
+from studies.strangers.cars import Topic
 
 #: Time in ns, bus, identifier and bytes of a frame.
 _Frame = tuple[int, int, int, bytes]
@@ -99,22 +96,17 @@ def _mcap(frames: Sequence[_Frame], databases: dict[str, str], path: Path) -> Pa
     return path
 
 
-def _write(kind: str, topics: Sequence[Topic], path: Path) -> Path:
+def write(kind: str, topics: Sequence[Topic], path: Path) -> Path:
+    """Write frames as ``blf``, ``asc``, ``mdf`` or ``mcap``; return the log, or its folder with the DBC files."""
     frames, databases = _coded(topics)
-    if kind == "can-mcap":
+    if kind == "mcap":
         return _mcap(frames, databases, path)
     shutil.rmtree(path, ignore_errors=True)
     path.mkdir(parents=True)
-    if kind == "can-mdf":
+    if kind == "mdf":
         _mdf(frames, path)
     else:
-        _python_can(frames, path, kind.replace("can-", "."))
+        _python_can(frames, path, f".{kind}")
     for name, text in databases.items():
         (path / f"{name}.dbc").write_text(text)
     return path
-
-
-def writers() -> Iterator[tuple[str, Callable[[Sequence[Topic], Path], Any]]]:
-    """Yield the containers and their writers, which return the folder of the log and its DBC files."""
-    for name in ("can-blf", "can-asc", "can-mdf", "can-mcap"):
-        yield name, partial(_write, name)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from studies.pages import read_toml
 from truthsim.batch import DriveSpec
-from truthsim.sensors import SensorChannel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,85 +50,86 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Car:
-    """One drive of one car.
+class Topic:
+    """One topic: columns by dotted path ([N], [N, k] for an array or a vector struct, int64 ns for a ROS time)."""
 
-    Attributes
-    ----------
+    name: str
+    type_name: str
+    stamps_ns: IntArray
+    arrival_ns: IntArray
+    fields: Mapping[str, NDArray[Any]]
+    constants: Mapping[str, str | float | Sequence[float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Car:
+    """One drive of one car. Each sensor and each quantity is an attribute, too.
+
     force, rate : specific force (m/s², with gravity) and angular rate (rad/s) of the IMU, forward, left, up, [N, 3].
     steer, steering_wheel : road-wheel angle and angle of the steering wheel, rad, left positive.
-    wheels : speeds of fl, fr, rl, rr, m/s, [N, 4]. ratio, wheel_radius_m : of steering and wheels.
+    wheels, wheel_rates : of fl, fr, rl, rr, m/s and rad/s, [N, 4]. speed : mean of the rear wheels, m/s.
     position, velocity, attitude : of GNSS/INS: east, north, up (m); east, north (m/s); roll, pitch, yaw (rad, ENU).
+    east, north, ground_speed : of the velocity, m/s. course, signed_course, heading : clockwise from north, degrees.
     body_velocity : forward and left, m/s, [N, 2]. yaw_rate : rad/s. fix : latitude, longitude (deg), height (m).
+    sideslip : of the GNSS/INS, rad; 0 where the car hardly moves. roll, pitch, yaw, lat, lon, alt : as above.
     """
 
-    force: Series
-    rate: Series
-    steer: Series
-    steering_wheel: Series
-    wheels: Series
     ratio: float
     wheel_radius_m: float
-    position: Series
-    velocity: Series
-    attitude: Series
-    body_velocity: Series
-    yaw_rate: Series
-    fix: Series
+    sensors: Mapping[str, Series]
 
-    @property
-    def speed(self) -> Series:
-        """Mean of the rear wheels, m/s."""
-        return self.wheels.times(np.array([[0.0, 0.0, 0.5, 0.5]]))[0]
-
-    @property
-    def ground_speed(self) -> Series:
-        """Speed over ground as GNSS gives it, m/s."""
-        v = self.velocity
-        return Series(v.stamps_ns, v.arrival_ns, np.hypot(v.values[:, 0], v.values[:, 1]))
-
-    @property
-    def sideslip(self) -> Series:
-        """Sideslip of the GNSS/INS, rad; 0 where the car hardly moves."""
-        v = self.body_velocity
-        moves = v.values[:, 0] > 1.0
-        return Series(v.stamps_ns, v.arrival_ns, np.where(moves, np.arctan2(v.values[:, 1], v.values[:, 0]), 0.0))
+    def __getattr__(self, name: str) -> Series:
+        """Return a sensor or a quantity."""
+        if name not in self.sensors:
+            raise AttributeError(name)
+        return self.sensors[name]
 
 
 _DRIVES = read_toml(Path(__file__).with_name("drives.toml"))
+#: Channel of the simulator and its columns, by the name in :class:`Car`.
+_SENSORS = {
+    "force": ("imu", "ax_m_s2", "ay_m_s2", "az_m_s2"),
+    "rate": ("imu", "roll_rate_rad_s", "pitch_rate_rad_s", "yaw_rate_rad_s"),
+    "steer": ("steering", "steer_rad"),
+    "steering_wheel": ("steering", "steering_wheel_rad"),
+    "wheels": ("wheels", "fl_m_s", "fr_m_s", "rl_m_s", "rr_m_s"),
+    "position": ("rtk", "x_m", "y_m", "z_m"),
+    "attitude": ("rtk", "roll_rad", "pitch_rad", "yaw_rad"),
+    "body_velocity": ("rtk", "vx_m_s", "vy_m_s"),
+    "yaw_rate": ("rtk", "yaw_rate_rad_s"),
+    "fix": ("fix", "lat_deg", "lon_deg", "alt_m"),
+}
 
 
 @lru_cache(maxsize=16)
 def drive(name: str, imu_x_m: float = 0.0) -> Car:
     """Drive one of ``drives.toml``, with the IMU ``imu_x_m`` before the centre of gravity."""
     made = DriveSpec(**_DRIVES[name], sensors=(("imu_x_m", imu_x_m),)).simulate()
-    start = made.start_ns
-    channels = made.channels
-    ins = channels["rtk"]
-    yaw = ins.fields["yaw_rad"]
-    v_x, v_y = ins.fields["vx_m_s"], ins.fields["vy_m_s"]
-    enu = {"e": v_x * np.cos(yaw) - v_y * np.sin(yaw), "n": v_x * np.sin(yaw) + v_y * np.cos(yaw)}
-    return Car(
-        force=_series(channels["imu"], start, "ax_m_s2", "ay_m_s2", "az_m_s2"),
-        rate=_series(channels["imu"], start, "roll_rate_rad_s", "pitch_rate_rad_s", "yaw_rate_rad_s"),
-        steer=_series(channels["steering"], start, "steer_rad")[0],
-        steering_wheel=_series(channels["steering"], start, "steering_wheel_rad")[0],
-        wheels=_series(channels["wheels"], start, "fl_m_s", "fr_m_s", "rl_m_s", "rr_m_s"),
-        ratio=made.vehicle.steering_ratio,
-        wheel_radius_m=made.vehicle.wheel_radius_m,
-        position=_series(ins, start, "x_m", "y_m", "z_m"),
-        velocity=_stacked(ins, start, enu),
-        attitude=_series(ins, start, "roll_rad", "pitch_rad", "yaw_rad"),
-        body_velocity=_series(ins, start, "vx_m_s", "vy_m_s"),
-        yaw_rate=_series(ins, start, "yaw_rate_rad_s")[0],
-        fix=_series(channels["fix"], start, "lat_deg", "lon_deg", "alt_m"),
-    )
-
-
-def _series(channel: SensorChannel, start_ns: int, *names: str) -> Series:
-    return _stacked(channel, start_ns, {name: channel.fields[name] for name in names})
-
-
-def _stacked(channel: SensorChannel, start_ns: int, columns: Mapping[str, FloatArray]) -> Series:
-    values = np.stack(list(columns.values()), axis=1)
-    return Series(channel.stamps_ns(start_ns), channel.arrival_ns(start_ns), values)
+    read: dict[str, Series] = {}
+    for sensor, (channel_name, *names) in _SENSORS.items():
+        channel = made.channels[channel_name]
+        values = np.stack([channel.fields[n] for n in names], axis=1)
+        series = Series(channel.stamps_ns(made.start_ns), channel.arrival_ns(made.start_ns), values)
+        read[sensor] = series if len(names) > 1 else series[0]
+    body, attitude = read["body_velocity"], read["attitude"]
+    v_x, v_y = body.values.T
+    yaw = attitude.values[:, 2]
+    east, north = v_x * np.cos(yaw) - v_y * np.sin(yaw), v_x * np.sin(yaw) + v_y * np.cos(yaw)
+    course = np.arctan2(east, north) / np.radians(1.0)
+    of_body = {
+        "velocity": np.stack([east, north], axis=1),
+        "east": east,
+        "north": north,
+        "ground_speed": np.hypot(east, north),
+        "signed_course": course,
+        "course": course % 360.0,
+        "sideslip": np.where(v_x > 1.0, np.arctan2(v_y, v_x), 0.0),
+        "heading": (90.0 - yaw / np.radians(1.0)) % 360.0,
+    }
+    read |= {name: Series(body.stamps_ns, body.arrival_ns, values) for name, values in of_body.items()}
+    read |= {name: attitude[i] for i, name in enumerate(("roll", "pitch", "yaw"))}
+    read |= {name: read["fix"][i] for i, name in enumerate(("lat", "lon", "alt"))}
+    wheels = read["wheels"]
+    read["speed"] = wheels.times(np.array([[0.0, 0.0, 0.5, 0.5]]))[0]
+    read["wheel_rates"] = Series(wheels.stamps_ns, wheels.arrival_ns, wheels.values / made.vehicle.wheel_radius_m)
+    return Car(made.vehicle.steering_ratio, made.vehicle.wheel_radius_m, read)

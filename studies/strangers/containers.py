@@ -7,31 +7,16 @@ import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
-from pdhef_logtool.records.signals import IntArray
-from studies.mcap_logs import Message, write_log
+from studies.mcap_logs import Message, messages, write_log
 from studies.strangers import buses, tables
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Topic:
-    """One topic: columns by dotted path ([N], [N, k] for an array or a vector struct, int64 ns for a ROS time)."""
-
-    name: str
-    type_name: str
-    stamps_ns: IntArray
-    arrival_ns: IntArray
-    fields: Mapping[str, NDArray[Any]]
-    constants: Mapping[str, str | float | Sequence[float]] = field(default_factory=dict)
+from studies.strangers.cars import Topic as Topic
 
 
 @lru_cache(maxsize=2)
@@ -69,6 +54,10 @@ def write(topics: Sequence[Topic], path: Path, container: str) -> Path:
         ``rosbag1``, ``rosbag2`` (sqlite3), ``rosbag2-bare`` (without message definitions, as up to Humble),
         ``rosbag2-mcap``, or one of the files of ``tables.py``.
     """
+    if container in tables.WRITERS:
+        suffix, put = tables.WRITERS[container]
+        put(path.with_suffix(suffix), topics)
+        return path.with_suffix(suffix)
     return _WRITERS[container](topics, path)
 
 
@@ -105,17 +94,14 @@ def _joints(writer: McapLogWriter, topic: Topic) -> Iterator[RawMessage]:
 
 def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tuple[Topic, int, int, bytes]]:
     """Yield topic, arrival, stamp and the bytes of every message, in CDR or as ROS 1 has them, as they arrive."""
-    from mcap.reader import make_reader
-
     by_name = {t.name: t for t in topics}
     scratch = _mcap(topics, path.with_name(f".{path.stem}-scratch"))
     store = _store(False)
     try:
-        with scratch.open("rb") as stream:
-            for _, channel, message in make_reader(stream).iter_messages():
-                topic, data = by_name[channel.topic], message.data
-                data = bytes(store.cdr_to_ros1(data, topic.type_name)) if ros1 else data
-                yield topic, message.log_time, message.publish_time, data
+        for m in messages(scratch):
+            topic = by_name[m.topic]
+            data = bytes(store.cdr_to_ros1(m.data, topic.type_name)) if ros1 else m.data
+            yield topic, m.log_time_ns, m.publish_time_ns, data
     finally:
         scratch.unlink()
 
@@ -197,9 +183,9 @@ def _json(topics: Sequence[Topic], path: Path, *, bare: bool = False) -> Path:
     return _by_time(path, map(encoded, topics))
 
 
-def _by_time(path: Path, messages: Iterable[Iterable[Message]]) -> Path:
+def _by_time(path: Path, of_topics: Iterable[Iterable[Message]]) -> Path:
     """Write the messages of topics by their arrival."""
-    return write_log(path.with_suffix(".mcap"), sorted(chain.from_iterable(messages), key=lambda m: m.log_time_ns))
+    return write_log(path.with_suffix(".mcap"), sorted(chain.from_iterable(of_topics), key=lambda m: m.log_time_ns))
 
 
 def _protobuf(topics: Sequence[Topic], path: Path) -> Path:
@@ -245,6 +231,5 @@ _WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
     "rosbag2": _rosbag2,
     "rosbag2-bare": _rosbag2_bare,
     "rosbag2-mcap": partial(_rosbag2, plugin="MCAP"),
-    **dict(tables.writers()),
-    **dict(buses.writers()),
+    **{f"can-{kind}": partial(buses.write, kind) for kind in ("blf", "asc", "mdf", "mcap")},
 }

@@ -52,31 +52,7 @@ class Columns(dict[str, Any]):
 
     def __missing__(self, name: str) -> FloatArray:
         """Return a column; raise KeyError for an unknown name, which Python then searches elsewhere."""
-        return series(self.car, name).along(self.clock).values
-
-
-def series(car: Car, name: str) -> Series:
-    """Return a sensor or a quantity of a car; raises KeyError for another name."""
-    east, north = car.velocity.values.T
-    course = np.arctan2(east, north) / DEG
-    derived: dict[str, tuple[Series, FloatArray]] = {
-        "east": (car.velocity, east),
-        "north": (car.velocity, north),
-        # Clockwise from north, degrees.
-        "signed_course": (car.velocity, course),
-        "course": (car.velocity, course % 360.0),
-        "heading": (car.velocity, (90.0 - car.attitude.values[:, 2] / DEG) % 360.0),
-        "wheel_rates": (car.wheels, car.wheels.values / car.wheel_radius_m),
-        **{n: (car.attitude, car.attitude.values[:, i]) for i, n in enumerate(("roll", "pitch", "yaw"))},
-        **{n: (car.fix, car.fix.values[:, i]) for i, n in enumerate(("lat", "lon", "alt"))},
-    }
-    if name in derived:
-        clock, values = derived[name]
-        return Series(clock.stamps_ns, clock.arrival_ns, values)
-    sensor = getattr(car, name, None)
-    if not isinstance(sensor, Series):
-        raise KeyError(name)
-    return sensor
+        return self.car.sensors[name].along(self.clock).values
 
 
 def layouts(*groups: str) -> Iterator[Recording]:
@@ -150,7 +126,7 @@ def _topics(car: Car, lines: Sequence[str], names: dict[str, Any]) -> Iterator[T
         elif line.startswith("/"):
             name, type_name, clock_name, *stamp = line.split()
             sensor, _, step = clock_name.partition("/")
-            clock = series(car, sensor).every(int(step or 1))
+            clock = car.sensors[sensor].every(int(step or 1))
             columns = Columns(car, clock)
             fields: dict[str, Any] = {}
             for field_line in lines[i + 1 :]:

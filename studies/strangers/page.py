@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from studies.pages import table, template
+from studies.strangers.recordings import Recording
 
 #: Outcomes of an item, the worst first.
 OUTCOMES = ("wrong, not reported", "wrong, reported", "missing", "right")
@@ -30,17 +31,14 @@ class Result:
 
     Attributes
     ----------
-    items : outcome by item, one of :data:`OUTCOMES`. wrong : source mapped by mistake, by item.
+    log : without its series. items : outcome by item, one of :data:`OUTCOMES`. wrong : source mapped by mistake.
     silent : the wrong ones that are not reported, with their sources. doubted : right ones that a sentence doubts.
     verdicts : by right item the worst verdict of its checks: ``failed``, ``undecided``, ``passed``, or ``none``.
     alarms : failed checks on right channels that are not at fault. named : whether the cause is named.
     """
 
-    name: str
-    group: str
-    what: str
+    log: Recording
     items: Mapping[str, str]
-    page: str = ""
     wrong: Mapping[str, str] = field(default_factory=dict)
     verdicts: Mapping[str, str] = field(default_factory=dict)
     silent: tuple[str, ...] = ()
@@ -60,7 +58,8 @@ class Result:
 
     def as_json(self) -> dict[str, Any]:
         """Values that are stored for later comparison."""
-        return {"group": self.group, "items": dict(self.items), "named": self.named, "verdicts": dict(self.verdicts)}
+        kept = {"items": dict(self.items), "named": self.named, "verdicts": dict(self.verdicts)}
+        return {"group": self.log.group} | kept
 
 
 def merged(results: Sequence[Result]) -> Result:
@@ -72,12 +71,9 @@ def merged(results: Sequence[Result]) -> Result:
     items = {n: min((r.items[n] for r in results if n in r.items), key=OUTCOMES.index) for n in names}
     named = [r.named for r in results if r.named is not None]
     return Result(
-        name=f"{len(results)} logs: {first.name.rpartition('-')[0]}",
-        group=first.group,
-        what=first.what,
-        page=first.page,
+        log=replace(first.log, name=f"{len(results)} logs: {first.log.name.rpartition('-')[0]}"),
         items=items,
-        silent=tuple(f"{r.name}: {what}" for r in results for what in r.silent),
+        silent=tuple(f"{r.log.name}: {what}" for r in results for what in r.silent),
         verdicts=first.verdicts,
         alarms=tuple(a for r in results for a in r.alarms),
         named=all(named) if named else None,
@@ -91,11 +87,11 @@ def page(results: Sequence[Result], remark: str) -> str:
     ----------
     results : one a kind. remark : text below the score.
     """
-    others = sum(r.group == "recording" for r in results)
+    others = sum(r.log.group == "recording" for r in results)
     counts = f"{len(results) - others} generated logs and {others} third-party recordings"
     parts = [template(__file__, counts=counts), "## Score\n", _score(results), _remarks(results), remark]
     for group, title in GROUPS.items():
-        rows = [r for r in results if r.group == group]
+        rows = [r for r in results if r.log.group == group]
         if rows:
             parts += [f"## {title[0].upper()}{title[1:]}\n", _logs(rows)]
     parts += ["## Wrong and questionable results\n", _wrong(results)]
@@ -103,8 +99,8 @@ def page(results: Sequence[Result], remark: str) -> str:
 
 
 def _score(results: Sequence[Result]) -> str:
-    counted = {title: [r for r in results if r.group == group] for group, title in GROUPS.items()}
-    counted["all except held-out layouts"] = [r for r in results if r.group not in HELD_OUT]
+    counted = {title: [r for r in results if r.log.group == group] for group, title in GROUPS.items()}
+    counted["all except held-out layouts"] = [r for r in results if r.log.group not in HELD_OUT]
     rows = []
     for title, of in counted.items():
         outcomes = Counter(outcome for r in of for outcome in r.items.values())
@@ -119,7 +115,7 @@ def _score(results: Sequence[Result]) -> str:
 
 
 def _remarks(results: Sequence[Result]) -> str:
-    sound = [r for r in results if r.group in SOUND]
+    sound = [r for r in results if r.log.group in SOUND]
     right = [v for r in sound for v in r.verdicts.values()]
     counts = {verdict: right.count(verdict) for verdict in ("passed", "undecided", "failed", "none")}
     doubted = sum(len(r.doubted) for r in sound)
@@ -134,8 +130,8 @@ def _logs(rows: Sequence[Result]) -> str:
     def cells(r: Result) -> list[str]:
         other = [f"{item}: {outcome}" for item, outcome in r.items.items() if outcome != "right"]
         named = {None: "", True: "yes", False: "**no**"}[r.named]
-        what = f"[{r.what}]({r.page})" if r.page else r.what
-        return [r.name, what, f"{r.count('right')} of {len(r.items)}", "; ".join(other), named]
+        what = f"[{r.log.what}]({r.log.page})" if r.log.page else r.log.what
+        return [r.log.name, what, f"{r.count('right')} of {len(r.items)}", "; ".join(other), named]
 
     return table(["log", "content", "right", "other", "cause named"], map(cells, rows)) + "\n"
 
@@ -145,10 +141,10 @@ def _wrong(results: Sequence[Result]) -> str:
     checks: dict[str, Callable[[Result], Iterable[str]]] = {
         "wrong, not reported": lambda r: r.silent,
         "failed check on a right channel": lambda r: r.alarms,
-        "undecided check on a right channel": lambda r: r.undecided if r.group in SOUND else (),
+        "undecided check on a right channel": lambda r: r.undecided if r.log.group in SOUND else (),
         "cause not named": lambda r: ("",) if r.named is False else (),
     }
     for title, of in checks.items():
         for r in results:
-            lines += [f"- {r.name}: {title}{': ' + what if what else ''}" for what in of(r)]
+            lines += [f"- {r.log.name}: {title}{': ' + what if what else ''}" for what in of(r)]
     return "\n".join(lines) + "\n" if lines else "None.\n"

@@ -28,17 +28,18 @@ ITEMS: dict[str, list[str]] = SCORING["items"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Expected:
-    """What the tool must find in a log.
+class Recording:
+    """A log and what the tool must find in it.
 
     Attributes
     ----------
     name : of the log. what : description in one line. page : where the layout is documented.
-    group : ``fault``, ``layout``, ``recording`` or ``held-out`` (built last, run once).
+    group : ``fault``, ``layout``, ``recording`` (of others) or ``held-out`` (built last, run once).
     right : by channel (``truth.`` before ground truth) the expected series, any one of them.
     allowed : channels that may be mapped, and are not missed: an INS that is no ground truth, a second source.
     cause : pattern of a message that names the cause; empty for a log without a fault.
     at_fault : channels with the fault; of all others no check may fail.
+    container, topics : of a log of our own making. kind : logs of one kind count as one.
     """
 
     name: str
@@ -49,20 +50,9 @@ class Expected:
     cause: str = ""
     at_fault: frozenset[str] = frozenset()
     page: str = ""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Recording(Expected):
-    """A log of our own making; logs of one ``kind`` count as one."""
-
     container: str = "mcap"
     topics: tuple[Topic, ...] = ()
     kind: str = ""
-
-    @property
-    def counted_as(self) -> str:
-        """Name of the kind that the log counts for."""
-        return self.kind or self.name
 
 
 def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
@@ -76,7 +66,6 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
         car.velocity.arrival_ns,
         np.column_stack([car.velocity.values, car.speed.along(car.velocity).values * 0]),
     )
-    rates = car.wheels.times(1.0 / car.wheel_radius_m)
     yaw_rates = (car.rate[2], car.yaw_rate)
     # All quantities accepted as speed: rims, the body's forward velocity, the speed over ground.
     speeds = (car.speed, car.body_velocity[0], car.ground_speed)
@@ -88,7 +77,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
         "steering wheel": {"steering_wheel_rad": (car.steering_wheel,)},
         "speed": {"speed_m_s": speeds},
         "wheels": {f"wheel_speed_{w}_m_s": (car.wheels[i],) for i, w in enumerate(WHEELS)},
-        "wheel rates": {f"wheel_speed_{w}_rad_s": (rates[i],) for i, w in enumerate(WHEELS)},
+        "wheel rates": {f"wheel_speed_{w}_rad_s": (car.wheel_rates[i],) for i, w in enumerate(WHEELS)},
         "truth": {
             "truth.vx_m_s": speeds,
             "truth.vy_m_s": (car.body_velocity[1],),

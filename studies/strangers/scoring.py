@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,14 +19,13 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, fit_clocks, read_signals
-from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import POSITIONS, Channel, FloatArray
 from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.pages import ROOT, read_toml
 from studies.strangers.cars import Series
 from studies.strangers.page import Result
-from studies.strangers.recordings import ITEMS, SCORING, Expected
+from studies.strangers.recordings import ITEMS, SCORING, Recording
 
 #: Values are compared as means over so long: noise and a late stamp of a few milliseconds count little.
 BIN_S = 0.25
@@ -68,40 +67,28 @@ class Told:
 # ------------------------------------------------------------------------------------------------ messages of the tool
 
 
-def _databases(path: Path) -> Path | None:
-    """Return the folder of a log with its DBC files, which a person gives as ``--set msgs=``."""
-    return path if path.is_dir() and any(path.glob("*.dbc")) else None
-
-
 def look(path: Path) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
     """Let the tool read a log on its own; return its mapping, its messages, and its channels."""
+    # A person gives the folder of the DBC files as --set msgs=.
+    msgs = path if path.is_dir() and any(path.glob("*.dbc")) else None
     try:
-        with closing(open_log(path, msgs=_databases(path))) as log:
-            return _look(log)
+        with closing(open_log(path, msgs=msgs)) as log:
+            inspection = inspect_drive_log(log)
+            channels = _channels(log, inspection.mapping)
     except PdhefError as error:
         return None, Told((), (), str(error)), {}
-
-
-def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
-    said: list[str] = []
-    error = ""
-    try:
-        chosen = choose_mapping(log, None, prefer_truth="perfect")
-        said += [*map(str, chosen.ambiguities), *chosen.mapping.notes]
-    except PdhefError as refused:
-        error = str(refused)
-    inspection = inspect_drive_log(log)
-    document = inspection.to_dict()
-    warnings = document.get("warnings") or []
-    said += [w["message"] for w in warnings]
+    document, refused_run = inspection.to_dict(), ""
+    checks, warnings = list(document.get("checks") or ()), document.get("warnings") or []
+    said = [w["message"] for w in warnings]
     said += [*map(str, inspection.ambiguities), *inspection.notes, *(f"missing: {name}" for name in inspection.missing)]
     suspects = frozenset(name for w in warnings for name in (w["suspects"] or w["signals"]))
-    checks = list(document.get("checks") or ())
-    more, refused_run = _checks_of_a_run(Path(str(log.path)))
-    checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
-    error = error or refused_run
-    messages = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
-    return inspection.mapping, messages, _channels(log, inspection.mapping)
+    try:
+        with read_drive(path, Car.load("saloon"), options=ReadOptions(msgs=msgs), require_sensors=False) as drive:
+            more = [asdict(check) for check in getattr(drive, "checks", ())]
+            checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
+    except PdhefError as error:
+        refused_run = str(error)
+    return inspection.mapping, Told(tuple(checks), tuple(said), refused_run, suspects), channels
 
 
 def _channels(log: DriveLog, mapping: SignalMapping) -> dict[str, Channel]:
@@ -111,21 +98,13 @@ def _channels(log: DriveLog, mapping: SignalMapping) -> dict[str, Channel]:
     return read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
 
 
-def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
-    """Return the checks that ``pdhef run`` would show, and why it would not run."""
-    try:
-        options = ReadOptions(msgs=_databases(path))
-        with read_drive(path, Car.load("saloon"), options=options, require_sensors=False) as drive:
-            return [asdict(check) for check in getattr(drive, "checks", ())], ""
-    except PdhefError as error:
-        return [], str(error)
-
-
 # ------------------------------------------------------------------------------------------------ by value
 
 
-def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> bool:
+def agrees(channel: Channel, right: Series, name: str) -> bool:
     """Return whether a channel has the values of a series, but for noise, a few milliseconds and a bias."""
+    floor = FLOORS.get(name, FLOORS["rad_s" if name.endswith("rad_s") else "m_s"])
+    bias = BIAS_M_S2 if name in ("ax_m_s2", "ay_m_s2") else 0.0
     if not len(channel) or not len(right.stamps_ns):
         return False
     if channel.name.endswith(("course_rad", "yaw_rad", "heading_rad")):
@@ -180,20 +159,10 @@ def _means(at_ns: Any, values: FloatArray, width: int, count: int) -> FloatArray
         return np.stack(sums, axis=1) / hits[:, None]
 
 
-def floor_of(name: str) -> float:
-    """Return the least difference that counts for a channel."""
-    return FLOORS.get(name, FLOORS["rad_s" if name.endswith("rad_s") else "m_s"])
-
-
-def bias_of(name: str) -> float:
-    """Return the constant difference that does not count for a channel."""
-    return BIAS_M_S2 if name in ("ax_m_s2", "ay_m_s2") else 0.0
-
-
 # ------------------------------------------------------------------------------------------------ the score
 
 
-def score_log(path: Path, expected: Expected, start_ns: int | None = None) -> Result:
+def score_log(path: Path, expected: Recording, start_ns: int | None = None) -> Result:
     """Let the tool map a log and compare the mapping with the right answers.
 
     A channel of :data:`ITEMS` that is neither right nor allowed is wrong.
@@ -212,7 +181,7 @@ def score_log(path: Path, expected: Expected, start_ns: int | None = None) -> Re
         shift = (RELATIVE_NS if first < RELATIVE_NS + 10**12 else first) - start_ns
         fitting = {n: [s.late(shift * 1e-9) for s in series] for n, series in fitting.items()}
     is_right = {
-        name: any(agrees(channel, series, floor_of(name), bias_of(name)) for series in fitting.get(name, ()))
+        name: any(agrees(channel, series, name) for series in fitting.get(name, ()))
         for name, channel in channels.items()
     }
     items, wrong, verdicts, doubted, silent = dict[str, str](), dict[str, str](), dict[str, str](), [], []
@@ -243,10 +212,8 @@ def score_log(path: Path, expected: Expected, start_ns: int | None = None) -> Re
         and not c["name"].endswith(".corrected")  # the correction made it right
     )
     named = bool(re.search(expected.cause, messages.text, re.IGNORECASE)) if expected.cause else None
-    return Result(
-        expected.name, expected.group, expected.what, items, expected.page, wrong, verdicts, tuple(silent),
-        tuple(doubted), alarms, named, messages.text,
-    )  # fmt: skip
+    found = tuple(silent), tuple(doubted), alarms, named, messages.text
+    return Result(replace(expected, right={}, allowed={}, topics=()), items, wrong, verdicts, *found)
 
 
 def _sources(mapping: SignalMapping) -> dict[str, str]:
@@ -275,65 +242,33 @@ def _is_doubted(name: str, source: str, messages: Told) -> bool:
 # ------------------------------------------------------------------------------------------------ recordings of others
 
 SHARED = ROOT.parent / "shared"
-ANSWERS = Path(__file__).with_name("answers.toml")
+#: Right sources of recordings by channel (alternatives), sources that are also ``allowed``, and channels ``at_fault``.
+ANSWERS = read_toml(Path(__file__).with_name("answers.toml"))
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """Right sources of one recording by channel (alternatives), sources that are also allowed, and faulty channels."""
-
-    file: str
-    right: dict[str, tuple[SignalSource, ...]]
-    allowed: dict[str, tuple[SignalSource, ...]]
-    at_fault: frozenset[str]
-
-    @property
-    def path(self) -> Path:
-        """Where the recording lies, if it is there."""
-        return SHARED / self.file
-
-    def expected(self) -> Expected:
-        """Read the right and the allowed channels."""
-        right, allowed = (_read(self.path, sources) for sources in (self.right, self.allowed))
-        return Expected(self.file, "recording", "", right, allowed, at_fault=self.at_fault)
-
-
-def load_answers() -> Iterator[Answer]:
-    """Yield all of them, whether the recordings are there or not."""
-    for file, table in read_toml(ANSWERS).items():
-        if "same_as" not in table:
-            allowed, at_fault = _alternatives(table.get("allowed", {})), frozenset(table.get("at_fault", ()))
-            yield Answer(file, _alternatives(table), allowed, at_fault)
-
-
-def answered_files() -> frozenset[str]:
-    """Return the recordings that somebody has looked at."""
-    return frozenset(read_toml(ANSWERS))
-
-
-def _alternatives(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:
-    sources_by_name = {}
-    for name, given in table.items():
-        if name not in ("allowed", "at_fault"):
-            texts = given if isinstance(given, list) else [given]
-            sources_by_name[name] = tuple(_source(name.removeprefix("truth."), *text.split()) for text in texts)
-    return sources_by_name
+def other_recording(file: str) -> Recording:
+    """Read a recording of others: its right and its allowed channels."""
+    table = dict(ANSWERS[file])
+    sources, at_fault = table.pop("allowed", {}), frozenset(table.pop("at_fault", ()))
+    right, allowed = (_read(SHARED / file, given) for given in (table, sources))
+    return Recording(file, "recording", "", right, allowed, at_fault=at_fault)
 
 
 def _source(name: str, topic: str, field: str, scale: str = "1", offset: str = "0") -> SignalSource:
     return SignalSource(name, topic, field, scale=float(scale), offset=float(offset))
 
 
-def _read(path: Path, sources: dict[str, tuple[SignalSource, ...]]) -> dict[str, tuple[Series, ...]]:
+def _read(path: Path, table: Mapping[str, str | list[str]]) -> dict[str, tuple[Series, ...]]:
     """Return the channels of a recording, several where a channel has alternative sources."""
+    alternatives = {name: given if isinstance(given, list) else [given] for name, given in table.items()}
     series: dict[str, tuple[Series, ...]] = {}
     with closing(open_log(path)) as log:
-        for turn in range(max(map(len, sources.values()), default=0)):
+        for turn in range(max(map(len, alternatives.values()), default=0)):
             signals, truth = dict[str, SignalSource](), dict[str, SignalSource]()
-            for name, alternatives in sources.items():
-                if turn < len(alternatives):
-                    section = truth if name.startswith("truth.") else signals
-                    section[name.removeprefix("truth.")] = alternatives[turn]
+            for name, texts in alternatives.items():
+                if turn < len(texts):
+                    bare = name.removeprefix("truth.")
+                    (signals if bare == name else truth)[bare] = _source(bare, *texts[turn].split())
             for name, c in _channels(log, SignalMapping(signals=signals, truth=truth)).items():
                 if len(c):
                     series[name] = (*series.get(name, ()), Series(c.stamps_ns, c.arrival_ns, c.values))

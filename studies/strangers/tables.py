@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import IntArray
 from studies.pages import read_toml
-
-if TYPE_CHECKING:
-    from studies.strangers.containers import Topic
+from studies.strangers.cars import Topic
 
 #: GPS time is ahead of UTC by 18 leap seconds, and began 315964800 s after 1970.
 _GPS_NS, _WEEK_NS, _DAY_NS = (18 - 315_964_800) * 10**9, 604_800 * 10**9, 86_400 * 10**9
@@ -102,12 +100,8 @@ def _table_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> It
 
 
 def _value_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
-    for i, (stamp, name, value, unit) in enumerate(_long_rows(topics)):
-        yield form["row"].format(name=name, value=value, unit=unit, **_times(stamp, start, i))
-
-
-def _series_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
-    rows = sorted(_long_rows(topics), key=lambda row: row[1])
+    """Yield a row for each value; in a series, signal after signal."""
+    rows = sorted(_long_rows(topics), key=lambda row: row[1]) if form["rows"] == "series" else _long_rows(topics)
     for i, (stamp, name, value, unit) in enumerate(rows):
         if not i or name != rows[i - 1][1]:
             yield from (line.format(name=name, unit=unit) for line in form["above"])
@@ -139,7 +133,7 @@ def _side_by_side(form: dict[str, Any], topics: Sequence[Topic], start: int) -> 
 
 
 _ROWS: dict[str, Callable[[dict[str, Any], Sequence[Topic], int], Iterator[str]]] = {
-    "table": _table_rows, "samples": _sample_rows, "values": _value_rows, "series": _series_rows,
+    "table": _table_rows, "samples": _sample_rows, "values": _value_rows, "series": _value_rows,
     "columns": _side_by_side,
 }  # fmt: skip
 
@@ -313,33 +307,27 @@ def _mdf(path: Path, topics: Sequence[Topic]) -> None:
         file.save(path, overwrite=True)
 
 
-#: Suffix and writer of the document by the begin of a template's name.
+#: Suffix and writer of a document by the begin of a template's name.
 _KINDS = {"mat": (".mat", _write_mat), "json": (".json", _write_json), "hdf5": (".h5", _write_hdf5)}
-_PARQUET = {
-    "parquet": _parquet, "parquet-nested": _nested_parquet, "parquet-seconds": _seconds_parquet,
-    "parquet-long": _long_parquet, "parquet-measures": _measures_parquet,
-}  # fmt: skip
-_WRITERS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
+
+
+def _document(name: str, path: Path, topics: Sequence[Topic]) -> None:
+    template = {key: entry for key, entry in _DOCUMENTS[name].items() if key != "suffix"}
+    _KINDS[name.partition("-")[0]][1](path, _filled(template, list(_signals(topics))))
+
+
+#: Suffix and writer of each container.
+WRITERS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     **{name: (form.get("suffix", ".csv"), partial(_text, name)) for name, form in _DIALECTS.items()},
-    **{name: (".parquet", put) for name, put in _PARQUET.items()},
+    **{
+        name: (form.get("suffix", _KINDS[name.partition("-")[0]][0]), partial(_document, name))
+        for name, form in _DOCUMENTS.items()
+    },
+    "parquet": (".parquet", _parquet),
+    "parquet-nested": (".parquet", _nested_parquet),
+    "parquet-seconds": (".parquet", _seconds_parquet),
+    "parquet-long": (".parquet", _long_parquet),
+    "parquet-measures": (".parquet", _measures_parquet),
     "mat-7.3": (".mat", _mat_hdf5),
     "mdf": (".mf4", _mdf),
 }
-
-
-def _write(container: str, topics: Sequence[Topic], path: Path) -> Path:
-    if container in _DOCUMENTS:
-        suffix, put = _KINDS[container.partition("-")[0]]
-        template = dict(_DOCUMENTS[container])
-        suffix = template.pop("suffix", suffix)
-        put(path.with_suffix(suffix), _filled(template, list(_signals(topics))))
-    else:
-        suffix, write = _WRITERS[container]
-        write(path.with_suffix(suffix), topics)
-    return path.with_suffix(suffix)
-
-
-def writers() -> Iterator[tuple[str, Callable[[Sequence[Topic], Path], Path]]]:
-    """Yield the containers and their writers, which return the path with the suffix."""
-    for name in (*_DOCUMENTS, *_WRITERS):
-        yield name, partial(_write, name)

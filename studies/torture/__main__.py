@@ -12,7 +12,6 @@ something ended as it should not.
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
 import time
@@ -24,7 +23,7 @@ from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
 from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
-from studies.pages import DOCS, ROOT, fill, options, table, write
+from studies.pages import DOCS, ROOT, fill, options, read_json, table, write, write_json
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
 from studies.torture.mutants import HANG_S, format_judge, log_judge
@@ -102,28 +101,19 @@ def _say(text: str) -> None:
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def blocks(results: dict[str, Any]) -> dict[str, str]:
-    """Return the tables of the page by name."""
-    lists = [name for name in ("bombs", "crashes", "hours", "shared") if results.get(name)]
-    texts: dict[str, str] = {name: _list(results[name]) for name in lists}
-    texts |= {name: _mutations(results[name]) for name in ("mutations", "formats") if results.get(name)}
-    return texts
-
-
 def _list(rows: list[dict[str, Any]]) -> str:
-    costs = [key for key in _COSTS if key in rows[0]]
-    wrong = [f", **wrong**: {_cell(r['problem'])}" if r["problem"] else "" for r in rows]
-    shown = [[_COSTS[key][1](r[key]) if key in r else "–" for key in costs] for r in rows]
-    body = [[r["name"], r["end"] + w, *cells] for r, w, cells in zip(rows, wrong, shown, strict=True)]
-    return table(["case", "ended", *(_COSTS[key][0] for key in costs)], body, right_from=2)
+    """Return a line for each case, with its costs."""
+    costs = [key for key in rows[0] if key not in ("name", "end", "problem")]
+    body = [
+        [r["name"], r["end"] + (f", **wrong**: {_cell(r['problem'])}" if r["problem"] else ""),
+         *(_cost(key, r[key]) if key in r else "–" for key in costs)]
+        for r in rows
+    ]  # fmt: skip
+    return table(["case", "ended", *("MiB" if key == "bytes" else key for key in costs)], body, right_from=2)
 
 
-#: Heading and format of the costs of a case.
-_COSTS: dict[str, tuple[str, Callable[[Any], str]]] = {
-    "s": ("s", "{:.1f}".format),
-    "bytes": ("MiB", lambda value: str(value >> 20)),
-    **{how: (how, "{:.0f}".format) for how in ("lost", "stale", "unequal")},
-}
+def _cost(key: str, value: float) -> str:
+    return f"{value:.1f}" if key == "s" else f"{int(value) >> 20 if key == 'bytes' else value:.0f}"
 
 
 def _cell(text: str) -> str:
@@ -184,26 +174,19 @@ def main() -> int:
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
-        former = json.loads(kept.read_text()) if kept.is_file() else None
         again = name == "formats" and given.format
-        if (again or former is None) and (not parts or name in parts):
-            former = (former or {}) | do() if again else do()
-            kept.write_text(json.dumps(former, indent=1))
-        if former is not None:
-            results[name] = json.loads(json.dumps(former))
+        if (again or not kept.is_file()) and (not parts or name in parts):
+            write_json(kept, (read_json(kept) if again and kept.is_file() else {}) | do() if again else do())
+        if kept.is_file():
+            results[name] = read_json(kept)
     if given.out.is_file():
         counts = f"--logs {given.logs} --count {given.count}"
         counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"
+        tables = {name: (_list if isinstance(r, list) else _mutations)(r) for name, r in results.items() if r}
         asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
-        write(given.out, fill(given.out.read_text(), blocks(results) | asked, str(given.out)))
-    return int(any(_wrong(r) for r in results.values()))
-
-
-def _wrong(result: Any) -> bool:
-    """Return whether anything in a part's results ended as it should not."""
-    if isinstance(result, list):
-        return any(r["problem"] for r in result)
-    return bool(result.get("problems")) or any(isinstance(r, dict) and r.get("problems") for r in result.values())
+        write(given.out, fill(given.out.read_text(), tables | asked, str(given.out)))
+    rows = [r for part in results.values() for r in (part if isinstance(part, list) else part.values())]
+    return int(any(r.get("problem") or r.get("problems") for r in rows))
 
 
 if __name__ == "__main__":

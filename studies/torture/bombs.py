@@ -16,10 +16,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
+import zstandard
+
 from studies.pages import ROOT
 from studies.torture.damage import ENDLESS_VIEW, MAGIC, Record, join_bag, join_mcap
 from studies.torture.seeds import SEEDS, START_NS
-from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Verdict, judge, measured
+from studies.torture.workers import LIMIT_S, Verdict, judge_process, measured
 
 _NO_LOG, _EITHER, _SOUND, _ANY = (1,), (1, 3), (0, 3), (0, 1, 3)
 _PAST_NS = START_NS - 315_360_000 * 10**9
@@ -73,14 +76,10 @@ def _typed(name: bytes, encoding: bytes, schema: bytes, wire: bytes, payload: by
 
 
 def _zeros_zstd(size: int) -> bytes:
-    import zstandard
-
     return _zeros(zstandard.ZstdCompressor(level=3).compressobj(size=size), size)
 
 
 def _zeros_lz4(size: int) -> bytes:
-    import lz4.frame
-
     with lz4.frame.LZ4FrameCompressor() as compressor:
         return bytes(compressor.begin()) + _zeros(compressor, size)
 
@@ -310,10 +309,4 @@ def former_cases() -> list[Bomb]:
 def judge_bomb(bomb: Bomb, folder: Path) -> Verdict:
     """Make a bomb in a folder and inspect it in a separate process."""
     process = measured("inspect", str(bomb.make(folder)), limit_s=3 * LIMIT_S)
-    verdict = judge(process, bomb.codes)
-    problems = [verdict.problem] if verdict.problem else []
-    if process.late or process.wall_s > LIMIT_S:
-        problems.append(f"{process.wall_s:.1f} s")
-    if process.peak_bytes > LIMIT_BYTES:
-        problems.append(f"{process.peak_bytes >> 20} MiB")
-    return Verdict(verdict.end, "; ".join(problems), {"s": process.wall_s, "bytes": process.peak_bytes})
+    return judge_process(process, bomb.codes, LIMIT_S)

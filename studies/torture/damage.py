@@ -21,7 +21,12 @@ from functools import partial
 from pathlib import Path, PurePath
 from typing import Any
 
+import h5py
+import lz4.frame
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import zstandard
 
 from studies.pages import read_toml
 from studies.torture.seeds import TOPICS
@@ -273,9 +278,6 @@ def _damage_bag_chunk(record: Record, rng: random.Random) -> Record | None:
 
 
 def _unpacked(compression: bytes, stored: bytes, size: int) -> bytes:
-    import lz4.frame
-    import zstandard
-
     if compression == b"zstd":
         return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
     if compression == b"lz4":
@@ -284,9 +286,6 @@ def _unpacked(compression: bytes, stored: bytes, size: int) -> bytes:
 
 
 def _packed(compression: bytes, body: bytes) -> bytes:
-    import lz4.frame
-    import zstandard
-
     if compression == b"zstd":
         return zstandard.ZstdCompressor().compress(body)
     if compression == b"lz4":
@@ -518,8 +517,6 @@ def _nested(element: bytes, levels: int) -> bytes:
 
 def damage_hdf5(content: bytes, rng: random.Random, canary: Path) -> bytes:
     """Change signed blocks and addresses, or add external, cyclic, huge and unusual objects."""
-    import h5py
-
     if rng.random() < 0.3:
         data = bytearray(content)
         blocks = [m.start() for m in re.finditer(rb"TREE|SNOD|HEAP|OHDR|\x89HDF|\x08\0\x17\0|\x01\0\x01\0", content)]
@@ -543,8 +540,6 @@ def _many_groups(car: Any, name: str, rng: random.Random, _: Path) -> None:
 
 
 def _virtual(car: Any, name: str, rng: random.Random, canary: Path) -> None:
-    import h5py
-
     layout = h5py.VirtualLayout((1, rng.choice((150, 1 << 40))), "f8")
     layout[:, :150] = h5py.VirtualSource(rng.choice((f"{canary}.h5", ".")), rng.choice(("x", f"car/{name}")), (1, 150))
     car.create_virtual_dataset(name, layout)
@@ -561,8 +556,6 @@ def _huge(car: Any, name: str, rng: random.Random, _: Path) -> None:
 
 
 def _odd(car: Any, name: str, rng: random.Random, _: Path) -> None:
-    import h5py
-
     odd: tuple[Any, ...] = (
         h5py.Empty("f8"), np.array("x" * 100_000, dtype=h5py.string_dtype()), np.zeros((1, 150), "c16"),
         np.float16(1.0), np.zeros((1, 150), [("a", "f8"), ("b", "S9")]),
@@ -575,8 +568,6 @@ def _odd(car: Any, name: str, rng: random.Random, _: Path) -> None:
 
 
 def _link(car: Any, name: str, rng: random.Random, canary: Path) -> None:
-    import h5py
-
     soft = [h5py.SoftLink(path) for path in (f"{car.name}/{name}", "/car")]
     files = [h5py.ExternalLink(*target) for target in ((f"{canary}.h5", "/x"), (".", "/"), ("/dev/zero", "/"))]
     car[name] = rng.choice((*soft, *files, car, car.parent))
@@ -601,9 +592,6 @@ def damage_parquet(content: bytes, rng: random.Random) -> bytes:
         footer = len(data) - len(content) + size
         _put(data, len(data) - 8, 4, footer if rng.random() < 0.9 else rng.choice(EDGES))
         return bytes(data)
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     rows = rng.choice((150, 150, 150, 300_000))
     columns: dict[str, Any] = {k: np.resize(v, rows) for topic in TOPICS for k, v in topic.fields.items()}
     columns |= {"time": TOPICS[0].stamps_ns[0] + 20_000_000 * np.arange(rows)} if rng.random() < 0.8 else {}
@@ -617,8 +605,6 @@ def damage_parquet(content: bytes, rng: random.Random) -> bytes:
 
 
 def _arrow_values(rng: random.Random) -> Any:
-    import pyarrow as pa
-
     text = rng.choice(_CELLS).decode(errors="replace")
     value, kind = rng.choice((
         (0.0, pa.float64()), (text, pa.string()), ([1.0, None], pa.list_(pa.float64())), (None, pa.null()),

@@ -11,9 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from studies.mcap_logs import messages
 from studies.torture.damage import mutant, table_mutant
 from studies.torture.seeds import FORMATS, table_seeds, write_seeds
-from studies.torture.workers import LIMIT_BYTES, Verdict, command, judge, measured
+from studies.torture.workers import Verdict, command, judge, judge_process, measured
 
 RUN_EVERY = 100
 _RUN = ("--car", "saloon", "--estimators", "zero,kinematic,phy-ukf")
@@ -96,21 +97,9 @@ def judge_mutant(work: Path, name: str, seeds: Sequence[bytes], seed: int, canar
         arguments = ["inspect"] if number % CONVERT_EVERY else ["convert", "-o", str(out)]
         env = {**os.environ, "TMPDIR": str(places[1])}
         process = measured(arguments[0], str(log), *arguments[1:], limit_s=HANG_S, cwd=places[0], env=env)
-        verdict = judge(process, (0, 1, 3))
-        problems = [verdict.problem] if verdict.problem else []
-        problems += ["a traceback"] if "Traceback" in process.err else []
-        problems += [f"more than {HANG_S:g} s"] if process.late else []
-        problems += [f"{process.peak_bytes >> 20} MiB"] if process.peak_bytes > LIMIT_BYTES else []
-        problems += ["left a process"] if process.left else []
-        problems += [f"left {path.name}" for place in places for path in place.iterdir()]
-        problems += ["contains another file"] if out.is_file() and _has_canary(out) else []
-        return Verdict(verdict.end, "; ".join(problems), {"s": process.wall_s, "bytes": process.peak_bytes})
+        left = [f"left {path.name}" for place in places for path in place.iterdir()]
+        if out.is_file() and any(_CANARY in m.data for m in messages(out)):
+            left.append("contains another file")
+        return judge_process(process, (0, 1, 3), HANG_S, *left)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _has_canary(path: Path) -> bool:
-    from mcap.reader import make_reader
-
-    with path.open("rb") as file:
-        return any(_CANARY in message.data for _, _, message in make_reader(file).iter_messages())

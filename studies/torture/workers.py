@@ -162,6 +162,20 @@ class Process(Ended):
     left: bool = False
 
 
+def judge_process(process: Process, allowed: Sequence[int], limit_s: float, *more: str) -> Verdict:
+    """Judge the end of a command and its costs; ``more`` are further problems, empty if there is none."""
+    verdict = judge(process, allowed)
+    problems = (
+        verdict.problem,
+        "a traceback" if "Traceback" in process.err else "",
+        f"more than {limit_s:g} s" if process.late or process.wall_s > limit_s else "",
+        f"{process.peak_bytes >> 20} MiB" if process.peak_bytes > LIMIT_BYTES else "",
+        "left a process" if process.left else "",
+        *more,
+    )
+    return Verdict(verdict.end, "; ".join(filter(None, problems)), {"s": process.wall_s, "bytes": process.peak_bytes})
+
+
 def start(
     *arguments: str, prefix: Sequence[str] = (), env: Mapping[str, str] | None = None, **options: object
 ) -> subprocess.Popen[bytes]:
