@@ -7,17 +7,18 @@ The constants that the paper leaves open come from ``python -m studies.paper.con
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
 
 from pdhef_logtool.car.car import Car
 from studies.gates.tool import Tool
-from studies.pages import ROOT, page_options, read_json, write, write_json
+from studies.pages import ROOT, page_options, write
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
-from studies.paper.page import write_page
-from studies.paper.results import gather
+from studies.paper.page import PAGE_FIGURES, write_page
+from studies.paper.results import document, gather
 
 #: Results of this command and of the constants, in the folder of results.
 STORED = ("results.json", "constants.json")
@@ -25,10 +26,10 @@ STORED = ("results.json", "constants.json")
 
 def render(results: Path, docs: Path) -> None:
     """Write the page from the stored results and figures of a folder."""
-    stored, constants = (read_json(results / name) for name in STORED)
+    stored, constants = (json.loads((results / n).read_text(encoding="utf-8")) for n in STORED)
     (docs / "paper").mkdir(parents=True, exist_ok=True)
-    for picture in results.glob("*.png"):
-        shutil.copyfile(picture, docs / "paper" / picture.name)
+    for name in PAGE_FIGURES:
+        shutil.copyfile(results / name, docs / "paper" / name)
     write(docs / "paper.md", write_page(stored, constants))
 
 
@@ -39,9 +40,9 @@ def main() -> int:
     given = parser.parse_args()
     if not given.stored:
         seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + given.noise_seeds)
-        experiment, results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)
-        draw(experiment, results, given.results)
-        write_json(given.results / STORED[0], results)
+        results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)
+        draw(results, given.results)
+        write(given.results / STORED[0], json.dumps(document(results), indent=1, allow_nan=False) + "\n")
     render(given.results, given.out)
     return 0
 

@@ -11,10 +11,11 @@ the chosen point, on these drives and on scenarios A and B, which have no part i
 from __future__ import annotations
 
 import itertools
+import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from studies.defaults.paper_drives import plan_drives
-from studies.pages import RESULTS, options, write_json
+from studies.pages import RESULTS, options, write
 from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, as_logged, on_the_road
 from truthsim.drive import Drive, simulate_drive
 
@@ -102,21 +103,22 @@ def cases_of(drives: Iterable[Drive], car: Car) -> list[Case]:
     return [Case(d, on_the_road(car, d.friction), use) for d in drives for use in SENSOR_SETS.values()]
 
 
-#: Geometric mean of the sideslip RMSE in degrees at a point.
-Goal = Callable[[Constants], float]
+class Goal:
+    """Geometric mean of the sideslip RMSE in degrees over cases; each point is computed once."""
+
+    def __init__(self, cases: Sequence[Case]) -> None:
+        self._cases = cases
+        self._values: dict[Constants, float] = {}
+
+    def __call__(self, point: Constants) -> float:
+        """Return the mean at a point."""
+        if point not in self._values:
+            logs = [np.log(case.rmse_deg(point)) for case in self._cases]
+            self._values[point] = float(np.exp(np.mean(logs)))
+        return self._values[point]
 
 
-def goal_of(cases: Sequence[Case]) -> Goal:
-    """Return the goal over cases; each point is computed once."""
-
-    @cache
-    def goal(point: Constants) -> float:
-        return float(np.exp(np.mean([np.log(case.rmse_deg(point)) for case in cases])))
-
-    return goal
-
-
-def choose(goal: Goal, start: Constants = START) -> Constants:
+def choose(goal: Callable[[Constants], float], start: Constants = START) -> Constants:
     """Return the result of the cyclic search."""
     while True:
         point = start
@@ -144,14 +146,14 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, default=FILE)
     arguments = parser.parse_args()
     car = Car.load("saloon")
-    training = goal_of(cases_of(training_drives(), car))
+    training = Goal(cases_of(training_drives(), car))
     chosen = choose(training)
     seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + NOISE_SEEDS)
     goals = {"training drives": training}
     for scenario in SCENARIO_PAIR:
         cases = cases_of((simulate_drive(scenario.manoeuvre, seed=seed) for seed in seeds), car)
         for title, use_speed in SENSOR_SETS.items():
-            goals[f"{scenario.name}, {title}"] = goal_of([c for c in cases if c.use_speed == use_speed])
+            goals[f"{scenario.name}, {title}"] = Goal([c for c in cases if c.use_speed == use_speed])
     document = {
         "made_by": "python -m studies.paper.constants",
         "training_drives": COUNT,
@@ -162,7 +164,7 @@ def main() -> int:
                   "errors_deg": {title: goal(START) for title, goal in goals.items()}},
                  *sensitivity(chosen, goals)],
     }  # fmt: skip
-    write_json(arguments.output, document)
+    write(arguments.output, json.dumps(document, indent=1) + "\n")
     return 0
 
 

@@ -21,34 +21,11 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool, estimates
-from studies.pages import read_toml
+from studies.paper.schemes import ESP, SCHEMES
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import MANOEUVRES
 
-#: Published values, documented in their file.
-PUBLISHED = read_toml(Path(__file__).with_name("published.toml"))
-
-#: End of the names of schemes without wheel speed, the paper's sensor set.
-ESP = ", esp"
-
-#: All schemes that belong in the tables (docs/method.md#evaluation).
-SCHEMES = (
-    "zero", "zero:no-lateral", "kinematic", "open-loop", "linear-regression", "phy-ukf", "phy-ukf:tuned", "physics",
-    "pure-lstm", "pd-hef-paper", "pd-hef:fixed-r", "pd-hef",
-    *(f"{name}{ESP}" for name in ("phy-ukf", "physics", "pd-hef-paper", "pd-hef")),
-)  # fmt: skip
-
-#: Our hybrid filter, the paper's, and the paper's three in the order in which the time histories draw them.
-HYBRID, PAPER = "pd-hef", "pd-hef-paper"
-DRAWN = ("phy-ukf", "pure-lstm", HYBRID)
-#: Scheme and baseline of the improvements.
-PAIRS = (
-    *((HYBRID, b) for b in ("phy-ukf", "physics", PAPER, "phy-ukf:tuned", "linear-regression", "pure-lstm")),
-    (PAPER, "phy-ukf"),
-    (f"{HYBRID}{ESP}", f"phy-ukf{ESP}"),
-    (f"{PAPER}{ESP}", f"phy-ukf{ESP}"),
-)
 GRAVITY_M_S2 = 9.80665
 #: Sensor errors of the reported drives. No training or tuning set has these seeds: sample logs have seeds of one digit,
 #: the sets of the shipped car are drawn from seeds 1000 to 4000.
@@ -123,10 +100,11 @@ class Experiment:
         """Return the ground truth of the first noise seed."""
         return self.tracks[scenario].filter(estimator="truth").sort("stamp_ns")
 
-    def track(self, scenario: str, scheme: str) -> pl.DataFrame:
-        """Return the estimate of a scheme at the stamps of the ground truth."""
+    def track(self, scenario: str, scheme: str) -> pl.DataFrame | None:
+        """Return the estimate of a scheme at the stamps of the ground truth; None if it did not run."""
         own = self.tracks[scenario].filter(estimator=scheme)
-        return self.truth(scenario).select("stamp_ns").join(own, on="stamp_ns", how="left", maintain_order="left")
+        stamps = self.truth(scenario).select("stamp_ns")
+        return stamps.join(own, on="stamp_ns", how="left", maintain_order="left") if len(own) else None
 
 
 def valid(track: pl.DataFrame, column: str) -> FloatArray:
@@ -224,14 +202,16 @@ def spread(metrics: pl.DataFrame, scenario: str, scheme: str, figure: str) -> di
     return {"median": float(np.median(values)), "low": min(values), "high": max(values), "n": len(values)}
 
 
-def improvement(metrics: pl.DataFrame, scenario: str, scheme: str, baseline: str) -> dict[str, Any]:
-    """Return the relative reduction of the sideslip RMSE, pooled over the seeds.
+def improvement(metrics: pl.DataFrame, scenario: str, scheme: str, baseline: str) -> dict[str, Any] | None:
+    """Return the relative reduction of the sideslip RMSE, pooled over the seeds; None if a scheme is missing.
 
     Its bounds are those of a bootstrap in which seeds are drawn in pairs; NaN with fewer than two.
     """
     of = metrics.filter(scenario=scenario, figure="sideslip_deg")
     ours, theirs = (of.filter(scheme=name).select("noise_seed", "value") for name in (scheme, baseline))
     both = ours.join(theirs, on="noise_seed", suffix="_baseline").sort("noise_seed")
+    if both.is_empty():
+        return None
     squares = both.select("value", "value_baseline").to_numpy() ** 2
 
     def share(sums: np.ndarray) -> np.ndarray:

@@ -7,9 +7,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from studies.pages import table, template
-from studies.paper.experiment import HYBRID, PAPER, PUBLISHED, SCHEMES
+from studies.paper.schemes import HYBRID, PAPER, PUBLISHED, SCHEMES
 from truthsim.sensors import SensorNoise
 
+#: Figures of the page; the folder of results contains all.
+PAGE_FIGURES = (
+    "figure09_convergence.png", "figure12_sideslip_a.png", "figure16_sideslip_b.png", "figure22_rmse.png",
+    "figure23_step_time.png",
+)  # fmt: skip
 #: Rows of the sensitivity, with the symbols of the page.
 CONSTANTS = {
     "start": "first point of the search",

@@ -61,7 +61,7 @@ def test_sideslip_stays_below_its_bounds(shipped: Experiment) -> None:
 @pytest.mark.parametrize("key", list(LEAST_GAIN), ids="-".join)
 def test_the_hybrid_filter_keeps_its_gain(shipped: Experiment, key: tuple[str, str, str]) -> None:
     found = improvement(shipped.metrics, *key)
-    assert found["value"] > LEAST_GAIN[key]
+    assert found is not None and found["value"] > LEAST_GAIN[key]
 
 
 def test_drives_are_the_papers(shipped: Experiment) -> None:
@@ -83,9 +83,11 @@ def test_improvement_is_that_of_pooled_errors_and_pairs_the_noise_seeds() -> Non
     theirs = {1: 1.0, 2: 2.0, 3: 4.0}
     # Half the error on every drive: paired seeds remove all variation, however different the drives are.
     gain = improvement(_metrics({s: 0.5 * v for s, v in theirs.items()}, theirs), "A", "ours", "theirs")
+    assert gain is not None
     assert (gain["value"], gain["low"], gain["high"]) == pytest.approx((0.5, 0.5, 0.5))
 
     mixed = improvement(_metrics({1: 0.1, 2: 2.5, 3: 4.0}, theirs), "A", "ours", "theirs")
+    assert mixed is not None
     expected = 1.0 - math.sqrt((0.1**2 + 2.5**2 + 4.0**2) / (1.0 + 4.0 + 16.0))
     assert mixed["value"] == pytest.approx(expected)
     assert mixed["low"] < mixed["value"] < 0.0 < mixed["high"]
