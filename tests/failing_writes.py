@@ -1,7 +1,5 @@
 """Makes the n-th call fail with which files are written, wherever in the program it stands."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -12,8 +12,6 @@ changes, and numba's cache remains valid. A fault in a compiled function (``comp
 numba would take its callers from the cache. Exit code 1: a mutant survived or its lines are gone.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

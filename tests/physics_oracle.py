@@ -3,8 +3,6 @@
 It shares no code with the compiled model, nor its integration steps, sigma points or order of evaluation.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

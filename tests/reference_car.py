@@ -3,8 +3,6 @@
 It shares no code with ``pdhef_logtool.car.nominal_model``: it is the reference for the compiled model.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

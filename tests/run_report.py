@@ -1,7 +1,5 @@
 """Reports of runs with figures that a test gives."""
 
-from __future__ import annotations
-
 import functools
 import html
 import re

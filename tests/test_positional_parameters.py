@@ -1,7 +1,5 @@
 """No function takes more than eight positional parameters without a reason beside it."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path
@@ -31,7 +29,7 @@ def overlong(source: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("package", ["pdhef_logtool", "truthsim", "studies", "benchmarks"])
-def test_no_function_takes_many_positional_parameters(package: str) -> None:
+def test_no_function_takes_many_positional_parameters(package):
     found = {str(p.relative_to(_ROOT)): overlong(p.read_text()) for p in sorted((_ROOT / package).rglob("*.py"))}
     assert found, "nothing was looked at"
     assert {path: names for path, names in found.items() if names} == {}

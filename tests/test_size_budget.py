@@ -1,14 +1,11 @@
 """Size limits: the counted figures, and that no limit rises without a reason."""
 
-from __future__ import annotations
-
 import ast
-from pathlib import Path
 
 import size_budget
 
 
-def test_long_and_complex_functions_count_unless_they_are_compiled(tmp_path: Path) -> None:
+def test_long_and_complex_functions_count_unless_they_are_compiled(tmp_path):
     body = "def f(x):\n" + "    if x:\n        x += 1\n" * 31
     (tmp_path / "a.py").write_text(body)
     assert size_budget.python_sizes(tmp_path)["long_functions"] == 1
@@ -19,13 +16,13 @@ def test_long_and_complex_functions_count_unless_they_are_compiled(tmp_path: Pat
     assert (sizes["long_functions"], sizes["complex_functions"]) == (0, 0)
 
 
-def test_a_size_above_its_limit_or_without_one_is_a_problem() -> None:
+def test_a_size_above_its_limit_or_without_one_is_a_problem():
     assert list(size_budget.problems({"a.x": 3}, {"a.x": 3})) == []
     assert "a.x: 4, limit 3" in next(size_budget.problems({"a.x": 4}, {"a.x": 3}))
     assert "expected in both" in next(size_budget.problems({"a.x": 4}, {}))
 
 
-def test_a_limit_rises_with_a_reason_only() -> None:
+def test_a_limit_rises_with_a_reason_only():
     before, after = {"a": {"x": 3}}, {"a": {"x": 4}}
     assert "raised from 3 to 4" in next(size_budget.unexplained(after, before))
     reasons = [{"figure": "a.x", "limit": 4, "reason": "a log format"}]

@@ -1,9 +1,6 @@
 """The residual gain of pd-hef: 1 with a network for the physics of the car, unless file or name state another."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import polars as pl
 import pytest
@@ -23,10 +20,10 @@ OWN, FOREIGN = replace(random_network(), physics_sha256=SEDAN.physics_sha256), r
 def _gain(car: Car, name: str = "pd-hef") -> tuple[float, str]:
     """Return gain and note of an estimator."""
     estimator = make_estimator(name, car)
-    return estimator.trust, " ".join(estimator.notes)  # type: ignore[attr-defined]
+    return estimator.trust, " ".join(estimator.notes)
 
 
-def test_a_network_acts_on_the_physics_that_it_was_trained_with() -> None:
+def test_a_network_acts_on_the_physics_that_it_was_trained_with():
     own, foreign = replace(SEDAN, network=OWN), replace(SEDAN, network=FOREIGN)
     assert _gain(own) == (1.0, "residual gain 1: within its region of validity")
     assert _gain(foreign) == (
@@ -38,7 +35,7 @@ def test_a_network_acts_on_the_physics_that_it_was_trained_with() -> None:
     assert _gain(own.with_noise("physics", FilterNoise(q_std=(1.0, 1.0, 1.0))))[0] == 1.0
 
 
-def test_the_file_decides_before_the_network_and_the_name_before_both(tmp_path: Path) -> None:
+def test_the_file_decides_before_the_network_and_the_name_before_both(tmp_path):
     for gain in (0.0, 0.25):
         (tmp_path / "car.toml").write_text(f"{part_toml(SEDAN.vehicle)}\n[network]\ngain = {gain}\n")
         loaded = Car.load(tmp_path / "car.toml")
@@ -50,7 +47,7 @@ def test_the_file_decides_before_the_network_and_the_name_before_both(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_run_says_the_gain_and_uses_it(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_a_run_says_the_gain_and_uses_it(sample_logs_dir, tmp_path):
     vehicle = read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle
     car = tmp_path / "car"
     car.mkdir()

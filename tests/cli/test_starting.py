@@ -1,7 +1,5 @@
 """A command imports only the modules that it needs. Process start dominates the run time of a short log."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -29,7 +27,7 @@ loaded("torch", "rerun", "scipy.linalg", "scipy.special", "scipy.ndimage", "matp
 
 
 @pytest.mark.slow
-def test_the_package_an_inspection_and_a_light_run_load_no_large_library_that_they_do_not_need(tmp_path: Path) -> None:
+def test_the_package_an_inspection_and_a_light_run_load_no_large_library_that_they_do_not_need(tmp_path):
     words = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "-o", str(tmp_path / "out"), "--end", "2")
     done = subprocess.run(
         [sys.executable, "-c", _CODE, *words, "--keep", "metrics", "--no-report"],
@@ -85,7 +83,7 @@ def ended_without_torch(folder: Path, *commands: tuple[object, ...]) -> list[str
 
 
 @pytest.mark.slow
-def test_what_trains_no_network_works_without_it_and_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
+def test_what_trains_no_network_works_without_it_and_what_trains_one_ends_with_one_line(tmp_path):
     drive = ("sample_logs/dlc.mcap", "--car", "saloon", "--set", "end=3")
     trained = ("train", tmp_path, "-o", tmp_path / "network")
     ran, extracted, *refused = ended_without_torch(

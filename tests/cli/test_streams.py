@@ -1,7 +1,5 @@
 """Readers that go, terminals that are full, streams that are closed, and requests to end."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -15,7 +13,7 @@ FULL = Path("/dev/full")
 
 
 @pytest.mark.slow
-def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path) -> None:
+def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir):
     read, write = os.pipe()
     os.close(read)
     command = ["inspect", str(sample_logs_dir / "dlc.mcap")]
@@ -26,7 +24,7 @@ def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
-def test_an_output_that_takes_nothing_is_one_line() -> None:
+def test_an_output_that_takes_nothing_is_one_line():
     with FULL.open("w") as full:
         done = subprocess.run([*PDHEF, "--version"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
@@ -37,7 +35,7 @@ def test_an_output_that_takes_nothing_is_one_line() -> None:
 
 
 @pytest.mark.slow
-def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path: Path) -> None:
+def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path):
     log = tmp_path / "x.mcap"
     shell = " ".join([*PDHEF, "simulate", "dlc", "--duration", "5", "-o", str(log), "0>&- 1>&- 2>&-"])
     done = subprocess.run(["sh", "-c", shell], capture_output=True, check=False)
@@ -69,14 +67,14 @@ main()
     ("name", "way", "code", "said"),
     [("SIGINT", "changed", 130, "interrupted"), ("SIGTERM", "swallowed", 143, "terminated")],
 )
-def test_a_request_to_end_is_one_line_whatever_becomes_of_it(name: str, way: str, code: int, said: str) -> None:
+def test_a_request_to_end_is_one_line_whatever_becomes_of_it(name, way, code, said):
     script = STOP.format(name=name, way=way)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr == f"pdhef: {said}; no output file was left incomplete\n"
 
 
-def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so() -> None:
+def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so():
     script = "import signal; from pdhef_logtool.cli import stopping\n"
     script += "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nstopping.watch()\n"
     script += "signal.raise_signal(signal.SIGTERM)\n"
@@ -86,9 +84,7 @@ def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so() -> None:
     assert (done.returncode, done.stdout) == (-signal.SIGINT, "")
 
 
-def test_without_a_terminal_progress_is_a_line_every_half_minute(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_terminal_progress_is_a_line_every_half_minute(monkeypatch, capsys):
     from pdhef_logtool.cli import console
 
     now = [0.0]

@@ -1,7 +1,5 @@
 """Alignment: no value crosses a gap, each measurement counts once, late measurements do not delay a step."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The hash that says whether two files are recordings of one drive."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -43,8 +41,8 @@ def _write(path: Path, topics: tuple[str, ...], container: str, factor: float = 
 
 def _hashes(path: Path, **changed: object) -> tuple[str | None, str | None]:
     sources = (
-        SignalSource("ay_m_s2", "/imu", ("linear_acceleration.y",), **changed),  # type: ignore[arg-type]
-        SignalSource("yaw_rate_rad_s", "/imu", ("angular_velocity.z",), **changed),  # type: ignore[arg-type]
+        SignalSource("ay_m_s2", "/imu", ("linear_acceleration.y",), **changed),
+        SignalSource("yaw_rate_rad_s", "/imu", ("angular_velocity.z",), **changed),
         SignalSource("speed_m_s", "/speed", ("twist.linear.x",)),
         SignalSource("vx_m_s", "/ins", ("twist.twist.linear.x",)),
         SignalSource("vy_m_s", "/ins", ("twist.twist.linear.y",)),
@@ -56,13 +54,13 @@ def _hashes(path: Path, **changed: object) -> tuple[str | None, str | None]:
 
 
 @pytest.fixture(scope="module")
-def full(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str | None, str | None]]:
+def full(tmp_path_factory):
     path = _write(tmp_path_factory.mktemp("full") / "drive", ALL, "rosbag2-mcap")
     return path, _hashes(path)
 
 
 @pytest.mark.slow
-def test_a_slim_copy_and_other_containers_have_one_hash(tmp_path: Path, full: tuple[Path, tuple[str, str]]) -> None:
+def test_a_slim_copy_and_other_containers_have_one_hash(tmp_path, full):
     _, expected = full
     assert None not in expected
     assert expected[0] != expected[1]
@@ -71,17 +69,17 @@ def test_a_slim_copy_and_other_containers_have_one_hash(tmp_path: Path, full: tu
     assert _hashes(_write(tmp_path / "drive", MAPPED, "rosbag1")) == expected
 
 
-def test_a_latency_that_becomes_known_leaves_the_drive_the_same(full: tuple[Path, tuple[str, str]]) -> None:
+def test_a_latency_that_becomes_known_leaves_the_drive_the_same(full):
     assert _hashes(full[0], latency_s=0.02) == full[1]
 
 
-def test_another_truth_is_another_truth_of_the_same_drive(tmp_path: Path, full: tuple[Path, tuple[str, str]]) -> None:
+def test_another_truth_is_another_truth_of_the_same_drive(tmp_path, full):
     signals, truth = _hashes(_write(tmp_path / "truth", MAPPED, "rosbag2-mcap", factor=1.0 + 1e-12))
     assert signals == full[1][0]
     assert truth != full[1][1]
 
 
-def test_other_values_and_another_scale_are_another_drive(tmp_path: Path, full: tuple[Path, tuple[str, str]]) -> None:
+def test_other_values_and_another_scale_are_another_drive(tmp_path, full):
     signals, truth = _hashes(_write(tmp_path / "other", MAPPED, "rosbag2-mcap", ay_offset=1e-9))
     assert signals != full[1][0]
     assert truth == full[1][1]

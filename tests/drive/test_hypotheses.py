@@ -1,10 +1,7 @@
 """The posterior of mistakes: constant factors are units, gains that change are the car's, and units are likelier."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,11 +33,11 @@ def probabilities(*relations: Relation) -> dict[str, float]:
 
 @settings(max_examples=50, deadline=None, derandomize=True)
 @given(gains=st.lists(st.floats(0.7, 1.5), min_size=3, max_size=8))
-def test_plausible_gains_blame_nobody(gains: list[float]) -> None:
+def test_plausible_gains_blame_nobody(gains):
     assert max(probabilities(relation(*gains)).values()) < 0.05
 
 
-def test_a_unit_is_wrong_in_every_block_and_a_slide_in_some() -> None:
+def test_a_unit_is_wrong_in_every_block_and_a_slide_in_some():
     sound = relation(1.0, 1.05, 0.95, 1.0, powers={"speed_m_s": 1}, text="another speed")
     degrees = np.pi / 180.0
     wrong = probabilities(sound, *(relation(*(g * degrees for g in (1.0, 1.1, 0.9, 1.0)), text=t) for t in "ab"))
@@ -48,7 +45,7 @@ def test_a_unit_is_wrong_in_every_block_and_a_slide_in_some() -> None:
     assert max(probabilities(sound, relation(1.0, 0.6, 0.35, 0.2)).values()) < 0.05
 
 
-def test_two_mistakes_are_found_that_are_worse_than_none_alone() -> None:
+def test_two_mistakes_are_found_that_are_worse_than_none_alone():
     """All that turns counts to the right, and only the path over ground shows it: IMU and steering are two mistakes."""
     steady, steer = (1.0, 1.1, 0.9, 1.0), {"steer_rad": 1}
     relations = [
@@ -63,7 +60,7 @@ def test_two_mistakes_are_found_that_are_worse_than_none_alone() -> None:
     assert probability > 0.97 and {n for h in chosen for n in h.factors} == {*imu, "steer_rad"}
 
 
-def test_scales_of_right_mappings_are_those_of_units() -> None:
+def test_scales_of_right_mappings_are_those_of_units():
     """A gain between km/h and mph fits both; only one of them corrects the mapping to the scale of a unit."""
     between = relation(2.8, 2.9, 2.85, powers={"speed_m_s": 1}, text="another speed")
     likeliest = {
@@ -76,7 +73,7 @@ def test_scales_of_right_mappings_are_those_of_units() -> None:
     assert counts == posterior([between], known_hypotheses(("speed_m_s",)))
 
 
-def test_inspect_and_run_refuse_the_same_channels(sample_logs_dir: Path) -> None:
+def test_inspect_and_run_refuse_the_same_channels(sample_logs_dir):
     log = open_log(sample_logs_dir / "dlc.mcap")
     right = auto_map(log).mapping
     degrees = {"yaw_rate_rad_s": scaled_source(right.truth["yaw_rate_rad_s"], 180.0 / np.pi)}

@@ -1,9 +1,6 @@
 """Mistakes of a mapping: wrong units, signs, axes and topics are named with the right remedy, and nothing else is."""
 
-from __future__ import annotations
-
 import tomllib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,7 +50,7 @@ def checks_by_name(vehicle: VehicleParameters, vy_factor: float) -> dict[str, Ch
 
 @pytest.mark.parametrize("place_m", [-1.1, 0.0])
 @pytest.mark.parametrize("factor", [1.0, 57.2958, 1.0 / 57.2958, 9.80665, 1.0 / 9.80665])
-def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -> None:
+def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
     vehicle = VEHICLE.model_copy(update={"truth_position_m": (place_m, 0.0, 0.0)})
     checks = checks_by_name(vehicle, factor)
     if factor == 1.0:
@@ -64,9 +61,7 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -
 
 @pytest.mark.parametrize(("mirrored", "antenna_m"), [(False, 0.0), (True, 0.0), (False, 1.5)])
 @pytest.mark.parametrize("factor", [1.0, 3.6, 1.0 / 3.6, -1.0])
-def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
-    factor: float, mirrored: bool, antenna_m: float
-) -> None:
+def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(factor, mirrored, antenna_m):
     """A rigid-body identity: a pose with y to the right, or from an antenna further ahead, fails no check."""
     vehicle = default_vehicle().model_copy(update={"truth_position_m": (1.3, 0.0, 0.0)})
     signals, truth = with_truth(vehicle, 1.0)
@@ -85,7 +80,7 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
 
 
-def test_exchanged_velocities_of_ground_truth_are_named() -> None:
+def test_exchanged_velocities_of_ground_truth_are_named():
     signals, truth = with_truth(VEHICLE, 1.0)
     ahead, across = truth["vx_m_s"], truth["vy_m_s"]
     truth |= {"vx_m_s": replace(ahead, values=across.values), "vy_m_s": replace(across, values=ahead.values)}
@@ -95,7 +90,7 @@ def test_exchanged_velocities_of_ground_truth_are_named() -> None:
     assert {c.subject for c in found if c.verdict == "failed"} <= {*named, "truth.sideslip_rad"}
 
 
-def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> None:
+def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro():
     signals, truth = with_truth(VEHICLE, 1.0)
     rate = truth["yaw_rate_rad_s"]
     truth["yaw_rate_rad_s"] = replace(rate, values=2000.0 * rate.values)
@@ -103,7 +98,7 @@ def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> Non
     assert {c.subject for c in found if c.verdict == "failed"} == {"truth.yaw_rate_rad_s"}
 
 
-def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back() -> None:
+def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back():
     """A file without the place of ground truth means the CG; the lever of its front axle is no other unit."""
     back = VEHICLE.model_copy(update={"cg_to_rear_axle_m": 0.8, "cg_to_front_axle_m": 1.8})
     signals, truth = with_truth(back, 1.0)
@@ -111,7 +106,7 @@ def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back() -> None
     assert axle.law.gains[1] > (0.8 + 1.8) / 0.8
 
 
-def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
+def test_a_unit_that_the_drive_leaves_open_is_not_checkable():
     """At a low correlation both regressions reach far: 3.6 times as much would be plausible too."""
     signals = drive(3)
     ay = signals["ay_m_s2"]
@@ -120,12 +115,11 @@ def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
     kept = {n: signals[n] for n in ("yaw_rate_rad_s", "speed_m_s")} | {"ay_m_s2": loud}
     checks = {c.name: c for c in checks_of(kept)}
     unit = checks.get("ay_m_s2.unit", checks.get("ay_m_s2.sign"))
-    assert unit is not None
     assert unit.verdict == "undecided"
     assert unit.remedy.startswith("needs ")
 
 
-def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed() -> None:
+def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed():
     """Without ground truth, four wheel speeds with reversed sign contradict no other signal."""
     signals = {n: c for n, c in drive(3, calm=True).items() if n in ("wheel_speed_rl_m_s", "yaw_rate_rad_s", "ay_m_s2")}
     wheel = signals["wheel_speed_rl_m_s"]
@@ -136,7 +130,7 @@ def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed() -> None:
 
 
 @pytest.mark.parametrize(("name", "factor"), [("x_m", 1e-3), ("y_m", 3.2808), ("x_m", -1.0), ("y_m", -1.0), ("", 1.0)])
-def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(name: str, factor: float) -> None:
+def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(name, factor):
     signals, truth = with_truth(VEHICLE, 1.0)
     vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
     yaw = np.cumsum(rate) * 0.01
@@ -157,7 +151,7 @@ def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(
         assert set(misread_channels(checks)) == {expected.rpartition(".")[0]}
 
 
-def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
+def test_exchanged_degrees_of_a_place_are_named_as_such():
     signals, truth = with_truth(VEHICLE, 1.0)
     yaw = np.cumsum(truth["yaw_rate_rad_s"].values) * 0.01
     north, east = (np.cumsum(truth["vx_m_s"].values * way) * 0.01 / 111_320.0 for way in (np.sin(yaw), np.cos(yaw)))
@@ -175,7 +169,7 @@ def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
 
 
 @pytest.mark.parametrize("factor", [1.0, np.pi / 180.0, 180.0 / np.pi, -1.0])
-def test_a_heading_turns_as_the_gyro_does(factor: float) -> None:
+def test_a_heading_turns_as_the_gyro_does(factor):
     signals, truth = with_truth(VEHICLE, 1.0)
     yaw = 1.0 + np.cumsum(truth["yaw_rate_rad_s"].values) * 0.01
     truth["yaw_rad"] = replace(truth["vx_m_s"], name="yaw_rad", values=factor * np.angle(np.exp(1j * yaw)))
@@ -190,7 +184,7 @@ pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
 
 @pytest.fixture(scope="module")
-def mapping_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], dict[str, Any]]:
+def mapping_of(tmp_path_factory):
     """Return the mapping file that is recognised of a log."""
 
     def recognise(path: Path) -> dict[str, Any]:
@@ -201,7 +195,7 @@ def mapping_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], dic
     return recognise
 
 
-def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path, tmp_path: Path, mapping_of: Any) -> None:
+def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir, tmp_path, mapping_of):
     """A wrong unit, sign and axis of each signal; the speed and the tyres of the default car may leave one open."""
     path = sample_logs_dir / "dlc.mcap"
     mapping = mapping_of(path)
@@ -220,7 +214,7 @@ def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path, t
         ("roll_rate_rad_s", 300.0, "degrees"),
     ],
 )
-def test_impossible_magnitudes_need_no_second_signal(name: str, factor: float, remedy: str) -> None:
+def test_impossible_magnitudes_need_no_second_signal(name, factor, remedy):
     channel = drive(3)[name.replace("roll", "yaw")]
     checks = checks_of({name: replace(channel, name=name, values=channel.values * factor)})
     (check,) = (c for c in checks if c.name == f"{name}.unit")
@@ -236,9 +230,7 @@ def run_with(path: Path, mapping: Path, out: Path) -> int:
 
 
 @pytest.mark.parametrize(("subject", "kind", "code"), [("steer_rad", "x57.3", 3), ("wheel_speed", "/57.3", 1)])
-def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(
-    sample_logs_dir: Path, tmp_path: Path, mapping_of: Any, subject: str, kind: str, code: int
-) -> None:
+def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(sample_logs_dir, tmp_path, mapping_of, subject, kind, code):
     path = sample_logs_dir / "fishhook.mcap"
     wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), subject, kind))
     if code == 1:
@@ -248,7 +240,7 @@ def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(
         assert run_with(path, wrong, tmp_path / "out") == code
 
 
-def test_a_waived_check_stops_nothing(sample_logs_dir: Path, tmp_path: Path, mapping_of: Any) -> None:
+def test_a_waived_check_stops_nothing(sample_logs_dir, tmp_path, mapping_of):
     path = sample_logs_dir / "fishhook.mcap"
     wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), "steer_rad", "x57.3"))
     car = sample_logs_dir / "vehicle.toml"

@@ -1,7 +1,5 @@
 """The one way to read a drive: it is read once, logs are closed, and the source of its friction is stated."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -26,7 +24,7 @@ from pdhef_logtool.runs.config import RunConfig
 
 
 @pytest.fixture
-def car(sample_logs_dir: Path) -> Car:
+def car(sample_logs_dir):
     return Car.load(sample_logs_dir / "vehicle.toml")
 
 
@@ -37,9 +35,7 @@ def _assert_equal(a: Signals | StateTrack, b: Signals | StateTrack) -> None:
             assert x.tobytes() == y.tobytes(), f.name
 
 
-def test_a_drive_is_read_once_and_says_the_same_again(
-    sample_logs_dir: Path, car: Car, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_is_read_once_and_says_the_same_again(sample_logs_dir, car, monkeypatch):
     reads: list[object] = []
     monkeypatch.setattr(recorded, "read_signals", lambda *a: reads.append(a) or read_signals(*a))
     with read_drive(sample_logs_dir / "dlc.mcap", car, options=ReadOptions()) as drive:
@@ -56,7 +52,7 @@ def test_a_drive_is_read_once_and_says_the_same_again(
     assert first.seconds == pytest.approx(9.5, abs=0.1)
 
 
-def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> None:
+def test_what_is_told_is_noted_and_named(sample_logs_dir, car):
     told: list[str] = []
     without = Car(car.vehicle.model_copy(update={"friction": None}))
     with read_drive(sample_logs_dir / "dlc.mcap", without, tell=told.append) as drive:
@@ -69,7 +65,7 @@ def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> Non
     assert notes[-1] == "one more"
 
 
-def test_the_mapping_can_be_adjusted_and_is_checked(sample_logs_dir: Path, car: Car) -> None:
+def test_the_mapping_can_be_adjusted_and_is_checked(sample_logs_dir, car):
     def with_friction(field: str) -> reading.Adjust:
         def adjust(_log: DriveLog, mapping: Mapping, tell: Tell) -> Mapping:
             tell("adjusted")
@@ -90,7 +86,7 @@ def test_the_mapping_can_be_adjusted_and_is_checked(sample_logs_dir: Path, car: 
         read_drive(log, car, options=options, adjust=with_friction("nothing"))
 
 
-def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bounds_and_ends(sample_logs_dir, car, monkeypatch):
     closed: list[str] = []
     open_log = reading.open_log
 
@@ -110,9 +106,7 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("size", [250, 3000])
-def test_a_log_that_is_cut_before_its_messages_names_the_cut_and_the_remedy(
-    sample_logs_dir: Path, tmp_path: Path, car: Car, size: int
-) -> None:
+def test_a_log_that_is_cut_before_its_messages_names_the_cut_and_the_remedy(sample_logs_dir, tmp_path, car, size):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes((sample_logs_dir / "dlc.mcap").read_bytes()[:size])
     with pytest.raises(MappingError, match=f"the file ends inside a record at byte .* of {size}") as error:
@@ -136,10 +130,10 @@ def test_other_texts_are_refused(text):
 
 def _read(logs: Path, **options: object) -> Drive:
     """Open a drive on a road with friction 0.3; the vehicle file states 0.85."""
-    return read_drive(logs / "sweep.mcap", logs / "vehicle.toml", options=RunConfig(end="4", **options).read_options)  # type: ignore[arg-type]
+    return read_drive(logs / "sweep.mcap", logs / "vehicle.toml", options=RunConfig(end="4", **options).read_options)
 
 
-def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir: Path) -> None:
+def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir):
     with _read(sample_logs_dir) as drive:
         frictions = []
         for of_truth in (True, False):
@@ -153,15 +147,13 @@ def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir: Path)
 
 
 @pytest.mark.parametrize("options", [{"friction": 0.5}, {"prefer_truth": "rtk"}])
-def test_a_friction_of_the_options_and_another_ground_truth_go_before(
-    sample_logs_dir: Path, options: dict[str, object]
-) -> None:
+def test_a_friction_of_the_options_and_another_ground_truth_go_before(sample_logs_dir, options):
     with _read(sample_logs_dir, **options) as drive:
         source = friction_of(drive.plan, drive.car.vehicle, drive.options, of_truth=True)
         assert source.source is not FrictionFrom.TRUTH
 
 
-def test_segments_take_the_friction_of_the_ground_truth_and_estimators_do_not(sample_logs_dir: Path) -> None:
+def test_segments_take_the_friction_of_the_ground_truth_and_estimators_do_not(sample_logs_dir):
     with _read(sample_logs_dir) as drive:
         whole, vehicle = drive.whole(), drive.car.vehicle
     assert whole.truth is not None and "friction" not in whole.signals.available

@@ -1,9 +1,6 @@
 """Truth: every derivation against one analytic drive, latency and dependence found again."""
 
-from __future__ import annotations
-
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -446,7 +443,7 @@ SLOW_M_S, RATE_HZ = 1.0, 50
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     """Write 20 s of driving: at 10 s the car stops, at 14 s the sensors fail for 2 s beside the ground truth."""
     path = tmp_path_factory.mktemp("log") / "correvit.csv"
     t = np.arange(20 * RATE_HZ) / RATE_HZ
@@ -458,7 +455,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_sideslip_alone_is_scored_above_the_measured_low_speed_limit(log: Path) -> None:
+def test_sideslip_alone_is_scored_above_the_measured_low_speed_limit(log):
     mapping = log.with_suffix(".toml")
     entry = '[{}]\ntopic = "csv"\nfield = "{}"\n'
     fields = {"speed_m_s": "Speed", "yaw_rate_rad_s": "YawRate", "ay_m_s2": "AccY", "ax_m_s2": "AccX"}

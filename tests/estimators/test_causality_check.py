@@ -1,10 +1,7 @@
 """No estimator is scored that declares itself causal and looks ahead; the harness alone compensates latency."""
 
-from __future__ import annotations
-
 import re
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -66,7 +63,7 @@ class Cheat:
 
 
 @pytest.fixture(scope="module")
-def signals() -> Signals:
+def signals():
     s = with_noise(drive(slalom(0.03, 0.5), 4.0, speed=22.0).signals, seed=3)
     return replace(s, ready_ns=s.stamps_ns + 16_000_000)
 
@@ -81,12 +78,12 @@ def reason(estimator: Any, signals: Signals, *windows: tuple[int, int]) -> str:
 
 
 @pytest.mark.parametrize("of", [peek, centred, over_window])
-def test_an_estimator_that_looks_ahead_fails(of: Any, signals: Signals) -> None:
+def test_an_estimator_that_looks_ahead_fails(of, signals):
     found = reason(Cheat(of), signals)
     assert re.search(r"causality check: .* steps up to \d+ ns change .* declare causal = False", found), found
 
 
-def test_looking_ahead_that_begins_late_is_found_in_a_later_window(signals: Signals) -> None:
+def test_looking_ahead_that_begins_late_is_found_in_a_later_window(signals):
     late = Cheat(lambda rate: peek(rate) if len(rate) == 77 else rate)
     starts = [0, 100, 110, 120]
     windows = [*zip(starts, [*starts[1:], 197], strict=True)]
@@ -95,15 +92,15 @@ def test_looking_ahead_that_begins_late_is_found_in_a_later_window(signals: Sign
 
 
 @pytest.mark.parametrize("of", [past, lambda rate: rate, np.cumsum])
-def test_a_causal_estimator_passes(of: Any, signals: Signals) -> None:
+def test_a_causal_estimator_passes(of, signals):
     assert reason(Cheat(of), signals) == ""
 
 
-def test_an_estimator_that_declares_that_it_is_not_causal_is_not_checked(signals: Signals) -> None:
+def test_an_estimator_that_declares_that_it_is_not_causal_is_not_checked(signals):
     assert reason(Cheat(peek, causal=False), signals) == ""
 
 
-def test_rounding_is_no_looking_ahead(signals: Signals) -> None:
+def test_rounding_is_no_looking_ahead(signals):
     """Sums of another length round differently; a real dependence is larger by far."""
     assert reason(Cheat(lambda rate: rate * (1.0 + 1e-13 * len(rate))), signals) == ""
     assert reason(Cheat(lambda rate: rate * (1.0 + 1e-6 * len(rate))), signals)
@@ -117,7 +114,7 @@ def _spec(name: str, of: str) -> Spec:
 
 
 @pytest.fixture
-def plugged(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def plugged(monkeypatch):
     specs = (*table.SPECS, _spec("peeks", "peek"), _spec("honest", "past"))
     monkeypatch.setattr(table, "all_specs", lambda: specs)
     yield
@@ -129,9 +126,7 @@ def _run(tmp_path: Path, sample_logs_dir: Path, *names: str) -> Any:
 
 
 @pytest.mark.slow
-def test_a_run_leaves_out_what_looks_ahead_says_why_and_ends_with_3(
-    plugged: None, tmp_path: Path, sample_logs_dir: Path
-) -> None:
+def test_a_run_leaves_out_what_looks_ahead_says_why_and_ends_with_3(plugged, tmp_path, sample_logs_dir):
     result = _run(tmp_path / "a", sample_logs_dir, "zero", "peeks", "honest")
     report = result.results[0].report
     outcomes = {e["name"]: e["outcome"] for e in report["estimators"]}
@@ -149,7 +144,7 @@ def test_a_run_leaves_out_what_looks_ahead_says_why_and_ends_with_3(
 
 
 @pytest.mark.slow
-def test_a_run_of_nothing_else_fails_with_the_reason(plugged: None, tmp_path: Path, sample_logs_dir: Path) -> None:
+def test_a_run_of_nothing_else_fails_with_the_reason(plugged, tmp_path, sample_logs_dir):
     with pytest.raises(EstimatorError, match="causality check"):
         _run(tmp_path, sample_logs_dir, "peeks")
 
@@ -158,7 +153,7 @@ def test_a_run_of_nothing_else_fails_with_the_reason(plugged: None, tmp_path: Pa
 
 
 @pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+def installed(tmp_path, monkeypatch):
     """Return a function that installs a package with an estimator for this test."""
     names: list[str] = []
 
@@ -175,9 +170,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calla
 
 
 @pytest.mark.slow
-def test_an_estimator_of_another_package_runs_under_its_name(
-    installed: Callable[..., None], tmp_path: Path, sample_logs_dir: Path
-) -> None:
+def test_an_estimator_of_another_package_runs_under_its_name(installed, tmp_path, sample_logs_dir):
     installed(example_code())
     result = _run(tmp_path / "out", sample_logs_dir, "zero", "half-slip")
     assert result.exit_code == EXIT_OK
@@ -198,9 +191,7 @@ def test_an_estimator_of_another_package_runs_under_its_name(
         (example_code().replace('"half-slip"', '"zero"'), "an estimator named zero exists"),
     ],
 )
-def test_a_package_that_cannot_be_used_is_named_and_left_out(
-    code: str, why: str, installed: Callable[..., None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_package_that_cannot_be_used_is_named_and_left_out(code, why, installed, capsys):
     installed(code, "broken_plugin")
     assert table.all_specs() == table.SPECS
     told = capsys.readouterr().err

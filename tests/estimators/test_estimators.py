@@ -1,7 +1,5 @@
 """Requirements for all estimators: continuity across windows, causality, symmetry, latency compensation, robustness."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 from functools import cache, partial
@@ -76,7 +74,7 @@ def worst(error: np.ndarray, mask: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def rough() -> Signals:
+def rough():
     """Noisy, on irregular stamps, with missing samples, a gap of 0.8 s and messages that arrive late and bunched."""
     rng = np.random.default_rng(11)
     dt = rng.uniform(0.004, 0.022, 500)
@@ -114,7 +112,7 @@ EVERY = {
 
 
 @pytest.fixture(scope="module")
-def faulty(rough) -> Signals:
+def faulty(rough):
     """The same with GNSS, a stuck gyro, a burst, a spike, spinning wheels and a second without steering."""
     rng = np.random.default_rng(3)
     t = (rough.stamps_ns - rough.stamps_ns[0]) * 1e-9
@@ -289,7 +287,7 @@ def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
 
 
 @pytest.fixture(scope="module")
-def plain() -> Signals:
+def plain():
     s = with_noise(drive(slalom(0.035, 0.5), 8.0, speed=22.0).signals, seed=9)
     s.friction[:] = 0.85
     return replace(s, ready_ns=s.stamps_ns + 10_000_000)

@@ -1,7 +1,5 @@
 """pd-hef: it is ``physics`` plus exactly the residual, and a right residual makes it right."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -31,7 +29,7 @@ COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis"
 
 
 @pytest.fixture(scope="module")
-def signals() -> Signals:
+def signals():
     made = drive(slalom(0.02, 0.3), 8.0, step_s=np.random.default_rng(0).uniform(0.008, 0.012, 800), speed_every=1)
     noisy = with_noise(made.signals, 0)
     return replace(noisy, ready_ns=noisy.stamps_ns + 10_000_000, available=frozenset(ALIGNED_SIGNALS))
@@ -47,7 +45,7 @@ def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) 
 
 
 @pytest.mark.parametrize("parts", [(), ("lag", "roll", "biases", "bank"), tuple(PhysicsParts.model_fields)])
-def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...], signals: Signals) -> None:
+def test_without_trust_it_is_physics_to_the_bit(parts, signals):
     trusted = hybrid(*parts)
     physics = run_estimator(AdaptivePhysics(trusted.physics, name="physics"), signals)
     for change in ({"trust": 0.0}, {"network": random_network(constant=(0.0, 0.0))}):
@@ -58,9 +56,7 @@ def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...], signals:
     assert not _same(run_estimator(trusted, signals), physics)
 
 
-def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none(
-    signals: Signals,
-) -> None:
+def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none(signals):
     estimator = hybrid("bank", "force_scale", network=random_network(constant=(0.4, 0.1)), trust=0.5)
     steps, _ = estimator.run(signals, None)
     unchanged, other_vehicle, banked = (f.residual_rate for f in steps.filters)
@@ -71,7 +67,7 @@ def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_ba
 
 #: A model without roll states has the body lean with a force of the residual at once.
 @pytest.mark.parametrize(("has", "felt_m_s2"), [((), 0.8 * (1.0 + G * 0.0105)), (("lag", "roll"), 0.8)])
-def test_a_residual_in_the_model_is_what_the_car_does_with_it(has: tuple[str, ...], felt_m_s2: float) -> None:
+def test_a_residual_in_the_model_is_what_the_car_does_with_it(has, felt_m_s2):
     """The car has a force and a moment that its model lacks. With both as a residual, the filter is correct."""
     oracle = Oracle(parts(*has))
 

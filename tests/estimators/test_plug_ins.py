@@ -1,9 +1,7 @@
 """A faulty estimator of another package is named in the error; only its estimates are lost."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import dedent
@@ -68,7 +66,7 @@ def write_by_force(signals: Signals, _state: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def signals() -> Signals:
+def signals():
     return drive(slalom(0.03, 0.5), 4.0, speed=22.0).signals
 
 
@@ -86,14 +84,12 @@ def signals() -> Signals:
         (lambda s, _: (replace(sound(s), values=sound(s).values.astype(object)), None), "a column of type object"),
     ],
 )
-def test_what_a_plug_in_does_wrong_is_an_error_that_names_it(
-    misbehave: Callable[..., Any], got: str, signals: Signals
-) -> None:
+def test_what_a_plug_in_does_wrong_is_an_error_that_names_it(misbehave, got, signals):
     with pytest.raises(EstimatorError, match=r"^plug \(plug-in test_plug_ins\): .*" + got):
         run_estimator(PlugIn(misbehave), signals)
 
 
-def test_no_plug_in_changes_the_signals_of_others(signals: Signals) -> None:
+def test_no_plug_in_changes_the_signals_of_others(signals):
     before = signals.yaw_rate_rad_s.copy()
     track = run_estimator(PlugIn(write_by_force), signals)
     assert np.nanmax(track.yaw_rate_rad_s) == 0.5
@@ -101,12 +97,12 @@ def test_no_plug_in_changes_the_signals_of_others(signals: Signals) -> None:
     assert signals.yaw_rate_rad_s.flags.writeable
 
 
-def test_what_a_plug_in_prints_goes_to_stderr(signals: Signals, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_plug_in_prints_goes_to_stderr(signals, capsys):
     run_estimator(PlugIn(lambda _signals, _state: print("hello")), signals)
     assert capsys.readouterr() == ("", "hello\n")
 
 
-def test_a_plug_in_that_cannot_be_built_is_left_out_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plug_in_that_cannot_be_built_is_left_out_with_its_error(monkeypatch):
     unbuilt = Spec("plug", "a plug-in", lambda *_: sys.exit(0), frozenset(), 0x123456)
     monkeypatch.setattr(table, "all_specs", lambda: (*table.SPECS, unbuilt))
     available = frozenset({"speed_m_s", "yaw_rate_rad_s"})
@@ -129,7 +125,7 @@ MODEL = Constant()
 
 
 @pytest.fixture(autouse=True)
-def _no_cached_names() -> Iterator[None]:
+def _no_cached_names():
     plug_in_names.cache_clear()
     yield
     plug_in_names.cache_clear()
@@ -149,7 +145,7 @@ def track_of(network: str, driven: Signals, check: CausalityCheck | None = None)
     return run_estimator(make_estimator("pd-hef:gain=1", Car.load(network=network)), driven, check)
 
 
-def test_the_documented_network_acts_in_the_filter_causally(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_documented_network_acts_in_the_filter_causally(tmp_path, monkeypatch):
     pytest.importorskip("torch")
     code = dedent((interface.__doc__ or "").partition("into calls::\n")[2])
     name = with_model(tmp_path, code, monkeypatch, "tyre_gru")
@@ -170,19 +166,19 @@ def test_the_documented_network_acts_in_the_filter_causally(tmp_path: Path, monk
         ("return Residual(np.zeros((count, 2)), np.full(count, 2.0)), None", "gain of 0 to 1"),
     ],
 )
-def test_a_faulty_model_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, reason: str) -> None:
+def test_a_faulty_model_is_named(tmp_path, monkeypatch, line, reason):
     name = with_model(tmp_path, CONSTANT.format(line=line), monkeypatch, "faulty_model")
     with pytest.raises(EstimatorError, match=reason) as error:
         track_of(name, noisy_slalom())
     assert "faulty_model" in str(error.value)
 
 
-def test_a_model_without_the_interface_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_without_the_interface_is_refused(tmp_path, monkeypatch):
     name = with_model(tmp_path, "MODEL = 3\n", monkeypatch, "no_model")
     with pytest.raises(ModelError, match="residual model with sha256"):
         Car.load(network=name)
 
 
-def test_a_model_has_no_gain_unless_the_estimator_names_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_has_no_gain_unless_the_estimator_names_one(tmp_path, monkeypatch):
     name = with_model(tmp_path, CONSTANT.format(line="pass"), monkeypatch, "constant_model")
     assert Car.load(network=name).residual_gain == 0.0

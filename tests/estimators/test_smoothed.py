@@ -1,7 +1,5 @@
 """The smoother: against an independent one, better than its filter, and bounded in look-ahead and memory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -53,7 +51,7 @@ def on_time(signals: Signals) -> Signals:
 
 
 @pytest.fixture(scope="module")
-def rough() -> Signals:
+def rough():
     """Noise, irregular stamps, missing samples, a gap that restarts the filter, messages late, a gyro that jumps."""
     rng = np.random.default_rng(12)
     s = with_noise(drive(slalom(0.035, 0.5), speed=22.0, step_s=rng.uniform(0.004, 0.022, 700)).signals, seed=6)

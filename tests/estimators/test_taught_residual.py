@@ -1,7 +1,5 @@
 """``pd-hef`` of a taught car: the residual acts in the filter, causally, window by window, within its region."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -36,7 +34,7 @@ def acts(estimator: Any) -> bool:
 
 
 @pytest.fixture(scope="module")
-def signals() -> Signals:
+def signals():
     s = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
     return replace(s, friction=np.full(len(s), 0.85))
 
@@ -45,7 +43,7 @@ def track_of(name: str, car: Car, signals: Signals) -> StateTrack:
     return run_estimator(make_estimator(name, car), signals)
 
 
-def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:
+def test_its_response_is_the_one_that_teaching_uses(signals):
     estimator = make_estimator("physics", taught_car(None))
     assert isinstance(estimator, AdaptivePhysics)
     response = residual_response(estimator, signals, np.arange(len(signals)))
@@ -61,14 +59,14 @@ def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:
     assert np.allclose(response(rate[:, None])[late, 0], expected[late], atol=0.1 * np.nanmax(np.abs(expected)))
 
 
-def test_beyond_the_taught_speed_it_is_physics(signals: Signals) -> None:
+def test_beyond_the_taught_speed_it_is_physics(signals):
     car = taught_car(linear_residual(fastest_m_s=10.0))
     physics, hybrid = (track_of(name, car, signals) for name in ("physics", "pd-hef"))
     assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
     assert np.nanmax(hybrid.network_trust) == 0.0
 
 
-def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signals) -> None:
+def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals):
     calibration = Posterior(SEDAN)
     for calibrated in (False, True):
         car = taught_car(linear_residual(), calibrated=calibrated)
@@ -76,14 +74,14 @@ def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signal
         assert acts(plain) is not calibrated
         assert acts(of_log) is calibrated
         without = of_log if not calibrated else plain
-        assert any("residual gain 0" in note for note in without.notes)  # type: ignore[attr-defined]
+        assert any("residual gain 0" in note for note in without.notes)
     track = track_of(
         "pd-hef", replace(taught_car(linear_residual(), calibrated=True), self_calibrated=calibration), signals
     )
     assert np.nanmax(track.network_trust) == 1.0
 
 
-def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> None:
+def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it():
     assert not acts(make_estimator("pd-hef", taught_car(None)))
     assert make_estimator("pd-hef", taught_car(linear_residual())).causal
     with_network = replace(taught_car(linear_residual()), network=random_network())

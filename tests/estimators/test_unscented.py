@@ -1,7 +1,5 @@
 """Linear algebra of the filters against numpy; transform and update are in the filter that filterpy checks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,7 +27,7 @@ def root_of(P: np.ndarray) -> np.ndarray:
 
 @random_cases
 @given(SEEDS, st.integers(1, 6), st.integers(0, 5))
-def test_the_root_is_that_of_numpy_and_zero_for_an_entry_without_variance(seed: int, n: int, known: int) -> None:
+def test_the_root_is_that_of_numpy_and_zero_for_an_entry_without_variance(seed, n, known):
     P = random_covariance(np.random.default_rng(seed), n)
     np.testing.assert_allclose(root_of(P), np.linalg.cholesky(P), rtol=1e-8, atol=1e-12)
     P[known % n, :] = P[:, known % n] = 0.0
@@ -40,7 +38,7 @@ def test_the_root_is_that_of_numpy_and_zero_for_an_entry_without_variance(seed: 
 
 @random_cases
 @given(SEEDS, st.integers(2, 6), st.floats(-6, 6))
-def test_repair_gives_the_nearest_positive_definite_matrix(seed: int, n: int, log_size: float) -> None:
+def test_repair_gives_the_nearest_positive_definite_matrix(seed, n, log_size):
     rng = np.random.default_rng(seed)
     broken = 10.0**log_size * rng.standard_normal((n, n))  # neither symmetric nor definite
     P = broken.copy()
@@ -54,13 +52,13 @@ def test_repair_gives_the_nearest_positive_definite_matrix(seed: int, n: int, lo
 
 
 @pytest.mark.parametrize("size", [np.inf, np.nan])
-def test_repair_keeps_non_finite_values_for_the_filter(size: float) -> None:
+def test_repair_keeps_non_finite_values_for_the_filter(size):
     P = np.diag([size, 1.0])
     repair_covariance(P)
     assert not np.isfinite(P).all()
 
 
-def test_the_root_after_an_update_that_rounds_to_zero_is_definite() -> None:
+def test_the_root_after_an_update_that_rounds_to_zero_is_definite():
     # A measurement 1e16 times better than the prior: P - K S K' is zero in one direction, to rounding.
     x, P = np.zeros(2), np.array([[1e8, 1e8 - 1.0], [1e8 - 1.0, 1e8]])
     H = np.array([[1.0, 0.0]])

@@ -1,7 +1,5 @@
 """The models of the vehicle filter against an ODE in plain Python, the nominal model and closed forms."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

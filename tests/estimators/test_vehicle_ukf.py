@@ -1,7 +1,5 @@
 """The vehicle filter: equal to filterpy on the same models; gate, standstill, gaps, divergence and likelihood."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -169,7 +167,7 @@ def filterpy_run(signals, estimator, motion, sensor, residual_rate, extra_r):
 
 
 @pytest.fixture(scope="module")
-def irregular() -> Signals:
+def irregular():
     """Drive to 0.6 g on irregular stamps, with missing samples and a change of friction."""
     rng = np.random.default_rng(7)
     dt = rng.uniform(0.002, 0.03, 400)
@@ -217,7 +215,7 @@ def test_it_is_the_unscented_kalman_filter_of_filterpy(made, irregular):
 
 
 @pytest.fixture(scope="module")
-def good() -> Drive:
+def good():
     made = drive(slalom(0.03, 0.5), 8.0)
     return replace(made, signals=with_noise(made.signals, 4))
 

@@ -1,7 +1,5 @@
 """Manoeuvres: every one of the simulator is found, on both sides, at any rate and time; ordinary roads have few."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Metrics against one-line numpy formulas, known lags, calibrated Gaussians and closed-form positions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Training: it learns learnable targets, resumes bit for bit, and rejects unusable data."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -55,7 +53,7 @@ def make_sequences(seed: int, count: int, steps: int = 400) -> list[FeatureSeque
     return out
 
 
-def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path: Path) -> None:
+def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path):
     training, validation = make_sequences(0, 24), make_sequences(1, 4)
     bundle, history = train(training, validation, replace(SMALL, epochs=12), tmp_path)
     assert history[-1].validation_loss < 0.15 * history[0].validation_loss or history[-1].validation_loss < 0.05
@@ -65,7 +63,7 @@ def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path: Path) -> 
     assert np.all(error < 0.35 * np.sqrt(np.mean(test.target**2, axis=0)))
 
 
-def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path: Path) -> None:
+def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path):
     training, validation = make_sequences(0, 6), make_sequences(1, 2)
     whole, history = train(training, validation, SMALL, tmp_path / "whole")
 
@@ -80,7 +78,7 @@ def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path: Path) ->
     assert [e.validation_loss for e in again] == [e.validation_loss for e in history]
 
 
-def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path: Path) -> None:
+def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path):
     """Validation targets have the other sign, so that their error grows while the network learns."""
     training = make_sequences(0, 6)
     validation = [replace(s, target=-s.target) for s in make_sequences(1, 2)]
@@ -92,7 +90,7 @@ def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path: Pa
     assert bundle.provenance["test_loss"] == pytest.approx(losses[best])
 
 
-def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path: Path) -> None:
+def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path):
     training, validation = make_sequences(0, 4), make_sequences(1, 2)
     train(training, validation, replace(SMALL, epochs=1), tmp_path)
     with pytest.raises(ModelError, match="checkpoint"):
@@ -107,14 +105,14 @@ def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path: Path) -
                 train(training, validation, replace(SMALL, epochs=1), tmp_path)
 
 
-def test_paper_recipe_is_table_1() -> None:
+def test_paper_recipe_is_table_1():
     r = PAPER_RECIPE
     assert (r.batch, r.epochs, r.learning_rate, r.dropout) == (64, 200, 1e-3, 0.2)
     assert (r.hidden, r.layers, r.head, len(r.feature_names)) == (128, 2, (64, 32), 6)
 
 
 @pytest.fixture(scope="module")
-def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(sample_logs_dir, tmp_path_factory):
     return extracted(sample_logs_dir, tmp_path_factory.mktemp("sets") / "physics")
 
 
@@ -129,9 +127,7 @@ def extracted(sample_logs_dir: Path, folder: Path, *options: str) -> Path:
     return folder
 
 
-def test_train_writes_a_model_that_runs(
-    sample_logs_dir: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_train_writes_a_model_that_runs(sample_logs_dir, dataset, tmp_path, capsys):
     joined = dataset
     done = called("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
     assert done.returncode == 0, done.stderr
@@ -163,7 +159,7 @@ def test_train_writes_a_model_that_runs(
         run_training(joined, tmp_path / "paper", paper=True, epochs=1)
 
 
-def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
+def test_wrong_calls_are_one_line(dataset, tmp_path):
     with pytest.raises(UsageError, match="epoch"):
         run_training(dataset, tmp_path / "m", epochs=0)
     with pytest.raises(OutputError, match="extract"):
@@ -219,10 +215,9 @@ def test_regression_recovers_known_coefficients():
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory):
     """A network with its baselines."""
     folder, network = tmp_path_factory.mktemp("model"), full_network()
-    assert network.pure_lstm is not None
     network.save(folder)
     network.pure_lstm.save(folder / PURE_LSTM_FOLDER)
     model = LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
@@ -231,7 +226,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def saved(tmp_path: Path, whole: Path) -> Path:
+def saved(tmp_path, whole):
     """A copy of it."""
     return Path(shutil.copytree(whole, tmp_path / "model"))
 

@@ -1,7 +1,5 @@
 """Finished runs as files, made without estimating: the input of a page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

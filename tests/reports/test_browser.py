@@ -1,11 +1,8 @@
 """The pages in a browser: messages, requests, figures, and drawing time."""
 
-from __future__ import annotations
-
 import base64
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -31,7 +28,7 @@ _DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     with Browser() as made:
         yield made
 
@@ -43,7 +40,7 @@ def page_of(folder: Path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _usual_window(browser: Browser) -> None:
+def _usual_window(browser):
     browser.show()
 
 

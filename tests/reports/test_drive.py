@@ -1,7 +1,5 @@
 """The page of a drive, without a browser: its content for drives of every kind."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

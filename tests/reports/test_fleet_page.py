@@ -1,7 +1,5 @@
 """The page of a run: its content and links, and that text from a log is never executed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -55,7 +53,7 @@ def words(folder: Path, **options: Any) -> str:
     return fleet_page(open_run(folder), **options).html.decode()
 
 
-def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
+def test_a_run_with_everything_says_everything(tmp_path):
     drives: dict[str, dict[str, Any]] = {
         f"d{i}": {"errors": (0.001 * (1 + i), 0.0015 * (1 + i)), "metadata": {"road": "ab"[i // 5]}} for i in range(10)
     }
@@ -72,12 +70,12 @@ def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("drives", [{}, {"a": {"truth": {"available": False, "not_independent": []}}}])
-def test_without_a_score_there_is_no_verdict_and_no_empty_figure(tmp_path: Path, drives: dict[str, Any]) -> None:
+def test_without_a_score_there_is_no_verdict_and_no_empty_figure(tmp_path, drives):
     page = words(run_of(tmp_path, drives, {"bad": "empty"}))
     assert "No verdict" in page and "<figure" not in page.split("<script type")[0]
 
 
-def test_what_logs_say_is_text(tmp_path: Path) -> None:
+def test_what_logs_say_is_text(tmp_path):
     drives = {f"d{i}": {"errors": (0.001, 0.002), "metadata": {HOSTILE: HOSTILE[: 20 + i % 2]}} for i in range(4)}
     page = words(run_of(tmp_path, drives, {"bad": HOSTILE}))
     assert "<script>alert" not in page and "<img" not in page and "\u202e" not in page
@@ -85,7 +83,7 @@ def test_what_logs_say_is_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
+def test_every_page_of_a_run_is_written_and_removed(tmp_path):
     drives: dict[str, dict[str, Any]] = {f"d{i}": {"errors": (0.001, 0.002)} for i in range(4)}
     folder = run_of(tmp_path, drives, {"bad": "empty"})
     written = write_pages(open_run(folder))
@@ -97,7 +95,7 @@ def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
     assert not [*folder.rglob("*.html")]
 
 
-def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path: Path) -> None:
+def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path):
     folder = run_of(tmp_path, {"a": {"errors": (0.001, 0.002)}}, {"bad": "empty"})
     (folder / "tables/metrics.parquet").write_bytes(b"PAR1 no")
     written = write_pages(open_run(folder))
@@ -114,7 +112,7 @@ def _page(a: Path, b: Path, limit: float | None = 0.05) -> str:
     return comparison_page(compare_runs(open_run(a), open_run(b), (figure(limit=limit),))).decode()
 
 
-def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
+def test_a_page_says_what_the_terminal_says(tmp_path):
     a = write_run(tmp_path / "a", TEN)
     worse = {label: value * (1.1 + 0.01 * i) for i, (label, value) in enumerate(TEN.items())}
     page = _page(a, write_run(tmp_path / "b", {**worse, "new": 0.1}, config={"friction": 0.3}))
@@ -126,7 +124,7 @@ def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
     assert page.count('data-figure="') == 2
 
 
-def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp_path: Path) -> None:
+def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp_path):
     a = write_run(tmp_path / "a", {MARKUP: float("nan"), "d": 0.1}, config={MARKUP: 1})
     entries = [entry(MARKUP), entry("d", main=MARKUP)]
     b = write_run(tmp_path / "b", {MARKUP: 0.1, "d": float("nan")}, entries=entries)

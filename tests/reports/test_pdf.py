@@ -1,7 +1,5 @@
 """The document to sign: its content and its omissions."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys

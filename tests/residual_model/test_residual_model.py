@@ -1,7 +1,5 @@
 """Features, bundle, and the network in service."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import partial
@@ -36,7 +34,7 @@ from pdhef_logtool.residual_model.network import ResidualNetwork
 make_bundle = partial(random_network, hidden=16, layers=2, head=(8,), scales=(2.0, 0.7))
 
 
-def test_features_by_hand() -> None:
+def test_features_by_hand():
     physics, stamps = (
         VehicleUkf(default_vehicle().model_copy(update={"physics": PhysicsParts(roll=True)})),
         np.arange(1),
@@ -58,7 +56,7 @@ def test_features_by_hand() -> None:
     assert len(FEATURES) == len(expected)
 
 
-def test_an_odd_network_is_odd_to_the_last_digits() -> None:
+def test_an_odd_network_is_odd_to_the_last_digits():
     plain = make_bundle()
     centred = replace(plain.normalisation, feature_mean=(0.0,) * len(FEATURES))
     bundle = replace(plain, odd=True, normalisation=centred)
@@ -75,7 +73,7 @@ def test_an_odd_network_is_odd_to_the_last_digits() -> None:
     np.testing.assert_array_equal(np.concatenate([first, second]), out)
 
 
-def test_bundle_round_trip_and_hash(tmp_path: Path) -> None:
+def test_bundle_round_trip_and_hash(tmp_path):
     bundle = replace(make_bundle(), provenance={"seed": 0})
     bundle.save(tmp_path / "model")
     back = load_bundle(tmp_path / "model")
@@ -86,7 +84,7 @@ def test_bundle_round_trip_and_hash(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["weights", "document", "missing", "version", "feature"])
-def test_wrong_bundles_are_one_clear_error(tmp_path: Path, damage: str) -> None:
+def test_wrong_bundles_are_one_clear_error(tmp_path, damage):
     make_bundle().save(tmp_path)
     document = json.loads((tmp_path / DOCUMENT_FILE).read_text())
     if damage == "weights":
@@ -115,7 +113,7 @@ def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("hidden", [12, 64])  # widths that fill the compiled blocks, and widths that do not
-def test_service_equals_torch(hidden: int) -> None:
+def test_service_equals_torch(hidden):
     bundle = make_bundle(hidden=hidden)
     features = np.random.default_rng(0).normal(size=(300, len(FEATURES)))
     rates, _ = bundle.run(features, np.zeros(len(features), dtype=np.bool_), None)
@@ -123,7 +121,7 @@ def test_service_equals_torch(hidden: int) -> None:
     np.testing.assert_allclose(rates, expected, atol=2e-6)
 
 
-def test_shipped_networks_say_what_torch_makes_of_them() -> None:
+def test_shipped_networks_say_what_torch_makes_of_them():
     for folder in SHIPPED_FOLDERS.values():
         whole = load_bundle(folder)
         for bundle in (whole, whole.pure_lstm, whole.paper_network):
@@ -141,14 +139,14 @@ def test_shipped_networks_say_what_torch_makes_of_them() -> None:
             np.testing.assert_allclose(said / np.array(n.target_std), expected, rtol=0, atol=1e-5)
 
 
-def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
+def test_weights_of_another_shape_are_refused(tmp_path):
     # Compiled code would read beyond them.
     replace(make_bundle(), hidden=32).save(tmp_path)
     with pytest.raises(ModelError, match="architecture"):
         load_bundle(tmp_path)
 
 
-def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
+def test_a_restart_forgets_and_unknown_rows_give_nothing():
     service = make_bundle()
     rng = np.random.default_rng(2)
     features = rng.normal(size=(300, len(FEATURES)))
@@ -163,7 +161,7 @@ def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
     np.testing.assert_array_equal(rates[101:200], behind)
 
 
-def test_causality_and_limits() -> None:
+def test_causality_and_limits():
     bundle = make_bundle()
     service = bundle
     features = np.random.default_rng(3).normal(size=(400, len(FEATURES)))
@@ -176,7 +174,7 @@ def test_causality_and_limits() -> None:
     assert np.isfinite(after).all()
 
 
-def test_models_are_found_by_name() -> None:
+def test_models_are_found_by_name():
     default = load_bundle(SHIPPED_FOLDERS["default"])
     assert default.feature_names == FEATURES
     assert None not in (default.pure_lstm, default.linear_regression, default.paper_network)
@@ -186,12 +184,12 @@ def test_models_are_found_by_name() -> None:
         load_bundle(Path("elsewhere"))
 
 
-def test_all_of_it_is_below_three_megabytes() -> None:
+def test_all_of_it_is_below_three_megabytes():
     folder = SHIPPED_FOLDERS["default"].parents[1]
     assert sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) < 3_000_000
 
 
-def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
+def test_noise_evidence_and_calibration_are_of_the_shipped_network():
     model, car = load_bundle(SHIPPED_FOLDERS["default"]), Car.load("saloon")
     assert car.network is not None and car.network.sha256 == model.sha256
     assert (car.residual_gain, model.physics_sha256) == (0.75, physics_sha256(car.physics_vehicle))

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -26,7 +24,7 @@ def adaptive_columns(at: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture
-def circle() -> TrackMaker:
+def circle():
     """Return a maker of a window of a steady circle drive; rows [first, first + n) of it."""
 
     def make(
@@ -66,7 +64,7 @@ def circle() -> TrackMaker:
 
 
 @pytest.fixture
-def circle_signals() -> Callable[..., Signals]:
+def circle_signals():
     """Return a maker of the inputs of the same drive."""
 
     def make(first: int = 0, n: int = 200) -> Signals:

@@ -1,7 +1,5 @@
 """JUnit XML of a plan as CI systems count it."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
@@ -29,7 +27,7 @@ def verdicts(*errors: float | None, strict: bool = False, title: str = "") -> Pl
     return PlanVerdicts(ValidationPlan(requirements, title, "plan.toml"), tuple(judged), strict)
 
 
-def test_counts_agree_with_the_cases() -> None:
+def test_counts_agree_with_the_cases():
     data = junit_bytes(verdicts(0.01, 0.03, None))
     assert data.startswith(b"<?xml version=")
     root = ET.fromstring(data)
@@ -42,7 +40,7 @@ def test_counts_agree_with_the_cases() -> None:
     assert (strict.attrib["failures"], strict.attrib["skipped"]) == ("2", "0")
 
 
-def test_a_case_names_requirement_limit_value_margin_and_exposure() -> None:
+def test_a_case_names_requirement_limit_value_margin_and_exposure():
     passed, failed, skipped = ET.fromstring(junit_bytes(verdicts(0.01, 0.03, None))).iter("testcase")
     assert (passed.attrib["name"], passed.attrib["classname"]) == ("No bad drive", "pdhef.plan_toml.R0")
     assert passed.findtext("system-out") == (
@@ -55,7 +53,7 @@ def test_a_case_names_requirement_limit_value_margin_and_exposure() -> None:
     assert skip is not None and "record drives with ground truth" in skip.attrib["message"]
 
 
-def test_checks_that_did_not_pass_are_properties() -> None:
+def test_checks_that_did_not_pass_are_properties():
     checks = {"a": [{"name": "speed", "verdict": "failed", "waived": False, "evidence": "too fast"}]}
     root = ET.fromstring(junit_bytes(verdicts(0.01), checks))
     assert [p.attrib for p in root.iter("property")] == [{"name": "check speed", "value": "failed: too fast"}]
@@ -65,6 +63,6 @@ def test_checks_that_did_not_pass_are_properties() -> None:
 
 @settings(derandomize=True, max_examples=15)
 @given(name=st.text(min_size=1))
-def test_any_name_gives_xml_that_parsers_read(name: str) -> None:
+def test_any_name_gives_xml_that_parsers_read(name):
     root = ET.fromstring(junit_bytes(verdicts(0.03, title=name)))
     assert len(root.findall(".//failure")) == 1

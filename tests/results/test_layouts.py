@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
@@ -34,7 +32,7 @@ def write(folder: Path, tracks: Sequence[StateTrack]) -> Path:
 
 
 @pytest.fixture
-def written(tmp_path: Path, circle: Any) -> Path:
+def written(tmp_path, circle):
     """Write a sidecar and the layouts of three tracks."""
     return write(tmp_path, [circle(name, 0, 200) for name in ("truth", "pd-hef", "2nd try")])
 
@@ -61,7 +59,7 @@ def panels_of(node: Any) -> list[str]:
     return panels_of(node["first"]) + panels_of(node["second"])
 
 
-def test_every_path_of_foxglove_is_in_the_log(written: Path) -> None:
+def test_every_path_of_foxglove_is_in_the_log(written):
     layout = json.loads((written / "foxglove.json").read_text())
     assert layout.keys() == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
     topics = fields_by_topic(written / "annotated.mcap")
@@ -110,7 +108,7 @@ def conforms(value: Any, kind: Any) -> bool:
     return isinstance(value, (int, float) if kind is float else kind) and isinstance(value, bool) == (kind is bool)
 
 
-def test_panels_have_the_settings_that_foxglove_publishes(written: Path) -> None:
+def test_panels_have_the_settings_that_foxglove_publishes(written):
     layout = json.loads((written / "foxglove.json").read_text())
     published = {
         "Plot": fl.PlotConfig,
@@ -149,7 +147,7 @@ PLOTJUGGLER = {
 }
 
 
-def test_elements_are_those_that_plotjuggler_reads(written: Path) -> None:
+def test_elements_are_those_that_plotjuggler_reads(written):
     root = ET.fromstring((written / "plotjuggler.xml").read_bytes())
     assert root.tag == "root"
     for element in root.iter():
@@ -160,7 +158,7 @@ def test_elements_are_those_that_plotjuggler_reads(written: Path) -> None:
     assert all(re.fullmatch("#[0-9a-f]{6}", c.attrib["color"]) for c in root.iter("curve"))
 
 
-def test_every_curve_of_plotjuggler_is_in_the_log(written: Path) -> None:
+def test_every_curve_of_plotjuggler_is_in_the_log(written):
     topics = fields_by_topic(written / "annotated.mcap")
     root = ET.fromstring((written / "plotjuggler.xml").read_bytes())
     curves = [curve.attrib["name"].rpartition("/") for curve in root.iter("curve")]

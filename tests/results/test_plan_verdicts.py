@@ -1,11 +1,8 @@
 """A plan on the figures of a run: which drives count, against what, with how much driving, and why none does."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,14 +46,14 @@ def judged(rows: list[MetricRow], requirement: Requirement = BETA, **options: An
     return verdict
 
 
-def test_drives_are_pooled_with_the_exposure_of_their_scored_stamps() -> None:
+def test_drives_are_pooled_with_the_exposure_of_their_scored_stamps():
     verdict = judged(scored())
     assert (verdict.outcome, verdict.basis, verdict.units, verdict.worst) == ("PASS", "drives", 6, "f")
     assert (verdict.exposure.minutes, verdict.exposure.km) == (6.0, 9.0)  # half of the stamps are scored
     assert verdict.estimators == ("pd-hef",)
 
 
-def test_a_file_gives_the_same_verdict_as_the_rows() -> None:
+def test_a_file_gives_the_same_verdict_as_the_rows():
     rows = scored() + scored(value=0.5, estimator="zero")
     plan = ValidationPlan((BETA,))
     frame = pl.DataFrame([{k: getattr(r, k) for k in MetricRow.__dataclass_fields__} for r in rows]).lazy()
@@ -65,7 +62,7 @@ def test_a_file_gives_the_same_verdict_as_the_rows() -> None:
     assert of_file == plan_verdicts(plan, figures_of_rows(rows), drives)
 
 
-def test_the_estimated_reference_counts_only_without_ground_truth() -> None:
+def test_the_estimated_reference_counts_only_without_ground_truth():
     reference = [r for log in SIX for r in (row(log, "reference_rms", 0.001), row(log, "reference_std", 0.0005))]
     alone = judged(reference)
     assert (alone.against, alone.outcome) == ("estimated reference", "PASS")
@@ -83,13 +80,13 @@ def test_the_estimated_reference_counts_only_without_ground_truth() -> None:
         (Requirement("A", "", "sideslip_rad", baseline="run", max_ratio=1.0), "pdhef compare A B --plan PLAN"),
     ],
 )
-def test_the_reason_for_no_value_is_given(requirement: Requirement, reason: str) -> None:
+def test_the_reason_for_no_value_is_given(requirement, reason):
     verdict = judged(scored(), requirement)
     assert (verdict.outcome, verdict.exposure.drives) == ("INCONCLUSIVE", 0)
     assert reason in verdict.reason and verdict.next
 
 
-def test_run_a_is_the_baseline_of_a_comparison_with_its_own_selected_estimate() -> None:
+def test_run_a_is_the_baseline_of_a_comparison_with_its_own_selected_estimate():
     requirement = Requirement("A", "", "sideslip_rad", baseline="run", max_ratio=1.05)
     a = figures_of_rows(scored(value=0.02, estimator="physics"))
     partners = {log: JudgedDrive(log, "physics") for log in SIX}
@@ -99,7 +96,7 @@ def test_run_a_is_the_baseline_of_a_comparison_with_its_own_selected_estimate() 
     assert judged(scored(), requirement, against={"run": (a, partners)}).exposure.drives == 5
 
 
-def test_blocks_are_read_only_where_fewer_than_five_drives_are_scored() -> None:
+def test_blocks_are_read_only_where_fewer_than_five_drives_are_scored():
     read: list[str] = []
 
     def blocks(log: str) -> list[RequirementBlocks]:
@@ -110,7 +107,7 @@ def test_blocks_are_read_only_where_fewer_than_five_drives_are_scored() -> None:
     def drives(logs: Sequence[str]) -> list[JudgedDrive]:
         return [
             JudgedDrive(log, "pd-hef", lambda log=log: {"requirement_blocks": jsonable(blocks(log))}) for log in logs
-        ]  # type: ignore[misc]
+        ]
 
     assert judged(scored(), drives=drives(SIX)).basis == "drives" and read == []
     few = judged(scored("ab"), drives=drives("ab"))
@@ -118,7 +115,7 @@ def test_blocks_are_read_only_where_fewer_than_five_drives_are_scored() -> None:
     assert few.exposure.minutes == pytest.approx(160.0 / 60.0)
 
 
-def test_only_a_users_plan_closes_the_gate() -> None:
+def test_only_a_users_plan_closes_the_gate():
     rows = scored(value=0.5)
     for file, strict, closed in (("", True, False), ("plan.toml", False, True)):
         plan = ValidationPlan((BETA,), file=file)
@@ -130,7 +127,7 @@ def test_only_a_users_plan_closes_the_gate() -> None:
 
 
 @pytest.mark.parametrize(("factor", "outcome"), [(1.0, "PASS"), (1.02, "PASS"), (1.08, "FAIL"), (0.9, "PASS")])
-def test_a_plan_and_the_gate_of_compare_decide_alike(factor: float, outcome: str, tmp_path: Path) -> None:
+def test_a_plan_and_the_gate_of_compare_decide_alike(factor, outcome, tmp_path):
     """Of drives of six days, each is compared with itself: days that are harder in both runs cancel."""
     rng = np.random.default_rng(11)
     level = {f"d{i:02d}": 0.01 * math.exp(0.5 * (i % 6) + 0.3 * rng.normal()) for i in range(60)}
@@ -141,7 +138,6 @@ def test_a_plan_and_the_gate_of_compare_decide_alike(factor: float, outcome: str
     for baseline in ("run", "0/"):
         plan.write_text(EARLIER.format(baseline).replace("1.0", "1.05\nconfidence = 0.9"))
         found = compare(a, b, plan=plan)
-        assert found.requirements is not None
         (verdict,) = found.requirements.verdicts
         assert (verdict.outcome, found.exit_code) == (outcome, 4 * (outcome == "FAIL"))
         assert any("6 days" in note for note in verdict.notes)
@@ -150,7 +146,7 @@ def test_a_plan_and_the_gate_of_compare_decide_alike(factor: float, outcome: str
     assert verdict.value == pytest.approx(math.exp(gated.figures[0].change.median))
 
 
-def test_a_missing_earlier_run_ends_the_command_before_the_work(tmp_path: Path) -> None:
+def test_a_missing_earlier_run_ends_the_command_before_the_work(tmp_path):
     (tmp_path / "plan.toml").write_text(EARLIER.format("gone/run"))
     with pytest.raises(OutputError, match="no such folder") as raised:
         read_validation_plan(tmp_path / "plan.toml", None)
@@ -172,7 +168,7 @@ def test_a_missing_earlier_run_ends_the_command_before_the_work(tmp_path: Path) 
         ({"car": "polo", "minutes": 1.0}, "INCONCLUSIVE", "0.0 of 1 minutes at car polo"),
     ],
 )
-def test_exposure_in_conditions(need: dict[str, Any], outcome: str, words: str) -> None:
+def test_exposure_in_conditions(need, outcome, words):
     space = {(20.0, 0.0): 20.0, (5.0, 2.0): 20.0}
     drives = [JudgedDrive(x, "pd-hef", dict, {"car": "golf"}, space, 0.3 if x < "d" else 0.9) for x in SIX]
     verdict = judged(scored(), replace(BETA, exposure=(ExposureNeed(**need),)), drives=drives)
@@ -180,7 +176,7 @@ def test_exposure_in_conditions(need: dict[str, Any], outcome: str, words: str) 
 
 
 @pytest.mark.parametrize(("logs", "judged_logs"), [(4, None), (5, 5)])
-def test_the_default_plan_judges_only_as_many_drives_as_a_bootstrap_needs(logs: int, judged_logs: int | None) -> None:
+def test_the_default_plan_judges_only_as_many_drives_as_a_bootstrap_needs(logs, judged_logs):
     outcomes = [LogOutcome(str(i), f"{i}.mcap", "0" * 64, main="pd-hef") for i in range(logs)]
     results = [LogResult(o, None, {}, tuple(scored([o.log]))) for o in outcomes]
     verdicts = judge(default_plan(), results, strict=False)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 import os
 import subprocess
@@ -64,7 +62,7 @@ def write(path: Path, circle, circle_signals) -> None:
 
 
 @pytest.fixture
-def recording(tmp_path, circle, circle_signals) -> Path:
+def recording(tmp_path, circle, circle_signals):
     path = tmp_path / "recording.rrd"
     write(path, circle, circle_signals)
     return path

@@ -1,11 +1,8 @@
 """Logs and outputs on storage that fails during a run."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import polars as pl
@@ -29,7 +26,7 @@ CONFIG = RunConfig(car=Path("saloon"), estimators=("zero",), keep="metrics", end
 
 
 @pytest.fixture
-def logs(sample_logs_dir: Path, tmp_path: Path) -> Path:
+def logs(sample_logs_dir, tmp_path):
     folder = tmp_path / "logs"
     folder.mkdir()
     for name in ("dlc", "step"):
@@ -38,7 +35,7 @@ def logs(sample_logs_dir: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_log_that_changes_fails_alone_and_is_run_again(logs: Path, tmp_path: Path) -> None:
+def test_a_log_that_changes_fails_alone_and_is_run_again(logs, tmp_path):
     def changing(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
         def told(text: str, share: float) -> None:
             if task.log.stem == "dlc" and share > 0.5:
@@ -58,9 +55,7 @@ def test_a_log_that_changes_fails_alone_and_is_run_again(logs: Path, tmp_path: P
 
 @pytest.mark.slow
 @pytest.mark.parametrize("returns", [True, False])
-def test_a_log_that_vanishes_is_waited_for_and_is_not_given_up(
-    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, returns: bool
-) -> None:
+def test_a_log_that_vanishes_is_waited_for_and_is_not_given_up(logs, tmp_path, monkeypatch, returns):
     monkeypatch.setattr(working, "_WAITS_S", (0.0, 0.0))
     away, lines = tmp_path / "away", list[str]()
 
@@ -84,7 +79,7 @@ def test_a_log_that_vanishes_is_waited_for_and_is_not_given_up(
     assert run([str(logs)], out, CONFIG, work=run_drive, resume=True).exit_code == 0
 
 
-def test_a_disk_that_fails_is_no_damage_of_the_log() -> None:
+def test_a_disk_that_fails_is_no_damage_of_the_log():
     with pytest.raises(byte_source.SourceError, match="Stale file handle"):
         byte_source.raise_source_error(OSError(116, "Stale file handle"))
     byte_source.raise_source_error(ValueError("damage"))
@@ -103,7 +98,7 @@ def full_disk(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
     raise AssertionError
 
 
-def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(tmp_path: Path) -> None:
+def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(tmp_path):
     folder, out, work = named_logs(tmp_path / "logs", "a", "b", "c", "d"), tmp_path / "out", Counted(full_disk)
     run(folder, tmp_path / "undisturbed")
     with pytest.raises(OutputError, match=r"No space left.*; 1 of 4 logs are done; --resume goes on$") as raised:
@@ -117,7 +112,7 @@ OPTIONS = ("--car", "saloon", "-e", "zero,kinematic", "--end", "1.5", "--keep", 
 
 
 @pytest.fixture(scope="module")
-def sound(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sound(sample_logs_dir, tmp_path_factory):
     out = tmp_path_factory.mktemp("sound") / "out"
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
     assert command("run", *logs, "-o", str(out), *OPTIONS).code == 0
@@ -125,7 +120,7 @@ def sound(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 @pytest.fixture
-def out(sound: Path, tmp_path: Path) -> Path:
+def out(sound, tmp_path):
     return Path(shutil.copytree(sound, tmp_path / "out"))
 
 
@@ -148,9 +143,7 @@ def of_drive(out: Path, kind: str, label: str) -> Path:
 
 @pytest.mark.parametrize("kind", ["report.json", "metrics.parquet", "part"])
 @pytest.mark.parametrize("deed", [flip, Path.unlink])
-def test_a_drive_whose_outputs_are_damaged_or_gone_is_run_again_and_that_is_said(
-    tmp_path: Path, kind: str, deed: Callable[[Path], None]
-) -> None:
+def test_a_drive_whose_outputs_are_damaged_or_gone_is_run_again_and_that_is_said(tmp_path, kind, deed):
     logs, out, said, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", list[str](), Counted()
     run(logs, out)
     before = contents(out)
@@ -162,7 +155,7 @@ def test_a_drive_whose_outputs_are_damaged_or_gone_is_run_again_and_that_is_said
 
 
 @pytest.mark.slow
-def test_every_file_of_a_drive_is_regenerated_and_a_page_alone(out: Path, sample_logs_dir: Path) -> None:
+def test_every_file_of_a_drive_is_regenerated_and_a_page_alone(out, sample_logs_dir):
     logs, keep = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")], ("--keep", "full")
     options = [o for o in OPTIONS if o not in ("--keep", "estimates", "--no-report")]
     assert command("run", *logs, "-o", str(out), *options, *keep).code == 0
@@ -179,7 +172,7 @@ def test_every_file_of_a_drive_is_regenerated_and_a_page_alone(out: Path, sample
         assert name.endswith(".rrd") or (out / "logs/dlc" / name).read_bytes() == files[name]
 
 
-def test_a_damaged_line_of_the_journal_costs_its_drive_alone_and_is_said_once(tmp_path: Path) -> None:
+def test_a_damaged_line_of_the_journal_costs_its_drive_alone_and_is_said_once(tmp_path):
     logs, out, said, work = named_logs(tmp_path / "logs", *"abc"), tmp_path / "out", list[str](), Counted()
     run(logs, out)
     before, journal = contents(out), out / "journal.jsonl"
@@ -197,7 +190,7 @@ def test_a_damaged_line_of_the_journal_costs_its_drive_alone_and_is_said_once(tm
     assert (work.asked, len(said)) == (["b"], 1)
 
 
-def test_a_damaged_drive_is_named_and_the_others_are_used(out: Path, sound: Path) -> None:
+def test_a_damaged_drive_is_named_and_the_others_are_used(out, sound):
     flip(of_drive(out, "estimates.parquet", "dlc"))
     told = f"{of_drive(out, 'estimates.parquet', 'dlc')}: expected the estimates.parquet that run.json names, got "
     report = command("report", str(out))
@@ -212,7 +205,7 @@ def test_a_damaged_drive_is_named_and_the_others_are_used(out: Path, sound: Path
     assert (compared.code, json.loads(compared.out)["verdict"], warnings(compared)) == (0, "equal", [])  # reads tables
 
 
-def test_where_nothing_is_usable_the_exit_code_is_1(out: Path) -> None:
+def test_where_nothing_is_usable_the_exit_code_is_1(out):
     for label in ("dlc", "step"):
         flip(of_drive(out, "report.json", label))
         flip(of_drive(out, "estimates.parquet", label))
@@ -232,7 +225,7 @@ def test_where_nothing_is_usable_the_exit_code_is_1(out: Path) -> None:
         assert len(ended.err.splitlines()) == 1
 
 
-def test_a_run_whose_entries_were_changed_is_refused(out: Path) -> None:
+def test_a_run_whose_entries_were_changed_is_refused(out):
     document = json.loads((out / "run.json").read_text())
     (out / "run.json").write_text(json.dumps(document | {"remaining": 7}))
     with pytest.raises(OutputError, match=r"run\.json.*as it was written"):

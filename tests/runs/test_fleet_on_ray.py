@@ -1,7 +1,5 @@
 """``pdhef run --ray``: three nodes here; one is lost while it works on a drive. Part of ``make fleet``."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
@@ -26,9 +24,7 @@ from tests.workers.ray_nodes import START_S, cluster_of_one, grow, processes_of
 
 
 @pytest.mark.fleet
-def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'pdhef-logtool[ray]'")
     named_logs(tmp_path / "logs", *(f"drive_{i}" for i in range(12)))
     monkeypatch.chdir(tmp_path)
@@ -70,9 +66,7 @@ def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(
 
 
 @pytest.mark.fleet
-def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'pdhef-logtool[ray]'")
     logs = named_logs(tmp_path / "logs", *(f"drive_{i}" for i in range(6)))
     run = partial(run_logs, [str(logs)], config=RunConfig(keep="metrics"), report=False, work=stub_drive)
@@ -86,7 +80,7 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
     assert {name: data for name, data in found.items() if name not in timed} == contents(tmp_path / "out", "run.json")
 
 
-def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_output_that_a_node_does_not_see_is_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (log,) = find_logs([str(named_logs(tmp_path / "logs", "a"))])
     task = DriveTask(log, Path("out"), RunConfig(), default_plan(), page=False, run="")
@@ -95,7 +89,7 @@ def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path, monkeypatch:
     assert "a folder that all nodes of the cluster see" in str(told)
 
 
-def test_without_ray_or_a_cluster_there_is_one_line(tmp_path: Path) -> None:
+def test_without_ray_or_a_cluster_there_is_one_line(tmp_path):
     logs = named_logs(tmp_path / "logs", "a", "b")
     with pytest.raises(UsageError, match="--ray: expected"):
         run_logs(

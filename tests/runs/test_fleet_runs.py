@@ -1,7 +1,5 @@
 """A run of several logs: its journal, resumed drives, repeated drives, and aborted drives."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -63,7 +61,7 @@ def run(folder: Path | list[str], output: Path, config: RunConfig | None = None,
     return run_logs(arguments, output, config, reporter=Reporter(warn=warn, note=note), **options)
 
 
-def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_path: Path) -> None:
+def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_path):
     day = named_logs(tmp_path / "logs/day", "a", "b")
     out, work = tmp_path / "out", Counted()
     run(day, out, work=work)
@@ -79,7 +77,7 @@ def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_
     assert parts.collect().sort("log").equals(metrics.sort("log"))
 
 
-def test_a_log_is_known_by_what_it_holds(tmp_path: Path) -> None:
+def test_a_log_is_known_by_what_it_holds(tmp_path):
     logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
     run(logs, out, work=work)
     (logs / "later").mkdir()
@@ -94,7 +92,7 @@ def test_a_log_is_known_by_what_it_holds(tmp_path: Path) -> None:
     assert said == ["1 of 2 drives are run again: their logs have changed"]
 
 
-def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path: Path) -> None:
+def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path):
     logs, out, work = named_logs(tmp_path / "logs", "a"), tmp_path / "out", Counted()
     shutil.copy(logs / "a.mcap", logs / "b.mcap")
     warned: list[str] = []
@@ -104,7 +102,7 @@ def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path: P
     assert warned == ["b.mcap has the same content as a.mcap: the drive is run once"] * 2
 
 
-def test_resuming_reads_no_log_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resuming_reads_no_log_again(tmp_path, monkeypatch):
     logs, out = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out"
     run(logs, out)
 
@@ -117,7 +115,7 @@ def test_resuming_reads_no_log_again(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert work.asked == []
 
 
-def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path) -> None:
+def test_what_is_run_anew_is_said_and_why(tmp_path, sample_logs_dir):
     car = tmp_path / "car.toml"
     text = (sample_logs_dir / "vehicle.toml").read_text()
     car.write_text(text)
@@ -135,7 +133,7 @@ def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path)
     assert len(list((out / "tables/parts").iterdir())) == 2
 
 
-def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> None:
+def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path):
     logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
     run(logs, out, RunConfig(keep="metrics"), work=work)
     run(logs, out, RunConfig(keep="metrics"), work=work, repeat=["b"])
@@ -149,9 +147,7 @@ def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> Non
         run(logs, out, RunConfig(keep="metrics", friction=0.4), repeat=["a"])
 
 
-def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(tmp_path, monkeypatch):
     for module in ("fleet", "run_result"):
         monkeypatch.setattr(f"pdhef_logtool.runs.{module}.FEW_LOGS", 7)
     logs = named_logs(tmp_path / "logs", *(f"drive{i:02d}" for i in range(8)))
@@ -169,7 +165,7 @@ def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(
     assert again.asked == []
 
 
-def test_a_run_that_is_ended_tells_of_what_is_done_and_goes_on(tmp_path: Path) -> None:
+def test_a_run_that_is_ended_tells_of_what_is_done_and_goes_on(tmp_path):
     logs = named_logs(tmp_path / "logs", "a", "b", "c", "d")
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
     run(logs, undisturbed)
@@ -197,7 +193,7 @@ def contents(output: Path, *without: str) -> dict[str, bytes]:
     return {p.relative_to(output).as_posix(): p.read_bytes() for p in files}
 
 
-def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: Path) -> None:
+def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path):
     logs, out = named_logs(tmp_path / "logs", "a", "full", "bad"), tmp_path / "out"
 
     def failing(task: DriveTask, tell: Tell) -> DriveEnd:
@@ -216,9 +212,7 @@ def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(tmp_path, monkeypatch):
     monkeypatch.setattr(fleet, "_PRELOAD", ("tests.runs.stub_drives",))  # all that a stub needs
     logs, out = named_logs(tmp_path / "logs", "a", "hangs", "b", "kills"), tmp_path / "out"
     result = run(logs, out, work=planted_stub, jobs=2, limits=Limits(2.0))
@@ -235,7 +229,7 @@ def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(
 
 
 @pytest.mark.fleet
-def test_memory_is_flat_to_3000_logs(tmp_path: Path) -> None:
+def test_memory_is_flat_to_3000_logs(tmp_path):
     memory: list[int] = []
 
     def noted(*_: object) -> None:
@@ -248,7 +242,7 @@ def test_memory_is_flat_to_3000_logs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir, tmp_path):
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
     config = RunConfig(car=Path("saloon"), keep="metrics", end="4")
     result = run_logs(logs, tmp_path, replace(config, full_worst=1))
@@ -266,7 +260,7 @@ def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path,
     assert [(r.document, r.rows) for r in result.results] == [(None, ())] * 2  # no drive stays in memory
 
 
-def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:
+def test_a_fleets_summary_counts_what_the_figures_say(tmp_path):
     logs, out = named_logs(tmp_path / "logs", "a", "b", "c"), tmp_path / "out"
 
     def failing(task: DriveTask, tell: Tell) -> DriveEnd:

@@ -1,7 +1,5 @@
 """The page of an inspection: pictures of candidate fields, reasons, and a mapping that loads as it is pasted."""
 
-from __future__ import annotations
-
 import html
 import json
 import re
@@ -55,13 +53,13 @@ def car(count: int = 300) -> dict[str, np.ndarray]:
 
 
 @given(st.lists(_VALUES, min_size=1, max_size=100))
-def test_a_sparkline_shows_each_run_of_finite_values_within_its_box(values: list[float]) -> None:
+def test_a_sparkline_shows_each_run_of_finite_values_within_its_box(values):
     v = np.array(values)
     drawn = str(sparkline(v))
     finite = np.isfinite(v)
     runs = int(np.count_nonzero(np.diff(np.concatenate([[False], finite]).astype(int)) == 1))
     assert drawn.count("M") == runs
-    width = float(re.search(r'viewBox="0 0 (\d+) 60"', drawn)[1])  # type: ignore[index]
+    width = float(re.search(r'viewBox="0 0 (\d+) 60"', drawn)[1])
     for x, y, down in re.findall(r"[ML](\d+) (\d+)(?:V(\d+))?", drawn):
         assert 0 <= float(x) <= width
         assert 0 <= float(y) <= 60
@@ -78,7 +76,7 @@ def _page(path: Path) -> str:
     return pages[0].decode()
 
 
-def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> None:
+def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path):
     log = write_log(tmp_path / "car.mcap", {"/car": car(), "/other": {"temperature": np.arange(300.0)}})
     file = tmp_path / "page.html"
     assert called("inspect", str(log), "--report", str(file)).returncode == 0
@@ -98,14 +96,14 @@ def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> N
     drawn = [n for n in re.findall(r'<path d="([^"]*)"', page) if n]
     assert len(drawn) == len(inspection.signals) + len([c for c in inspection.candidates if not c.taken])
     pasted = tmp_path / "mapping.toml"
-    pasted.write_text(html.unescape(re.search(r'<pre class="paste"[^>]*>(.*?)</pre>', page, re.DOTALL)[1]))  # type: ignore[index]
+    pasted.write_text(html.unescape(re.search(r'<pre class="paste"[^>]*>(.*?)</pre>', page, re.DOTALL)[1]))
     assert load_mapping(pasted).signals == inspection.mapping.signals
     assert len(page) < _MOST_BYTES
     called("inspect", str(log), "--mapping", str(pasted), "--report", str(file))
     assert "named by the mapping file" in text_of(file.read_text())
 
 
-def test_a_log_of_many_fields_stays_below_the_limit(tmp_path: Path) -> None:
+def test_a_log_of_many_fields_stays_below_the_limit(tmp_path):
     rng = np.random.default_rng(1)
     topics = {f"/ecu{k}": {f"signal_{i}_{'x' * 200}": rng.normal(size=120) for i in range(60)} for k in range(8)}
     log = write_log(tmp_path / "many.mcap", {"/car": car(120), **topics})
@@ -113,7 +111,7 @@ def test_a_log_of_many_fields_stays_below_the_limit(tmp_path: Path) -> None:
     assert len(page) < _MOST_BYTES
 
 
-def test_the_log_is_never_replaced_and_fields_stand_alone(tmp_path: Path) -> None:
+def test_the_log_is_never_replaced_and_fields_stand_alone(tmp_path):
     log = write_log(tmp_path / "car.mcap", {"/car": car()})
     before = log.read_bytes()
     result = called("inspect", str(log), "--report", str(log))
@@ -125,7 +123,7 @@ def test_the_log_is_never_replaced_and_fields_stand_alone(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
-def test_hostile_names_run_nothing_and_a_narrow_dark_page_is_readable(tmp_path: Path) -> None:
+def test_hostile_names_run_nothing_and_a_narrow_dark_page_is_readable(tmp_path):
     log = write_log(tmp_path / "hostile.mcap", {HOSTILE: car(), "/car": {"<img src=x>": np.arange(300.0)}})
     file = tmp_path / "page.html"
     file.write_text(_page(log))

@@ -1,7 +1,5 @@
 """The whole inspection of a log, as record, as JSON, as tables and as a mapping to edit."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -59,7 +57,7 @@ def small_log(n: int = 3000, period_ms: int = 10) -> FakeLog:
     return FakeLog({"/imu": imu, "/vendor": vendor}, lost=lost)
 
 
-def test_topics_are_measured() -> None:
+def test_topics_are_measured():
     log = small_log()
     found = inspect_drive_log(log)
     imu = next(t for t in found.topics if t.name == "/imu")
@@ -72,7 +70,7 @@ def test_topics_are_measured() -> None:
     assert found.duration_s == pytest.approx(31.49, abs=1e-6)
 
 
-def test_signals_are_measured() -> None:
+def test_signals_are_measured():
     log = small_log()
     found = inspect_drive_log(log)
     ay = found.signals["ay_m_s2"]
@@ -93,7 +91,7 @@ def test_signals_are_measured() -> None:
     assert found.is_partial
 
 
-def test_an_empty_log_is_reported() -> None:
+def test_an_empty_log_is_reported():
     found = inspect_drive_log(FakeLog({}))
     assert found.topics == ()
     json.dumps(found.to_dict(), allow_nan=False)
@@ -101,7 +99,7 @@ def test_an_empty_log_is_reported() -> None:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_tables_fit_and_say_what_matters(width: int) -> None:
+def test_tables_fit_and_say_what_matters(width):
     text = rendered(render_inspection, inspect_drive_log(small_log()), width)
     assert max(len(line) for line in text.splitlines()) <= width
     for part in (
@@ -118,7 +116,7 @@ def test_tables_fit_and_say_what_matters(width: int) -> None:
     assert "the file ends early" in text
 
 
-def test_the_written_mapping_loads_and_names_the_candidates(tmp_path: Path) -> None:
+def test_the_written_mapping_loads_and_names_the_candidates(tmp_path):
     found = inspect_drive_log(small_log())
     path = tmp_path / "m.toml"
     write_mapping(found, path)
@@ -131,7 +129,7 @@ def test_the_written_mapping_loads_and_names_the_candidates(tmp_path: Path) -> N
     assert [p.name for p in tmp_path.iterdir()] == ["m.toml"]
 
 
-def test_a_drive_has_its_checks_and_tells_the_failed_ones(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_a_drive_has_its_checks_and_tells_the_failed_ones(sample_logs_dir, tmp_path):
     told: list[str] = []
     log, car = sample_logs_dir / "sweep.mcap", Car.load(sample_logs_dir / "vehicle.toml")
     mapping = load_mapping(wrong_sign(log, tmp_path))
@@ -147,7 +145,7 @@ def test_a_drive_has_its_checks_and_tells_the_failed_ones(sample_logs_dir: Path,
 
 
 @pytest.mark.slow
-def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
+def test_a_log_with_a_dropout_and_losses(shared_dir):
     found = inspect_log(shared_dir / "data" / "drives" / "faulty" / "revs_250lm_a_disorder.mcap")
     imu = next(t for t in found.topics if t.name == "/imu/data")
     assert imu.largest_gap_s == pytest.approx(30.01, abs=0.02)
@@ -165,7 +163,7 @@ def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
     assert found.is_partial
 
 
-def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
+def test_covariances_do_not_hide_the_gyro(sample_logs_dir):
     found = fields_of_log(sample_logs_dir / "dlc.mcap", "/imu/data")
     (topic,) = found["topics"]
     paths = [f["path"] for f in topic["fields"]]
@@ -180,7 +178,7 @@ def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
     json.dumps(jsonable(found), allow_nan=False)
 
 
-def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path) -> None:
+def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir):
     found = fields_of_log(sample_logs_dir / "dlc.mcap")
     assert len(found["topics"]) > 5
     with pytest.raises(UsageError, match="topics: "):
@@ -188,9 +186,7 @@ def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path)
 
 
 @pytest.mark.slow
-def test_missing_signals_are_named_and_doubtful_candidates_stand_in_the_file_as_comments(
-    shared_dir: Path, tmp_path: Path
-) -> None:
+def test_missing_signals_are_named_and_doubtful_candidates_stand_in_the_file_as_comments(shared_dir, tmp_path):
     found = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
     text = rendered(render_inspection, found, 200)
     assert "speed_m_s" in next(line for line in text.splitlines() if line.startswith("missing"))
@@ -203,7 +199,7 @@ def test_missing_signals_are_named_and_doubtful_candidates_stand_in_the_file_as_
     assert set(load_mapping(tmp_path / "m.toml").signals) == {"steer_rad"}
 
 
-def test_a_mapping_by_question_and_answer(shared_dir: Path) -> None:
+def test_a_mapping_by_question_and_answer(shared_dir):
     found = inspect_log(shared_dir / "data" / "drives" / "lunda_v40")
     said: list[str] = []
     answers = iter(
@@ -224,7 +220,7 @@ UNSEEN, SEEN = 15, 3
 
 
 @pytest.fixture
-def _small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small_windows(monkeypatch):
     """Make a log of 300 s a large one: of it the first minute is checked, and four times 3 s are looked at."""
     monkeypatch.setattr("pdhef_logtool.runs.inspection.report.WHOLE_BYTES", 1 << 20)
     monkeypatch.setattr("pdhef_logtool.runs.inspection.report.WINDOW_NS", 60 * S)
@@ -241,10 +237,9 @@ def _by_times(found: Inspection) -> list[dict[str, object]]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small_windows")
-def test_a_sample_tells_what_the_whole_tells(sample_logs_dir: Path) -> None:
+def test_a_sample_tells_what_the_whole_tells(sample_logs_dir):
     some, whole = (inspect_log(sample_logs_dir / "road.mcap", whole=w) for w in (False, True))
     assert whole.sample is None
-    assert some.sample is not None
     assert (some.sample.of_chunks, some.sample.times) == (41, "index")
     assert 10 <= some.sample.chunks <= 25
     assert _by_times(some) == _by_times(whole)
@@ -263,7 +258,7 @@ def test_a_sample_tells_what_the_whole_tells(sample_logs_dir: Path) -> None:
     assert "--all" not in rendered(render_inspection, whole)
 
 
-def test_a_small_log_is_read_whole(sample_logs_dir: Path) -> None:
+def test_a_small_log_is_read_whole(sample_logs_dir):
     assert inspect_log(sample_logs_dir / "dlc.mcap").sample is None
 
 
@@ -272,7 +267,6 @@ def _flip_in_chunk(number: int) -> Callable[[Path], None]:
         source = LocalFile(file)
         index = read_index(source)
         source.close()
-        assert index is not None
         data = bytearray(file.read_bytes())
         extent, _ = index.chunks[number]
         data[(extent.start + extent.end) // 2] ^= 1
@@ -290,9 +284,7 @@ def _cut(file: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "seen"), [(_flip_in_chunk(SEEN), True), (_flip_in_chunk(UNSEEN), False), (_cut, True)]
 )
-def test_damage_that_is_met_has_all_of_it_read(
-    tmp_path: Path, sample_logs_dir: Path, spoil: Callable[[Path], None], seen: bool
-) -> None:
+def test_damage_that_is_met_has_all_of_it_read(tmp_path, sample_logs_dir, spoil, seen):
     file = tmp_path / "damaged.mcap"
     file.write_bytes((sample_logs_dir / "road.mcap").read_bytes())
     spoil(file)
@@ -306,12 +298,11 @@ def test_damage_that_is_met_has_all_of_it_read(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small_windows")
-def test_of_a_far_log_only_the_sample_is_fetched(sample_logs_dir: Path) -> None:
+def test_of_a_far_log_only_the_sample_is_fetched(sample_logs_dir):
     pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
     data = (sample_logs_dir / "road.mcap").read_bytes()
     with serving(**{"road.mcap": data, "again.mcap": data, "fields.mcap": data}) as server:
         far = inspect_log(RemotePlace(server.place("road.mcap")))
-        assert far.sample is not None
         assert (far.sample.times, far.sample.of_chunks) == ("sample", 41)
         assert 0.3 < server.bytes_sent / len(data) < 0.65
         assert len(server.requests) <= 12

@@ -1,7 +1,5 @@
 """Runs that are killed, meet full disks or each other, or would overwrite their input."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -36,14 +34,14 @@ def config(sample_logs_dir: Path, **changes: Any) -> RunConfig:
 
 
 @pytest.fixture
-def log(sample_logs_dir: Path) -> str:
+def log(sample_logs_dir):
     return str(sample_logs_dir / "dlc.mcap")
 
 
 # ------------------------------------------------------------------------------------- outputs that are inputs
 
 
-def test_a_run_never_replaces_what_it_reads(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+def test_a_run_never_replaces_what_it_reads(sample_logs_dir, tmp_path, log):
     folder = tmp_path / "d" / "logs" / "annotated"
     folder.mkdir(parents=True)
     recording = folder / "annotated.mcap"
@@ -66,7 +64,7 @@ def test_a_run_never_replaces_what_it_reads(sample_logs_dir: Path, tmp_path: Pat
     assert not (tmp_path / "o").exists()
 
 
-def test_a_mapping_in_a_folder_that_is_replaced_is_refused(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+def test_a_mapping_in_a_folder_that_is_replaced_is_refused(sample_logs_dir, tmp_path, log):
     mapping = tmp_path / "logs" / "dlc" / "mapping.toml"
     mapping.parent.mkdir(parents=True)
     mapping.write_text("[truth.vy_m_s]\ntopic = 't'\nfield = 'f'\n")
@@ -77,7 +75,7 @@ def test_a_mapping_in_a_folder_that_is_replaced_is_refused(sample_logs_dir: Path
 # ----------------------------------------------------------------------------------------------- files that stay
 
 
-def test_a_persons_files_and_what_the_run_does_not_write_stay(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+def test_a_persons_files_and_what_the_run_does_not_write_stay(sample_logs_dir, tmp_path, log):
     run_logs([log], tmp_path, config(sample_logs_dir))
     folder = tmp_path / "logs" / "dlc"
     (folder / "notes.txt").write_text("mine")
@@ -95,9 +93,7 @@ def test_a_persons_files_and_what_the_run_does_not_write_stay(sample_logs_dir: P
 
 
 @pytest.mark.slow
-def test_whichever_write_fails_a_log_is_whole_and_the_error_one_line(
-    sample_logs_dir: Path, tmp_path: Path, log: str
-) -> None:
+def test_whichever_write_fails_a_log_is_whole_and_the_error_one_line(sample_logs_dir, tmp_path, log):
     before, after = config(sample_logs_dir), config(sample_logs_dir, estimators=("zero", "kinematic"))
     out, old = tmp_path / "out", tmp_path / "old"
     run_logs([log], out, before)
@@ -137,13 +133,13 @@ def test_whichever_write_fails_a_log_is_whole_and_the_error_one_line(
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_may_not_be_written_is_one_line(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+def test_a_folder_that_may_not_be_written_is_one_line(sample_logs_dir, tmp_path, log):
     tmp_path.chmod(0o500)
     with pytest.raises(OutputError, match="choose a place that you may write to"):
         run_logs([log], tmp_path, config(sample_logs_dir))
 
 
-def test_a_file_in_the_place_of_a_folder_is_one_line(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+def test_a_file_in_the_place_of_a_folder_is_one_line(sample_logs_dir, tmp_path, log):
     (tmp_path / "logs").write_text("mine")
     with pytest.raises(OutputError, match="move it or choose another place"):
         run_logs([log], tmp_path, config(sample_logs_dir))
@@ -154,7 +150,7 @@ def test_a_file_in_the_place_of_a_folder_is_one_line(sample_logs_dir: Path, tmp_
 
 
 @pytest.mark.slow
-def test_kills_leave_whole_logs_and_the_next_run_the_same_results(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_kills_leave_whole_logs_and_the_next_run_the_same_results(sample_logs_dir, tmp_path):
     logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "step.mcap")]
     arguments = [*logs, "--car", "saloon", "-e", "zero", "--no-report", *SLICE]
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
@@ -176,7 +172,7 @@ def test_kills_leave_whole_logs_and_the_next_run_the_same_results(sample_logs_di
     assert leftovers(out) == []
 
 
-def test_a_second_run_in_the_same_folder_is_refused_and_changes_nothing(log: str, tmp_path: Path) -> None:
+def test_a_second_run_in_the_same_folder_is_refused_and_changes_nothing(log, tmp_path):
     def meanwhile(task: DriveTask, tell: Tell) -> DriveEnd:
         with pytest.raises(OutputError, match="another command is writing to"):
             run([log], tmp_path / "out")

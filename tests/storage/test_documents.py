@@ -1,7 +1,5 @@
 """Every document that is read: whatever stands in it, a valid record or one line that says why not."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tomllib
@@ -169,9 +167,7 @@ def changed(data: st.DataObject, document: Any, anything: st.SearchStrategy[Any]
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(data=st.data())
 @pytest.mark.slow
-def test_any_document_is_a_record_or_one_line(
-    loader: Loader, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_any_document_is_a_record_or_one_line(loader, tmp_path_factory, data):
     folder = tmp_path_factory.getbasetemp() / loader.name
     folder.mkdir(exist_ok=True)
     anything = documents(keys_of(loader.valid))
@@ -182,12 +178,12 @@ def test_any_document_is_a_record_or_one_line(
 
 
 @every_loader
-def test_the_document_that_the_others_are_made_of_is_taken(loader: Loader, tmp_path: Path) -> None:
+def test_the_document_that_the_others_are_made_of_is_taken(loader, tmp_path):
     assert outcome(loader, write(tmp_path / loader.name, loader.valid)) == ""
 
 
 @every_loader
-def test_what_cannot_be_read_is_one_line(loader: Loader, tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_one_line(loader, tmp_path):
     path = tmp_path / loader.name
     # A car needs none of its parts.
     assert ("no such file" in outcome(loader, path)) == (loader.load is not _part)
@@ -210,7 +206,7 @@ def test_what_cannot_be_read_is_one_line(loader: Loader, tmp_path: Path) -> None
     assert any(word in outcome(loader, path) for word in ("directory", "folder"))
 
 
-def test_nesting_up_to_the_limit_is_read(tmp_path: Path) -> None:
+def test_nesting_up_to_the_limit_is_read(tmp_path):
     depth = MAX_DEPTH - 1
     nested = "[" * depth + "]" * depth
     (tmp_path / "a.toml").write_text(f"a = {nested}")
@@ -219,7 +215,7 @@ def test_nesting_up_to_the_limit_is_read(tmp_path: Path) -> None:
     assert read_json(tmp_path / "a.json", "a file", UsageError)["n"] == 2**64 - 1
 
 
-def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path):
     path, document = tmp_path / "own.json", {"a": [1, 0.1, None, "é"], "b": {"c": True}}
     data = json.dumps(seal(document)).encode()
     path.write_bytes(data)
@@ -234,12 +230,12 @@ def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path: Pat
         read_sealed(path, "ours", UsageError)
 
 
-def test_errors_say_what_was_wanted_where_and_what_to_do(tmp_path: Path) -> None:
+def test_errors_say_what_was_wanted_where_and_what_to_do(tmp_path):
     with pytest.raises(VehicleError, match=r"none\.toml: expected a car, got no such file; write one"):
         read_toml(tmp_path / "none.toml", "a car", VehicleError, "write one")
 
 
-def test_the_nearest_name_is_told() -> None:
+def test_the_nearest_name_is_told():
     known = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
     assert unknown("ay", known, "r_std") == "r_std.ay: unknown, did you mean r_std.ay_m_s2?"
     assert unknown("yaw_rate_rads", known) == "yaw_rate_rads: unknown, did you mean yaw_rate_rad_s?"
@@ -259,14 +255,12 @@ def test_the_nearest_name_is_told() -> None:
         (LOADERS[4], "[filter.physics]\nq_sdt = [0.1, 0.1, 0.1]", "filter.physics.q_sdt", "filter.physics.q_std"),
     ],
 )
-def test_misspelt_entries_are_told_with_the_nearest_name(
-    loader: Loader, line: str, wrong: str, right: str, tmp_path: Path
-) -> None:
+def test_misspelt_entries_are_told_with_the_nearest_name(loader, line, wrong, right, tmp_path):
     (tmp_path / loader.name).write_text(line)
     assert f"{wrong}: unknown, did you mean {right}?" in outcome(loader, tmp_path / loader.name)
 
 
-def test_hashes_that_stand_in_files_stay_what_they_were() -> None:
+def test_hashes_that_stand_in_files_stay_what_they_were():
     """Hashes of version 0.2.0. Journals, caches, datasets and cars identify their sources by these hashes."""
     document = {"b": [1, 2.5, None, True], "a": {"ü\udc80": "/", "": (1e-9, 1e22)}}
     assert digest(document) == "67b92e78790c0c9feafdf6c5b26ff7e18525bc442921e21ed792a5d1dbcc28d6"

@@ -1,7 +1,5 @@
 """tomllib reads written TOML back unchanged."""
 
-from __future__ import annotations
-
 import tomllib
 from typing import Any
 
@@ -21,11 +19,11 @@ _TABLES: Any = st.recursive(
 
 
 @given(_TABLES)
-def test_a_document_is_read_back(entries: dict[str, Any]) -> None:
+def test_a_document_is_read_back(entries):
     assert tomllib.loads(toml_text(entries, "A head\nof two lines")) == entries
 
 
-def test_the_layout_is_for_readers() -> None:
+def test_the_layout_is_for_readers():
     entries = {"t": {"n": [1, 2.0], "u": {"x": True}}, "names": ["a", 'b"'], "rows": [{"k v": 1e-9}], "v": 1}
     text = """# Head
 v = 1

@@ -1,7 +1,5 @@
 """Fault injection for workers: each work item selects the fault."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,17 +1,13 @@
 """A cluster of three nodes here, one of which is lost while its task runs. Part of ``make fleet``."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -31,14 +27,14 @@ PRELOAD = ["tests.workers.planted_work"]
 
 
 @pytest.fixture
-def cluster() -> Iterator[Any]:
+def cluster():
     with cluster_of_one() as made:
         yield made
 
 
-def test_faults_end_on_a_node_as_they_do_here(cluster: Any) -> None:
+def test_faults_end_on_a_node_as_they_do_here(cluster):
     items = [("well", "x"), ("kill", ""), ("raise", ""), ("hang", "")]
-    found = supervise_on_ray(planted, items, address=cluster.address, limits=Limits(silence_s=3.0), preload=PRELOAD)  # type: ignore[var-annotated]
+    found = supervise_on_ray(planted, items, address=cluster.address, limits=Limits(silence_s=3.0), preload=PRELOAD)
     ended = sorted(found, key=lambda e: e.number)
     assert [e.item for e in ended] == items
     assert [(e.result, e.failure) for e in ended] == [
@@ -67,7 +63,7 @@ def lose_cluster(folder: Path) -> None:
             print(error, flush=True)
 
 
-def test_a_cluster_that_is_lost_is_one_error_and_no_failure_of_its_items(tmp_path: Path) -> None:
+def test_a_cluster_that_is_lost_is_one_error_and_no_failure_of_its_items(tmp_path):
     start = "from pathlib import Path; from tests.workers.test_ray_supervisor import lose_cluster"
     script = f"{start}; lose_cluster(Path({str(tmp_path)!r}))"
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False)

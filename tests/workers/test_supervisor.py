@@ -1,7 +1,5 @@
 """Supervised workers: a worker that dies, hangs or exceeds its memory loses only its item; the run reports it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -57,7 +55,7 @@ def assert_as_planted(ended: list[Ended[Item, object]]) -> None:
 
 
 @pytest.mark.slow
-def test_each_fault_costs_its_own_item_only(tmp_path: Path) -> None:
+def test_each_fault_costs_its_own_item_only(tmp_path):
     items = [(what, "") for what in REASONS] + [("kill once", str(tmp_path / "once")), ("slowly", "x")]
     items = [x for i, fault in enumerate(items) for x in (fault, ("well", str(i)))]
     assert_as_planted(outcomes(items, 2))
@@ -68,20 +66,20 @@ def test_each_fault_costs_its_own_item_only(tmp_path: Path) -> None:
     items=st.lists(st.tuples(st.sampled_from(["well", "well", "kill", "exit", "raise", "odd"]), st.text(max_size=5))),
     jobs=st.integers(1, 4),
 )
-def test_every_item_ends_once_whatever_happens_in_any_order(items: list[Item], jobs: int) -> None:
+def test_every_item_ends_once_whatever_happens_in_any_order(items, jobs):
     assert_as_planted(outcomes(items, jobs, Limits(silence_s=600.0)))
 
 
-def test_a_lost_item_is_tried_again_when_nothing_else_runs(tmp_path: Path) -> None:
+def test_a_lost_item_is_tried_again_when_nothing_else_runs(tmp_path):
     items = [("alone", str(tmp_path / "mark")), *[("well", "")] * 4]
     ended = list(supervise(planted, items, jobs=3, preload=PRELOAD))
     assert [e.number for e in ended[-1:]] == [0]
     assert ended[-1].result == 1
 
 
-def test_workers_have_one_thread_and_live_as_long_as_the_run() -> None:
+def test_workers_have_one_thread_and_live_as_long_as_the_run():
     ended = outcomes([("where", "")] * 20, 2, Limits())
-    pids, calls, threads, omp = zip(*(e.result for e in ended), strict=True)  # type: ignore[misc]
+    pids, calls, threads, omp = zip(*(e.result for e in ended), strict=True)
     assert len(set(pids)) <= 2
     assert os.getpid() not in pids
     assert set(threads) == {1}
@@ -90,24 +88,24 @@ def test_workers_have_one_thread_and_live_as_long_as_the_run() -> None:
     assert not called
 
 
-def test_the_processor_time_of_workers_counts_as_that_of_the_command() -> None:
+def test_the_processor_time_of_workers_counts_as_that_of_the_command():
     before = os.times()
     outcomes([("burn", "0.3")] * 2, 2, Limits())
     after = os.times()
     assert after.children_user + after.children_system - before.children_user - before.children_system > 0.6
 
 
-def test_one_job_without_limits_runs_here() -> None:
+def test_one_job_without_limits_runs_here():
     told: list[tuple[int, str, float]] = []
     items = [("where", ""), ("raise", ""), ("well", "x")]
     ended = list(supervise(planted, items, jobs=1, progress=lambda *what: told.append(what)))
-    assert ended[0].result[0] == os.getpid()  # type: ignore[index]
+    assert ended[0].result[0] == os.getpid()
     assert ended[1].failure == Failure(REASONS["raise"], "at raise", 1)
     assert ended[2].result == "x"
     assert told == [(0, "at where", 0.5), (1, "at raise", 0.5), (2, "at well", 0.5)]
 
 
-def test_a_fork_server_that_dies_with_a_worker_costs_no_item(tmp_path: Path) -> None:
+def test_a_fork_server_that_dies_with_a_worker_costs_no_item(tmp_path):
     warned: list[str] = []
     items = [("kill server once", str(tmp_path / "once")), *[("well", "x")] * 3]
     ended = list(supervise(planted, items, jobs=2, preload=PRELOAD, warn=warned.append))
@@ -116,7 +114,7 @@ def test_a_fork_server_that_dies_with_a_worker_costs_no_item(tmp_path: Path) -> 
 
 
 @pytest.fixture
-def deaths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def deaths(tmp_path, monkeypatch):
     """A file with a letter for each time that the fork server was killed while it loaded: at most twice."""
     file = tmp_path / "deaths"
     file.touch()
@@ -128,7 +126,7 @@ def deaths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 DYING = ["tests.workers.planted_work:die_at_start"]
 
 
-def test_a_fork_server_that_dies_again_and_again_is_one_error(deaths: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fork_server_that_dies_again_and_again_is_one_error(deaths, monkeypatch):
     monkeypatch.setenv(MOST_DEATHS, "99")
     with pytest.raises(WorkerError, match="4 that died, the last one by signal 9") as caught:
         list(supervise(planted, [("well", "")] * 4, jobs=2, preload=DYING))
@@ -136,12 +134,12 @@ def test_a_fork_server_that_dies_again_and_again_is_one_error(deaths: Path, monk
     assert deaths.read_text() == "xxxx"
 
 
-def test_no_jobs_are_refused_before_anything_is_pulled() -> None:
+def test_no_jobs_are_refused_before_anything_is_pulled():
     with pytest.raises(UsageError, match="at least one process"):
         list(supervise(planted, [], jobs=0))
 
 
-def test_items_are_pulled_as_workers_become_free() -> None:
+def test_items_are_pulled_as_workers_become_free():
     pulled = 0
 
     def items() -> Iterator[Item]:
@@ -184,7 +182,7 @@ with get_context("fork").Pool(1) as pool:
 """
 
 
-def test_workers_start_at_module_level_and_in_daemonic_processes(tmp_path: Path) -> None:
+def test_workers_start_at_module_level_and_in_daemonic_processes(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(AT_MODULE_LEVEL)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
@@ -193,7 +191,7 @@ def test_workers_start_at_module_level_and_in_daemonic_processes(tmp_path: Path)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_all_ends_with_the_parent_without_a_word(number: int) -> None:
+def test_all_ends_with_the_parent_without_a_word(number):
     root = Path(__file__).parents[2]
     with subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(SCRIPT)],
@@ -204,7 +202,6 @@ def test_all_ends_with_the_parent_without_a_word(number: int) -> None:
         text=True,
         start_new_session=True,
     ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "heard\n"
         assert process.stdout.readline() == "heard\n"
         if number == signal.SIGKILL:
