@@ -1,7 +1,10 @@
-"""Size limits: the counted figures, and that no limit rises without a reason."""
+"""Size limits: the counted figures, positional parameters, and that no limit rises without a reason."""
 
 import ast
+import re
+from pathlib import Path
 
+import pytest
 import size_budget
 
 
@@ -28,3 +31,32 @@ def test_a_limit_rises_with_a_reason_only():
     reasons = [{"figure": "a.x", "limit": 4, "reason": "a log format"}]
     assert list(size_budget.unexplained({**after, "raised": reasons}, before)) == []
     assert list(size_budget.unexplained(before, after)) == []
+
+
+_ROOT = Path(__file__).resolve().parents[1]
+MOST = 8
+#: On the line of the ``def``, or directly above it or its decorators.
+REASON = re.compile(r"#\s*positional: \S.*")
+
+
+def overlong(source: str) -> list[str]:
+    """Return name and count of the functions that take too many, and have no reason."""
+    lines, found = source.splitlines(), []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        names = [a.arg for a in (*node.args.posonlyargs, *node.args.args)]
+        count = len(names) - (names[:1] in (["self"], ["cls"]))
+        first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
+        beside = [lines[n - 1] for n in (first - 1, node.lineno - 1, node.lineno) if n > 0]
+        if count > MOST and not any(REASON.search(line) for line in beside):
+            found.append(f"{node.name} ({count})")
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("package", ["pdhef_logtool", "truthsim", "studies", "benchmarks"])
+def test_no_function_takes_many_positional_parameters(package):
+    found = {str(p.relative_to(_ROOT)): overlong(p.read_text()) for p in sorted((_ROOT / package).rglob("*.py"))}
+    assert found, "nothing was looked at"
+    assert {path: names for path, names in found.items() if names} == {}

@@ -7,14 +7,12 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.reports.fleet import fleet_page
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.storage.documents import seal
-from tests.results.made_run import entry, write_run, write_tables
+from tests.results.made_run import entry, row, write_run
 from tests.run_report import text_of
 
 HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u202egnp"
@@ -22,13 +20,13 @@ HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u2
 
 def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str] | None = None) -> Path:
     """Write a run: ``drives`` with RMSE in rad of pd-hef and physics, and changes of the report; ``failed`` reasons."""
-    logs, rows, reports = [], [], {}
+    rows, reports = [], {}
+    cells = [{"speed": 1, "ay": 0, "seconds": 90.0, "scored": 9, "sideslip_mse_rad2": 1e-4}]
     for label, drive in drives.items():
         given = dict(drive)
-        for name, value in zip(("pd-hef", "physics"), given.pop("errors", ()), strict=False):
-            rows.append(MetricRow(label, name, "sideslip_rad", "all", "rmse", value, "rad", 9))
-        cells = [{"speed": 1, "ay": 0, "seconds": 90.0, "scored": 9, "sideslip_mse_rad2": 1e-4}]
-        report = {
+        errors = zip(("pd-hef", "physics"), given.pop("errors", ()), strict=False)
+        rows += [row(label, value, estimator=name) for name, value in errors]
+        reports[label] = {
             "format": "pdhef.report",
             "log": {"name": label, "duration_s": 100.0, "kind": "mcap"},
             "vehicle": {"name": "golf"},
@@ -39,14 +37,11 @@ def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mappin
         }
         place = folder / "logs" / label
         place.mkdir(parents=True)
-        (place / "report.json").write_text(json.dumps(report))
-        reports[label] = report
+        (place / "report.json").write_text(json.dumps(reports[label]))
         (place / "report.html").write_text("x")
-        logs.append({"log": label, "outcome": "ok", "car": None, "main": "pd-hef"})
-    logs += [{"log": label, "outcome": f"failed: {reason}", "car": None} for label, reason in (failed or {}).items()]
-    write_tables(folder, logs, rows, reports)
-    (folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": logs, "versions": {"a": "1"}})))
-    return folder
+    entries = [entry(label, car=None) for label in drives]
+    entries += [entry(label, car=None, outcome=f"failed: {why}") for label, why in (failed or {}).items()]
+    return write_run(folder, {}, entries=entries, rows=rows, reports=reports)
 
 
 def words(folder: Path, **options: Any) -> str:

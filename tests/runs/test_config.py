@@ -100,10 +100,8 @@ def test_flags_win_over_file_and_paths_are_relative_to_it(tmp_path):
 def test_wrong_files_name_what_is_wrong(tmp_path, text, named):
     file = tmp_path / "c.toml"
     file.write_text(text)
-    with pytest.raises(UsageError, match=named) as caught:
+    with pytest.raises(UsageError, match=named):
         load_config(file, {})
-    assert caught.value.exit_code == 2
-    assert "\n" not in str(caught.value)
 
 
 def test_all_problems_of_a_file_come_at_once(tmp_path):

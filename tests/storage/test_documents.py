@@ -1,4 +1,4 @@
-"""Every document that is read: whatever stands in it, a valid record or one line that says why not."""
+"""Every document that is read is a valid record or one line that says why not; TOML that is written is read back."""
 
 import json
 import shutil
@@ -30,6 +30,7 @@ from pdhef_logtool.storage.documents import (
     seal,
     unknown,
 )
+from pdhef_logtool.storage.toml_text import toml_text
 
 SHIPPED, CAR = SHIPPED_FOLDERS["default"], SHIPPED_CARS["saloon"]
 VALID_CONFIG = {
@@ -269,3 +270,40 @@ def test_hashes_that_stand_in_files_stay_what_they_were():
     assert mapping.sha256 == "95bc15effd8048a668853de7ce24f1e84c771acd8e1692d120c193d57d689937"
     linear = LinearModel(("ay_m_s2",), (0.5,), 0.25, 2.0)
     assert linear.sha256 == "47076088d4172941685a059bf407bb89750dff940ccc307b7ca6278cb1868aed"
+
+
+_TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+_PLAIN = st.one_of(st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), _TEXTS)
+_TABLES: Any = st.recursive(
+    st.dictionaries(_TEXTS, st.one_of(_PLAIN, st.lists(_PLAIN, max_size=3))),
+    lambda inner: st.dictionaries(_TEXTS, st.one_of(_PLAIN, st.lists(inner, max_size=2), inner), max_size=4),
+    max_leaves=8,
+)
+
+
+@given(_TABLES)
+def test_a_document_is_read_back(entries):
+    assert tomllib.loads(toml_text(entries, "A head\nof two lines")) == entries
+
+
+def test_the_layout_is_for_readers():
+    entries = {"t": {"n": [1, 2.0], "u": {"x": True}}, "names": ["a", 'b"'], "rows": [{"k v": 1e-9}], "v": 1}
+    text = """# Head
+v = 1
+names = [
+    "a",
+    "b\\"",
+]
+rows = [
+    {"k v" = 1e-09},
+]
+
+[t]
+n = [1, 2.0]
+
+[t.u]
+x = true
+"""
+    assert toml_text(entries, "Head") == text
+    with pytest.raises(TypeError, match="NoneType"):
+        toml_text({"a": None})

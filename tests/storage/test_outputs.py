@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.storage.files import PendingFile, scratch_folder, write_bytes
 from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction, OutputFolder, check_no_input
+from tests.failing_writes import CALLS, failing_writes
 
 OLD = {"a.txt": "old a", "b.txt": "old b"}
 
@@ -92,47 +94,23 @@ def test_a_file_in_the_way_is_one_line_and_stays(tmp_path):
     assert texts(tmp_path) == {"x": "mine"}
 
 
-#: Every call to the system that a commit makes and that can fail on a full or broken disk.
-CALLS = ("fsync", "link", "rename", "replace", "mkdir", "chmod", "open")
-
-
-def test_whichever_call_fails_one_of_the_two_is_whole(tmp_path, monkeypatch, exchange):
-    done = False
-    number = 0
-    while not done:
-        number += 1
+def test_whichever_call_fails_one_of_the_two_is_whole(tmp_path, exchange):
+    before = {**OLD, "notes.txt": "mine"}
+    for number in count(1):
         folder = tmp_path / f"{number}" / "x"
-        make(folder, {**OLD, "notes.txt": "mine"})
-        left = number
-
-        with monkeypatch.context() as patch:
-
-            def failing(real, *, once=patch):
-                def call(*arguments, **options):
-                    nonlocal left
-                    left -= 1
-                    if left == 0:
-                        raise OSError(errno.EIO, "Input/output error")
-                    return real(*arguments, **options)
-
-                return call
-
-            for name in CALLS:
-                patch.setattr(os, name, failing(getattr(os, name)))
+        make(folder, before)
+        with failing_writes(number, errno.EIO, (*CALLS, "chmod", "open")) as failing:
             try:
                 with FolderTransaction(folder) as change:
                     write_bytes(change.file("a.txt"), b"new a")
-                done = left > 0
             except OutputError as error:
                 assert "Input/output error" in str(error)
-            except OSError as error:
-                pytest.fail(f"call {number}: {error!r} is not given as an error of writing")
-        found = texts(folder)
-        new = {**OLD, "a.txt": "new a", "notes.txt": "mine"}
-        assert found in ({**OLD, "notes.txt": "mine"}, new), number
-        assert found == new or not done
+        found, new, done = texts(folder), {**before, "a.txt": "new a"}, failing.count < number
+        assert found == new or (found == before and not done), number
         FolderTransaction(folder).discard()  # the next command removes the remains of a failed clean-up
         assert [p.name for p in folder.parent.iterdir()] == ["x"], number
+        if done:
+            break
     assert number > 8
 
 

@@ -175,6 +175,5 @@ def test_rows_are_the_same_drives_with_one_thing_wrong():
     ],
 )
 def test_bad_requests_are_refused(wrong, tmp_path):
-    with pytest.raises(UsageError) as caught:
+    with pytest.raises(UsageError):
         wrong(tmp_path / "x")
-    assert "\n" not in str(caught.value)
