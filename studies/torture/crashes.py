@@ -53,7 +53,7 @@ _OF_RUN = ("run.json", "report.json", "report.html", "metrics.parquet", "tables/
 #: Tests of a fleet on Ray: file and part of the name.
 _RAY = {
     "a Ray node is lost": ("tests/runs/test_fleet_runs.py", "one_of_which_goes"),
-    "a Ray cluster is lost": ("tests/workers/test_ray_supervisor.py", "is_lost"),
+    "a Ray cluster is lost": ("tests/workers/test_supervisor.py", "is_lost"),
 }
 
 

@@ -1,26 +1,31 @@
-"""pd-hef: it is ``physics`` plus exactly the residual, and a right residual makes it right."""
+"""pd-hef is ``physics`` plus exactly the residual, of a network or a taught car; a right residual makes it right."""
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
-from made_models import random_network
+from made_models import linear_residual, random_network
 from physics_oracle import G, Oracle, parts, vehicle
 from reference_car import FRICTION, Drive, drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, physics_sha256
+from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, VehicleParameters, correct_signals, default_vehicle
 from pdhef_logtool.drive.sensor_faults import without_faults
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
+from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, physics_filter
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle
+from pdhef_logtool.residual_model.ladder import LadderModel
 
 pytestmark = pytest.mark.slow
 
@@ -306,3 +311,71 @@ def test_the_mixture_has_the_moments_of_its_samples():
         assert mix(np.array(weights), [lone, tracks[1]]).vy_m_s[0] == tracks[1].vy_m_s[0]
     assert mix(np.array([[0.7, 0.3]]), [tracks[1], lone]).vy_m_s[0] == tracks[1].vy_m_s[0]
     assert not mix(np.array([[0.7, 0.3]]), [lone, lone]).valid[0]
+
+
+SEDAN = default_vehicle()
+
+
+def taught_car(residual: LadderModel | None, *, calibrated: bool = False) -> Car:
+    model = CarModel(physics_sha256=Car(SEDAN).physics_sha256, residual=residual, calibrated=calibrated)
+    return replace(Car(SEDAN), model=model)
+
+
+def acts(estimator: Any) -> bool:
+    """Whether an estimator uses the taught residual."""
+    return isinstance(estimator.network, LadderModel) and estimator.trust == 1.0
+
+
+@pytest.fixture(scope="module")
+def driven():
+    s = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
+    return replace(s, friction=np.full(len(s), 0.85))
+
+
+def track_of(name: str, car: Car, driven: Signals) -> StateTrack:
+    return run_estimator(make_estimator(name, car), driven)
+
+
+def test_its_response_is_the_one_that_teaching_uses(driven):
+    estimator = make_estimator("physics", taught_car(None))
+    assert isinstance(estimator, AdaptivePhysics)
+    response = residual_response(estimator, driven, np.arange(len(driven)))
+    rate = 0.2 * np.sin(np.arange(len(driven)) / 30.0)
+    tracks = []
+    for given in (0.0, 1.0):
+        rates = np.stack([given * rate, np.zeros(len(rate))], axis=1)
+        steps, _ = estimator.physics.run(driven, None, rates)
+        tracks.append(np.arctan2(steps.x[:, 1], steps.x[:, 0]))
+    expected = tracks[1] - tracks[0]
+    assert np.nanmax(np.abs(expected)) > 1e-4
+    late = slice(50, None)
+    assert np.allclose(response(rate[:, None])[late, 0], expected[late], atol=0.1 * np.nanmax(np.abs(expected)))
+
+
+def test_beyond_the_taught_speed_it_is_physics(driven):
+    car = taught_car(linear_residual(fastest_m_s=10.0))
+    physics, hybrid = (track_of(name, car, driven) for name in ("physics", "pd-hef"))
+    assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
+    assert np.nanmax(hybrid.network_trust) == 0.0
+
+
+def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(driven):
+    calibration = Posterior(SEDAN)
+    for calibrated in (False, True):
+        car = taught_car(linear_residual(), calibrated=calibrated)
+        plain, of_log = (make_estimator("pd-hef", c) for c in (car, replace(car, self_calibrated=calibration)))
+        assert acts(plain) is not calibrated
+        assert acts(of_log) is calibrated
+        without = of_log if not calibrated else plain
+        assert any("residual gain 0" in note for note in without.notes)
+    track = track_of(
+        "pd-hef", replace(taught_car(linear_residual(), calibrated=True), self_calibrated=calibration), driven
+    )
+    assert np.nanmax(track.network_trust) == 1.0
+
+
+def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it():
+    assert not acts(make_estimator("pd-hef", taught_car(None)))
+    assert make_estimator("pd-hef", taught_car(linear_residual())).causal
+    with_network = replace(taught_car(linear_residual()), network=random_network())
+    assert not acts(make_estimator("pd-hef:gain=1", with_network)) and acts(make_estimator("pd-hef", with_network))

@@ -1,22 +1,19 @@
 """The pages in a browser: messages, requests, figures, and drawing time."""
 
 import base64
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
-from made_runs import NAMES, drive_tracks, write_run
-from test_drive import hostile_run, plan_of
-from test_fleet_page import run_of
-
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
+from tests.reports.browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
+from tests.reports.made_runs import NAMES, drive_tracks, write_run
+from tests.reports.test_drive import hostile_run, plan_of
+from tests.reports.test_fleet_page import run_of
 from tests.results import made_run
 
 pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT), pytest.mark.slow]

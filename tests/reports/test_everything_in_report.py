@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_runs import drive_tracks, write_run
-from test_fleet_page import run_of
 
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.reports.page import DASH, degrees, duration, number
@@ -18,6 +16,8 @@ from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.reports.made_runs import drive_tracks, write_run
+from tests.reports.test_fleet_page import run_of
 
 #: Units of the page over units of report.json: degrees, percent, minutes, hours, kilometres, milliseconds.
 FACTORS = (1.0, math.degrees(1.0), 100.0, 1 / 60, 1 / 3600, 1e-3, 1e3)

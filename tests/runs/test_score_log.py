@@ -17,7 +17,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from tests.run_report import follows
-from tests.runs.test_inspection_page import write_log
+from tests.runs.test_inspection_report import write_log
 from tests.runs.test_run import NO_TRUTH_MAPPING
 
 ERRORS = ("rmse", "rmse_relative", "mae", "bias", "p95_abs", "max_abs", "coverage95", "lag_s", "availability", "nees")

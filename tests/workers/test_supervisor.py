@@ -1,10 +1,12 @@
-"""Supervised workers: a worker that dies, hangs or exceeds its memory loses only its item; the run reports it."""
+"""Supervised workers, here or on nodes of Ray (``make fleet``): one that dies, hangs or grows loses only its item."""
 
 import os
 import signal
 import subprocess
 import sys
 import textwrap
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -14,11 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.records.errors import EXIT_FAILURE, UsageError, WorkerError
+from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
 from pdhef_logtool.workers.supervisor import Ended, Failure, Limits, supervise
+from tests.conftest import ROOT
 from tests.workers.planted_work import DEATHS, MOST_DEATHS, Item, called, planted
+from tests.workers.ray_nodes import cluster_of_one, processes_of
 
 LIMITS = Limits(silence_s=3.0, memory_bytes=400_000_000)
 PRELOAD = ["tests.workers.planted_work:note_call"]
+NO_RAY = "Ray is not installed: pip install 'pdhef-logtool[ray]'"
 REASONS = {
     "kill": "the worker was killed (signal 9)",
     "exit": "the worker ended with exit code 5",
@@ -212,3 +218,47 @@ def test_all_ends_with_the_parent_without_a_word(number):
         _, err = process.communicate(timeout=300)
     told = [line for line in err.splitlines() if line and not line.startswith((" ", "Traceback"))]
     assert told == ([] if number == signal.SIGKILL else ["KeyboardInterrupt"]), "the workers and the server say nothing"
+
+
+@pytest.mark.fleet
+def test_faults_end_on_a_node_as_they_do_here():
+    pytest.importorskip("ray", reason=NO_RAY)
+    items = [("well", "x"), ("kill", ""), ("raise", ""), ("hang", "")]
+    with cluster_of_one() as cluster:
+        options = {"limits": Limits(silence_s=3.0), "preload": PRELOAD}
+        found = list(supervise_on_ray(planted, items, address=cluster.address, **options))
+    ended = sorted(found, key=lambda e: e.number)
+    assert [e.item for e in ended] == items
+    assert [(e.result, e.failure) for e in ended] == [
+        ("x", None),
+        (None, Failure("the worker was killed (signal 9)", "at kill", 2)),
+        (None, Failure("raised ValueError: two lines", "at raise", 1)),
+        (None, Failure("nothing heard for 3 s", "at hang", 2)),
+    ]
+
+
+def lose_cluster(folder: Path) -> None:
+    """Kill the only node of a cluster while it works; its death sends signals to the process that started it."""
+    with cluster_of_one() as cluster:
+
+        def kill() -> None:
+            while not list(folder.glob("*.begun")):
+                time.sleep(0.05)
+            for pid in processes_of(cluster.head_node):
+                os.kill(pid, signal.SIGKILL)
+
+        threading.Thread(target=kill, daemon=True).start()
+        items: list[Item] = [("wait", f"{folder}/0")] * 3
+        try:
+            list(supervise_on_ray(planted, items, address=cluster.address, limits=Limits(), preload=PRELOAD))
+        except WorkerError as error:
+            print(error, flush=True)
+
+
+@pytest.mark.fleet
+def test_a_cluster_that_is_lost_is_one_error_and_no_failure_of_its_items(tmp_path):
+    pytest.importorskip("ray", reason=NO_RAY)
+    start = "from pathlib import Path; from tests.workers.test_supervisor import lose_cluster"
+    script = f"{start}; lose_cluster(Path({str(tmp_path)!r}))"
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert "--ray: expected a Ray cluster that keeps running, got " in ended.stdout, ended.stderr
