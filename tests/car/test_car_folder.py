@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import polars as pl
 import pytest
 from made_models import random_network
 
@@ -26,14 +25,13 @@ from pdhef_logtool.car.parts import (
     physics_sha256,
 )
 from pdhef_logtool.car.store import check_output, update_car
-from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import of_car
 from pdhef_logtool.records.errors import OutputError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 from pdhef_logtool.storage import outputs
-from tests.command_line import called
 
 #: A vehicle file written by hand: with comments, entries in any order, and a blank line.
 PERSONS = """# My car, weighed on 3 May.
@@ -370,23 +368,3 @@ def test_the_file_decides_before_the_network_and_the_name_before_both(tmp_path):
             assert _gain(car)[0] == gain
             for option, named in (("gain=1", 1.0), ("gain=0.5", 0.5), ("fixed-r", 1.0)):
                 assert _gain(car, f"pd-hef:{option}") == (named, "")
-
-
-@pytest.mark.slow
-def test_a_run_says_the_gain_and_uses_it(sample_logs_dir, tmp_path):
-    vehicle = read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle
-    car = tmp_path / "car"
-    car.mkdir()
-    (car / "vehicle.toml").write_text(part_toml(vehicle))
-    replace(random_network(), physics_sha256=Car(vehicle).physics_sha256).save(car / "network")
-    random_network(1).save(tmp_path / "foreign")
-    for out, network, gain, text in (
-        ("own", (), 1.0, "residual gain 1 within the region of validity"),
-        ("other", ("--network", tmp_path / "foreign"), 0.0, "no network was trained with the physics of this car"),
-    ):
-        given = ("--car", car, *network, "-e", "pd-hef", "--model", "off", "-o", tmp_path / out)
-        shown = called("run", sample_logs_dir / "dlc.mcap", *given, env={"COLUMNS": "400"})
-        assert text in shown.stdout, shown.stdout + shown.stderr
-        rows = pl.read_parquet(tmp_path / out / "logs" / "dlc" / "estimates.parquet")
-        found = rows.filter((pl.col("estimator") == "pd-hef") & pl.col("valid"))["network_trust"]
-        assert found.unique().to_list() == [gain]

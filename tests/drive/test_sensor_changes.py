@@ -77,10 +77,11 @@ def test_a_change_is_named_within_2_s_and_corrected(road, name, gain, jump):
     assert error < (0.004**2 if stuck else 0.2 * planted)
 
 
-def test_an_offset_in_a_ramp_of_steering_is_no_change(road):
+@pytest.mark.parametrize(("name", "size", "rise_s"), [("steer_rad", np.radians(2.0), 0.6), ("ay_m_s2", 1.2, 1.5)])
+def test_a_slide_and_a_bank_that_begin_slowly_are_no_jump(road, name, size, rise_s):
     """A slide moves the steering relation as an offset of the steering does, but not from one sample to the next."""
-    ramp = np.radians(2.0) * np.clip((seconds(road) - AT_S) / 0.6, 0.0, 1.0)
-    assert find_changes(replace(road, steer_rad=road.steer_rad + ramp))[1] == ()
+    ramp = size * np.clip((seconds(road) - AT_S) / rise_s, 0.0, 1.0)
+    assert find_changes(replace(road, **{name: getattr(road, name) + ramp}))[1] == ()
 
 
 @pytest.mark.parametrize(("name", "jump"), [("yaw_rate_rad_s", 0.05), ("ay_m_s2", 1.0), ("steer_rad", np.nan)])
@@ -145,11 +146,6 @@ def test_a_bank_is_no_step_from_the_ground_truth(road_and_truth):
 def test_a_waived_sensor_is_not_changed(road):
     signals = changed(road, "ay_m_s2", 1.0)
     assert find_changes(signals, ["ay_m_s2"])[0] is signals
-
-
-def test_a_bank_that_begins_slowly_is_no_jump(road):
-    ramp = np.clip((seconds(road) - AT_S) / 1.5, 0.0, 1.0)
-    assert find_changes(replace(road, ay_m_s2=road.ay_m_s2 + 1.2 * ramp))[1] == ()
 
 
 def test_a_recorded_steering_that_freezes_is_named(shared_dir):

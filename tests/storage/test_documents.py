@@ -101,20 +101,8 @@ LOADERS = [
 every_loader = pytest.mark.parametrize("loader", LOADERS, ids=lambda loader: loader.name)
 
 
-def to_toml(value: Any, top: bool = False) -> str:
-    if top:
-        return "".join(f"{json.dumps(k, ensure_ascii=False)} = {to_toml(v)}\n" for k, v in value.items())
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k, ensure_ascii=False)} = {to_toml(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(to_toml(v) for v in value) + "]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    return str(value).lower()  # true, 1e+300, nan and inf are TOML
-
-
 def write(path: Path, document: Any) -> Path:
-    path.write_text(json.dumps(document) if path.suffix == ".json" else to_toml(document, top=True), encoding="utf-8")
+    path.write_text(json.dumps(document) if path.suffix == ".json" else toml_text(document), encoding="utf-8")
     return path
 
 
