@@ -23,6 +23,7 @@ from pdhef_logtool.drive.truth import (
     valid_as_a_whole,
 )
 from pdhef_logtool.evaluation.track_errors import signal_error
+from pdhef_logtool.records.geometry import geodetic_from_ecef
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
 from pdhef_logtool.records.tracks import make_track
 
@@ -86,22 +87,11 @@ NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 ECEF = Rotation.from_matrix(ENU_FROM_ECEF.T)
 
 
-def geodetic(d: Drive, ecef: np.ndarray) -> np.ndarray:
-    """Latitude, longitude, height by a fixed-point iteration in longhand."""
-    lon = np.arctan2(ecef[:, 1], ecef[:, 0])
-    p = np.hypot(ecef[:, 0], ecef[:, 1])
-    lat = np.arctan2(ecef[:, 2], p)
-    for _ in range(60):
-        n = 6378137.0 / np.sqrt(1 - E2 * np.sin(lat) ** 2)
-        h = p / np.cos(lat) - n
-        lat = np.arctan2(ecef[:, 2], p * (1 - E2 * n / (n + h)))
-    return np.stack([np.rad2deg(lat), np.rad2deg(lon), h])
-
-
 def sources(stamps, d: Drive) -> dict[str, dict]:
     enu = np.stack([d.x, d.y, np.zeros_like(d.x)], axis=1)
     ecef = ORIGIN + enu @ ENU_FROM_ECEF
-    lat, lon, alt = geodetic(d, ecef)
+    lat, lon, alt = geodetic_from_ecef(ecef).T
+    lat, lon = np.rad2deg(lat), np.rad2deg(lon)
     v_ecef = d.velocity @ ENU_FROM_ECEF
     turn = body_to_enu(d)
     wrapped = np.angle(np.exp(1j * d.yaw))

@@ -152,15 +152,10 @@ def stamps(count: int) -> np.ndarray:
 
 
 def by_hand(stamps_ns: np.ndarray, reason: np.ndarray, bit: int) -> list[Interval]:
-    """One stamp after the other."""
-    spans: list[list[int]] = []
-    for t, mask in zip(stamps_ns.tolist(), reason.tolist(), strict=True):
-        if mask & bit:
-            if spans and t - spans[-1][1] <= RUN_GAP_S * 1e9:
-                spans[-1][1] = t
-            else:
-                spans.append([t, t])
-    return [Interval(a, b + 1) for a, b in spans]
+    """Split the stamps that have the bit where they are far apart."""
+    marked = stamps_ns[reason & bit > 0]
+    parts = np.split(marked, np.flatnonzero(np.diff(marked) > RUN_GAP_S * 1e9) + 1)
+    return [Interval(int(part[0]), int(part[-1]) + 1) for part in parts if len(part)]
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 from made_models import full_network
+from scipy.signal import lfilter
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.learning.network.train_command import (
@@ -180,12 +181,9 @@ NAMES = ("vx_m_s", "ay_m_s2", "steer_rad", "friction")
 
 
 def smoothed(values: np.ndarray, dt: float, corner_hz: float) -> np.ndarray:
-    """The textbook recursion in plain Python."""
-    share = 1.0 - math.exp(-2.0 * math.pi * corner_hz * dt)
-    out = [values[0]]
-    for v in values[1:]:
-        out.append(out[-1] + share * (v - out[-1]))
-    return np.array(out)
+    """Return values behind a low-pass of first order that starts at the first one."""
+    kept = math.exp(-2.0 * math.pi * corner_hz * dt)
+    return lfilter([1.0 - kept], [1.0, -kept], values, zi=[kept * values[0]])[0]
 
 
 def make_features(seed: int, steps: int = 600) -> np.ndarray:
