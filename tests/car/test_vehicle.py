@@ -276,17 +276,11 @@ def test_what_is_given_is_kept_and_what_builds_on_it_follows(tmp_path):
     assert {"track_m", "wheel_radius_m", "cg_height_m"}.isdisjoint(a.entry for a in file.assumed)
 
 
-def test_one_axle_distance_and_the_wheelbase_give_the_other(tmp_path):
-    vehicle = read_vehicle_file(
-        write_entries(tmp_path, {"mass_kg": 1500, "wheelbase_m": 2.6, "cg_to_front_axle_m": 1.1})
-    ).vehicle
-    assert vehicle.cg_to_rear_axle_m == pytest.approx(1.5)
-
-
-def test_without_a_weight_split_that_of_a_passenger_car_is_assumed_and_named(tmp_path):
-    file = read_vehicle_file(write_entries(tmp_path, {"mass_kg": 1500, "wheelbase_m": 2.6}))
-    assert file.vehicle.cg_to_front_axle_m == pytest.approx(2.6 * 0.44)
-    assert "front_weight_share" in {a.entry for a in file.assumed}
+@pytest.mark.parametrize(("front", "rear_m"), [({"cg_to_front_axle_m": 1.1}, 1.5), ({}, 2.6 * 0.56)])
+def test_a_wheelbase_needs_one_axle_distance_or_has_the_weight_split_of_a_passenger_car(tmp_path, front, rear_m):
+    file = read_vehicle_file(write_entries(tmp_path, {"mass_kg": 1500, "wheelbase_m": 2.6, **front}))
+    assert file.vehicle.cg_to_rear_axle_m == pytest.approx(rear_m)
+    assert ("front_weight_share" in {a.entry for a in file.assumed}) is (not front)
 
 
 @pytest.mark.parametrize(

@@ -74,22 +74,16 @@ limit_deg = 0.1
 """
 
 
-@pytest.fixture(scope="module")
-def annotated(sample_logs_dir, tmp_path_factory):
-    out = tmp_path_factory.mktemp("annotated")
-    vehicle = str(sample_logs_dir / "vehicle.toml")
-    pdhef("run", sample_logs_dir / "dlc.mcap", "-o", out, "-e", "phy-ukf", "--annotate", "full", "--car", vehicle)
-    return str(out / "logs/dlc/annotated.mcap")
-
-
 def _plan(tmp_path: Path, limit: float) -> str:
     path = tmp_path / "plan.toml"
     path.write_text(PLAN.format(limit=limit))
     return str(path)
 
 
-def test_passed_gate_is_0_and_failed_gate_is_4(annotated, tmp_path):
-    junit = tmp_path / "gate.xml"
+def test_passed_gate_is_0_and_failed_gate_is_4(sample_logs_dir, tmp_path):
+    junit, log = tmp_path / "gate.xml", sample_logs_dir / "dlc.mcap"
+    pdhef("run", log, "-o", tmp_path, "-e", "phy-ukf", "--annotate", "full", "--car", sample_logs_dir / "vehicle.toml")
+    annotated = tmp_path / "logs/dlc/annotated.mcap"
     passed = called("metrics", annotated, *ESTIMATE, "--plan", _plan(tmp_path, 10.0), "--junit", str(junit))
     assert passed.returncode == 0, passed.stderr
     assert "PASS" in passed.stdout

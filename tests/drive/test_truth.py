@@ -432,21 +432,15 @@ def test_there_is_no_sideslip_at_standstill():
 SLOW_M_S, RATE_HZ = 1.0, 50
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    """Write 20 s of driving: at 10 s the car stops, at 14 s the sensors fail for 2 s beside the ground truth."""
-    path = tmp_path_factory.mktemp("log") / "correvit.csv"
+def test_sideslip_alone_is_scored_above_the_measured_low_speed_limit(tmp_path):
+    """At 10 s the car stops, at 14 s the sensors fail for 2 s beside the ground truth."""
+    log, mapping = tmp_path / "correvit.csv", tmp_path / "correvit.toml"
     t = np.arange(20 * RATE_HZ) / RATE_HZ
     speed = np.where((t > 10.0) & (t < 12.0), 0.0, 20.0)
     rate = np.where(speed > 0.0, 0.2 * np.sin(2.0 * t), 0.0)
     sensors = np.where((t < 14.0) | (t >= 16.0), [speed, rate, speed * rate, 0.0 * t], np.nan)
     titles = ["time [s]", "Speed [m/s]", "YawRate [rad/s]", "AccY [m/s2]", "AccX [m/s2]", "Sideslip [rad]"]
-    pl.DataFrame([t, *sensors, -0.1 * rate], schema=titles).fill_nan(None).write_csv(path)
-    return path
-
-
-def test_sideslip_alone_is_scored_above_the_measured_low_speed_limit(log):
-    mapping = log.with_suffix(".toml")
+    pl.DataFrame([t, *sensors, -0.1 * rate], schema=titles).fill_nan(None).write_csv(log)
     entry = '[{}]\ntopic = "csv"\nfield = "{}"\n'
     fields = {"speed_m_s": "Speed", "yaw_rate_rad_s": "YawRate", "ay_m_s2": "AccY", "ax_m_s2": "AccX"}
     signals = [entry.format(f"signals.{name}", field) for name, field in fields.items()]

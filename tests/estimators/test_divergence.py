@@ -134,18 +134,12 @@ def test_the_watch_adds_to_what_an_estimator_says_itself_and_leaves_those_withou
     assert watched_track(plain, signals, VEHICLE) is plain
 
 
-@pytest.fixture(scope="module")
-def sweep(tmp_path_factory):
+def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(sample_logs_dir, tmp_path):
     """A growing sine on a slippery road: beyond the peak of the tyres, the true sideslip still moderate."""
     drive = simulate_drive(
         "sine-sweep", speed_km_h=100.0, friction=0.3, amplitude=1.08, seed=7302, keep_spins=True, tolerance=0.01
     )
-    path = tmp_path_factory.mktemp("sweep") / "sweep.mcap"
-    write_drive(drive, path)
-    return path
-
-
-def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(sweep, sample_logs_dir, tmp_path):
+    write_drive(drive, sweep := tmp_path / "sweep.mcap")
     names = ("phy-ukf", "physics", "zero")
     config = RunConfig(car=sample_logs_dir / "vehicle_mu03.toml", estimators=names, annotate="none")
     result = run_logs([str(sweep)], tmp_path, config)

@@ -143,27 +143,12 @@ def test_what_a_user_must_know_of_a_drive_is_told_in_order_and_decides_the_exit_
     assert [exit_code(r) for r in ([good], [good, bad], [good, record("c", losses=(lost,))], [bad])] == [0, 3, 3, 1]
 
 
-@pytest.fixture(scope="module")
-def config(bare_vehicle, tmp_path_factory):
-    """Return the sample logs' car with a front axle that is half as stiff."""
-    path = tmp_path_factory.mktemp("car") / "vehicle.toml"
-    path.write_text(bare_vehicle.replace("B = 11.146", "B = 5.6"))
-    return RunConfig(car=path)
-
-
-@pytest.fixture(scope="module")
-def pool(sample_logs_dir, config, tmp_path_factory):
-    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step", "fishhook")]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            learning, "read_drive", partial(read_drive, adjust=lambda _log, mapping, _tell: replace(mapping, truth={}))
-        )
-        return learn(logs, tmp_path_factory.mktemp("out") / "car", LearnSettings(config=config))
-
-
 @pytest.mark.slow
-def test_a_pool_of_logs_mends_the_file_without_ground_truth(pool, sample_logs_dir):
+def test_a_pool_of_logs_mends_the_file_without_ground_truth(bare, sample_logs_dir, tmp_path, monkeypatch):
+    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step", "fishhook")]
+    without_truth = partial(read_drive, adjust=lambda _log, mapping, _tell: replace(mapping, truth={}))
+    monkeypatch.setattr(learning, "read_drive", without_truth)
+    pool = learn(logs, tmp_path / "car", LearnSettings(config=RunConfig(car=bare)))
     right, car = Car.load(sample_logs_dir / "vehicle.toml").vehicle, Car.load(pool.car)
     text = (pool.car / "model.toml").read_text()
     assert "calibrated without ground truth on" in text and car.model is not None and car.model.truth == ""

@@ -19,16 +19,6 @@ from truthsim.vehicle import Vehicle
 G = 9.80665
 
 
-@pytest.fixture(scope="module")
-def lane_change():
-    return simulate_drive("dlc", seed=1)
-
-
-@pytest.fixture(scope="module")
-def road():
-    return simulate_drive("road", seed=3, duration_s=120.0)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MANOEUVRES)
 def test_every_manoeuvre_reaches_what_it_is_for_without_a_spin(name):
@@ -41,7 +31,8 @@ def test_every_manoeuvre_reaches_what_it_is_for_without_a_spin(name):
 
 
 @pytest.mark.slow
-def test_lane_change_is_the_standard_s_course_and_peaks_near_0_7_g(lane_change):
+def test_lane_change_is_the_standard_s_course_and_peaks_near_0_7_g():
+    lane_change = simulate_drive("dlc", seed=1)
     assert 0.65 <= lane_change.peak_ay_m_s2 / G <= 0.75
     assert ISO_3888_1_M == (15.0, 30.0, 25.0, 25.0, 15.0, 15.0)
     plan = MANOEUVRES["dlc"].plan(Request(100.0 / 3.6, 0.85, 0, 9.5, 1.0))
@@ -124,8 +115,8 @@ def test_a_banked_road_leans_both_ways_and_climbs():
 
 
 @pytest.mark.slow
-def test_a_road_is_ordinary_and_has_a_standstill(road):
-    truth = road.truth
+def test_a_road_is_ordinary_and_has_a_standstill():
+    truth = simulate_drive("road", seed=3, duration_s=120.0).truth
     standing = np.hypot(truth["vx_m_s"], truth["vy_m_s"]) < 0.02
     edges = np.flatnonzero(np.diff(np.concatenate([[0], standing.astype(int), [0]])))
     stops = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 500]

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.records.errors import EXIT_FAILURE, UsageError, WorkerError
+from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
 from pdhef_logtool.workers.supervisor import Ended, Failure, Limits, supervise
 from tests.conftest import ROOT
-from tests.workers.planted_work import DEATHS, MOST_DEATHS, Item, called, planted
+from tests.workers.planted_work import DEATHS, Item, called, planted
 from tests.workers.ray_nodes import cluster_of_one, processes_of
 
 LIMITS = Limits(silence_s=3.0, memory_bytes=400_000_000)
@@ -119,24 +119,12 @@ def test_a_fork_server_that_dies_with_a_worker_costs_no_item(tmp_path):
     assert warned == ["the fork server died (signal 9): restart 1 of 3, no item is lost"]
 
 
-@pytest.fixture
-def deaths(tmp_path, monkeypatch):
-    """A file with a letter for each time that the fork server was killed while it loaded: at most twice."""
-    file = tmp_path / "deaths"
-    file.touch()
-    monkeypatch.setenv(DEATHS, str(file))
-    monkeypatch.setenv(MOST_DEATHS, "2")
-    return file
-
-
-DYING = ["tests.workers.planted_work:die_at_start"]
-
-
-def test_a_fork_server_that_dies_again_and_again_is_one_error(deaths, monkeypatch):
-    monkeypatch.setenv(MOST_DEATHS, "99")
-    with pytest.raises(WorkerError, match="4 that died, the last one by signal 9") as caught:
-        list(supervise(planted, [("well", "")] * 4, jobs=2, preload=DYING))
-    assert caught.value.exit_code == EXIT_FAILURE
+def test_a_fork_server_that_dies_again_and_again_is_one_error(tmp_path, monkeypatch):
+    deaths = tmp_path / "deaths"
+    deaths.touch()
+    monkeypatch.setenv(DEATHS, str(deaths))
+    with pytest.raises(WorkerError, match="4 that died, the last one by signal 9"):
+        list(supervise(planted, [("well", "")] * 4, jobs=2, preload=["tests.workers.planted_work:die_at_start"]))
     assert deaths.read_text() == "xxxx"
 
 
