@@ -187,11 +187,6 @@ def with_noise(signals: Signals, seed: int, scale: float = 1.0) -> Signals:
     )
 
 
-def cut(signals: Signals, first: int, end: int) -> Signals:
-    """The window [first, end) of aligned signals."""
-    return signals.rows(first, end)
-
-
 def keep(signals: Signals, mask: np.ndarray) -> Signals:
     """Only the stamps of ``mask``: a recorder that lost the others."""
     return replace(signals, **{name: getattr(signals, name)[mask] for name in SIGNAL_COLUMNS})

@@ -12,7 +12,7 @@ from pdhef_logtool.drive.correlation import CommonGrid, Shift, find_shift, on_co
 from pdhef_logtool.drive.delays import LatencyEstimate, late_sensors
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.measured import measure
-from pdhef_logtool.drive.plan import DrivePlan, plan_drive
+from pdhef_logtool.drive.plan import plan_drive
 from pdhef_logtool.drive.survey import mapping_proposals, survey_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks
@@ -83,15 +83,11 @@ def planned(sample_logs_dir):
         return plan_drive(log, auto_map(log).mapping, default_vehicle(), log.start_ns, log.end_ns)
 
 
-def with_latency(plan: DrivePlan, latency_s: float, std_error_s: float = ERROR_S) -> DrivePlan:
-    found = LatencyEstimate(latency_s, 0.99, std_error_s, True, False, "measured")
-    return replace(plan, latency=found)
-
-
 @pytest.mark.parametrize("std_errors", [2.001, -2.001, 30.0, 0.0, -1.1, 1.999, 2.0, -2.0])
 def test_a_latency_is_applied_if_it_is_beyond_two_standard_errors(planned, std_errors):
     applied = std_errors * ERROR_S if abs(std_errors) > 2.0 else 0.0
-    assert with_latency(planned, std_errors * ERROR_S).truth_latency_s == applied
+    found = LatencyEstimate(std_errors * ERROR_S, 0.99, ERROR_S, True, False, "measured")
+    assert replace(planned, latency=found).truth_latency_s == applied
     assert replace(planned, latency=None).truth_latency_s == 0.0
 
 

@@ -23,7 +23,6 @@ from pdhef_logtool.drive.survey import scaled_source
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, SignalSource, auto_map
-from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
 from pdhef_logtool.runs.inspection import inspect_drive_log
 from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
@@ -50,17 +49,13 @@ def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, 
     return signals, {n: replace(rate, name=n, values=v) for n, v in values.items()}
 
 
-def checks_by_name(vehicle: VehicleParameters, vy_factor: float) -> dict[str, Check]:
-    signals, truth = with_truth(vehicle, vy_factor)
-    derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
-    return {c.name: c for c in checks_of(signals, truth, derived, vehicle)}
-
-
 @pytest.mark.parametrize("place_m", [-1.1, 0.0])
 @pytest.mark.parametrize("factor", [1.0, 57.2958, 1.0 / 57.2958, 9.80665, 1.0 / 9.80665])
 def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
     vehicle = VEHICLE.model_copy(update={"truth_position_m": (place_m, 0.0, 0.0)})
-    checks = checks_by_name(vehicle, factor)
+    signals, truth = with_truth(vehicle, factor)
+    derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
+    checks = {c.name: c for c in checks_of(signals, truth, derived, vehicle)}
     if factor == 1.0:
         assert not [n for n, c in checks.items() if c.verdict == "failed" and n.startswith("truth.vy_m_s.")]
     else:

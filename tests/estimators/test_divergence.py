@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from reference_car import make_signals
 
 from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.divergence import watched_track, wrong_branch
 from pdhef_logtool.records.signals import Signals
@@ -70,8 +70,8 @@ def seconds(signals: Signals) -> np.ndarray:
     return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
 
 
-def flags(track: StateTrack, signals: Signals, vehicle: VehicleParameters = VEHICLE) -> np.ndarray:
-    return wrong_branch(track, signals, vehicle)
+def flags(track: StateTrack, signals: Signals) -> np.ndarray:
+    return wrong_branch(track, signals, VEHICLE)
 
 
 @settings(deadline=None, max_examples=20)

@@ -13,7 +13,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, physics_sha256
 from pdhef_logtool.car.posterior import Posterior
-from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, VehicleParameters, correct_signals, default_vehicle
+from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, correct_signals, default_vehicle
 from pdhef_logtool.drive.sensor_faults import without_faults
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.algorithm import resolve
@@ -101,16 +101,12 @@ def sideslip_rmse(estimator, made: Drive, signals: Signals) -> float:
     return float(np.sqrt(np.mean((track.sideslip_rad - made.sideslip)[late] ** 2)))
 
 
-def with_soft_tyres(v: VehicleParameters) -> VehicleParameters:
-    tyres = Tyres(**{name: tyre.model_copy(update={"B": 0.5 * tyre.B}) for name, tyre in v.tyres})
-    return v.model_copy(update={"tyres": tyres})
-
-
 def test_beyond_the_linear_range_kinematics_count_more():
     """With half the tyre stiffness in the file, the error at the limit is lower; the linear range does not change."""
     oracle = Oracle(parts("lag"))
     v = oracle.as_vehicle()
-    soft, made = with_soft_tyres(v), oracle.drive(slalom(0.09, 0.5), 8.0)
+    tyres = Tyres(**{name: tyre.model_copy(update={"B": 0.5 * tyre.B}) for name, tyre in v.tyres})
+    soft, made = v.model_copy(update={"tyres": tyres}), oracle.drive(slalom(0.09, 0.5), 8.0)
     noisy = with_noise(made.signals, 1)
     plain, yields = (sideslip_rmse(VehicleUkf(soft, limit_gain=gain), made, noisy) for gain in (0.0, 6.0))
     assert yields < 0.9 * plain

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 import pytest
 from half_slip_package import example_code, install
-from reference_car import cut, drive, slalom, with_noise
+from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
@@ -227,7 +227,7 @@ class Cheat:
 def reason(estimator: Any, signals: Signals, *windows: tuple[int, int]) -> str:
     check, state = CausalityCheck(), None
     for first, end in windows or ((0, len(signals)),):
-        part, before = cut(signals, first, end), check.state_before(estimator, state)
+        part, before = signals.rows(first, end), check.state_before(estimator, state)
         steps, state = estimator.run(part, state)
         check.check(estimator, part, before, steps)
     return check.failed.get(estimator.name, "")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import test_estimators as properties
 from made_models import random_network
-from reference_car import cut, drive, keep, slalom, with_noise
+from reference_car import drive, keep, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
@@ -87,7 +87,7 @@ def test_an_empty_drive_has_an_empty_track(rough):
 
 def test_nothing_behind_a_gap_tells_of_before(rough):
     gap = int(np.argmax(np.diff(rough.stamps_ns))) + 1
-    first = cut(rough, 0, gap)
+    first = rough.rows(0, gap)
     whole, before = smoother().smooth(rough), smoother().smooth(first)
     properties.same_bits(whole, before, gap)
     filtered = run_estimator(smoother().filtered, on_time(first))

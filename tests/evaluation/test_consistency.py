@@ -31,12 +31,6 @@ def drive() -> Signals:
     return signals_at(STAMPS, steer_rad=0.0, speed_m_s=measured, **columns)
 
 
-def rows_of(tracks, signals=None, names=None, masks=None) -> list[MetricRow]:
-    signals = drive() if signals is None else signals
-    evaluated = EvaluatedDrive("drive", {t.name: t for t in tracks}, None, signals, masks or {}, 3.0)
-    return evaluate_drive(evaluated, names)
-
-
 def test_figures_of_a_segment_are_formulas_over_its_stamps_and_steps():
     n = T.size
     rng = np.random.default_rng(1)
@@ -54,7 +48,8 @@ def test_figures_of_a_segment_are_formulas_over_its_stamps_and_steps():
         "exposure_s": (mask.sum() * step_s, mask.sum()),
         "exposure_m": (held[mask].sum() * step_s, mask.sum()),
     }
-    rows = {r.metric: (r.value, r.n) for r in rows_of([track], masks={"turn": mask}) if r.segment == "turn"}
+    found = evaluate_drive(EvaluatedDrive("drive", {"e": track}, None, drive(), {"turn": mask}, 3.0))
+    rows = {r.metric: (r.value, r.n) for r in found if r.segment == "turn"}
     for metric, (value, count) in expected.items():
         assert rows[metric] == (pytest.approx(value, rel=1e-9), count)
 

@@ -1,5 +1,3 @@
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from reference_car import signals_at
@@ -13,8 +11,6 @@ STEP_NS = 10_000_000
 RADIUS_M = 40.0
 SPEED_M_S = 10.0
 SIDESLIP_RAD = 0.05
-
-TrackMaker = Callable[..., StateTrack]
 
 
 def adaptive_columns(at: np.ndarray) -> dict[str, np.ndarray]:

@@ -55,16 +55,11 @@ def record(path: Path, tracks, signals=None, report=REPORT, events=(), shown=SHO
     write_recording(path, signals, tracks, report, events, shown=shown, **facts)
 
 
-def write(path: Path, circle, circle_signals) -> None:
-    names = ("phy-ukf", "truth", "zero")
-    tracks = [circle(name, 0, 600, bias=0.0 if name == "truth" else 0.02) for name in names]
-    record(path, tracks, circle_signals(0, 600), events=EVENTS, colours=COLOURS)
-
-
 @pytest.fixture
 def recording(tmp_path, circle, circle_signals):
-    path = tmp_path / "recording.rrd"
-    write(path, circle, circle_signals)
+    path, names = tmp_path / "recording.rrd", ("phy-ukf", "truth", "zero")
+    tracks = [circle(name, 0, 600, bias=0.0 if name == "truth" else 0.02) for name in names]
+    record(path, tracks, circle_signals(0, 600), events=EVENTS, colours=COLOURS)
     return path
 
 
