@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from made_models import full_network
 from scipy.signal import lfilter
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
@@ -22,9 +21,8 @@ from pdhef_logtool.learning.network.train_command import (
     train,
 )
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
-from pdhef_logtool.residual_model.bundle import LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER, load_bundle
+from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.storage.documents import seal
@@ -210,56 +208,3 @@ def test_regression_recovers_known_coefficients():
     noisy = fit_linear([make_sequence(s, 0.01) for s in range(8)], NAMES)
     assert noisy.coefficients[:3] == pytest.approx((0.002, -0.03, 0.5), abs=0.004)
     assert noisy.coefficients[3] == 0.0  # a constant feature gets no weight
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """A network with its baselines."""
-    folder, network = tmp_path_factory.mktemp("model"), full_network()
-    network.save(folder)
-    network.pure_lstm.save(folder / PURE_LSTM_FOLDER)
-    model = LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
-    (folder / LINEAR_REGRESSION_FILE).write_text(model.to_json())
-    return folder
-
-
-@pytest.fixture
-def saved(tmp_path, whole):
-    """A copy of it."""
-    return Path(shutil.copytree(whole, tmp_path / "model"))
-
-
-def test_baselines_come_with_the_model(whole):
-    bundle = load_bundle(whole)
-    assert bundle.pure_lstm.sha256 == full_network().pure_lstm.sha256
-    assert bundle.linear_regression == LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0)
-    assert bundle.linear_regression.provenance == {"dataset_sha256": "a"}
-    alone = replace(bundle, pure_lstm=None, linear_regression=None)
-    assert alone.sha256 == bundle.sha256  # the network's own
-
-
-@pytest.mark.parametrize(
-    ("file", "damage"),
-    [
-        (LINEAR_REGRESSION_FILE, {"version": 99}),
-        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1, 0.2, 0.3, 0.5]}),
-        (LINEAR_REGRESSION_FILE, {"features": ["truth", *NAMES[1:]]}),
-        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1]}),
-        (f"{PURE_LSTM_FOLDER}/model.json", {"target": None}),
-        (f"{PURE_LSTM_FOLDER}/model.json", {"normalisation": {"target_std": []}}),
-        (f"{PURE_LSTM_FOLDER}/weights.safetensors", "missing"),
-        (f"{PURE_LSTM_FOLDER}/weights.safetensors", "the network's"),
-    ],
-)
-def test_a_damaged_baseline_is_one_clear_error(saved, file, damage):
-    path = saved / file
-    if damage == "missing":
-        path.unlink()
-    elif damage == "the network's":
-        shutil.copy(saved / path.name, path)
-    else:
-        document = json.loads(path.read_text())
-        changed = {k: {**document[k], **v} if isinstance(v, dict) else v for k, v in damage.items()}
-        path.write_text(json.dumps({k: v for k, v in (document | changed).items() if v is not None}))
-    with pytest.raises(ModelError, match=file.partition("/")[0]):
-        load_bundle(saved)

@@ -1,6 +1,7 @@
 """Features, bundle, and the network in service."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_models import random_network
+from made_models import full_network, random_network
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import physics_sha256
@@ -20,7 +21,9 @@ from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
+    LINEAR_REGRESSION_FILE,
     OUTPUT_COUNT,
+    PURE_LSTM_FOLDER,
     SHIPPED_FOLDERS,
     WEIGHTS_FILE,
     ModelBundle,
@@ -29,6 +32,7 @@ from pdhef_logtool.residual_model.bundle import (
 )
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.interface import LIMITS
+from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import ResidualNetwork
 
 make_bundle = partial(random_network, hidden=16, layers=2, head=(8,), scales=(2.0, 0.7))
@@ -83,23 +87,60 @@ def test_bundle_round_trip_and_hash(tmp_path):
     assert make_bundle(seed=1).sha256 != bundle.sha256
 
 
-@pytest.mark.parametrize("damage", ["weights", "document", "missing", "version", "feature"])
-def test_wrong_bundles_are_one_clear_error(tmp_path, damage):
-    make_bundle().save(tmp_path)
-    document = json.loads((tmp_path / DOCUMENT_FILE).read_text())
-    if damage == "weights":
-        make_bundle(seed=9).save(tmp_path / "other")
-        (tmp_path / WEIGHTS_FILE).write_bytes((tmp_path / "other" / WEIGHTS_FILE).read_bytes())
-    elif damage == "document":
-        (tmp_path / DOCUMENT_FILE).write_text("{")
-    elif damage == "missing":
-        (tmp_path / WEIGHTS_FILE).unlink()
-    elif damage == "version":
-        (tmp_path / DOCUMENT_FILE).write_text(json.dumps({**document, "version": 99}))
+BASELINE = LinearModel(FEATURES[:4], (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """Return a folder with a network and its baselines."""
+    network = full_network()
+    network.save(tmp_path)
+    network.pure_lstm.save(tmp_path / PURE_LSTM_FOLDER)
+    (tmp_path / LINEAR_REGRESSION_FILE).write_text(BASELINE.to_json())
+    return tmp_path
+
+
+def test_baselines_come_with_the_model(saved):
+    bundle = load_bundle(saved)
+    assert bundle.pure_lstm.sha256 == full_network().pure_lstm.sha256
+    assert (bundle.linear_regression, bundle.linear_regression.provenance) == (BASELINE, BASELINE.provenance)
+    assert replace(bundle, pure_lstm=None, linear_regression=None).sha256 == bundle.sha256  # the network's own
+
+
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        *(
+            (f"{folder}{WEIGHTS_FILE}", how)
+            for folder in ("", f"{PURE_LSTM_FOLDER}/")
+            for how in ("missing", "another's")
+        ),
+        (DOCUMENT_FILE, "cut"),
+        (DOCUMENT_FILE, {"version": 99}),
+        (DOCUMENT_FILE, {"features": ["truth"] * 8}),
+        (f"{PURE_LSTM_FOLDER}/{DOCUMENT_FILE}", {"target": None}),
+        (f"{PURE_LSTM_FOLDER}/{DOCUMENT_FILE}", {"normalisation": {"target_std": []}}),
+        (LINEAR_REGRESSION_FILE, {"version": 99}),
+        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1, 0.2, 0.3, 0.5]}),
+        (LINEAR_REGRESSION_FILE, {"features": ["truth", *FEATURES[1:4]]}),
+        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1]}),
+    ],
+)
+def test_a_damaged_network_or_baseline_is_one_clear_error(saved, file, damage):
+    path = saved / file
+    if damage == "missing":
+        path.unlink()
+    elif damage == "cut":
+        path.write_text("{")
+    elif damage == "another's":
+        random_network(9).save(saved / "other")
+        shutil.copy(saved / "other" / WEIGHTS_FILE, path)
     else:
-        (tmp_path / DOCUMENT_FILE).write_text(json.dumps({**document, "features": ["truth"] * 8}))
-    with pytest.raises(ModelError, match=tmp_path.name):
-        load_bundle(tmp_path)
+        document = json.loads(path.read_text())
+        changed = {k: {**document[k], **v} if isinstance(v, dict) else v for k, v in damage.items()}
+        path.write_text(json.dumps({k: v for k, v in (document | changed).items() if v is not None}))
+    with pytest.raises(ModelError, match=file.partition("/")[0] if "/" in file else saved.name):
+        load_bundle(saved)
 
 
 def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:

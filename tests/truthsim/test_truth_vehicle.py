@@ -72,6 +72,7 @@ def check_bands(found: dict, bands: dict[str, tuple[float, float, float]]) -> No
         assert correlation > alike, (column, correlation)
 
 
+OTHER_TYRE = {"stiffness_friction_power": 0.0, "lateral_relaxation_m": 0.2, "lateral_relaxation_min_m": 0.2}
 #: The sedan with the known values of the other car: no bars, short relaxation, no compliance, its axle stiffness.
 LIKE_THE_OTHER = CAR._replace(
     front_anti_roll_n_m_per_rad=0.0,
@@ -80,12 +81,8 @@ LIKE_THE_OTHER = CAR._replace(
     front_compliance_rad_per_n=0.0,
     rear_compliance_rad_per_n=0.0,
     ackermann=0.0,
-    front_tyre=CAR.front_tyre._replace(
-        stiffness_peak=15.80, stiffness_friction_power=0.0, lateral_relaxation_m=0.2, lateral_relaxation_min_m=0.2
-    ),
-    rear_tyre=CAR.rear_tyre._replace(
-        stiffness_peak=20.81, stiffness_friction_power=0.0, lateral_relaxation_m=0.2, lateral_relaxation_min_m=0.2
-    ),
+    front_tyre=CAR.front_tyre._replace(stiffness_peak=15.80, **OTHER_TYRE),
+    rear_tyre=CAR.rear_tyre._replace(stiffness_peak=20.81, **OTHER_TYRE),
 )
 CLOSE = {
     "ay": (0.94, 1.03, 0.999),
