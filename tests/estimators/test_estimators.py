@@ -33,7 +33,7 @@ NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 #: With all parts that the model of ``physics`` may have; the baselines do not use them.
 PARTS = PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))
 VEHICLE = default_vehicle().model_copy(update={"physics": PARTS})
-#: Without the estimator on a self-calibrated car (test_calibrated_band.py).
+#: Without the estimator on a self-calibrated car (tests/model/test_intervals.py).
 NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != OPEN_LOOP)
 NETWORKS = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")
 #: Estimators that compute the lateral velocity from a model or by integration.
