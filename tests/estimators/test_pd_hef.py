@@ -297,7 +297,8 @@ def test_the_mixture_has_the_moments_of_its_samples():
     mean = weights @ means
     away = means - mean
     covariance = np.einsum("k,kij->ij", weights, P + away[:, :, None] * away[:, None, :])
-    np.testing.assert_allclose([mixed.vx_m_s[0], mixed.vy_m_s[0], mixed.yaw_rate_rad_s[0]], mean, rtol=1e-12)
+    found = [mixed.vx_m_s[0], mixed.vy_m_s[0], mixed.yaw_rate_rad_s[0], mixed.sideslip_rad[0]]
+    np.testing.assert_allclose(found, [*mean, np.arctan2(mean[1], mean[0])], rtol=1e-12)
     np.testing.assert_allclose(mixed.covariance[0], covariance, rtol=1e-12)
     slope = np.array([-mean[1], mean[0], 0.0]) / (mean[0] ** 2 + mean[1] ** 2)
     assert mixed.sideslip_std_rad[0] == pytest.approx(np.sqrt(slope @ covariance @ slope))
