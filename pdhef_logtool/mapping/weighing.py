@@ -209,8 +209,12 @@ class Weighing:
                 yield from ((x, y) for x in [f for f in beside if f.meaning.quantity == "speed" and f.seen.changes][:1])
 
     def _take(self, name: str, candidates: Sequence[Field]) -> None:
-        # A speed before the x of a velocity, which is ahead in some axes only; what is constant last.
-        ordered = sorted(candidates, key=lambda f: (-f.score, f.meaning.part, -f.topic.messages, f.topic.name, f.path))
+        # The car's own sensor before that of a receiver, which may be the ground truth; a speed before the x of a
+        # velocity, which is ahead in some axes only.
+        def rank(f: Field) -> tuple[object, ...]:
+            return -f.score, f.role == "navigation", f.meaning.part, -f.topic.messages, f.topic.name, f.path
+
+        ordered = sorted(candidates, key=rank)
         good = [f for f in ordered if f.score >= LEAST_SCORE]
         if not good:
             return
@@ -358,6 +362,10 @@ class Weighing:
         if not self.truth_from:
             return
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
+        # In a table of several instruments, those named as ground truth or as receivers alone, if they are sufficient.
+        for role in ("truth", "navigation"):
+            of_role = [f for f in its if f.role == role]
+            its = of_role if _truth_of(of_role) else its
         documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
         # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
         self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
