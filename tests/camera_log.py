@@ -1,7 +1,5 @@
 """MCAP logs with either sensors or camera images in each chunk."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -44,7 +42,6 @@ def with_camera(source: Path, slice_ns: int = _SLICE_NS) -> Iterator[list[Messag
 
     with source.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
-            assert schema is not None
             if sensors and message.log_time - sensors[0][2] >= slice_ns:
                 yield sensors
                 yield images(sensors[0][2])

@@ -1,9 +1,6 @@
 """The command line, called in this process."""
 
-from __future__ import annotations
-
 import io
-import json
 import os
 import signal
 import subprocess
@@ -21,14 +18,6 @@ from pdhef_logtool.cli.app import app, main
 def pdhef(*arguments: object) -> None:
     """Run a command that ends well."""
     assert not app([str(a) for a in arguments], prog_name="pdhef", standalone_mode=False)
-
-
-def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    """Run a command with ``--json`` and return its document."""
-    capsys.readouterr()
-    pdhef(*arguments, "--json")
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
 
 
 def rendered(render: Callable[[Any, Console], None], result: object, width: int = 80) -> str:

@@ -7,14 +7,12 @@ command line in the test process (``called`` in ``tests/command_line.py``) unles
 two seconds. Limits in seconds only end a hang (minutes): another load of the machine must not reach them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os
 import signal
 import sys
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import hypothesis
@@ -36,19 +34,19 @@ hypothesis.settings.load_profile("any load")
 
 
 @pytest.fixture(scope="session")
-def shared_dir() -> Path:
+def shared_dir():
     if not (SHARED / "data").is_dir():
         pytest.skip("needs ../shared beside the repository (recorded drives that may not be redistributed)")
     return SHARED
 
 
 @pytest.fixture(scope="session")
-def sample_logs_dir() -> Path:
+def sample_logs_dir():
     return ROOT / "sample_logs"
 
 
 @pytest.fixture(scope="session")
-def bare_vehicle(sample_logs_dir: Path) -> str:
+def bare_vehicle(sample_logs_dir):
     """Return the vehicle file of the sample logs without a network."""
     head, _, rest = (sample_logs_dir / "vehicle.toml").read_text().partition("[network]")
     return head + rest[rest.index("[sensors]") :]
@@ -80,7 +78,7 @@ def _process_state() -> set[str]:
 
 
 @pytest.fixture(autouse=True)
-def _unchanged_process() -> Iterator[None]:
+def _unchanged_process():
     """Fail a test that leaves a process behind, or another signal handler, environment variable or folder."""
     before = _process_state()
     yield

@@ -1,7 +1,5 @@
 """A web server on this machine: files with ranges and ETags, every request counted, faults on demand."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 import time

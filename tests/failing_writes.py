@@ -1,7 +1,5 @@
 """Makes the n-th call fail with which files are written, wherever in the program it stands."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os
@@ -33,7 +31,7 @@ class Failing:
 
 
 @contextmanager
-def failing_writes(number: int, code: int = errno.ENOSPC) -> Iterator[Failing]:
+def failing_writes(number: int, code: int = errno.ENOSPC, calls: tuple[str, ...] = CALLS) -> Iterator[Failing]:
     """Let the ``number``-th call of this block fail."""
     failing = Failing(number, code)
 
@@ -59,6 +57,6 @@ def failing_writes(number: int, code: int = errno.ENOSPC) -> Iterator[Failing]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Path, "open", open_failing)
-        for name in CALLS:
+        for name in calls:
             patch.setattr(os, name, wrapped(getattr(os, name)))
         yield failing

@@ -1,7 +1,5 @@
 """A log in memory with the reader's protocol, to test code that reads logs without files."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,7 +18,7 @@ from pdhef_logtool.records.signals import IntArray, Loss
 class FakeTopic:
     type_name: str
     log_time_ns: IntArray
-    fields: dict[str, NDArray]  # type: ignore[type-arg]
+    fields: dict[str, NDArray]
     publish_time_ns: IntArray | None = None
     encoding: str = "cdr"
     examples: tuple[object, ...] = ()
@@ -94,7 +92,7 @@ class FakeLog(DriveLog):
             fields={p: self._field(topic, p)[pick] for p in paths},
         )
 
-    def _field(self, topic: FakeTopic, path: str) -> NDArray:  # type: ignore[type-arg]
+    def _field(self, topic: FakeTopic, path: str) -> NDArray:
         if path in topic.fields:
             return topic.fields[path]
         if path.endswith("]"):

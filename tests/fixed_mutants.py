@@ -12,8 +12,6 @@ changes, and numba's cache remains valid. A fault in a compiled function (``comp
 numba would take its callers from the cache. Exit code 1: a mutant survived or its lines are gone.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -38,11 +36,12 @@ import pytest
 
 ROOT = mutants.ROOT
 LIST = Path(__file__).with_suffix(".json")
-#: Imports of tests and sources that are faster to load once.
+#: Imports of tests and sources that are faster to load once. Not rerun: it starts threads at import, and its server
+#: waits for them in a fork, which has none.
 LIBRARIES = (
     "numpy", "numba", "numba.typed", "polars", "pyarrow.parquet", "scipy.optimize", "scipy.ndimage", "scipy.stats",
     "pydantic", "rich.console", "typer", "jinja2", "mcap.reader", "mcap.writer", "rosbags.rosbag1",
-    "rosbags.typesys", "google.protobuf.descriptor_pb2", "cantools", "fsspec", "safetensors.numpy", "torch", "rerun",
+    "rosbags.typesys", "google.protobuf.descriptor_pb2", "cantools", "fsspec", "safetensors.numpy", "torch",
     "matplotlib.figure", "matplotlib.backends.backend_agg", "hypothesis.extra.numpy", "jsonschema",
 )  # fmt: skip
 #: Other folders with tests of a package, if not ``tests/runs``.

@@ -11,8 +11,6 @@ names with an underscore, which are contracts of files and commands, and names o
 of the field should understand at least 57 at first reading.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import io

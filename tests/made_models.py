@@ -1,7 +1,5 @@
 """Small residual models for tests."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

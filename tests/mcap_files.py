@@ -1,7 +1,5 @@
 """MCAP files that the mcap library writes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

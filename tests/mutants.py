@@ -3,8 +3,6 @@
 No function gets two. Message texts are not changed, nor is code with effects that no test can observe.
 """
 
-from __future__ import annotations
-
 import ast
 import copy
 import functools

@@ -3,14 +3,23 @@
 It shares no code with the compiled model, nor its integration steps, sigma points or order of evaluation.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M, YAW_INERTIA, Drive, magic_tyre, make_signals
+from reference_car import (
+    FRICTION,
+    FRONT_M,
+    MASS_KG,
+    REAR_M,
+    WHEELBASE_M,
+    YAW_INERTIA,
+    Drive,
+    magic_tyre,
+    make_signals,
+    runge_kutta_step,
+)  # fmt: skip
 from scipy.integrate import solve_ivp
 
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, default_vehicle
@@ -171,17 +180,12 @@ class Oracle:
                 x = self.settled(x, steer(t0), 0.0, FRICTION)
             states[k], ax[k], ay[k] = x, -x[1] * x[2], self.lateral(x, steer(t0))
             sensed[k] = self.sensed_ay(x, steer(t0))
+
+            def f(y: np.ndarray, at: float, a: float = float(ax[k])) -> np.ndarray:
+                return self.derivative(y, steer(at), a, FRICTION)
+
             for i in range(n):
-                t = t0 + i * h
-
-                def f(y: np.ndarray, at: float, a: float = float(ax[k])) -> np.ndarray:
-                    return self.derivative(y, steer(at), a, FRICTION)
-
-                k1 = f(x, t)
-                k2 = f(x + h / 2 * k1, t + h / 2)
-                k3 = f(x + h / 2 * k2, t + h / 2)
-                k4 = f(x + h * k3, t + h)
-                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+                x = runge_kutta_step(f, x, t0 + i * h, h)
         signals = make_signals(
             np.full(count - 1, 0.01),
             steer_rad=np.array([steer(0.01 * k) for k in range(count)]),

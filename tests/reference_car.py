@@ -3,8 +3,6 @@
 It shares no code with ``pdhef_logtool.car.nominal_model``: it is the reference for the compiled model.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -57,14 +55,18 @@ def derivative(s: np.ndarray, steer: float, ax: float, mu: float, tyre: Force = 
 def runge_kutta(
     s: np.ndarray, steer: float, ax: float, mu: float, dt: float, n: int = 1, tyre: Force = magic_tyre
 ) -> np.ndarray:
-    h = dt / n
     for _ in range(n):
-        k1 = derivative(s, steer, ax, mu, tyre)
-        k2 = derivative(s + h / 2 * k1, steer, ax, mu, tyre)
-        k3 = derivative(s + h / 2 * k2, steer, ax, mu, tyre)
-        k4 = derivative(s + h * k3, steer, ax, mu, tyre)
-        s = s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        s = runge_kutta_step(lambda y, _t: derivative(y, steer, ax, mu, tyre), s, 0.0, dt / n)
     return s
+
+
+def runge_kutta_step(f: Callable[[np.ndarray, float], np.ndarray], s: np.ndarray, t: float, h: float) -> np.ndarray:
+    """Return the state after a step of ``h`` seconds of ds/dt = f(s, t)."""
+    k1 = f(s, t)
+    k2 = f(s + h / 2 * k1, t + h / 2)
+    k3 = f(s + h / 2 * k2, t + h / 2)
+    k4 = f(s + h * k3, t + h)
+    return s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 @dataclass(frozen=True)
@@ -183,11 +185,6 @@ def with_noise(signals: Signals, seed: int, scale: float = 1.0) -> Signals:
         yaw_rate_rad_s=noisy(signals.yaw_rate_rad_s, 0.004),
         speed_m_s=noisy(signals.speed_m_s, 0.08),
     )
-
-
-def cut(signals: Signals, first: int, end: int) -> Signals:
-    """The window [first, end) of aligned signals."""
-    return signals.rows(first, end)
 
 
 def keep(signals: Signals, mask: np.ndarray) -> Signals:

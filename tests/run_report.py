@@ -1,7 +1,5 @@
 """Reports of runs with figures that a test gives."""
 
-from __future__ import annotations
-
 import functools
 import html
 import re
@@ -23,7 +21,7 @@ MAIN = MainFacts("pd-hef", "", False, "zero", ("pd-hef", "physics", "zero"), nam
 
 @functools.cache
 def _validator(schema: str) -> Draft202012Validator:
-    return Draft202012Validator(load_schema(schema))  # ``tests/car/test_schemas.py`` checks the schemas
+    return Draft202012Validator(load_schema(schema))  # ``tests/car/test_vehicle.py`` checks schemas
 
 
 def follows(document: Any, schema: str = "report.schema.json") -> None:

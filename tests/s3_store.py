@@ -1,7 +1,5 @@
 """moto's server on this machine in place of S3, to which the environment points."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -10,8 +10,6 @@ number. Functions count as long above 60 code lines and as complex above a cyclo
 kernels.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import io
@@ -124,10 +122,10 @@ def command_line_sizes() -> dict[str, int]:
     from pdhef_logtool.estimators.table import SPECS
 
     group = typer.main.get_command(app)
-    commands = {name: c for name, c in group.commands.items() if not c.hidden}  # type: ignore[attr-defined]
+    commands = {name: c for name, c in group.commands.items() if not c.hidden}
 
     def options(command: object) -> int:
-        own = sum(p.param_type_name == "option" and not p.hidden for p in command.params)  # type: ignore[attr-defined]
+        own = sum(p.param_type_name == "option" and not p.hidden for p in command.params)
         return own + sum(options(c) for c in getattr(command, "commands", {}).values())
 
     return {

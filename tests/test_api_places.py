@@ -1,7 +1,5 @@
 """Every file, folder and log that the Python API takes may be a text instead of a path; one log is a list of one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,17 +13,17 @@ MAPPING = '[signals.yaw_rate_rad_s]\ntopic = "/imu/data"\nfield = "angular_veloc
 
 
 @pytest.fixture(scope="module")
-def dlc(sample_logs_dir: Path) -> Path:
+def dlc(sample_logs_dir):
     return sample_logs_dir / "dlc.mcap"
 
 
 @pytest.fixture
-def mapping(tmp_path: Path) -> Path:
+def mapping(tmp_path):
     (tmp_path / "m.toml").write_text(f"fill_recognised = true\n{MAPPING}")
     return tmp_path / "m.toml"
 
 
-def test_read_drive(dlc: Path, sample_logs_dir: Path, mapping: Path, tmp_path: Path) -> None:
+def test_read_drive(dlc, sample_logs_dir, mapping, tmp_path):
     (tmp_path / "Any.msg").write_text("float64 a\n")
     options = pdhef.ReadOptions(msgs=str(tmp_path))
     with pdhef.read_drive(str(dlc), str(sample_logs_dir / "vehicle.toml"), str(mapping), options=options) as drive:
@@ -33,7 +31,7 @@ def test_read_drive(dlc: Path, sample_logs_dir: Path, mapping: Path, tmp_path: P
         assert drive.mapping.origin == "file"
 
 
-def test_inspect_log(dlc: Path, mapping: Path, tmp_path: Path) -> None:
+def test_inspect_log(dlc, mapping, tmp_path):
     (tmp_path / "Any.msg").write_text("float64 a\n")
     found = pdhef.inspect_log(str(dlc), str(mapping), pdhef.ReadOptions(msgs=str(tmp_path)))
     assert set(found.signals) > {"yaw_rate_rad_s", "ay_m_s2"}
@@ -41,7 +39,7 @@ def test_inspect_log(dlc: Path, mapping: Path, tmp_path: Path) -> None:
     assert read_definitions(str(tmp_path)).files == read_definitions(tmp_path).files
 
 
-def test_run(dlc: Path, mapping: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_run(dlc, mapping, sample_logs_dir, tmp_path):
     (tmp_path / "t.toml").write_text('[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit = 9.0\n')
     config = pdhef.RunConfig(
         estimators=("zero",), annotate="none", keep="metrics", mapping=str(mapping),
@@ -65,7 +63,7 @@ def _ends(call: Callable[[], Any]) -> str:
 
 
 @pytest.mark.parametrize("kind", [str, Path])
-def test_what_learns_takes_texts_and_paths(kind: Callable[[object], Any], tmp_path: Path) -> None:
+def test_what_learns_takes_texts_and_paths(kind, tmp_path):
     log, out = tmp_path / "none.mcap", kind(tmp_path / "out")
     config = pdhef.RunConfig(car=kind("saloon"), network=kind("none"))
     for name in ("learn", "extract"):

@@ -1,7 +1,5 @@
 """The steps in ARCHITECTURE.md and docs/api.md work as written."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import json
@@ -21,9 +19,7 @@ def blocks(document: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
-def test_the_api_page_runs_as_it_stands(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_api_page_runs_as_it_stands(sample_logs_dir, tmp_path, monkeypatch, capsys):
     (code,) = blocks("docs/api.md")
     assert sum(bool(line.strip()) for line in code.splitlines()) <= 30
     (tmp_path / "sample_logs").symlink_to(sample_logs_dir)
@@ -33,9 +29,7 @@ def test_the_api_page_runs_as_it_stands(
     assert (tmp_path / "out" / "mycar" / "model.toml").is_file()
 
 
-def test_the_notebook_runs_cell_by_cell(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_notebook_runs_cell_by_cell(sample_logs_dir, tmp_path, monkeypatch, capsys):
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("agg")
     notebook = json.loads((ROOT / "docs" / "notebook.ipynb").read_text(encoding="utf-8"))
@@ -56,7 +50,7 @@ def test_the_notebook_runs_cell_by_cell(
     assert 0.2 < math.degrees(names["own_rmse"]) < 10.0
 
 
-def test_every_name_of_the_api_is_there() -> None:
+def test_every_name_of_the_api_is_there():
     import pdhef_logtool
 
     page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
@@ -66,19 +60,19 @@ def test_every_name_of_the_api_is_there() -> None:
 
 
 @pytest.mark.parametrize("module", ["car.car", "drive.reading", "runs.frames"])
-def test_examples_of_the_api_give_what_they_show(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_of_the_api_give_what_they_show(module, monkeypatch):
     monkeypatch.chdir(ROOT)
     done = doctest.testmod(importlib.import_module(f"pdhef_logtool.{module}"))
     assert done.attempted and not done.failed
 
 
-def test_every_option_of_the_pages_exists() -> None:
+def test_every_option_of_the_pages_exists():
     import typer
 
     from pdhef_logtool.cli.app import app
 
     group = typer.main.get_command(app)
-    commands: Any = [group, *group.commands.values()]  # type: ignore[attr-defined]
+    commands: Any = [group, *group.commands.values()]
     options = {o for c in commands for p in c.params for o in (*p.opts, *p.secondary_opts)} | {"--help"}
     unknown = []
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:

@@ -1,13 +1,11 @@
 """The list of fixed mutants, and how each of them can end."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import fixed_mutants
 
 
-def test_the_list_has_different_mutants_of_most_packages_each_with_a_test() -> None:
+def test_the_list_has_different_mutants_of_most_packages_each_with_a_test():
     found = fixed_mutants.read_list()
     assert len(found) >= 340
     assert len({(m.file, m.old, m.new) for m in found}) == len(found)

@@ -1,7 +1,5 @@
 """References from sources and documentation to the documentation resolve, and the glossary stays short."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from functools import cache
@@ -42,7 +40,7 @@ def broken(references: Iterator[tuple[str, str, str]]) -> list[str]:
     ]
 
 
-def test_references_in_sources_resolve() -> None:
+def test_references_in_sources_resolve():
     references = [
         (where, page, anchor)
         for where, text in texts("*.py", "*.md", "*.schema.json")
@@ -52,7 +50,7 @@ def test_references_in_sources_resolve() -> None:
     assert not broken(iter(references))
 
 
-def test_links_between_pages_resolve() -> None:
+def test_links_between_pages_resolve():
     links = [
         (where, page or Path(where).name, anchor)
         for where, text in texts("*.md")
@@ -63,12 +61,12 @@ def test_links_between_pages_resolve() -> None:
     assert not broken(iter(links))
 
 
-def test_no_reference_leads_out_of_the_repository() -> None:
+def test_no_reference_leads_out_of_the_repository():
     outside = re.compile(r"(METHOD|DESIGN)('s)? (§|section )")
     assert not [where for where, text in texts("*.py", "*.md", "*.schema.json") if outside.search(text)]
 
 
-def test_the_glossary_is_short_sorted_and_has_sources() -> None:
+def test_the_glossary_is_short_sorted_and_has_sources():
     page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if line[:2] == "| "]
     terms = rows[2:]
@@ -77,7 +75,7 @@ def test_the_glossary_is_short_sorted_and_has_sources() -> None:
     assert all(len(row) == 3 and row[1].endswith(".") and row[2] for row in terms)
 
 
-def test_equations_become_mathml_and_code_stays() -> None:
+def test_equations_become_mathml_and_code_stays():
     pytest.importorskip("latex2mathml")
     pytest.importorskip("mkdocs")
     from studies import mathml
@@ -92,7 +90,7 @@ def test_equations_become_mathml_and_code_stays() -> None:
 
 
 @pytest.mark.parametrize("wrong", [r"\nosuchcommand x", r"\frac{1", r"\begin{aligned}a&=b\end{aligned}"])
-def test_an_equation_that_is_not_understood_is_an_error(wrong: str) -> None:
+def test_an_equation_that_is_not_understood_is_an_error(wrong):
     pytest.importorskip("latex2mathml")
     errors = pytest.importorskip("mkdocs.exceptions")
     from studies.mathml import mathml
@@ -106,7 +104,7 @@ HEADS = re.findall(r"^\*\*(.*)\*\*$", PAGE, re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
-def sources() -> str:
+def sources():
     """All of the package with texts that stand in several literals joined to one."""
     package = ROOT / "pdhef_logtool"
     files = (p for kind in ("*.py", "templates/*.txt") for p in sorted(package.rglob(kind)))
@@ -114,12 +112,12 @@ def sources() -> str:
     return re.sub(r"[\"']\s*\n\s*f?[\"']", "", text)
 
 
-def test_the_page_has_what_people_meet_most() -> None:
+def test_the_page_has_what_people_meet_most():
     assert len(HEADS) > 15
 
 
 @pytest.mark.parametrize("head", HEADS)
-def test_a_quoted_message_is_one_of_ours(head: str, sources: str) -> None:
+def test_a_quoted_message_is_one_of_ours(head, sources):
     for quoted in re.findall("`([^`]*)`", head):
         for words in quoted.split("…"):
             assert words.strip().removeprefix("expected ").strip(" ,:") in sources

@@ -1,7 +1,5 @@
 """Windows and macOS: commands with one process need no POSIX-only function."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -18,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.slow
-def test_runs_need_no_posix(tmp_path: Path) -> None:
+def test_runs_need_no_posix(tmp_path):
     """The process has no POSIX-only functions, and streams in ASCII; the second run replaces a folder of the first."""
     logs = [f"{ROOT}/sample_logs/{name}" for name in ("step_rosbag2", "dlc.mcap")]
     options = "--car saloon --jobs 2 --end 2 -o out -e"
@@ -34,17 +32,17 @@ def test_runs_need_no_posix(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.rglob(".*")] == []
 
 
-def test_items_end_in_this_process_where_no_workers_can_be_forked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_items_end_in_this_process_where_no_workers_can_be_forked(monkeypatch):
     monkeypatch.setattr(supervisor, "can_fork", lambda: False)
     warned: list[str] = []
     items = [("where", ""), ("raise", ""), ("where", "")]
     ended = list(supervise(planted, items, jobs=2, limits=Limits(60.0), warn=warned.append))
     assert [e.failure is None for e in ended] == [True, False, True]
-    assert {e.result[0] for e in ended if e.result} == {os.getpid()}  # type: ignore[index]
+    assert {e.result[0] for e in ended if e.result} == {os.getpid()}
     assert len(warned) == 1
 
 
-def test_processes_are_known_by_their_start_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_are_known_by_their_start_without_proc(monkeypatch):
     def unreadable(_path: Path) -> bytes:
         raise FileNotFoundError
 

@@ -1,7 +1,5 @@
 """The documentation site: a strict build, and a search that works from disk."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -17,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine (apt-get install chromium)")
-def test_the_site_search_works_from_disk(tmp_path: Path) -> None:
+def test_the_site_search_works_from_disk(tmp_path):
     assert CHROMIUM is not None
     build = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(build, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -1,7 +1,5 @@
 """A log with a rotated IMU: every reading of the IMU is rotated before use."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

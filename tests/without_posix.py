@@ -71,19 +71,19 @@ def imitate() -> None:
         return library(name, *arguments, **options)
 
     library = ctypes.CDLL
-    shutil._use_fd_functions = False  # type: ignore[attr-defined]
-    tempfile.TemporaryFile = tempfile.NamedTemporaryFile  # type: ignore[assignment, misc]
+    shutil._use_fd_functions = False
+    tempfile.TemporaryFile = tempfile.NamedTemporaryFile
     for name in ("unlink", "remove", "rename", "replace", "rmdir"):
         setattr(os, name, not_in_use(getattr(os, name)))
-    os.kill, os.fsync, os.open, ctypes.CDLL = kill_no_probe, flush, no_folders(os.open), no_c_library  # type: ignore[misc, assignment]
+    os.kill, os.fsync, os.open, ctypes.CDLL = kill_no_probe, flush, no_folders(os.open), no_c_library
     for name in FUNCTIONS:
         delattr(os, name)
     for owner, name in ((signal, "SIGKILL"), (signal, "SIGALRM"), (socket, "send_fds"), (socket, "MSG_DONTWAIT")):
         delattr(owner, name)
     for name in MODULES:
-        sys.modules[name] = None  # type: ignore[assignment]
+        sys.modules[name] = None
     exists = Path.exists
-    Path.exists = lambda path: str(path) != "/dev/fd" and exists(path)  # type: ignore[assignment, method-assign]
+    Path.exists = lambda path: str(path) != "/dev/fd" and exists(path)
     from pdhef_logtool.storage import files
 
     files.WINDOWS = True

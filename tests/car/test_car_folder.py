@@ -1,15 +1,16 @@
-"""A car is a folder of parts: read one by one, left out when their basis has changed, written whole or not at all."""
-
-from __future__ import annotations
+"""A car is a folder of parts, read one by one and written whole; the residual gain is that of file, name or network."""
 
 import os
+import re
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from made_models import random_network
 
 from pdhef_logtool.car import store
 from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, SHIPPED_CARS, VEHICLE_FILE, Car
@@ -54,7 +55,7 @@ TUNED = "phy-ukf:tuned"
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     path = tmp_path / "car"
     path.mkdir()
     (path / VEHICLE_FILE).write_text(PERSONS)
@@ -88,7 +89,7 @@ def edit(folder: Path, old: str, new: str) -> None:
 # --- reading -------------------------------------------------------------------------------------------------------
 
 
-def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> None:
+def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan():
     saloon = Car.load("saloon")
     assert (saloon.vehicle.name, saloon.source) == ("truthsim saloon", SHIPPED_CARS["saloon"])
     assert saloon.network is not None
@@ -98,14 +99,14 @@ def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> Non
     assert default.residual_gain == 0.0
 
 
-def test_a_car_without_network_has_no_residual_network_and_one_for_physics_is_it() -> None:
+def test_a_car_without_network_has_no_residual_network_and_one_for_physics_is_it():
     assert Car(default_vehicle()).residual_network is None
     saloon = Car.load("saloon")
     assert saloon.network is not None
     assert saloon.residual_network is saloon.network
 
 
-def test_parts_come_one_by_one(folder: Path) -> None:
+def test_parts_come_one_by_one(folder):
     own = load(folder).vehicle
     fit = add_fit(folder)
     car = load(folder)
@@ -115,13 +116,12 @@ def test_parts_come_one_by_one(folder: Path) -> None:
     assert car.notes == ()
 
 
-def test_a_cars_network_may_be_its_own_or_named_by_the_cars_folder(folder: Path, tmp_path: Path) -> None:
+def test_a_cars_network_may_be_its_own_or_named_by_the_cars_folder(folder, tmp_path):
     shutil.copytree(SHIPPED_FOLDERS["default"], folder / NETWORK_FOLDER)
     car = Car.load(folder)
     assert car.network_name == NETWORK_FOLDER
     (tmp_path / "bare.toml").write_text(PERSONS)
     other = Car.load(tmp_path / "bare.toml", network=folder)
-    assert other.network is not None and car.network is not None
     assert other.network.sha256 == car.network.sha256
 
 
@@ -141,7 +141,7 @@ def add_physics(folder: Path) -> Fit:
     return fit
 
 
-def test_what_was_found_through_physics_is_its_own(folder: Path) -> None:
+def test_what_was_found_through_physics_is_its_own(folder):
     """Other filters do not see it."""
     add_physics(folder)
     car = load(folder)
@@ -166,7 +166,7 @@ def test_what_was_found_through_physics_is_its_own(folder: Path) -> None:
         ("[tyres.front]", "[sensors]\nay_bias_m_s2 = 0.1\n[tyres.front]"),
     ],
 )
-def test_other_physics_leave_the_fit_out_and_say_so(folder: Path, old: str, new: str) -> None:
+def test_other_physics_leave_the_fit_out_and_say_so(folder, old, new):
     add_fit(folder)
     edit(folder, old, new)
     car = load(folder, "default")
@@ -186,7 +186,7 @@ def test_other_physics_leave_the_fit_out_and_say_so(folder: Path, old: str, new:
         ("[tyres.front]", "[sensors]\nax_bias_m_s2 = 0.0\n[tyres.front]"),  # its default
     ],
 )
-def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str) -> None:
+def test_what_is_no_physics_makes_nothing_stale(folder, old, new):
     add_fit(folder)
     before = load(folder, "default")
     edit(folder, old, new)
@@ -199,7 +199,7 @@ def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str
 # --- rejected inputs -------------------------------------------------------------------------------------------------
 
 
-def test_a_network_is_no_car(tmp_path: Path) -> None:
+def test_a_network_is_no_car(tmp_path):
     with pytest.raises(VehicleError, match=r"a folder with vehicle\.toml, or such a file, got a network's folder"):
         Car.load(SHIPPED_FOLDERS["default"])
     with pytest.raises(VehicleError, match="got another folder"):
@@ -229,13 +229,11 @@ MODEL = FIT.replace("fit", "model")
         (MODEL_FILE, MODEL + "parameter = []\n", "parameter: unknown, did you mean parameters?"),
     ],
 )
-def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: str, text: str, said: str) -> None:
+def test_wrong_entries_of_every_part_are_told_in_one_line(folder, name, text, said):
     (folder / name).write_text(text)
-    with pytest.raises(VehicleError) as caught:
+    with pytest.raises(VehicleError, match=re.escape(said)) as caught:
         Car.load(folder, network="none")
-    assert said in str(caught.value)
     assert str(folder / name) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -248,7 +246,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_a_new_folder_gets_the_persons_file_byte_for_byte_and_the_parts(folder: Path, tmp_path: Path) -> None:
+def test_a_new_folder_gets_the_persons_file_byte_for_byte_and_the_parts(folder, tmp_path):
     add_fit(folder)
     written = tmp_path / "deep" / "new"
     update_car(load(folder), written, NEW)
@@ -258,7 +256,7 @@ def test_a_new_folder_gets_the_persons_file_byte_for_byte_and_the_parts(folder: 
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["new"]
 
 
-def test_a_bare_file_and_the_default_car_become_folders(tmp_path: Path) -> None:
+def test_a_bare_file_and_the_default_car_become_folders(tmp_path):
     (tmp_path / "mine.toml").write_text(PERSONS)
     update_car(load(tmp_path / "mine.toml"), tmp_path / "mine", NEW)
     assert (tmp_path / "mine" / VEHICLE_FILE).read_text() == PERSONS
@@ -269,7 +267,7 @@ def test_a_bare_file_and_the_default_car_become_folders(tmp_path: Path) -> None:
     assert load(tmp_path / "sedan").vehicle == default_vehicle()
 
 
-def test_the_same_folder_is_updated(folder: Path) -> None:
+def test_the_same_folder_is_updated(folder):
     (folder / "notes.txt").write_text("mine too")
     vehicle = (folder / VEHICLE_FILE).read_bytes()
     update_car(load(folder), folder, {MODEL_FILE: b"x"})
@@ -288,9 +286,7 @@ def _raise(error: BaseException) -> Callable[..., Any]:
 @pytest.mark.parametrize("error", [OSError(28, "no space left"), KeyboardInterrupt()])
 @pytest.mark.parametrize("place", ["file", "exchange"])
 @pytest.mark.parametrize("new", [False, True])
-def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, place: str, new: bool
-) -> None:
+def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(folder, monkeypatch, error, place, new):
     car, before = load(folder), files_of(folder)
     places = {"file": (store, "write_bytes"), "exchange": (outputs, "_exchanged")}
     monkeypatch.setattr(*places[place], _raise(error))
@@ -301,7 +297,7 @@ def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
     assert [p.name for p in folder.parent.iterdir()] == [folder.name]
 
 
-def test_what_is_no_place_for_a_car_is_refused_and_untouched(folder: Path, tmp_path: Path) -> None:
+def test_what_is_no_place_for_a_car_is_refused_and_untouched(folder, tmp_path):
     car = load(folder)
     another, full, file = tmp_path / "another", tmp_path / "full", tmp_path / "file"
     for path, text in ((another / VEHICLE_FILE, PERSONS.replace("0.85", "0.75")), (full / "x.txt", "x")):
@@ -326,7 +322,7 @@ def test_what_is_no_place_for_a_car_is_refused_and_untouched(folder: Path, tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("new", [False, True])
-def test_changes_by_several_commands_at_once_are_all_there(folder: Path, new: bool) -> None:
+def test_changes_by_several_commands_at_once_are_all_there(folder, new):
     car = load(folder)
     output = folder.with_name("new") if new else folder
     changes = [{f"part-{i}.toml": b"x = 1\n"} for i in range(8)]
@@ -336,6 +332,39 @@ def test_changes_by_several_commands_at_once_are_all_there(folder: Path, new: bo
     assert not [p for p in folder.parent.iterdir() if p.name.startswith(".")]
 
 
-def test_the_folder_of_a_cars_drives_is_short_and_portable() -> None:
+def test_the_folder_of_a_cars_drives_is_short_and_portable():
     assert car_folder("Saloon/2: my first – a_b.c", "0123456789abcdef") == "car=Saloon-2-my-first-a_b.c-01234567"
     assert car_folder("n" * 99, "f" * 64) == f"car={'n' * 24}-ffffffff"
+
+
+SEDAN = Car(default_vehicle())
+OWN, FOREIGN = replace(random_network(), physics_sha256=SEDAN.physics_sha256), random_network()
+
+
+def _gain(car: Car, name: str = "pd-hef") -> tuple[float, str]:
+    """Return gain and note of an estimator."""
+    estimator = make_estimator(name, car)
+    return estimator.trust, " ".join(estimator.notes)
+
+
+def test_a_network_acts_on_the_physics_that_it_was_trained_with():
+    own, foreign = replace(SEDAN, network=OWN), replace(SEDAN, network=FOREIGN)
+    assert _gain(own) == (1.0, "residual gain 1: within its region of validity")
+    assert _gain(foreign) == (
+        0.0,
+        "residual gain 0: the network was not trained with the physics of this car",
+    )
+    assert (own.has_evidence, foreign.has_evidence, SEDAN.has_evidence) == (True, False, False)
+    assert "no network" in _gain(SEDAN)[1]
+    assert _gain(own.with_noise("physics", FilterNoise(q_std=(1.0, 1.0, 1.0))))[0] == 1.0
+
+
+def test_the_file_decides_before_the_network_and_the_name_before_both(tmp_path):
+    for gain in (0.0, 0.25):
+        (tmp_path / "car.toml").write_text(f"{part_toml(SEDAN.vehicle)}\n[network]\ngain = {gain}\n")
+        loaded = Car.load(tmp_path / "car.toml")
+        for network in (OWN, FOREIGN):
+            car = replace(loaded, network=network)
+            assert _gain(car)[0] == gain
+            for option, named in (("gain=1", 1.0), ("gain=0.5", 0.5), ("fixed-r", 1.0)):
+                assert _gain(car, f"pd-hef:{option}") == (named, "")

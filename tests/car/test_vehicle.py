@@ -1,7 +1,5 @@
 """The vehicle file: accepted entries and error messages."""
 
-from __future__ import annotations
-
 import json
 import os
 import tomllib
@@ -68,11 +66,8 @@ def write(tmp_path: Path, text: str | bytes) -> Path:
 def problem(path: Path) -> str:
     with pytest.raises(VehicleError) as caught:
         read_vehicle_file(path)
-    text = str(caught.value)
-    assert "\n" not in text
-    assert str(path) in text
-    assert caught.value.exit_code == 2
-    return text
+    assert str(path) in str(caught.value)
+    return str(caught.value)
 
 
 def test_every_entry_of_the_example_is_read(tmp_path):
@@ -220,7 +215,7 @@ def valid(part: str, value: dict[str, Any]) -> bool:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_schema_is_what_its_model_says(name: str) -> None:
+def test_a_schema_is_what_its_model_says(name):
     path = FOLDER / f"{name}.schema.json"
     if os.environ.get("PDHEF_UPDATE_SCHEMAS") == "1":
         path.write_text(said_by_the_model(name), encoding="utf-8")
@@ -229,7 +224,7 @@ def test_a_schema_is_what_its_model_says(name: str) -> None:
 
 
 @pytest.mark.parametrize("part", ["vehicle", "fit"])
-def test_what_pdhef_wrote_is_valid_and_what_it_refuses_is_not(part: str) -> None:
+def test_what_pdhef_wrote_is_valid_and_what_it_refuses_is_not(part):
     written = document(part)
     assert valid(part, written)
     assert not valid(part, written | {"no_such_entry": 1})
@@ -262,7 +257,7 @@ def write_entries(folder: Path, entries: dict[str, float]) -> Path:
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
-def test_mass_wheelbase_and_weight_split_suffice(tmp_path: Path, vehicle: tuple[float, float, float]) -> None:
+def test_mass_wheelbase_and_weight_split_suffice(tmp_path, vehicle):
     file = read_vehicle_file(write_entries(tmp_path, rough(*vehicle)))
     mass, wheelbase, share = vehicle
     assert file.vehicle.mass_kg == mass and file.vehicle.wheelbase_m == pytest.approx(wheelbase)
@@ -272,7 +267,7 @@ def test_mass_wheelbase_and_weight_split_suffice(tmp_path: Path, vehicle: tuple[
     assert file.vehicle.understeer_gradient_rad_per_m_s2() > 0  # the default vehicle understeers
 
 
-def test_what_is_given_is_kept_and_what_builds_on_it_follows(tmp_path: Path) -> None:
+def test_what_is_given_is_kept_and_what_builds_on_it_follows(tmp_path):
     given_entries = rough(1500.0, 2.6, 0.6) | {"wheel_radius_m": 0.4, "track_m": 1.7, "cg_height_m": 0.7}
     file = read_vehicle_file(write_entries(tmp_path, given_entries))
     assert (file.vehicle.wheel_radius_m, file.vehicle.track_m) == (0.4, 1.7)
@@ -281,17 +276,11 @@ def test_what_is_given_is_kept_and_what_builds_on_it_follows(tmp_path: Path) -> 
     assert {"track_m", "wheel_radius_m", "cg_height_m"}.isdisjoint(a.entry for a in file.assumed)
 
 
-def test_one_axle_distance_and_the_wheelbase_give_the_other(tmp_path: Path) -> None:
-    vehicle = read_vehicle_file(
-        write_entries(tmp_path, {"mass_kg": 1500, "wheelbase_m": 2.6, "cg_to_front_axle_m": 1.1})
-    ).vehicle
-    assert vehicle.cg_to_rear_axle_m == pytest.approx(1.5)
-
-
-def test_without_a_weight_split_that_of_a_passenger_car_is_assumed_and_named(tmp_path: Path) -> None:
-    file = read_vehicle_file(write_entries(tmp_path, {"mass_kg": 1500, "wheelbase_m": 2.6}))
-    assert file.vehicle.cg_to_front_axle_m == pytest.approx(2.6 * 0.44)
-    assert "front_weight_share" in {a.entry for a in file.assumed}
+@pytest.mark.parametrize(("front", "rear_m"), [({"cg_to_front_axle_m": 1.1}, 1.5), ({}, 2.6 * 0.56)])
+def test_a_wheelbase_needs_one_axle_distance_or_has_the_weight_split_of_a_passenger_car(tmp_path, front, rear_m):
+    file = read_vehicle_file(write_entries(tmp_path, {"mass_kg": 1500, "wheelbase_m": 2.6, **front}))
+    assert file.vehicle.cg_to_rear_axle_m == pytest.approx(rear_m)
+    assert ("front_weight_share" in {a.entry for a in file.assumed}) is (not front)
 
 
 @pytest.mark.parametrize(
@@ -314,12 +303,12 @@ def test_without_a_weight_split_that_of_a_passenger_car_is_assumed_and_named(tmp
         ({"mass_kg": 1500, "wheelbase_m": 2.6, "cg_to_front_axle_m": 1.1, "cg_to_rear_axle_m": 1.5}, "wheelbase_m"),
     ],
 )
-def test_wrong_entries_are_named(tmp_path: Path, entries: dict[str, float], named: str) -> None:
+def test_wrong_entries_are_named(tmp_path, entries, named):
     with pytest.raises(VehicleError, match=named):
         read_vehicle_file(write_entries(tmp_path, entries))
 
 
-def test_without_a_file_only_a_wheelbase_below_that_of_road_cars_replaces_the_sedan() -> None:
+def test_without_a_file_only_a_wheelbase_below_that_of_road_cars_replaces_the_sedan():
     model = assumed_car(0.4)
     assert model.wheelbase_m == pytest.approx(0.4) and 4.0 < model.mass_kg < 20.0
     assert model.low_speed_blend_m_s == pytest.approx(1.12, abs=0.01)
@@ -327,7 +316,7 @@ def test_without_a_file_only_a_wheelbase_below_that_of_road_cars_replaces_the_se
         assert assumed_car(unknown_or_usual) is default_vehicle()
 
 
-def test_the_softest_tyres_that_a_fit_of_a_model_car_can_have_are_a_vehicle() -> None:
+def test_the_softest_tyres_that_a_fit_of_a_model_car_can_have_are_a_vehicle():
     car = assumed_car(0.3)
     values = {
         p.name: p.low if p.name in (priors.RATIO, priors.REAR_STIFFNESS) else p.mean for p in priors.parameters_of(car)

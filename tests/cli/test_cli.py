@@ -1,7 +1,5 @@
 """The command line as a user meets it: help, exit codes, streams, one-line errors."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket
@@ -31,7 +29,7 @@ def _one_line_error(result: subprocess.CompletedProcess[str]) -> str:
     return lines[0]
 
 
-def test_help_names_every_command_with_a_whole_sentence() -> None:
+def test_help_names_every_command_with_a_whole_sentence():
     text = called("--help", env={"COLUMNS": "80"}).stdout
     commands = text[text.index("Look at logs:") : text.index("Exit codes:")]
     listed = re.split(r"\n  (?=\S)", commands.replace("\n\n", "\n"))[1:]
@@ -40,7 +38,7 @@ def test_help_names_every_command_with_a_whole_sentence() -> None:
     assert all(re.search(r"\.(\n[A-Z].*:)?\s*$", entry) for entry in listed)
 
 
-def test_help_says_what_each_command_does() -> None:
+def test_help_says_what_each_command_does():
     for command in COMMANDS:
         for width in (80, 120):
             text = called(*command.split(), "--help", env={"COLUMNS": str(width)}).stdout
@@ -50,18 +48,18 @@ def test_help_says_what_each_command_does() -> None:
             assert f"{examples[0]} ".startswith(f"    pdhef {command} ")
 
 
-def test_the_table_of_commands_describes_each_option_and_no_other() -> None:
+def test_the_table_of_commands_describes_each_option_and_no_other():
     from pdhef_logtool.cli import app
 
     texts = tomllib.loads(Path(app.__file__).with_name("commands.toml").read_text())
-    for name, command in typer.main.get_command(app.app).commands.items():  # type: ignore[attr-defined]
+    for name, command in typer.main.get_command(app.app).commands.items():
         described = {p.name: p.help for p in command.params}
         assert all(described.values()), name
         assert texts[name].get("options", {}).keys() <= described.keys(), name
 
 
 @pytest.mark.slow
-def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir, tmp_path):
     run = ("run", sample_logs_dir / "dlc.mcap", "-o", tmp_path, "--keep", "estimates", "--no-report", "-e")
     document = json.loads(called(*run, "zero", "--json").stdout)
     assert document["logs"][0]["report"] == json.loads((tmp_path / "logs/dlc/report.json").read_text())
@@ -75,7 +73,7 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Pa
     assert all(len(line) <= 160 for line in result.stdout.splitlines() if "outputs in" not in line)
 
 
-def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
+def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path):
     (tmp_path / "no.mcap").write_bytes(b"hello, this is no log\n")
     for arguments in ("run no.mcap -o out", "inspect no.mcap"):
         result = called(*arguments.split(), cwd=tmp_path)
@@ -105,9 +103,7 @@ def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
         ("fly", "pdhef --help"), ("learn x -o y --seed many", "--seed"),
     ],
 )  # fmt: skip
-def test_a_mistake_is_one_line_and_exit_code_2(
-    sample_logs_dir: Path, tmp_path: Path, arguments: str, said: str
-) -> None:
+def test_a_mistake_is_one_line_and_exit_code_2(sample_logs_dir, tmp_path, arguments, said):
     places = {"NONE": tmp_path / "none", "OUT": tmp_path / "out", "LOG": sample_logs_dir / "dlc.mcap"}
     words = [re.sub("NONE|OUT|LOG", lambda m: str(places[m[0]]), word) for word in arguments.split()]
     result = called(*words, cwd=tmp_path)
@@ -116,14 +112,14 @@ def test_a_mistake_is_one_line_and_exit_code_2(
     assert result.stdout == ""
 
 
-def test_the_bare_command_shows_its_help_and_the_version_is_one_line() -> None:
+def test_the_bare_command_shows_its_help_and_the_version_is_one_line():
     assert called("--version").stdout == f"pdhef {__version__}\n"
     result = called()
     assert result.returncode == 2
     assert "Look at logs:" in result.stderr
 
 
-def test_settings_are_those_of_the_file_and_options_win(tmp_path: Path) -> None:
+def test_settings_are_those_of_the_file_and_options_win(tmp_path):
     from pdhef_logtool.cli.options import run_config
 
     file = tmp_path / "pdhef.toml"
@@ -134,7 +130,7 @@ def test_settings_are_those_of_the_file_and_options_win(tmp_path: Path) -> None:
     assert (config.friction, config.estimators) == (0.9, ("zero", "phy-ukf"))
 
 
-def test_quiet_leaves_errors_and_results_and_verbose_shows_progress(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_quiet_leaves_errors_and_results_and_verbose_shows_progress(sample_logs_dir, tmp_path):
     car, log = str(sample_logs_dir / "vehicle.toml"), str(sample_logs_dir / "no_truth.mcap")
     run = ("run", log, "--car", car, "-e", "zero", "--end", "2", "--annotate", "none", "--no-report", "-o")
     plain, quiet = called(*run, str(tmp_path / "a")), called(*run, str(tmp_path / "b"), "--quiet")
@@ -148,7 +144,7 @@ def test_quiet_leaves_errors_and_results_and_verbose_shows_progress(sample_logs_
 
 
 @pytest.mark.slow
-def test_inspect_writes_a_mapping_that_run_takes(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_inspect_writes_a_mapping_that_run_takes(sample_logs_dir, tmp_path):
     log = str(sample_logs_dir / "dlc.mcap")
     mapping = tmp_path / "mapping.toml"
     result = called("inspect", log, "--write-mapping", str(mapping), "--json")
@@ -176,7 +172,7 @@ def _run_of(folder: Path, *names: str) -> Path:
 
 
 @pytest.mark.slow
-def test_view_says_what_is_missing(tmp_path: Path) -> None:
+def test_view_says_what_is_missing(tmp_path):
     result = called("view", str(tmp_path))
     assert result.returncode == 1
     assert "run.json" in _one_line_error(result)
@@ -184,7 +180,7 @@ def test_view_says_what_is_missing(tmp_path: Path) -> None:
     assert "expected a log named failed, got b, a" in _one_line_error(result)
 
 
-def test_view_takes_all_recordings_of_a_run_or_the_named_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view_takes_all_recordings_of_a_run_or_the_named_ones(tmp_path, monkeypatch):
     from pdhef_logtool.cli import running
 
     out = _run_of(tmp_path, "b", "a", "failed")
@@ -198,7 +194,7 @@ def test_view_takes_all_recordings_of_a_run_or_the_named_ones(tmp_path: Path, mo
     assert called[0][1:] == ["-m", "rerun", "--bind", "127.0.0.1", "--new", "--web-viewer", str(of["b"]), str(of["a"])]
 
 
-def test_view_serves_a_catalog_of_the_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view_serves_a_catalog_of_the_recordings(tmp_path, monkeypatch):
     from pdhef_logtool.cli import running
 
     recording = tmp_path / "recording.rrd"
@@ -220,7 +216,7 @@ def test_view_serves_a_catalog_of_the_recordings(tmp_path: Path, monkeypatch: py
     assert f"catalog at {opened[0]}, dataset recording" in done.stdout
 
 
-def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_of_ours_is_one_line_too(sample_logs_dir, tmp_path, monkeypatch):
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("on purpose")
 
@@ -234,7 +230,7 @@ def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path, mo
 
 
 @pytest.mark.slow
-def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir, tmp_path):
     result = called("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
     assert result.returncode == 0
     assert "[signals.steer" in (tmp_path / "m.toml").read_text()

@@ -1,11 +1,8 @@
 """``pdhef compare`` as it is called and as it is seen."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +23,7 @@ def _pdhef(*arguments: str) -> tuple[int, str]:
 
 
 @pytest.fixture
-def runs(tmp_path: Path) -> tuple[str, str]:
+def runs(tmp_path):
     a = write_run(tmp_path / "a", TEN)
     worse = {label: value * (1.1 + 0.01 * i) for i, (label, value) in enumerate(TEN.items())}
     b = write_run(tmp_path / "b", worse, config={"friction": 0.3})
@@ -35,7 +32,7 @@ def runs(tmp_path: Path) -> tuple[str, str]:
     return str(a), str(b)
 
 
-def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[str, str]) -> None:
+def test_a_regression_is_told_with_its_drives_and_where_they_part(runs):
     code, text = _pdhef("compare", *runs, "--max-regression", "5%")
     assert code == 4
     assert all(len(line) <= 80 for line in text.splitlines() if not line.startswith("A "))
@@ -46,7 +43,7 @@ def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[st
     assert first.endswith("Next look at drive_9 first: its error increased most")
 
 
-def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> None:
+def test_json_and_junit_say_the_same(runs, tmp_path):
     plan = tmp_path / "plan.toml"
     ratio = 'id = "{}"\nsignal = "sideslip_rad"\nmetric = "{}"\nbaseline = "run"\nmax_ratio = 1.05\n'
     plan.write_text("".join("[[requirement]]\n" + ratio.format(*named) for named in (("A", "rmse"), ("B", "mae"))))
@@ -76,9 +73,7 @@ def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> N
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )
-def test_three_lines_come_first(
-    command: tuple[str, ...], result: str, width: str, runs: tuple[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_three_lines_come_first(command, result, width, runs, monkeypatch):
     monkeypatch.setenv("COLUMNS", width)
     _, text = _pdhef(*({"A": runs[0], "B": runs[1]}.get(word, word) for word in command))
     head = re.split(r"\n *\n", text)[0]
@@ -86,7 +81,7 @@ def test_three_lines_come_first(
     assert result in " ".join(head.split())
 
 
-def test_a_history_is_a_table_of_runs_in_every_output(runs: tuple[str, str], tmp_path: Path) -> None:
+def test_a_history_is_a_table_of_runs_in_every_output(runs, tmp_path):
     code, text = _pdhef("compare", *runs, runs[1], "--html", str(tmp_path / "history.html"))
     assert code == 0 and "Result   equal: all figures" in text
     assert re.search(r"unknown +10 .*\+14\.5 %.*worse", text.replace("\n", " "))
@@ -97,12 +92,12 @@ def test_a_history_is_a_table_of_runs_in_every_output(runs: tuple[str, str], tmp
 
 
 @pytest.mark.parametrize("option", ["--html", "--junit"])
-def test_an_output_that_is_an_input_is_refused(runs: tuple[str, str], option: str) -> None:
+def test_an_output_that_is_an_input_is_refused(runs, option):
     with pytest.raises(UsageError, match="an output that is no input"):
         _pdhef("compare", *runs, option, f"{runs[0]}/run.json")
 
 
-def test_a_plan_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[str, str], tmp_path: Path) -> None:
+def test_a_plan_and_a_figure_of_the_command_line_do_not_go_together(runs, tmp_path):
     _pdhef("plan", "init", "-o", str(tmp_path / "plan.toml"))
     with pytest.raises(UsageError, match="--plan or --metric, got both"):
         _pdhef("compare", *runs, "--plan", str(tmp_path / "plan.toml"), "--metric", "mae")
@@ -112,7 +107,7 @@ def test_a_plan_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[
         _pdhef("compare", *runs, "--max-regression", "five")
 
 
-def test_events_are_told_in_a_table_with_what_was_not_searched(runs: tuple[str, str]) -> None:
+def test_events_are_told_in_a_table_with_what_was_not_searched(runs):
     code, text = _pdhef("events", runs[1], "--where", "sideslip_deg > 0.5")
     assert code == 0
     assert re.search(r"drive_9 +0\.00 +0\.49 +0\.49 +0\.573", text)

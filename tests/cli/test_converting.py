@@ -1,7 +1,5 @@
 """``pdhef convert``: the MCAP of a log gives the same columns, the same mapping and the same estimates."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -30,7 +28,7 @@ COLUMNS = {
 
 
 @pytest.fixture(scope="module")
-def table(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def table(sample_logs_dir, tmp_path_factory):
     """A CSV file with the signals of a sample log; the speed in every second row."""
     with read_drive(sample_logs_dir / "dlc.mcap", Car.load("saloon")) as drive:
         signals = drive.whole().signals
@@ -56,7 +54,7 @@ def _same_columns(one: DriveLog, two: DriveLog) -> None:
             np.testing.assert_array_equal(first.fields[path], second.fields[path])
 
 
-def test_a_converted_table_has_the_same_columns_mapping_and_estimates(table: Path, tmp_path: Path) -> None:
+def test_a_converted_table_has_the_same_columns_mapping_and_estimates(table, tmp_path):
     output = tmp_path / "drive.mcap"
     done = called("convert", table, "-o", output)
     assert done.returncode == 0, done.stderr
@@ -73,7 +71,7 @@ def test_a_converted_table_has_the_same_columns_mapping_and_estimates(table: Pat
     assert np.nanmax(np.abs(tracks[0].sideslip_rad)) > 0.01
 
 
-def test_frames_and_messages_are_converted(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_frames_and_messages_are_converted(sample_logs_dir, tmp_path):
     can = pytest.importorskip("can")
     with can.BLFWriter(str(tmp_path / "a.blf")) as writer:
         for i in range(50):
@@ -93,7 +91,7 @@ def test_frames_and_messages_are_converted(sample_logs_dir: Path, tmp_path: Path
     np.testing.assert_array_equal(*(c.fields["angular_velocity.z"] for c in columns))
 
 
-def test_a_conversion_is_complete_or_absent(table: Path, tmp_path: Path) -> None:
+def test_a_conversion_is_complete_or_absent(table, tmp_path):
     output = tmp_path / "drive.mcap"
     output.write_bytes(b"mine")
     done = called("convert", table, "-o", output)
@@ -113,7 +111,7 @@ _LIGHT = ("--end", "3", "--annotate", "none")
 
 
 @pytest.mark.slow
-def test_the_first_command_of_the_readme_answers_with_an_error_and_no_verdict(tmp_path: Path) -> None:
+def test_the_first_command_of_the_readme_answers_with_an_error_and_no_verdict(tmp_path):
     line = next(s for s in (_REPO / "README.md").read_text().splitlines() if s.startswith("pdhef run"))
     _, *words = shlex.split(line, comments=True)
     words[words.index("-o") + 1] = str(tmp_path / "out")
@@ -129,9 +127,7 @@ def test_the_first_command_of_the_readme_answers_with_an_error_and_no_verdict(tm
     assert f"speed up to {top:.1f} m/s" in page
 
 
-def test_only_the_named_estimator_runs_and_is_judged(
-    sample_logs_dir: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_only_the_named_estimator_runs_and_is_judged(sample_logs_dir, tmp_path, capfd):
     out = tmp_path / "of 1.0 (ä)"  # characters that Rerun would warn of
     done = called("run", sample_logs_dir / "dlc.mcap", "-e", "linear-kf", *_LIGHT, "-o", out)
     assert done.stdout.startswith("Result   Sideslip RMSE of linear-kf: ")
@@ -143,7 +139,7 @@ def test_only_the_named_estimator_runs_and_is_judged(
     assert "pd-hef" not in (out / "logs/dlc/report.html").read_text()
 
 
-def test_a_table_without_a_date_is_of_no_year(tmp_path: Path) -> None:
+def test_a_table_without_a_date_is_of_no_year(tmp_path):
     t = np.arange(0.0, 12.0, 0.02)
     steer, speed = 0.04 * np.sin(1.5 * t), 15.0 + 0.5 * np.sin(0.8 * t)
     rate = speed * steer / 2.7
@@ -162,7 +158,7 @@ def test_a_table_without_a_date_is_of_no_year(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out/run.json").read_text())["logs"][0]["day"] is None
 
 
-def test_the_start_of_an_estimate_is_not_its_largest_error() -> None:
+def test_the_start_of_an_estimate_is_not_its_largest_error():
     stamps_ns = np.arange(1000) * 10_000_000
     still = np.zeros(1000)
     truth = make_track("truth", stamps_ns, vx_m_s=still + 10.0, vy_m_s=still, yaw_rate_rad_s=still)

@@ -1,7 +1,5 @@
 """Printed output of a run: result first, within the terminal width, complete names, no repeated line."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,7 +51,7 @@ def rows(text: str, *names: str) -> list[str]:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_every_estimator_fits_and_keeps_its_whole_name(width: int) -> None:
+def test_every_estimator_fits_and_keeps_its_whole_name(width):
     every = [ran(n, causal=n != "pd-hef-smoothed") for n in NAMES]
     main = replace(MAIN, shown=NAMES, named=True)
     text = shown(report(main, estimators=every, metrics=ALL_METRICS), width=width)
@@ -66,7 +64,7 @@ def test_every_estimator_fits_and_keeps_its_whole_name(width: int) -> None:
     assert ("max °" in text) == (width == 120)  # the least important column is dropped first
 
 
-def test_the_answer_stands_first_then_three_rows() -> None:
+def test_the_answer_stands_first_then_three_rows():
     text = shown(named("drive"))
     order = [text.index(word) for word in ("Result", "Assumed", "Next", "drive  mcap", "95 % CI", "estimator")]
     assert order == sorted(order)
@@ -75,7 +73,7 @@ def test_the_answer_stands_first_then_three_rows() -> None:
     assert "In hindsight" not in text  # no other estimator was better
 
 
-def test_without_truth_there_is_no_column_of_errors() -> None:
+def test_without_truth_there_is_no_column_of_errors():
     metrics = figures(
         ("pd-hef", "vy_m_s", "d2", 0.1),
         ("zero", "vy_m_s", "d2", 1.0),
@@ -88,7 +86,7 @@ def test_without_truth_there_is_no_column_of_errors() -> None:
     assert rows(text, "physics ")[0].split() == ["physics", "0.573", "-"]
 
 
-def test_failed_checks_stand_above_the_table_and_undecided_ones_are_named() -> None:
+def test_failed_checks_stand_above_the_table_and_undecided_ones_are_named():
     document = report(metrics=GOOD)
     checks = [("steer_rad.sign", "failed"), ("ay_m_s2.unit", "undecided"), ("speed_m_s.unit", "passed")]
     document["checks"] = [{**CHECK, "name": name, "verdict": verdict} for name, verdict in checks]
@@ -100,7 +98,7 @@ def test_failed_checks_stand_above_the_table_and_undecided_ones_are_named() -> N
     assert "waived: steer_rad.sign" in shown(document)
 
 
-def test_several_logs_have_one_table_and_say_once_what_holds_for_all() -> None:
+def test_several_logs_have_one_table_and_say_once_what_holds_for_all():
     first, second = named("monday"), named("tuesday", truth=truth(), metrics=[], remarks=["a remark"])
     lost = named("wednesday", losses=[Loss("gap", "0.4 s without samples", "/imu")], remarks=["a remark"])
     text = shown(first, second, lost, failed="no log")
@@ -115,7 +113,7 @@ def test_several_logs_have_one_table_and_say_once_what_holds_for_all() -> None:
     assert "4 logs: 3 done, 1 failed, 1 with input lost" in text
 
 
-def test_estimators_that_were_skipped_are_named_with_the_reason_once() -> None:
+def test_estimators_that_were_skipped_are_named_with_the_reason_once():
     drive = named("drive")
     skipped = {"outcome": "skipped", "reason": "needs a gyro"}
     drive["estimators"] += [{**drive["estimators"][0], "name": name, **skipped} for name in ("one", "two")]
@@ -123,7 +121,7 @@ def test_estimators_that_were_skipped_are_named_with_the_reason_once() -> None:
     assert line.strip() == "one, two skipped: needs a gyro"
 
 
-def test_a_fleet_is_told_in_a_few_lines_within_80_columns() -> None:
+def test_a_fleet_is_told_in_a_few_lines_within_80_columns():
     spread = {"drives": 290, "median_rad": 0.001, "p90_rad": 0.003, "max_rad": 0.01}
     errors_rad = {"pd-hef": 0.01, "zero": 0.2}
     worst = [{"log": f"a_day_in_may__drive_{i:05d}", "main": "pd-hef", "errors_rad": errors_rad} for i in range(10)]

@@ -1,7 +1,5 @@
 """``pdhef simulate`` in all its forms: drives with faults, suites, condition tables, and the gate on RTK truth."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import xml.etree.ElementTree as ET
@@ -15,7 +13,7 @@ from truthsim.manoeuvres import MANOEUVRES
 pytestmark = pytest.mark.slow
 
 
-def test_a_drive_s_command_makes_the_same_file_again(tmp_path: Path) -> None:
+def test_a_drive_s_command_makes_the_same_file_again(tmp_path):
     made = called(
         *("simulate", "step-steer", "--speed", "90", "--mu", "0.7", "--seed", "4", "--duration", "5"),
         *("--amplitude", "0.8", "--vehicle", "suv~3,mass=1.1", "--fault", "burst20:yaw_rate:2:3"),
@@ -29,7 +27,7 @@ def test_a_drive_s_command_makes_the_same_file_again(tmp_path: Path) -> None:
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
-def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:
+def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults():
     listed = json.loads(called("simulate", "--list", "--json").stdout)["manoeuvres"]
     assert [row["name"] for row in listed] == list(MANOEUVRES)
     text = called("simulate", "--help").stdout
@@ -53,9 +51,7 @@ def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:
         (("dlc-3888-2", "--speed", "70", "--mu", "0.2", "--vehicle", "sedan,cg=0.45"), 1, ("spun", "--keep-spins")),
     ],
 )
-def test_mistakes_are_one_clear_line(
-    arguments: tuple[str, ...], code: int, words: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_mistakes_are_one_clear_line(arguments, code, words, tmp_path):
     result = called("simulate", *arguments, "-o", str(tmp_path / "x.mcap"))
     assert result.returncode == code, result.stderr
     assert len(result.stderr.strip().splitlines()) == 1 and all(word in result.stderr for word in words)
@@ -78,22 +74,16 @@ limit_deg = 0.1
 """
 
 
-@pytest.fixture(scope="module")
-def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    out = tmp_path_factory.mktemp("annotated")
-    vehicle = str(sample_logs_dir / "vehicle.toml")
-    pdhef("run", sample_logs_dir / "dlc.mcap", "-o", out, "-e", "phy-ukf", "--annotate", "full", "--car", vehicle)
-    return str(out / "logs/dlc/annotated.mcap")
-
-
 def _plan(tmp_path: Path, limit: float) -> str:
     path = tmp_path / "plan.toml"
     path.write_text(PLAN.format(limit=limit))
     return str(path)
 
 
-def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -> None:
-    junit = tmp_path / "gate.xml"
+def test_passed_gate_is_0_and_failed_gate_is_4(sample_logs_dir, tmp_path):
+    junit, log = tmp_path / "gate.xml", sample_logs_dir / "dlc.mcap"
+    pdhef("run", log, "-o", tmp_path, "-e", "phy-ukf", "--annotate", "full", "--car", sample_logs_dir / "vehicle.toml")
+    annotated = tmp_path / "logs/dlc/annotated.mcap"
     passed = called("metrics", annotated, *ESTIMATE, "--plan", _plan(tmp_path, 10.0), "--junit", str(junit))
     assert passed.returncode == 0, passed.stderr
     assert "PASS" in passed.stdout
@@ -105,7 +95,7 @@ def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -
     assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["skipped"]) == ("2", "1", "1")
 
 
-def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir, tmp_path):
     (tmp_path / "logs").mkdir()
     whole = (sample_logs_dir / "dlc.mcap").read_bytes()
     (tmp_path / "logs/cut.mcap").write_bytes(whole[: len(whole) * 3 // 4])

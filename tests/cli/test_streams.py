@@ -1,6 +1,4 @@
-"""Readers that go, terminals that are full, streams that are closed, and requests to end."""
-
-from __future__ import annotations
+"""Processes: what a command imports, readers that go, terminals that are full, closed streams and requests to end."""
 
 import os
 import signal
@@ -15,7 +13,7 @@ FULL = Path("/dev/full")
 
 
 @pytest.mark.slow
-def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path) -> None:
+def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir):
     read, write = os.pipe()
     os.close(read)
     command = ["inspect", str(sample_logs_dir / "dlc.mcap")]
@@ -26,7 +24,7 @@ def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
-def test_an_output_that_takes_nothing_is_one_line() -> None:
+def test_an_output_that_takes_nothing_is_one_line():
     with FULL.open("w") as full:
         done = subprocess.run([*PDHEF, "--version"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
@@ -37,7 +35,7 @@ def test_an_output_that_takes_nothing_is_one_line() -> None:
 
 
 @pytest.mark.slow
-def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path: Path) -> None:
+def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path):
     log = tmp_path / "x.mcap"
     shell = " ".join([*PDHEF, "simulate", "dlc", "--duration", "5", "-o", str(log), "0>&- 1>&- 2>&-"])
     done = subprocess.run(["sh", "-c", shell], capture_output=True, check=False)
@@ -69,14 +67,14 @@ main()
     ("name", "way", "code", "said"),
     [("SIGINT", "changed", 130, "interrupted"), ("SIGTERM", "swallowed", 143, "terminated")],
 )
-def test_a_request_to_end_is_one_line_whatever_becomes_of_it(name: str, way: str, code: int, said: str) -> None:
+def test_a_request_to_end_is_one_line_whatever_becomes_of_it(name, way, code, said):
     script = STOP.format(name=name, way=way)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr == f"pdhef: {said}; no output file was left incomplete\n"
 
 
-def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so() -> None:
+def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so():
     script = "import signal; from pdhef_logtool.cli import stopping\n"
     script += "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nstopping.watch()\n"
     script += "signal.raise_signal(signal.SIGTERM)\n"
@@ -86,9 +84,7 @@ def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so() -> None:
     assert (done.returncode, done.stdout) == (-signal.SIGINT, "")
 
 
-def test_without_a_terminal_progress_is_a_line_every_half_minute(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_terminal_progress_is_a_line_every_half_minute(monkeypatch, capsys):
     from pdhef_logtool.cli import console
 
     now = [0.0]
@@ -98,3 +94,96 @@ def test_without_a_terminal_progress_is_a_line_every_half_minute(
             now[0] = float(second)
             reporter.progress(f"drive {second}", second / 100.0)
     assert capsys.readouterr().err.splitlines() == [" 30%  drive 30", " 60%  drive 60", " 90%  drive 90"]
+
+
+ROOT = Path(__file__).parents[2]
+_CODE = """
+import sys
+def loaded(*heavy):
+    print("loaded:", *(name for name in heavy if name in sys.modules))
+import pdhef_logtool
+loaded("numpy", "pydantic")
+import pdhef_logtool.cli.inspecting, pdhef_logtool.runs.config, pdhef_logtool.runs.inspection, truthsim.manoeuvres
+loaded("numba", "torch", "scipy", "rerun", "polars", "pyarrow")
+from pdhef_logtool.cli.app import main
+sys.argv = ["pdhef", *sys.argv[1:]]
+try:
+    main()
+except SystemExit as done:
+    assert not done.code, done.code
+loaded("torch", "rerun", "scipy.linalg", "scipy.special", "scipy.ndimage", "matplotlib", "polars")
+"""
+
+
+@pytest.mark.slow
+def test_the_package_an_inspection_and_a_light_run_load_no_large_library_that_they_do_not_need(tmp_path):
+    words = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "-o", str(tmp_path / "out"), "--end", "2")
+    done = subprocess.run(
+        [sys.executable, "-c", _CODE, *words, "--keep", "metrics", "--no-report"],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert [line.strip() for line in done.stdout.splitlines() if line.startswith("loaded:")] == ["loaded:"] * 3
+
+
+#: Read by every Python process that starts, workers too: as if PyTorch were not installed.
+_BLOCKED = """
+import sys
+from importlib.machinery import PathFinder
+
+class WithoutTorch(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name.partition(".")[0] == "torch" else super().find_spec(name, path, target)
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = WithoutTorch
+"""
+_COMMANDS = """
+import contextlib, io, sys
+from pdhef_logtool.cli.app import main
+for line in sys.stdin.read().splitlines():
+    sys.argv, said = ["pdhef", *line.split("|")], io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            main()
+        code = 0
+    except SystemExit as ended:
+        code = ended.code or 0
+    print("ended:", line.split("|")[0], code, " ".join(said.getvalue().split()), flush=True)
+"""
+
+
+def ended_without_torch(folder: Path, *commands: tuple[object, ...]) -> list[str]:
+    """Run commands in a separate process; return their names, exit codes and lines on stderr."""
+    (folder / "sitecustomize.py").write_text(_BLOCKED)
+    done = subprocess.run(
+        [sys.executable, "-c", _COMMANDS],
+        input="\n".join("|".join(map(str, words)) for words in commands),
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return [line.removeprefix("ended: ") for line in done.stdout.splitlines() if line.startswith("ended: ")]
+
+
+@pytest.mark.slow
+def test_what_trains_no_network_works_without_it_and_what_trains_one_ends_with_one_line(tmp_path):
+    drive = ("sample_logs/dlc.mcap", "--car", "saloon", "--set", "end=3")
+    trained = ("train", tmp_path, "-o", tmp_path / "network")
+    ran, extracted, *refused = ended_without_torch(
+        tmp_path,
+        ("run", *drive, "-e", "pd-hef,physics", "--annotate", "none", "-o", tmp_path / "out"),
+        ("extract", *drive, "-o", tmp_path / "residuals"),
+        trained,
+    )
+    assert ran.startswith("run 0") and extracted.startswith("extract 0")
+    assert (tmp_path / "out/logs/dlc/report.html").is_file()
+    remedy = "got an installation without it; pip install 'pdhef-logtool[train]'"
+    for line in refused:
+        assert line.startswith("train 2 ") and remedy in line, line
+    assert not (tmp_path / "network").exists()

@@ -1,14 +1,11 @@
 """Location of the compiled code, and limits of the cache."""
 
-from __future__ import annotations
-
 import errno
 import importlib.util
 import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -22,7 +19,7 @@ _CODE = "from pdhef_logtool.compiled.cache import njit\n\n\n@njit(cache=True)\nd
 
 
 @pytest.fixture
-def module_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def module_file(tmp_path, monkeypatch):
     """A module with one compiled function, and a separate installation, user folder and temporary folder."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
@@ -40,8 +37,6 @@ def module_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
 
 def _load(file: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location("module", file)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -63,9 +58,7 @@ def _code_files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.suffix in (".nbi", ".nbc"))
 
 
-def test_the_first_folder_that_can_be_written_keeps_the_code(
-    module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_first_folder_that_can_be_written_keeps_the_code(module_file, tmp_path, monkeypatch, capsys):
     named, installed, home, tmp = (tmp_path / name for name in ("named", "installed", "home", "tmp"))
     monkeypatch.setattr(cache.config, "CACHE_DIR", str(named))
     order = (named, installed, home, tmp)
@@ -81,18 +74,14 @@ def test_the_first_folder_that_can_be_written_keeps_the_code(
     assert stat.S_IMODE(next(tmp.glob("pdhef-compiled*")).stat().st_mode) == 0o700
 
 
-def test_without_any_folder_it_runs_and_says_so(
-    module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_any_folder_it_runs_and_says_so(module_file, tmp_path, monkeypatch, capsys):
     _close(monkeypatch, tmp_path)
     assert _load(module_file).more(1) == 2
     assert not _code_files(tmp_path)
     assert "in every run" in capsys.readouterr().err
 
 
-def test_code_serves_the_same_sources_at_another_place_and_time(
-    module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_code_serves_the_same_sources_at_another_place_and_time(module_file, tmp_path, monkeypatch, capsys):
     assert _load(module_file).more(1) == 2
     shutil.copytree(tmp_path / "installed", tmp_path / "other")
     elsewhere = tmp_path / "other" / module_file.relative_to(tmp_path / "installed")
@@ -107,7 +96,7 @@ def test_code_serves_the_same_sources_at_another_place_and_time(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("length", [0, 40])
-def test_a_file_that_was_cut_short_is_compiled_anew(module_file: Path, length: int) -> None:
+def test_a_file_that_was_cut_short_is_compiled_anew(module_file, length):
     _load(module_file).more(1)
     files = _code_files(module_file.parent)
     assert {p.parents[1].name for p in files} == {sources.compiled_digest()}
@@ -119,7 +108,7 @@ def test_a_file_that_was_cut_short_is_compiled_anew(module_file: Path, length: i
         assert all(p.stat().st_size > 1000 for p in files)
 
 
-def test_a_full_disk_ends_no_call(module_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_ends_no_call(module_file, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -128,9 +117,7 @@ def test_a_full_disk_ends_no_call(module_file: Path, monkeypatch: pytest.MonkeyP
     assert not _code_files(module_file.parent)
 
 
-def test_two_processes_that_save_at_once_never_take_each_others_code(
-    module_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_processes_that_save_at_once_never_take_each_others_code(module_file, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("numba.core.caching.IndexDataCacheFile._load_index", lambda _: {})  # neither has read the other's
         patch.setattr("pdhef_logtool.compiled.cache.os.getpid", iter(range(100)).__next__)
@@ -142,9 +129,7 @@ def test_two_processes_that_save_at_once_never_take_each_others_code(
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="users and permissions of POSIX")
-def test_a_temporary_folder_of_somebody_else_is_not_taken(
-    module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_temporary_folder_of_somebody_else_is_not_taken(module_file, tmp_path, monkeypatch):
     def is_taken() -> bool:
         _close(monkeypatch, tmp_path / "installed", tmp_path / "home")
         kept = cache.kept_in()
@@ -167,9 +152,7 @@ def test_a_temporary_folder_of_somebody_else_is_not_taken(
     assert not is_taken()
 
 
-def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(
-    module_file: Path, tmp_path: Path
-) -> None:
+def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(module_file, tmp_path):
     of_sources, of_processor = sources.compiled_digest().split("-")
     installed = module_file.parent / "__pycache__/compiled"
     stale = installed / f"{'0' * 16}-{of_processor}" / "a.nbi"
@@ -186,7 +169,7 @@ def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(
     assert all(f.exists() for f in others)
 
 
-def test_what_compiled_code_is_made_of() -> None:
+def test_what_compiled_code_is_made_of():
     names = {p.relative_to(_ROOT).as_posix() for p in sources.compiled_sources()}
     assert {"pdhef_logtool/estimators/vehicle_ukf.py", "truthsim/motion.py", "truthsim/tyres.py"} <= names
     assert "pdhef_logtool/records/signals.py" in names  # constants
@@ -200,7 +183,7 @@ def test_what_compiled_code_is_made_of() -> None:
     )
 
 
-def test_another_compiler_or_processor_is_another_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_compiler_or_processor_is_another_digest(monkeypatch):
     def digest() -> str:
         sources.compiled_digest.cache_clear()
         return sources.compiled_digest()
@@ -216,7 +199,7 @@ def test_another_compiler_or_processor_is_another_digest(monkeypatch: pytest.Mon
     assert digest() == usual
 
 
-def test_an_edit_of_a_callee_in_another_file_counts(tmp_path: Path) -> None:
+def test_an_edit_of_a_callee_in_another_file_counts(tmp_path):
     for package in sources.PACKAGES:
         shutil.copytree(_ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__", "models"))
     before = sources.sources_digest(tmp_path)

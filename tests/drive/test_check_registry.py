@@ -1,12 +1,9 @@
 """A check is an entry of checks.toml and a function: added that way, it is in every output."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,7 +34,7 @@ def fastest(drive: checks.CheckedDrive) -> Iterator[Check]:
 
 
 @pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch) -> str:
+def toy(monkeypatch):
     monkeypatch.setitem(TABLE, NAME, ENTRY)
     monkeypatch.setattr(checks, "FUNCTIONS", (*checks.FUNCTIONS, fastest))
     return NAME
@@ -45,9 +42,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("waived", [False, True])
-def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(
-    toy: str, sample_logs_dir: Path, tmp_path: Path, waived: bool
-) -> None:
+def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(toy, sample_logs_dir, tmp_path, waived):
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     config = RunConfig(
         car=sample_logs_dir / "vehicle.toml",
@@ -76,6 +71,6 @@ def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(
     assert found.attrib["value"] == f"{word.lower()}: {check['evidence']}"
 
 
-def test_inspect_shows_it(toy: str, sample_logs_dir: Path) -> None:
+def test_inspect_shows_it(toy, sample_logs_dir):
     found = inspect_log(sample_logs_dir / "dlc.mcap")
     assert [c.verdict for c in found.checks if c.name == toy] == ["failed"]

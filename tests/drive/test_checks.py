@@ -1,7 +1,5 @@
 """Wrong signs, units and axes contradict rigid-body kinematics; a sound drive passes and a quiet one is undecided."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping as Mapped
 from dataclasses import replace
 from pathlib import Path
@@ -89,12 +87,12 @@ def failed(channels: dict[str, Channel]) -> set[str]:
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000), calm=st.booleans())
-def test_right_drives_fail_nothing(seed: int, calm: bool) -> None:
+def test_right_drives_fail_nothing(seed, calm):
     assert failed(drive(seed, calm=calm)) == set()
 
 
 @pytest.mark.parametrize("name", ["steer_rad", "yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"])
-def test_a_quiet_drive_accuses_nobody_and_says_what_it_lacks(name: str) -> None:
+def test_a_quiet_drive_accuses_nobody_and_says_what_it_lacks(name):
     channels = drive(5, calm=True)
     for factor in (-1.0, 1.5):
         wrong = replace(channels[name], values=channels[name].values * factor)
@@ -105,7 +103,7 @@ def test_a_quiet_drive_accuses_nobody_and_says_what_it_lacks(name: str) -> None:
         assert doubt.remedy.startswith("needs ")
 
 
-def test_a_swapped_axis_is_said_to_be_another() -> None:
+def test_a_swapped_axis_is_said_to_be_another():
     channels = drive(2)
     rng = np.random.default_rng(1)
     time_s = np.arange(0.0, 60.0, 0.01)
@@ -114,14 +112,14 @@ def test_a_swapped_axis_is_said_to_be_another() -> None:
 
 
 @pytest.mark.parametrize(("offset", "name"), [(9.81, "axis"), (-9.81, "axis"), (1.2, "level"), (0.2, "")])
-def test_gravity_in_a_level_axis_is_found(offset: float, name: str) -> None:
+def test_gravity_in_a_level_axis_is_found(offset, name):
     channels = drive(2)
     lateral = channels["ay_m_s2"]
     found = failed({**channels, "ay_m_s2": replace(lateral, values=lateral.values + offset)})
     assert found == ({f"ay_m_s2.{name}"} if name else set())
 
 
-def test_exchanged_steering_angles() -> None:
+def test_exchanged_steering_angles():
     channels = drive(4)
     as_wheel = replace(channels["steer_rad"], values=channels["steer_rad"].values * 16.0)
     (check,) = (c for c in checks_of({**channels, "steer_rad": as_wheel}) if c.verdict == "failed")
@@ -134,7 +132,7 @@ def test_exchanged_steering_angles() -> None:
     assert "road-wheel angle" in check.remedy
 
 
-def test_standing_or_missing_data_decide_nothing() -> None:
+def test_standing_or_missing_data_decide_nothing():
     channels = drive(6)
     standing = {n: replace(c, values=0.0 * c.values) for n, c in channels.items()}
     assert failed(standing) == set()
@@ -167,17 +165,17 @@ def checked(found: MappedChannels, vehicle: VehicleParameters | None = None, **f
 
 
 @pytest.fixture(scope="module")
-def road(sample_logs_dir: Path) -> MappedChannels:
+def road(sample_logs_dir):
     return survey(sample_logs_dir / "road.mcap")
 
 
 @pytest.fixture(scope="module")
-def saloon(sample_logs_dir: Path) -> VehicleParameters:
+def saloon(sample_logs_dir):
     return Car.load(sample_logs_dir / "vehicle.toml").vehicle.model_copy(update={"name": "saloon"})
 
 
 @pytest.mark.slow
-def test_a_sound_road_passes_everything(road: MappedChannels, saloon: VehicleParameters) -> None:
+def test_a_sound_road_passes_everything(road, saloon):
     checks = checked(road, saloon)
     alone = {"roll_rate_rad_s", "pitch_rate_rad_s"}  # the log has no second measurement of them
     place = {"ay_m_s2.place"}  # too few quick bends
@@ -197,14 +195,12 @@ def test_a_sound_road_passes_everything(road: MappedChannels, saloon: VehiclePar
         ({"steering_ratio": 16.0}, ""),
     ],
 )
-def test_a_vehicle_file_of_another_car(
-    road: MappedChannels, saloon: VehicleParameters, changes: dict[str, float], name: str
-) -> None:
+def test_a_vehicle_file_of_another_car(road, saloon, changes, name):
     checks = checked(road, saloon.model_copy(update=changes))
     assert verdicts(checks, "failed") == ({name} if name else set())
 
 
-def test_a_mass_that_the_tyres_do_not_carry(sample_logs_dir: Path, saloon: VehicleParameters) -> None:
+def test_a_mass_that_the_tyres_do_not_carry(sample_logs_dir, saloon):
     found = survey(sample_logs_dir / "dlc.mcap")
     heavy = saloon.model_copy(update={"mass_kg": 2.0 * saloon.mass_kg})
     assert "vehicle.mass" not in verdicts(checked(found, saloon), "failed")
@@ -224,7 +220,7 @@ DRIVES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("file", "mapping_name"), DRIVES)
-def test_recorded_drives_fail_nothing(shared_dir: Path, file: str, mapping_name: str) -> None:
+def test_recorded_drives_fail_nothing(shared_dir, file, mapping_name):
     checks = checked(survey(shared_dir / "data" / "drives" / file, mapping_name))
     # Its README: a constant sideslip of 0.8 deg in this truth is mounting, not slip.
     known = {"truth.sideslip_rad.offset"} if mapping_name == "comma2k19" else set()
@@ -263,15 +259,13 @@ def late_checks(found: MappedChannels, vehicle: VehicleParameters | None = None)
         ({"delay_s": 0.038}, "yaw_rate_rad_s.delay"),
     ],
 )
-def test_place_gain_and_delay_are_told_apart(
-    sample_logs_dir: Path, saloon: VehicleParameters, errors: dict[str, float], name: str
-) -> None:
+def test_place_gain_and_delay_are_told_apart(sample_logs_dir, saloon, errors, name):
     checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), **errors), saloon)
     assert verdicts(checks, "failed") == ({name} if name else set())
     assert {"ay_m_s2.place", "yaw_rate_rad_s.gain", "yaw_rate_rad_s.delay"} <= {c.name for c in checks}
 
 
-def test_what_the_car_knows_of_its_sensors_fails_nothing(sample_logs_dir: Path, saloon: VehicleParameters) -> None:
+def test_what_the_car_knows_of_its_sensors_fails_nothing(sample_logs_dir, saloon):
     found = planted(survey(sample_logs_dir / "sweep.mcap"), lever_m=-1.45, gain=1.08)
     sensors = saloon.sensors.model_copy(update={"yaw_rate_gain": 1.08})
     knows = saloon.model_copy(update={"imu_position_m": (-1.45, 0.0, 0.0), "sensors": sensors})
@@ -280,7 +274,7 @@ def test_what_the_car_knows_of_its_sensors_fails_nothing(sample_logs_dir: Path, 
 
 
 @pytest.mark.parametrize("delay_s", [0.038, -0.038])
-def test_a_delay_is_booked_on_what_is_late(sample_logs_dir: Path, delay_s: float) -> None:
+def test_a_delay_is_booked_on_what_is_late(sample_logs_dir, delay_s):
     found = planted(survey(sample_logs_dir / "sweep.mcap"), delay_s=delay_s)
     latency = truth_latency(found.signals, found.truth, derive_truth(found.truth))
     late_gyro, late_truth = max(delay_s, 0.0), max(-delay_s, 0.0)
@@ -288,7 +282,7 @@ def test_a_delay_is_booked_on_what_is_late(sample_logs_dir: Path, delay_s: float
     assert latency.latency_s == pytest.approx(late_truth, abs=0.002)
 
 
-def test_sensors_that_are_all_late_by_the_same_leave_it_with_the_truth() -> None:
+def test_sensors_that_are_all_late_by_the_same_leave_it_with_the_truth():
     gyro = LatencyEstimate(-0.038, 0.99, 0.001, True, False, "")
     assert booked_on_the_late(gyro, replace(gyro, latency_s=-0.035)).latency_s == -0.038
     assert booked_on_the_late(gyro, replace(gyro, latency_s=0.010)).gyro_delay_s == 0.038
@@ -298,7 +292,7 @@ def test_sensors_that_are_all_late_by_the_same_leave_it_with_the_truth() -> None
 # ------------------------------------------------------------------------------- which of two is wrong
 
 
-def test_what_one_wrong_signal_contradicts_is_not_blamed_with_it() -> None:
+def test_what_one_wrong_signal_contradicts_is_not_blamed_with_it():
     """The speed agrees with a_x, a_y and steering, so the wheel speeds that disagree are wrong."""
     channels = drive(3)
     angles = {
@@ -312,7 +306,7 @@ def test_what_one_wrong_signal_contradicts_is_not_blamed_with_it() -> None:
     assert not {c.subject for c in checks if c.verdict == "undecided"}
 
 
-def test_of_two_that_nothing_tells_apart_one_fails_and_the_other_is_undecided() -> None:
+def test_of_two_that_nothing_tells_apart_one_fails_and_the_other_is_undecided():
     channels = {n: c for n, c in drive(3).items() if n in ("steer_rad", "yaw_rate_rad_s", "ax_m_s2", "speed_m_s")}
     for name in ("steer_rad", "yaw_rate_rad_s"):
         wrong = replace(channels[name], values=-channels[name].values)
@@ -322,7 +316,7 @@ def test_of_two_that_nothing_tells_apart_one_fails_and_the_other_is_undecided() 
         assert {c.subject for c in checks if c.verdict == "passed"} >= {"ax_m_s2", "speed_m_s"}
 
 
-def test_a_wheel_that_spins_and_a_gain_that_is_close_are_undecided() -> None:
+def test_a_wheel_that_spins_and_a_gain_that_is_close_are_undecided():
     channels = drive(3)
     wheel = channels["wheel_speed_rl_m_s"]
     checks = checks_of({**channels, wheel.name: replace(wheel, values=1.3 * wheel.values)})
@@ -330,13 +324,13 @@ def test_a_wheel_that_spins_and_a_gain_that_is_close_are_undecided() -> None:
     assert verdicts(checks, "undecided") == {f"{wheel.name}.unit"}
 
 
-def test_a_steering_sensor_that_never_moves_is_no_steering() -> None:
+def test_a_steering_sensor_that_never_moves_is_no_steering():
     channels = drive(1)
     dead = replace(channels["steer_rad"], values=np.full_like(channels["steer_rad"].values, 0.01))
     assert failed({**channels, "steer_rad": dead}) == {"steer_rad.axis"}
 
 
-def test_two_spinning_wheels_show_no_speed() -> None:
+def test_two_spinning_wheels_show_no_speed():
     """The derivative of spinning wheels is no acceleration; a wheel in another unit does not spin."""
     channels = drive(2)
     wheel = channels.pop("wheel_speed_rl_m_s")
@@ -353,7 +347,7 @@ def test_two_spinning_wheels_show_no_speed() -> None:
     assert np.isfinite(measure(km_h).columns["wheel_speeds"]).mean() > 0.95
 
 
-def test_a_magnitude_without_its_sign_does_not_pass() -> None:
+def test_a_magnitude_without_its_sign_does_not_pass():
     channels = drive(3)
     yaw = channels["yaw_rate_rad_s"]
     checks = checks_of({**channels, "yaw_rate_rad_s": replace(yaw, values=np.abs(yaw.values))})
@@ -361,7 +355,7 @@ def test_a_magnitude_without_its_sign_does_not_pass() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_signs_that_nothing_decides_are_undecided(sign: float) -> None:
+def test_signs_that_nothing_decides_are_undecided(sign):
     """Steering, yaw rate and lateral acceleration of a mirrored recorder agree with one another."""
     names = ("steer_rad", "yaw_rate_rad_s", "ay_m_s2")
     channels = {n: replace(c, values=sign * c.values) if n in names else c for n, c in drive(3).items()}
@@ -371,7 +365,7 @@ def test_signs_that_nothing_decides_are_undecided(sign: float) -> None:
     assert {verdicts[f"{n}.sign"] for n in names} == {"undecided"}
 
 
-def test_on_a_circle_the_mean_is_the_signal() -> None:
+def test_on_a_circle_the_mean_is_the_signal():
     rng, course = np.random.default_rng(0), law("gnss_path", name="")
     turning = 0.3 + 0.001 * np.cumsum(rng.standard_normal(1200)) / 3.0
     mirrored = -turning + 0.02 * rng.standard_normal(1200)
@@ -381,7 +375,7 @@ def test_on_a_circle_the_mean_is_the_signal() -> None:
         assert bool(abs(relation.gain + 1.0) < 0.1) is is_shown
 
 
-def test_driving_in_reverse_is_no_offset_of_the_heading() -> None:
+def test_driving_in_reverse_is_no_offset_of_the_heading():
     seconds = np.arange(0.0, 120.0, 0.05)
     speed, rate = -8.0 - np.sin(0.2 * seconds), 0.1 * np.sin(0.5 * seconds)
     columns = {"truth.vx_m_s": speed, "truth.vy_m_s": 0.3 * rate, "yaw_rate_rad_s": rate, "ay_m_s2": speed * rate}
@@ -392,7 +386,7 @@ def test_driving_in_reverse_is_no_offset_of_the_heading() -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", ["speed_m_s", "yaw_rate_rad_s", "wheel_speed_rl_m_s"])
-def test_no_number_warns(name: str) -> None:
+def test_no_number_warns(name):
     """Values of any magnitude and runs of NaN cause no warning; readers drop infinite values."""
     channels = drive(5)
     values, i = channels[name].values, np.arange(len(channels[name]))

@@ -1,26 +1,30 @@
-"""Mistakes of a mapping: wrong units, signs, axes and topics are named with the right remedy, and nothing else is."""
+"""Mistakes of a mapping: their probabilities, and that wrong units, signs, axes and topics get the right remedy."""
 
-from __future__ import annotations
-
+import math
 import tomllib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from pdhef_logtool import PdhefError, ReadOptions, RunConfig, read_drive, run
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.drive.checks import check_drive, misread_channels
+from pdhef_logtool.drive.hypotheses import Law, Relation, known_hypotheses, posterior
 from pdhef_logtool.drive.measured import measure
+from pdhef_logtool.drive.plan import plan_drive
+from pdhef_logtool.drive.survey import scaled_source
 from pdhef_logtool.drive.truth import derive_truth
-from pdhef_logtool.mapping import Mapping, SignalSource
-from pdhef_logtool.records.checks import Check
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import Mapping, SignalSource, auto_map
 from pdhef_logtool.records.signals import Channel
+from pdhef_logtool.runs.inspection import inspect_drive_log
 from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
 from studies.pages import write_toml
 from tests.drive.test_checks import checks_of, drive
@@ -45,17 +49,13 @@ def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, 
     return signals, {n: replace(rate, name=n, values=v) for n, v in values.items()}
 
 
-def checks_by_name(vehicle: VehicleParameters, vy_factor: float) -> dict[str, Check]:
-    signals, truth = with_truth(vehicle, vy_factor)
-    derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
-    return {c.name: c for c in checks_of(signals, truth, derived, vehicle)}
-
-
 @pytest.mark.parametrize("place_m", [-1.1, 0.0])
 @pytest.mark.parametrize("factor", [1.0, 57.2958, 1.0 / 57.2958, 9.80665, 1.0 / 9.80665])
-def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -> None:
+def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
     vehicle = VEHICLE.model_copy(update={"truth_position_m": (place_m, 0.0, 0.0)})
-    checks = checks_by_name(vehicle, factor)
+    signals, truth = with_truth(vehicle, factor)
+    derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
+    checks = {c.name: c for c in checks_of(signals, truth, derived, vehicle)}
     if factor == 1.0:
         assert not [n for n, c in checks.items() if c.verdict == "failed" and n.startswith("truth.vy_m_s.")]
     else:
@@ -64,9 +64,7 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -
 
 @pytest.mark.parametrize(("mirrored", "antenna_m"), [(False, 0.0), (True, 0.0), (False, 1.5)])
 @pytest.mark.parametrize("factor", [1.0, 3.6, 1.0 / 3.6, -1.0])
-def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
-    factor: float, mirrored: bool, antenna_m: float
-) -> None:
+def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(factor, mirrored, antenna_m):
     """A rigid-body identity: a pose with y to the right, or from an antenna further ahead, fails no check."""
     vehicle = default_vehicle().model_copy(update={"truth_position_m": (1.3, 0.0, 0.0)})
     signals, truth = with_truth(vehicle, 1.0)
@@ -85,7 +83,7 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
 
 
-def test_exchanged_velocities_of_ground_truth_are_named() -> None:
+def test_exchanged_velocities_of_ground_truth_are_named():
     signals, truth = with_truth(VEHICLE, 1.0)
     ahead, across = truth["vx_m_s"], truth["vy_m_s"]
     truth |= {"vx_m_s": replace(ahead, values=across.values), "vy_m_s": replace(across, values=ahead.values)}
@@ -95,7 +93,7 @@ def test_exchanged_velocities_of_ground_truth_are_named() -> None:
     assert {c.subject for c in found if c.verdict == "failed"} <= {*named, "truth.sideslip_rad"}
 
 
-def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> None:
+def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro():
     signals, truth = with_truth(VEHICLE, 1.0)
     rate = truth["yaw_rate_rad_s"]
     truth["yaw_rate_rad_s"] = replace(rate, values=2000.0 * rate.values)
@@ -103,7 +101,7 @@ def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> Non
     assert {c.subject for c in found if c.verdict == "failed"} == {"truth.yaw_rate_rad_s"}
 
 
-def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back() -> None:
+def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back():
     """A file without the place of ground truth means the CG; the lever of its front axle is no other unit."""
     back = VEHICLE.model_copy(update={"cg_to_rear_axle_m": 0.8, "cg_to_front_axle_m": 1.8})
     signals, truth = with_truth(back, 1.0)
@@ -111,7 +109,7 @@ def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back() -> None
     assert axle.law.gains[1] > (0.8 + 1.8) / 0.8
 
 
-def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
+def test_a_unit_that_the_drive_leaves_open_is_not_checkable():
     """At a low correlation both regressions reach far: 3.6 times as much would be plausible too."""
     signals = drive(3)
     ay = signals["ay_m_s2"]
@@ -120,12 +118,11 @@ def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
     kept = {n: signals[n] for n in ("yaw_rate_rad_s", "speed_m_s")} | {"ay_m_s2": loud}
     checks = {c.name: c for c in checks_of(kept)}
     unit = checks.get("ay_m_s2.unit", checks.get("ay_m_s2.sign"))
-    assert unit is not None
     assert unit.verdict == "undecided"
     assert unit.remedy.startswith("needs ")
 
 
-def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed() -> None:
+def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed():
     """Without ground truth, four wheel speeds with reversed sign contradict no other signal."""
     signals = {n: c for n, c in drive(3, calm=True).items() if n in ("wheel_speed_rl_m_s", "yaw_rate_rad_s", "ay_m_s2")}
     wheel = signals["wheel_speed_rl_m_s"]
@@ -136,7 +133,7 @@ def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed() -> None:
 
 
 @pytest.mark.parametrize(("name", "factor"), [("x_m", 1e-3), ("y_m", 3.2808), ("x_m", -1.0), ("y_m", -1.0), ("", 1.0)])
-def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(name: str, factor: float) -> None:
+def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(name, factor):
     signals, truth = with_truth(VEHICLE, 1.0)
     vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
     yaw = np.cumsum(rate) * 0.01
@@ -157,7 +154,7 @@ def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(
         assert set(misread_channels(checks)) == {expected.rpartition(".")[0]}
 
 
-def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
+def test_exchanged_degrees_of_a_place_are_named_as_such():
     signals, truth = with_truth(VEHICLE, 1.0)
     yaw = np.cumsum(truth["yaw_rate_rad_s"].values) * 0.01
     north, east = (np.cumsum(truth["vx_m_s"].values * way) * 0.01 / 111_320.0 for way in (np.sin(yaw), np.cos(yaw)))
@@ -175,7 +172,7 @@ def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
 
 
 @pytest.mark.parametrize("factor", [1.0, np.pi / 180.0, 180.0 / np.pi, -1.0])
-def test_a_heading_turns_as_the_gyro_does(factor: float) -> None:
+def test_a_heading_turns_as_the_gyro_does(factor):
     signals, truth = with_truth(VEHICLE, 1.0)
     yaw = 1.0 + np.cumsum(truth["yaw_rate_rad_s"].values) * 0.01
     truth["yaw_rad"] = replace(truth["vx_m_s"], name="yaw_rad", values=factor * np.angle(np.exp(1j * yaw)))
@@ -190,7 +187,7 @@ pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
 
 @pytest.fixture(scope="module")
-def mapping_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], dict[str, Any]]:
+def mapping_of(tmp_path_factory):
     """Return the mapping file that is recognised of a log."""
 
     def recognise(path: Path) -> dict[str, Any]:
@@ -201,7 +198,7 @@ def mapping_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], dic
     return recognise
 
 
-def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path, tmp_path: Path, mapping_of: Any) -> None:
+def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir, tmp_path, mapping_of):
     """A wrong unit, sign and axis of each signal; the speed and the tyres of the default car may leave one open."""
     path = sample_logs_dir / "dlc.mcap"
     mapping = mapping_of(path)
@@ -220,7 +217,7 @@ def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path, t
         ("roll_rate_rad_s", 300.0, "degrees"),
     ],
 )
-def test_impossible_magnitudes_need_no_second_signal(name: str, factor: float, remedy: str) -> None:
+def test_impossible_magnitudes_need_no_second_signal(name, factor, remedy):
     channel = drive(3)[name.replace("roll", "yaw")]
     checks = checks_of({name: replace(channel, name=name, values=channel.values * factor)})
     (check,) = (c for c in checks if c.name == f"{name}.unit")
@@ -236,9 +233,7 @@ def run_with(path: Path, mapping: Path, out: Path) -> int:
 
 
 @pytest.mark.parametrize(("subject", "kind", "code"), [("steer_rad", "x57.3", 3), ("wheel_speed", "/57.3", 1)])
-def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(
-    sample_logs_dir: Path, tmp_path: Path, mapping_of: Any, subject: str, kind: str, code: int
-) -> None:
+def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(sample_logs_dir, tmp_path, mapping_of, subject, kind, code):
     path = sample_logs_dir / "fishhook.mcap"
     wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), subject, kind))
     if code == 1:
@@ -248,10 +243,80 @@ def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(
         assert run_with(path, wrong, tmp_path / "out") == code
 
 
-def test_a_waived_check_stops_nothing(sample_logs_dir: Path, tmp_path: Path, mapping_of: Any) -> None:
+def test_a_waived_check_stops_nothing(sample_logs_dir, tmp_path, mapping_of):
     path = sample_logs_dir / "fishhook.mcap"
     wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), "steer_rad", "x57.3"))
     car = sample_logs_dir / "vehicle.toml"
     for waived in ((), ("steer_rad.unit",)):
         with read_drive(path, car, wrong, ReadOptions(waived=waived)) as drive:
             assert ("steer_rad" in drive.available) == bool(waived)
+
+
+NAMES = ["ay_m_s2", "yaw_rate_rad_s", "speed_m_s"]
+TURN = {"ay_m_s2": 1, "yaw_rate_rad_s": -1, "speed_m_s": -1}
+
+
+def relation(*gains: float, powers: dict[str, int] = TURN, text: str = "a_y") -> Relation:
+    size = math.exp(float(np.mean(np.log(np.abs(gains)))))
+    return Relation(Law(text, powers, (0.55, 1.8)), 0.99, math.copysign(size, gains[0]), 200.0, blocks=gains)
+
+
+def probabilities(*relations: Relation) -> dict[str, float]:
+    found = posterior(relations, known_hypotheses((*NAMES,)))
+    assert sum(p for p, _ in found.sets) == pytest.approx(1.0)
+    return {n: sum(p for p, _ in found.of(n)) for n in NAMES}
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(gains=st.lists(st.floats(0.7, 1.5), min_size=3, max_size=8))
+def test_plausible_gains_blame_nobody(gains):
+    assert max(probabilities(relation(*gains)).values()) < 0.05
+
+
+def test_a_unit_is_wrong_in_every_block_and_a_slide_in_some():
+    sound = relation(1.0, 1.05, 0.95, 1.0, powers={"speed_m_s": 1}, text="another speed")
+    degrees = np.pi / 180.0
+    wrong = probabilities(sound, *(relation(*(g * degrees for g in (1.0, 1.1, 0.9, 1.0)), text=t) for t in "ab"))
+    assert wrong["yaw_rate_rad_s"] > 0.85 and wrong["speed_m_s"] < 0.1
+    assert max(probabilities(sound, relation(1.0, 0.6, 0.35, 0.2)).values()) < 0.05
+
+
+def test_two_mistakes_are_found_that_are_worse_than_none_alone():
+    """All that turns counts to the right, and only the path over ground shows it: IMU and steering are two mistakes."""
+    steady, steer = (1.0, 1.1, 0.9, 1.0), {"steer_rad": 1}
+    relations = [
+        relation(*steady),
+        relation(*steady, powers=steer | {"yaw_rate_rad_s": -1}, text="steering"),
+        relation(*steady, powers=steer | {"ay_m_s2": -1}, text="steering and a_y"),
+        relation(*(-g for g in steady), powers={"yaw_rate_rad_s": 1}, text="path"),
+    ]
+    imu = ("ay_m_s2", "yaw_rate_rad_s")
+    found = posterior(relations, known_hypotheses((*NAMES, "steer_rad"), (imu,), (("steer_rad",),)))
+    probability, chosen = found.sets[0]
+    assert probability > 0.97 and {n for h in chosen for n in h.factors} == {*imu, "steer_rad"}
+
+
+def test_scales_of_right_mappings_are_those_of_units():
+    """A gain between km/h and mph fits both; only one of them corrects the mapping to the scale of a unit."""
+    between = relation(2.8, 2.9, 2.85, powers={"speed_m_s": 1}, text="another speed")
+    likeliest = {
+        scale: posterior([between], known_hypotheses(("speed_m_s",)), {"speed_m_s": scale}).of("speed_m_s")[0]
+        for scale in (3.6, 1.0 / 0.44704)
+    }
+    assert [h.factors["speed_m_s"] for _, h in likeliest.values()] == pytest.approx([1.0 / 3.6, 0.44704])
+    assert all(p > 0.75 for p, _ in likeliest.values())
+    counts = posterior([between], known_hypotheses(("speed_m_s",)), {"speed_m_s": 0.0123})
+    assert counts == posterior([between], known_hypotheses(("speed_m_s",)))
+
+
+def test_inspect_and_run_refuse_the_same_channels(sample_logs_dir):
+    log = open_log(sample_logs_dir / "dlc.mcap")
+    right = auto_map(log).mapping
+    degrees = {"yaw_rate_rad_s": scaled_source(right.truth["yaw_rate_rad_s"], 180.0 / np.pi)}
+    wrong = replace(right, truth={**right.truth, **degrees}, origin="file")
+    inspection = inspect_drive_log(log, wrong)
+    plan = plan_drive(log, wrong, default_vehicle(), log.start_ns, log.end_ns)
+    log.close()
+    assert inspection.refused == plan.refused
+    assert set(plan.refused) == {"truth.yaw_rate_rad_s"}
+    assert "physics" in inspection.estimators

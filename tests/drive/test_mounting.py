@@ -1,7 +1,5 @@
 """Signals of an IMU in any mounting are rotated to x forward, z up; a doubtful rotation is reported, not applied."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -28,7 +26,7 @@ IMU = ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 
 
 @pytest.fixture(scope="module")
-def log(sample_logs_dir: Path):
+def log(sample_logs_dir):
     opened = open_log(sample_logs_dir / "faults.mcap")
     yield opened
     opened.close()
@@ -60,7 +58,7 @@ def components(log):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("angles", ANGLES)
-def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles: tuple[float, float, float]) -> None:
+def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles):
     channels, triads, mapping = components
     turn = rotation(*angles)
     signals = dict(channels.signals)
@@ -68,7 +66,6 @@ def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles: tupl
         turned = np.stack([signals[n].values for n in names], axis=1) @ turn
         signals |= {n: replace(signals[n], values=turned[:, i]) for i, n in enumerate(names)}
     found = find_mounting(measure(signals), triads, mapping)
-    assert found is not None
     assert found.confident
     assert np.allclose(found.rotation, turn, atol=1e-9)
     assert found.is_as_named == (angles == (0, 0, 0))
@@ -76,7 +73,7 @@ def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles: tupl
 
 @pytest.mark.slow
 @pytest.mark.parametrize("angles", [(0, 0, 0), (0, 90, 0), (180, 0, 270)])
-def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles: tuple[float, float, float]) -> None:
+def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles):
     turned = TurnedLog(log, rotation(*angles))
     plan = planned(turned)
     upright = angles == (0, 0, 0)
@@ -92,7 +89,7 @@ def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles: tuple[float, flo
 
 @pytest.mark.slow
 @pytest.mark.parametrize("angles", [(7, 0, 0), (180, 0, 30)])
-def test_a_mounting_askew_is_found_to_two_degrees(log, angles: tuple[float, float, float]) -> None:
+def test_a_mounting_askew_is_found_to_two_degrees(log, angles):
     turned = TurnedLog(log, rotation(*angles))
     plan = planned(turned)
     rest = difference(signals_of(turned, plan), signals_of(log, planned(log)))
@@ -101,7 +98,7 @@ def test_a_mounting_askew_is_found_to_two_degrees(log, angles: tuple[float, floa
 
 
 @pytest.mark.slow
-def test_a_written_mapping_turns_once_and_never_again(log, tmp_path: Path) -> None:
+def test_a_written_mapping_turns_once_and_never_again(log, tmp_path):
     turned = TurnedLog(log, rotation(0, 90, 25))
     found = inspect_drive_log(turned)
     write_mapping(found, tmp_path / "mapping.toml")
@@ -114,7 +111,7 @@ def test_a_written_mapping_turns_once_and_never_again(log, tmp_path: Path) -> No
     assert {n: again.mapping.signals[n].scale for n in IMU} == {n: mapping.signals[n].scale for n in IMU}
 
 
-def test_a_mapping_file_is_checked_and_left_alone(log) -> None:
+def test_a_mapping_file_is_checked_and_left_alone(log):
     turned = TurnedLog(log, rotation(0, 0, 90))
     mapping = replace(auto_map(turned).mapping, origin="file")
     plan = planned(turned, mapping)
@@ -126,7 +123,7 @@ def test_a_mapping_file_is_checked_and_left_alone(log) -> None:
 
 
 @pytest.mark.slow
-def test_a_sensor_that_takes_gravity_off_is_turned_by_its_rates(log) -> None:
+def test_a_sensor_that_takes_gravity_off_is_turned_by_its_rates(log):
     class Compensated(TurnedLog):
         def read(self, requests, start_ns, end_ns, **options):
             found = super().read(requests, start_ns, end_ns, **options)
@@ -143,7 +140,7 @@ def test_a_sensor_that_takes_gravity_off_is_turned_by_its_rates(log) -> None:
 
 
 @pytest.mark.parametrize("angles", [(0, 90, 30), (0, -90, -120), (170, 20, -30)])
-def test_angles_give_the_rotation_back(angles: tuple[float, float, float]) -> None:
+def test_angles_give_the_rotation_back(angles):
     assert np.allclose(rotation(*angles_deg(rotation(*angles))), rotation(*angles), atol=1e-6)
 
 
@@ -178,7 +175,7 @@ class WrongLog(TurnedLog):
 
 
 @pytest.fixture(scope="module")
-def wrong_log(sample_logs_dir: Path):
+def wrong_log(sample_logs_dir):
     opened = open_log(sample_logs_dir / "sweep.mcap")
     yield WrongLog(opened, rotation(90, 0, 0))
     opened.close()
@@ -196,7 +193,7 @@ def inspected(wrong_log, mapping: Mapping, path: Path) -> Mapping:
 
 
 @pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_each_error_is_taken_off_once_however_often(wrong_log, tmp_path: Path, times: int) -> None:
+def test_each_error_is_taken_off_once_however_often(wrong_log, tmp_path, times):
     mapping = auto_map(wrong_log).mapping
     for number in range(times):
         mapping = inspected(wrong_log, mapping, tmp_path / f"{number}.toml")
@@ -212,7 +209,7 @@ def test_each_error_is_taken_off_once_however_often(wrong_log, tmp_path: Path, t
     assert mapping_proposals(surveyed(wrong_log, mapping, CAR)) == ()
 
 
-def test_proposals_say_where_they_belong_and_why(wrong_log) -> None:
+def test_proposals_say_where_they_belong_and_why(wrong_log):
     found = inspect_drive_log(wrong_log)
     assert {p.subject for p in found.proposals} == {"yaw_rate_rad_s", "ay_m_s2"}, (
         "a sign is corrected in a recognised mapping itself"
@@ -238,7 +235,7 @@ class TurnedTruth(TurnedLog):
 
 
 @pytest.mark.slow
-def test_a_turned_truth_is_turned_back_once(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_a_turned_truth_is_turned_back_once(sample_logs_dir, tmp_path):
     opened = open_log(sample_logs_dir / "road.mcap")
     wrong_log = TurnedTruth(opened, np.eye(3))
     found = inspect_drive_log(wrong_log)

@@ -1,7 +1,5 @@
 """Logs with odd clocks and late topics are processed and say so; the rest equals the result of the sound log."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -53,12 +51,12 @@ START = 1_767_225_600 * S
 
 
 @pytest.fixture(scope="module")
-def car() -> Car:
+def car():
     return Car.load(Path(__file__).resolve().parents[2] / "sample_logs/vehicle.toml", network=Path("none"))
 
 
 def read(path: Path, car: Car, **options: object) -> tuple[Drive, WholeDrive]:
-    with read_drive(path, car, options=ReadOptions(friction=1.0, **options)) as drive:  # type: ignore[arg-type]
+    with read_drive(path, car, options=ReadOptions(friction=1.0, **options)) as drive:
         whole = drive.whole()
         for s in drive.recorded().ledger:
             assert s.used + sum(s.dropped.values()) == s.total, s
@@ -78,14 +76,12 @@ def same_at_common_stamps(whole: WholeDrive, sound: WholeDrive, least: int) -> N
     _, i, j = np.intersect1d(whole.signals.stamps_ns, sound.signals.stamps_ns, return_indices=True)
     assert len(i) >= least
     np.testing.assert_array_equal(whole.signals.yaw_rate_rad_s[i], sound.signals.yaw_rate_rad_s[j])
-    assert whole.truth is not None
-    assert sound.truth is not None
     known = whole.truth.valid[i] & sound.truth.valid[j]
     assert known.sum() >= least - 250
     np.testing.assert_allclose(whole.truth.vy_m_s[i][known], sound.truth.vy_m_s[j][known], atol=1e-6)
 
 
-def test_a_sound_log_uses_every_sample(sample_logs_dir: Path, car: Car) -> None:
+def test_a_sound_log_uses_every_sample(sample_logs_dir, car):
     drive, _ = read(sample_logs_dir / "dlc.mcap", car)
     assert drive.losses == ()
     assert all(s.used == s.total and not s.dropped for s in drive.recorded().ledger)
@@ -96,7 +92,7 @@ def test_a_sound_log_uses_every_sample(sample_logs_dir: Path, car: Car) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("at_ns", [0, 2**64 - 1])
-def test_one_message_at_the_end_of_time(at_ns: int, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+def test_one_message_at_the_end_of_time(at_ns, sample_logs_dir, tmp_path, car):
     def shift(number: int, at_s: float, topic: str) -> int:
         return (2 * at_ns - 2**64) if (topic, number) == ("/truth/perfect/state", 250) else 0
 
@@ -111,7 +107,7 @@ def test_one_message_at_the_end_of_time(at_ns: int, sample_logs_dir: Path, tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("until_s", "kept"), [(2.0, 0.75), (7.5, 0.75)])
-def test_a_clock_that_is_set(until_s: float, kept: float, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+def test_a_clock_that_is_set(until_s, kept, sample_logs_dir, tmp_path, car):
     log = tmp_path / "boot.mcap"
     rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: -YEARS if at_s < until_s else 0)
     drive, whole = read(log, car)
@@ -124,7 +120,7 @@ def test_a_clock_that_is_set(until_s: float, kept: float, sample_logs_dir: Path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("chunk", [30_000, 1 << 26])
-def test_a_clock_that_steps_back(chunk: int, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+def test_a_clock_that_steps_back(chunk, sample_logs_dir, tmp_path, car):
     """Log time and header stamps fall back by 3 s: the times that come twice are left out, and a gap shows the step."""
     log = tmp_path / "back.mcap"
     rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: -3 * S if at_s > 4.0 else 0, chunk=chunk)
@@ -141,7 +137,7 @@ def test_a_clock_that_steps_back(chunk: int, sample_logs_dir: Path, tmp_path: Pa
         np.testing.assert_array_equal(whole.signals.yaw_rate_rad_s[part][i], sound.yaw_rate_rad_s[j])
 
 
-def test_the_share_that_is_damage() -> None:
+def test_the_share_that_is_damage():
     def count(**reasons: int) -> SampleCount:
         named = {reason.replace("_", "-"): n for reason, n in reasons.items()}
         return SampleCount("signal", "ay_m_s2", "/imu.a", "header.stamp", 10_000, 10_000 - sum(named.values()), named)
@@ -159,7 +155,7 @@ INPUTS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
 
 @pytest.fixture(scope="module")
-def late(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def late(sample_logs_dir, tmp_path_factory):
     """Return the double lane change with steering that arrives 0.8 s later, with its stamps as they were."""
     path = tmp_path_factory.mktemp("late") / "late.mcap"
     rewrite(
@@ -182,7 +178,7 @@ def run(capsys: pytest.CaptureFixture[str], out: Path, *arguments: object) -> tu
     return code, json.loads(report.read_text(encoding="utf-8")), capsys.readouterr().err
 
 
-def test_only_the_late_topic_is_read_by_stamp_and_it_is_named(late: Path, sample_logs_dir: Path) -> None:
+def test_only_the_late_topic_is_read_by_stamp_and_it_is_named(late, sample_logs_dir):
     found, notes, not_causal = signals_of(late)
     sound, no_notes, causal = signals_of(sample_logs_dir / "dlc.mcap")
     assert causal == ""
@@ -199,23 +195,21 @@ def test_only_the_late_topic_is_read_by_stamp_and_it_is_named(late: Path, sample
 
 
 @pytest.mark.slow
-def test_a_run_of_it_scores_and_calls_nothing_causal(
-    late: Path, sample_logs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_of_it_scores_and_calls_nothing_causal(late, sample_logs_dir, tmp_path, capsys):
     code, report, err = run(capsys, tmp_path / "out", late, "--estimators", "zero,phy-ukf")
     assert code == 0
     assert STEERING in err
     assert [e["causal"] for e in report["estimators"]] == [False] * 2
     assert all("steer_rad read by stamp" in " ".join(e["notes"]) for e in report["estimators"])
     rows = pl.read_parquet(tmp_path / "out/logs/late/estimates.parquet").filter(estimator="phy-ukf")
-    assert rows["valid"].mean() > 0.95  # type: ignore[operator]
+    assert rows["valid"].mean() > 0.95
     run(capsys, tmp_path / "sound", sample_logs_dir / "dlc.mcap", "--estimators", "zero,phy-ukf")
     sound = pl.read_parquet(tmp_path / "sound/logs/dlc/estimates.parquet").filter(estimator="phy-ukf")
     both = rows.join(sound, on="stamp_ns").filter("valid", "valid_right")
-    assert (both["vy_m_s"] - both["vy_m_s_right"]).abs().max() < 1e-9  # type: ignore[operator]
+    assert (both["vy_m_s"] - both["vy_m_s_right"]).abs().max() < 1e-9
 
 
-def test_a_pause_of_twenty_minutes_is_no_epoch(sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+def test_a_pause_of_twenty_minutes_is_no_epoch(sample_logs_dir, tmp_path, car):
     log = tmp_path / "pause.mcap"
     rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: 1200 * S if at_s > 4.0 else 0)
     drive, whole = read(log, car)

@@ -1,6 +1,4 @@
-"""The one way to read a drive: it is read once, logs are closed, and the source of its friction is stated."""
-
-from __future__ import annotations
+"""The one way to read a drive: once, with the source of its friction, and a hash that other recordings of it share."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -23,10 +21,11 @@ from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
+from studies.strangers.containers import Topic, write
 
 
 @pytest.fixture
-def car(sample_logs_dir: Path) -> Car:
+def car(sample_logs_dir):
     return Car.load(sample_logs_dir / "vehicle.toml")
 
 
@@ -37,9 +36,7 @@ def _assert_equal(a: Signals | StateTrack, b: Signals | StateTrack) -> None:
             assert x.tobytes() == y.tobytes(), f.name
 
 
-def test_a_drive_is_read_once_and_says_the_same_again(
-    sample_logs_dir: Path, car: Car, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_is_read_once_and_says_the_same_again(sample_logs_dir, car, monkeypatch):
     reads: list[object] = []
     monkeypatch.setattr(recorded, "read_signals", lambda *a: reads.append(a) or read_signals(*a))
     with read_drive(sample_logs_dir / "dlc.mcap", car, options=ReadOptions()) as drive:
@@ -56,7 +53,7 @@ def test_a_drive_is_read_once_and_says_the_same_again(
     assert first.seconds == pytest.approx(9.5, abs=0.1)
 
 
-def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> None:
+def test_what_is_told_is_noted_and_named(sample_logs_dir, car):
     told: list[str] = []
     without = Car(car.vehicle.model_copy(update={"friction": None}))
     with read_drive(sample_logs_dir / "dlc.mcap", without, tell=told.append) as drive:
@@ -69,7 +66,7 @@ def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> Non
     assert notes[-1] == "one more"
 
 
-def test_the_mapping_can_be_adjusted_and_is_checked(sample_logs_dir: Path, car: Car) -> None:
+def test_the_mapping_can_be_adjusted_and_is_checked(sample_logs_dir, car):
     def with_friction(field: str) -> reading.Adjust:
         def adjust(_log: DriveLog, mapping: Mapping, tell: Tell) -> Mapping:
             tell("adjusted")
@@ -90,7 +87,7 @@ def test_the_mapping_can_be_adjusted_and_is_checked(sample_logs_dir: Path, car: 
         read_drive(log, car, options=options, adjust=with_friction("nothing"))
 
 
-def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bounds_and_ends(sample_logs_dir, car, monkeypatch):
     closed: list[str] = []
     open_log = reading.open_log
 
@@ -110,9 +107,7 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("size", [250, 3000])
-def test_a_log_that_is_cut_before_its_messages_names_the_cut_and_the_remedy(
-    sample_logs_dir: Path, tmp_path: Path, car: Car, size: int
-) -> None:
+def test_a_log_that_is_cut_before_its_messages_names_the_cut_and_the_remedy(sample_logs_dir, tmp_path, car, size):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes((sample_logs_dir / "dlc.mcap").read_bytes()[:size])
     with pytest.raises(MappingError, match=f"the file ends inside a record at byte .* of {size}") as error:
@@ -136,10 +131,10 @@ def test_other_texts_are_refused(text):
 
 def _read(logs: Path, **options: object) -> Drive:
     """Open a drive on a road with friction 0.3; the vehicle file states 0.85."""
-    return read_drive(logs / "sweep.mcap", logs / "vehicle.toml", options=RunConfig(end="4", **options).read_options)  # type: ignore[arg-type]
+    return read_drive(logs / "sweep.mcap", logs / "vehicle.toml", options=RunConfig(end="4", **options).read_options)
 
 
-def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir: Path) -> None:
+def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir):
     with _read(sample_logs_dir) as drive:
         frictions = []
         for of_truth in (True, False):
@@ -153,15 +148,13 @@ def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir: Path)
 
 
 @pytest.mark.parametrize("options", [{"friction": 0.5}, {"prefer_truth": "rtk"}])
-def test_a_friction_of_the_options_and_another_ground_truth_go_before(
-    sample_logs_dir: Path, options: dict[str, object]
-) -> None:
+def test_a_friction_of_the_options_and_another_ground_truth_go_before(sample_logs_dir, options):
     with _read(sample_logs_dir, **options) as drive:
         source = friction_of(drive.plan, drive.car.vehicle, drive.options, of_truth=True)
         assert source.source is not FrictionFrom.TRUTH
 
 
-def test_segments_take_the_friction_of_the_ground_truth_and_estimators_do_not(sample_logs_dir: Path) -> None:
+def test_segments_take_the_friction_of_the_ground_truth_and_estimators_do_not(sample_logs_dir):
     with _read(sample_logs_dir) as drive:
         whole, vehicle = drive.whole(), drive.car.vehicle
     assert whole.truth is not None and "friction" not in whole.signals.available
@@ -169,3 +162,79 @@ def test_segments_take_the_friction_of_the_ground_truth_and_estimators_do_not(sa
     nonlinear = segment_masks(whole.signals, whole.truth, vehicle)["nonlinear"]
     assert nonlinear.any()
     assert np.abs(whole.truth.ay_m_s2[nonlinear]).max() < 0.5 * 0.85 * 9.81
+
+
+START_NS = 1_700_000_000_000_000_123
+SECONDS = np.arange(600) * 0.01
+ALL = ("/imu", "/speed", "/ins", "/other")
+MAPPED = ALL[:3]
+
+IMU = {"linear_acceleration.z": np.full(600, 9.81)}
+
+
+def _write(path: Path, topics: tuple[str, ...], container: str, factor: float = 1.0, ay_offset: float = 0.0) -> Path:
+    """Write a drive; ``factor`` scales the true lateral velocity."""
+    rate, speed = 0.2 * np.sin(SECONDS), np.full(600, 15.0)
+    imu = IMU | {"angular_velocity.z": rate, "linear_acceleration.y": 15.0 * rate + ay_offset}
+    velocity = {"twist.twist.linear.x": speed, "twist.twist.linear.y": factor * rate, "twist.twist.angular.z": rate}
+    ins = velocity | {"pose.pose.position.x": 15.0 * SECONDS}
+    of_topics: dict[str, tuple[str, dict[str, np.ndarray], int, int]] = {
+        "/imu": ("sensor_msgs/msg/Imu", imu, 1, 1),
+        "/speed": ("geometry_msgs/msg/TwistStamped", {"twist.linear.x": speed}, 5, 2),
+        "/ins": ("nav_msgs/msg/Odometry", ins, 5, 3),
+        "/other": ("sensor_msgs/msg/Imu", imu, 10, 4),
+    }
+    found = []
+    for topic in topics:
+        kind, fields, step, late_ms = of_topics[topic]
+        stamps_ns = START_NS + np.arange(0, 600, step, dtype=np.int64) * 10_000_000
+        columns = {"header.stamp": stamps_ns} | {n: v[::step] for n, v in fields.items()}
+        found.append(Topic(topic, kind, stamps_ns, stamps_ns + late_ms * 1_000_000, columns))
+    return write(found, path, container)
+
+
+def _hashes(path: Path, **changed: object) -> tuple[str | None, str | None]:
+    sources = (
+        SignalSource("ay_m_s2", "/imu", ("linear_acceleration.y",), **changed),
+        SignalSource("yaw_rate_rad_s", "/imu", ("angular_velocity.z",), **changed),
+        SignalSource("speed_m_s", "/speed", ("twist.linear.x",)),
+        SignalSource("vx_m_s", "/ins", ("twist.twist.linear.x",)),
+        SignalSource("vy_m_s", "/ins", ("twist.twist.linear.y",)),
+    )
+    mapping = Mapping({s.name: s for s in sources[:3]}, {s.name: s for s in sources[3:]})
+    with read_drive(str(path), Car.load(), mapping) as drive:
+        assert len(drive.whole().signals) > 580
+        return drive.recorded().signals_sha256, drive.recorded().truth_sha256
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory):
+    path = _write(tmp_path_factory.mktemp("full") / "drive", ALL, "rosbag2-mcap")
+    return path, _hashes(path)
+
+
+@pytest.mark.slow
+def test_a_slim_copy_and_other_containers_have_one_hash(tmp_path, full):
+    _, expected = full
+    assert None not in expected
+    assert expected[0] != expected[1]
+    assert _hashes(_write(tmp_path / "slim", MAPPED, "rosbag2-mcap")) == expected
+    assert _hashes(_write(tmp_path / "database", ALL, "rosbag2")) == expected
+    assert _hashes(_write(tmp_path / "drive", MAPPED, "rosbag1")) == expected
+
+
+def test_a_latency_that_becomes_known_leaves_the_drive_the_same(full):
+    assert _hashes(full[0], latency_s=0.02) == full[1]
+
+
+def test_another_truth_is_another_truth_of_the_same_drive(tmp_path, full):
+    signals, truth = _hashes(_write(tmp_path / "truth", MAPPED, "rosbag2-mcap", factor=1.0 + 1e-12))
+    assert signals == full[1][0]
+    assert truth != full[1][1]
+
+
+def test_other_values_and_another_scale_are_another_drive(tmp_path, full):
+    signals, truth = _hashes(_write(tmp_path / "other", MAPPED, "rosbag2-mcap", ay_offset=1e-9))
+    assert signals != full[1][0]
+    assert truth == full[1][1]
+    assert _hashes(full[0], scale=1.01)[0] != full[1][0]

@@ -1,7 +1,5 @@
 """The fault detector: detected faults, detection times, and above all no false alarms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -51,7 +49,7 @@ def with_column(signals: Signals, channel: int, mask: np.ndarray, values) -> Sig
 
 
 @pytest.fixture(scope="module")
-def clean() -> Signals:
+def clean():
     s = with_noise(drive(slalom(0.035, 0.5), 12.0, speed=22.0).signals, seed=9)
     s.friction[:] = 0.85
     return s

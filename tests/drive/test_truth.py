@@ -1,9 +1,6 @@
 """Truth: every derivation against one analytic drive, latency and dependence found again."""
 
-from __future__ import annotations
-
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -26,6 +23,7 @@ from pdhef_logtool.drive.truth import (
     valid_as_a_whole,
 )
 from pdhef_logtool.evaluation.track_errors import signal_error
+from pdhef_logtool.records.geometry import geodetic_from_ecef
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
 from pdhef_logtool.records.tracks import make_track
 
@@ -89,22 +87,11 @@ NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 ECEF = Rotation.from_matrix(ENU_FROM_ECEF.T)
 
 
-def geodetic(d: Drive, ecef: np.ndarray) -> np.ndarray:
-    """Latitude, longitude, height by a fixed-point iteration in longhand."""
-    lon = np.arctan2(ecef[:, 1], ecef[:, 0])
-    p = np.hypot(ecef[:, 0], ecef[:, 1])
-    lat = np.arctan2(ecef[:, 2], p)
-    for _ in range(60):
-        n = 6378137.0 / np.sqrt(1 - E2 * np.sin(lat) ** 2)
-        h = p / np.cos(lat) - n
-        lat = np.arctan2(ecef[:, 2], p * (1 - E2 * n / (n + h)))
-    return np.stack([np.rad2deg(lat), np.rad2deg(lon), h])
-
-
 def sources(stamps, d: Drive) -> dict[str, dict]:
     enu = np.stack([d.x, d.y, np.zeros_like(d.x)], axis=1)
     ecef = ORIGIN + enu @ ENU_FROM_ECEF
-    lat, lon, alt = geodetic(d, ecef)
+    lat, lon, alt = geodetic_from_ecef(ecef).T
+    lat, lon = np.rad2deg(lat), np.rad2deg(lon)
     v_ecef = d.velocity @ ENU_FROM_ECEF
     turn = body_to_enu(d)
     wrapped = np.angle(np.exp(1j * d.yaw))
@@ -445,21 +432,15 @@ def test_there_is_no_sideslip_at_standstill():
 SLOW_M_S, RATE_HZ = 1.0, 50
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write 20 s of driving: at 10 s the car stops, at 14 s the sensors fail for 2 s beside the ground truth."""
-    path = tmp_path_factory.mktemp("log") / "correvit.csv"
+def test_sideslip_alone_is_scored_above_the_measured_low_speed_limit(tmp_path):
+    """At 10 s the car stops, at 14 s the sensors fail for 2 s beside the ground truth."""
+    log, mapping = tmp_path / "correvit.csv", tmp_path / "correvit.toml"
     t = np.arange(20 * RATE_HZ) / RATE_HZ
     speed = np.where((t > 10.0) & (t < 12.0), 0.0, 20.0)
     rate = np.where(speed > 0.0, 0.2 * np.sin(2.0 * t), 0.0)
     sensors = np.where((t < 14.0) | (t >= 16.0), [speed, rate, speed * rate, 0.0 * t], np.nan)
     titles = ["time [s]", "Speed [m/s]", "YawRate [rad/s]", "AccY [m/s2]", "AccX [m/s2]", "Sideslip [rad]"]
-    pl.DataFrame([t, *sensors, -0.1 * rate], schema=titles).fill_nan(None).write_csv(path)
-    return path
-
-
-def test_sideslip_alone_is_scored_above_the_measured_low_speed_limit(log: Path) -> None:
-    mapping = log.with_suffix(".toml")
+    pl.DataFrame([t, *sensors, -0.1 * rate], schema=titles).fill_nan(None).write_csv(log)
     entry = '[{}]\ntopic = "csv"\nfield = "{}"\n'
     fields = {"speed_m_s": "Speed", "yaw_rate_rad_s": "YawRate", "ay_m_s2": "AccY", "ax_m_s2": "AccX"}
     signals = [entry.format(f"signals.{name}", field) for name, field in fields.items()]

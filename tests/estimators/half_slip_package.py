@@ -1,7 +1,5 @@
 """The estimator in the docstring of ``estimators/table.py`` as a separate installed package with an entry point."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from textwrap import dedent
 

@@ -1,7 +1,5 @@
 """A simulated drive with the GNSS velocity that a receiver would show."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path

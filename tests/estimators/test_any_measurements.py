@@ -1,7 +1,5 @@
 """The filters take the measurements that there are: any of them may be missing for a while, or from the whole log."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,12 +33,12 @@ def without(*missing: str) -> object:
 
 def sideslip_rmse(log: Path, names: tuple[str, ...], *missing: str) -> dict[str, float]:
     """Return the RMSE by estimator of a log that lacks signals."""
-    with read_drive(log, SALOON, adjust=without(*missing)) as drive:  # type: ignore[arg-type]
+    with read_drive(log, SALOON, adjust=without(*missing)) as drive:
         rows = score(estimate(drive, names)).filter(signal="sideslip_rad", segment="all", metric="rmse")
     return dict(zip(rows["estimator"], rows["value"], strict=True))
 
 
-def test_physics_runs_on_what_there_is_and_what_there_is_helps(sample_logs_dir: Path) -> None:
+def test_physics_runs_on_what_there_is_and_what_there_is_helps(sample_logs_dir):
     whole = sideslip_rmse(sample_logs_dir / "dlc.mcap", NAMES)
     for missing in (("ay_m_s2",), ("yaw_rate_rad_s",), ("ay_m_s2", "yaw_rate_rad_s")):
         less = sideslip_rmse(sample_logs_dir / "dlc.mcap", NAMES, *missing)
@@ -49,12 +47,12 @@ def test_physics_runs_on_what_there_is_and_what_there_is_helps(sample_logs_dir: 
 
 
 @pytest.mark.parametrize("also", [(), ("ay_m_s2",), ("ax_m_s2",)])
-def test_without_steering_the_rear_axle_determines_the_sideslip(also: tuple[str, ...], sample_logs_dir: Path) -> None:
+def test_without_steering_the_rear_axle_determines_the_sideslip(also, sample_logs_dir):
     less = sideslip_rmse(sample_logs_dir / "dlc.mcap", ("zero", "physics", "pd-hef"), *STEERING, *also)
     assert less["physics"] == less["pd-hef"] < 0.1 * less["zero"]
 
 
-def test_speed_alone_is_not_enough() -> None:
+def test_speed_alone_is_not_enough():
     names = ("physics", "pd-hef", "pd-hef-smoothed")
     ready, skipped = runnable(names, SALOON, frozenset({"speed_m_s", "ax_m_s2"}))
     assert (ready, len(skipped)) == ([], 3)
@@ -62,7 +60,7 @@ def test_speed_alone_is_not_enough() -> None:
 
 
 @pytest.fixture(scope="module")
-def road(sample_logs_dir: Path) -> WholeDrive:
+def road(sample_logs_dir):
     with read_drive(sample_logs_dir / "road.mcap", SALOON) as drive:
         return drive.whole()
 
@@ -75,7 +73,6 @@ def with_gap(road: WholeDrive, *names: str) -> tuple[WholeDrive, np.ndarray]:
     signals = road.signals.rows(0, end)
     for name in names:
         signals = replace(signals, **{name: np.where(gap, np.nan, getattr(signals, name))})
-    assert road.truth is not None
     return replace(road, signals=signals, truth=road.truth.rows(0, end)), gap
 
 
@@ -84,17 +81,16 @@ def physics_of(drive: WholeDrive) -> StateTrack:
 
 
 @pytest.fixture(scope="module")
-def whole(road: WholeDrive) -> StateTrack:
+def whole(road):
     return physics_of(with_gap(road)[0])
 
 
 @pytest.mark.parametrize("name", ["steer_rad", "ay_m_s2", "yaw_rate_rad_s", "ax_m_s2", "speed_m_s"])
-def test_a_gap_of_20_s_widens_the_interval_that_covers(name: str, road: WholeDrive, whole: StateTrack) -> None:
+def test_a_gap_of_20_s_widens_the_interval_that_covers(name, road, whole):
     drive, gap = with_gap(road, name)
     track = physics_of(drive)
     assert track.valid[10:].all()
     assert np.isfinite(track.sideslip_rad[10:]).all()
-    assert drive.truth is not None
     scored = gap & drive.truth.valid & (drive.truth.vx_m_s > 3.0)
     error = (track.sideslip_rad - drive.truth.sideslip_rad)[scored]
     zero = drive.truth.sideslip_rad[scored]
@@ -105,19 +101,18 @@ def test_a_gap_of_20_s_widens_the_interval_that_covers(name: str, road: WholeDri
     np.testing.assert_allclose(track.sideslip_rad[after:], whole.sideslip_rad[after:], atol=2e-4)
 
 
-def test_without_steering_a_y_and_yaw_rate_there_is_no_estimate(road: WholeDrive) -> None:
+def test_without_steering_a_y_and_yaw_rate_there_is_no_estimate(road):
     drive, gap = with_gap(road, "steer_rad", "yaw_rate_rad_s", "ay_m_s2")
     track, within = physics_of(drive), np.flatnonzero(gap)
     assert not track.valid[within[-1] - 500 : within[-1]].any()
     assert track.valid[within[-1] + 100 :].all()
 
 
-def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir: Path) -> None:
+def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir):
     car = Car(default_vehicle())
-    with read_drive(sample_logs_dir / "dlc.mcap", car, adjust=without(*STEERING)) as drive:  # type: ignore[arg-type]
+    with read_drive(sample_logs_dir / "dlc.mcap", car, adjust=without(*STEERING)) as drive:
         model = DriveModel.fit(drive)
         calibration = model.posterior
-        assert calibration is not None
         assert calibration.text == "not calibrated: all parameters keep their prior"
         assert (calibration.parameters, calibration.refused) == ((), "")
         assert len(calibration.varied) == 6
@@ -125,10 +120,10 @@ def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir: Path
         assert estimator.causal  # it contains no data of the log
 
 
-def test_without_a_y_the_yaw_rate_calibrates(sample_logs_dir: Path) -> None:
+def test_without_a_y_the_yaw_rate_calibrates(sample_logs_dir):
     car, fits = Car(default_vehicle()), []
     for missing in ((), ("ay_m_s2",)):
-        with read_drive(sample_logs_dir / "sweep.mcap", car, adjust=without(*missing)) as drive:  # type: ignore[arg-type]
+        with read_drive(sample_logs_dir / "sweep.mcap", car, adjust=without(*missing)) as drive:
             driving = read_driving(drive)
         assert driving.has_ay is not bool(missing)
         fits.append({p.name: p for p in fit_car(driving, car.vehicle).parameters})

@@ -1,7 +1,5 @@
 """Frozen accuracy of the baselines and identities of the shipped presets: no flag updates the values."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import WholeDrive, read_drive
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.latency_compensation import run_estimator
@@ -31,12 +29,12 @@ STRENGTH = {
 
 
 @pytest.fixture(scope="module")
-def car() -> Car:
+def car():
     return Car.load("saloon", network="none")
 
 
 @pytest.fixture(scope="module", params=STRENGTH, ids=lambda key: key[0])
-def drive(car: Car, request: pytest.FixtureRequest) -> tuple[WholeDrive, dict[str, float]]:
+def drive(car, request):
     name, friction = request.param
     options = RunConfig().read_options
     with read_drive(SAMPLES / f"{name}.mcap", car, None, replace(options, friction=friction or options.friction)) as d:
@@ -44,7 +42,7 @@ def drive(car: Car, request: pytest.FixtureRequest) -> tuple[WholeDrive, dict[st
 
 
 @pytest.mark.slow
-def test_no_baseline_is_weaker_than_it_was(car: Car, drive: tuple[WholeDrive, dict[str, float]]) -> None:
+def test_no_baseline_is_weaker_than_it_was(car, drive):
     whole, strength = drive
     assert whole.truth is not None
     for name, rmse_deg in strength.items():
@@ -80,30 +78,30 @@ ROLES = {"name", "causal", "notes", "vehicle", "network", "model", "q_std", "r_s
 
 
 @pytest.fixture(scope="module")
-def saloon() -> Car:
+def saloon():
     return Car.load("saloon")
 
 
-def test_the_identities_of_the_shipped_presets_are_frozen(saloon: Car) -> None:
+def test_the_identities_of_the_shipped_presets_are_frozen(saloon):
     found = {name: resolve(make_estimator(name, saloon)) for name in all_names(saloon)}
     assert {name: (a.identity, a.sha256[:12]) for name, a in found.items()} == SHIPPED
 
 
-def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
+def test_a_new_option_at_its_default_changes_no_identity(saloon):
     estimator = make_estimator("pd-hef", saloon)
     assert isinstance(estimator, AdaptivePhysics)
     kind = make_dataclass("VehicleUkf", [("probe", bool, False)], bases=(VehicleUkf,), frozen=True)
-    kind.options = (*VehicleUkf.options, "probe")  # type: ignore[attr-defined]
+    kind.options = (*VehicleUkf.options, "probe")
     values = {f.name: getattr(estimator.physics, f.name) for f in fields(VehicleUkf)}
     assert resolve(replace(estimator, physics=kind(**values))) == resolve(estimator)
     changed = resolve(replace(estimator, physics=kind(**values, probe=True)))
     assert changed.identity == _HYBRID.replace("vehicle-ukf,", "vehicle-ukf, physics.probe=True,")
-    kind.version = 2  # type: ignore[attr-defined]
+    kind.version = 2
     assert "physics.version=2" in resolve(replace(estimator, physics=kind(**values))).identity
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)
-def test_every_field_of_an_estimator_is_an_option_or_has_a_role(spec: Any, saloon: Car) -> None:
+def test_every_field_of_an_estimator_is_an_option_or_has_a_role(spec, saloon):
     if spec.missing(saloon):
         assert spec.name == "open-loop:calibrated"  # the class of open-loop
         return
@@ -114,11 +112,11 @@ def test_every_field_of_an_estimator_is_an_option_or_has_a_role(spec: Any, saloo
         parts += [p for name in getattr(part, "options", ()) if is_dataclass(p := getattr(part, name))]
 
 
-def test_a_class_without_an_identity_is_refused() -> None:
+def test_a_class_without_an_identity_is_refused():
     @dataclass(frozen=True)
     class Nameless:
         name: str = "nameless"
         causal: bool = True
 
     with pytest.raises(UsageError, match="version = 1 in class Nameless"):
-        resolve(Nameless())  # type: ignore[arg-type]
+        resolve(Nameless())

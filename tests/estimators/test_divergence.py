@@ -1,11 +1,8 @@
 """The watch for divergence: exact kinematics with and without an error of the estimate, and the wrong branch itself."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -15,7 +12,7 @@ from hypothesis import strategies as st
 from reference_car import make_signals
 
 from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.divergence import watched_track, wrong_branch
 from pdhef_logtool.records.signals import Signals
@@ -73,13 +70,13 @@ def seconds(signals: Signals) -> np.ndarray:
     return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
 
 
-def flags(track: StateTrack, signals: Signals, vehicle: VehicleParameters = VEHICLE) -> np.ndarray:
-    return wrong_branch(track, signals, vehicle)
+def flags(track: StateTrack, signals: Signals) -> np.ndarray:
+    return wrong_branch(track, signals, VEHICLE)
 
 
 @settings(deadline=None, max_examples=20)
 @given(share=st.floats(0.0, 1.0), hz=st.floats(0.1, 1.5), seed=st.integers(0, 99))
-def test_the_true_motion_is_never_flagged(share: float, hz: float, seed: int) -> None:
+def test_the_true_motion_is_never_flagged(share, hz, seed):
     signals, truth = motion(share, hz=hz, seed=seed)
     noise = np.random.default_rng(seed)
     noisy = replace(
@@ -92,7 +89,7 @@ def test_the_true_motion_is_never_flagged(share: float, hz: float, seed: int) ->
 
 @settings(deadline=None, max_examples=20)
 @given(degrees=st.floats(8.0, 40.0), rise_s=st.floats(0.02, 1.0), sign=st.sampled_from([-1, 1]))
-def test_an_error_is_flagged_while_it_grows_and_taken_back_with_it(degrees: float, rise_s: float, sign: int) -> None:
+def test_an_error_is_flagged_while_it_grows_and_taken_back_with_it(degrees, rise_s, sign):
     signals, truth = motion()
     found, t = flags(off_by(truth, sign * degrees, 5.0, 7.0, rise_s), signals), seconds(signals)
     assert not found[t < 5.0].any()
@@ -103,13 +100,13 @@ def test_an_error_is_flagged_while_it_grows_and_taken_back_with_it(degrees: floa
     assert left > 2.9 or not found[t > 7.0 + rise_s + 0.1].any()
 
 
-def test_in_the_linear_range_bank_and_bias_are_no_divergence() -> None:
+def test_in_the_linear_range_bank_and_bias_are_no_divergence():
     signals, truth = motion(share=0.3)
     banked = replace(signals, ay_m_s2=signals.ay_m_s2 + 1.0)  # 10 % of bank
     assert not flags(truth, banked).any()
 
 
-def test_noise_that_the_drive_shows_is_no_divergence() -> None:
+def test_noise_that_the_drive_shows_is_no_divergence():
     signals, truth = motion()
     noisy = replace(signals, ay_m_s2=signals.ay_m_s2 + np.random.default_rng(0).normal(0.0, 8.0, len(signals)))
     shown = FilterNoise(r_std={"ay_m_s2": 8.0})
@@ -117,7 +114,7 @@ def test_noise_that_the_drive_shows_is_no_divergence() -> None:
     assert wrong_branch(off_by(truth, 40.0, 5.0, 7.0), noisy, VEHICLE, shown).any()
 
 
-def test_what_comes_later_changes_no_flag() -> None:
+def test_what_comes_later_changes_no_flag():
     signals, truth = motion()
     wrong = off_by(truth, 20.0, 5.0, 7.0)
     whole = flags(wrong, signals)
@@ -127,7 +124,7 @@ def test_what_comes_later_changes_no_flag() -> None:
     np.testing.assert_array_equal(part, whole[:end])
 
 
-def test_the_watch_adds_to_what_an_estimator_says_itself_and_leaves_those_without_a_covariance() -> None:
+def test_the_watch_adds_to_what_an_estimator_says_itself_and_leaves_those_without_a_covariance():
     signals, truth = motion()
     own = np.zeros(len(signals), dtype=np.bool_)
     own[:10] = True
@@ -137,20 +134,12 @@ def test_the_watch_adds_to_what_an_estimator_says_itself_and_leaves_those_withou
     assert watched_track(plain, signals, VEHICLE) is plain
 
 
-@pytest.fixture(scope="module")
-def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(sample_logs_dir, tmp_path):
     """A growing sine on a slippery road: beyond the peak of the tyres, the true sideslip still moderate."""
     drive = simulate_drive(
         "sine-sweep", speed_km_h=100.0, friction=0.3, amplitude=1.08, seed=7302, keep_spins=True, tolerance=0.01
     )
-    path = tmp_path_factory.mktemp("sweep") / "sweep.mcap"
-    write_drive(drive, path)
-    return path
-
-
-def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
-    sweep: Path, sample_logs_dir: Path, tmp_path: Path
-) -> None:
+    write_drive(drive, sweep := tmp_path / "sweep.mcap")
     names = ("phy-ukf", "physics", "zero")
     config = RunConfig(car=sample_logs_dir / "vehicle_mu03.toml", estimators=names, annotate="none")
     result = run_logs([str(sweep)], tmp_path, config)

@@ -1,7 +1,5 @@
 """Requirements for all estimators: continuity across windows, causality, symmetry, latency compensation, robustness."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 from functools import cache, partial
@@ -11,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_models import full_network, linear_residual
-from reference_car import cut, drive, keep, rolling_drive, slalom, with_noise
+from reference_car import drive, keep, rolling_drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
@@ -35,7 +33,7 @@ NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 #: With all parts that the model of ``physics`` may have; the baselines do not use them.
 PARTS = PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))
 VEHICLE = default_vehicle().model_copy(update={"physics": PARTS})
-#: Without the estimator on a self-calibrated car (test_calibrated_band.py).
+#: Without the estimator on a self-calibrated car (tests/model/test_intervals.py).
 NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != OPEN_LOOP)
 NETWORKS = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")
 #: Estimators that compute the lateral velocity from a model or by integration.
@@ -76,7 +74,7 @@ def worst(error: np.ndarray, mask: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def rough() -> Signals:
+def rough():
     """Noisy, on irregular stamps, with missing samples, a gap of 0.8 s and messages that arrive late and bunched."""
     rng = np.random.default_rng(11)
     dt = rng.uniform(0.004, 0.022, 500)
@@ -114,7 +112,7 @@ EVERY = {
 
 
 @pytest.fixture(scope="module")
-def faulty(rough) -> Signals:
+def faulty(rough):
     """The same with GNSS, a stuck gyro, a burst, a spike, spinning wheels and a second without steering."""
     rng = np.random.default_rng(3)
     t = (rough.stamps_ns - rough.stamps_ns[0]) * 1e-9
@@ -257,8 +255,8 @@ FAULTS = {
     "noise x20": lambda s: with_noise(s, 3, 20.0),
     "gap of 0.4 s": lambda s: keep(s, ~_between(2, 2.4)((s.stamps_ns - s.stamps_ns[0]) * 1e-9)),
     "gap of 1.5 s": lambda s: keep(s, ~_between(2, 3.5)((s.stamps_ns - s.stamps_ns[0]) * 1e-9)),
-    "one stamp": lambda s: cut(s, 0, 1),
-    "nothing": lambda s: cut(s, 0, 0),
+    "one stamp": lambda s: s.rows(0, 1),
+    "nothing": lambda s: s.rows(0, 0),
 }
 
 
@@ -289,7 +287,7 @@ def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
 
 
 @pytest.fixture(scope="module")
-def plain() -> Signals:
+def plain():
     s = with_noise(drive(slalom(0.035, 0.5), 8.0, speed=22.0).signals, seed=9)
     s.friction[:] = 0.85
     return replace(s, ready_ns=s.stamps_ns + 10_000_000)

@@ -1,7 +1,5 @@
 """GNSS velocity in ``physics``: benefit on a simulated car, causality, and samples that the filter must ignore."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +23,7 @@ AVAILABLE = frozenset({"steer_rad", "speed_m_s", "ay_m_s2", "yaw_rate_rad_s"})
 
 
 @pytest.fixture(scope="module")
-def bare() -> Car:
+def bare():
     return Car(Car.load(study.ROOT / "sample_logs" / "vehicle.toml").vehicle)
 
 

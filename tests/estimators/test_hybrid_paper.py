@@ -1,7 +1,5 @@
 """The paper's filter against plain numpy, its norm, and its place in the table."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -42,7 +40,7 @@ def paper_filter(**options: object) -> PaperHybridUkf:
 
 
 @pytest.fixture(scope="module")
-def weaving() -> Signals:
+def weaving():
     """A noisy slalom to the limit, with a burst of noise on a_y, missing samples and messages that come late."""
     made = drive(slalom(0.055, 0.5), 4.0, speed=23.0, step_s=np.random.default_rng(4).uniform(0.008, 0.012, 400))
     s = with_noise(made.signals, seed=8)
@@ -180,7 +178,6 @@ MODEL = full_network()
 def test_pure_lstm_says_what_its_network_says_and_predicts_it_over_the_delay():
     """The network output is constant, 0.25 m/s. Latency compensation adds the latency times the measured v̇_y."""
     lstm = MODEL.pure_lstm
-    assert lstm is not None
     weights = {k: np.zeros_like(v) for k, v in lstm.weights.items()}
     constant = max(k for k in weights if k.endswith("bias") and k.startswith("head"))
     weights[constant][:] = 0.25

@@ -1,7 +1,5 @@
 """The compiled single-track model against plain Python, linear theory and convergence order."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,28 +1,31 @@
-"""pd-hef: it is ``physics`` plus exactly the residual, and a right residual makes it right."""
-
-from __future__ import annotations
+"""pd-hef is ``physics`` plus exactly the residual, of a network or a taught car; a right residual makes it right."""
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
-from made_models import random_network
+from made_models import linear_residual, random_network
 from physics_oracle import G, Oracle, parts, vehicle
 from reference_car import FRICTION, Drive, drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, physics_sha256
-from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, VehicleParameters, correct_signals, default_vehicle
+from pdhef_logtool.car.posterior import Posterior
+from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, correct_signals, default_vehicle
 from pdhef_logtool.drive.sensor_faults import without_faults
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
+from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, physics_filter
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle
+from pdhef_logtool.residual_model.ladder import LadderModel
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +34,7 @@ COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis"
 
 
 @pytest.fixture(scope="module")
-def signals() -> Signals:
+def signals():
     made = drive(slalom(0.02, 0.3), 8.0, step_s=np.random.default_rng(0).uniform(0.008, 0.012, 800), speed_every=1)
     noisy = with_noise(made.signals, 0)
     return replace(noisy, ready_ns=noisy.stamps_ns + 10_000_000, available=frozenset(ALIGNED_SIGNALS))
@@ -47,7 +50,7 @@ def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) 
 
 
 @pytest.mark.parametrize("parts", [(), ("lag", "roll", "biases", "bank"), tuple(PhysicsParts.model_fields)])
-def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...], signals: Signals) -> None:
+def test_without_trust_it_is_physics_to_the_bit(parts, signals):
     trusted = hybrid(*parts)
     physics = run_estimator(AdaptivePhysics(trusted.physics, name="physics"), signals)
     for change in ({"trust": 0.0}, {"network": random_network(constant=(0.0, 0.0))}):
@@ -58,9 +61,7 @@ def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...], signals:
     assert not _same(run_estimator(trusted, signals), physics)
 
 
-def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none(
-    signals: Signals,
-) -> None:
+def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none(signals):
     estimator = hybrid("bank", "force_scale", network=random_network(constant=(0.4, 0.1)), trust=0.5)
     steps, _ = estimator.run(signals, None)
     unchanged, other_vehicle, banked = (f.residual_rate for f in steps.filters)
@@ -71,7 +72,7 @@ def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_ba
 
 #: A model without roll states has the body lean with a force of the residual at once.
 @pytest.mark.parametrize(("has", "felt_m_s2"), [((), 0.8 * (1.0 + G * 0.0105)), (("lag", "roll"), 0.8)])
-def test_a_residual_in_the_model_is_what_the_car_does_with_it(has: tuple[str, ...], felt_m_s2: float) -> None:
+def test_a_residual_in_the_model_is_what_the_car_does_with_it(has, felt_m_s2):
     """The car has a force and a moment that its model lacks. With both as a residual, the filter is correct."""
     oracle = Oracle(parts(*has))
 
@@ -100,16 +101,12 @@ def sideslip_rmse(estimator, made: Drive, signals: Signals) -> float:
     return float(np.sqrt(np.mean((track.sideslip_rad - made.sideslip)[late] ** 2)))
 
 
-def with_soft_tyres(v: VehicleParameters) -> VehicleParameters:
-    tyres = Tyres(**{name: tyre.model_copy(update={"B": 0.5 * tyre.B}) for name, tyre in v.tyres})
-    return v.model_copy(update={"tyres": tyres})
-
-
 def test_beyond_the_linear_range_kinematics_count_more():
     """With half the tyre stiffness in the file, the error at the limit is lower; the linear range does not change."""
     oracle = Oracle(parts("lag"))
     v = oracle.as_vehicle()
-    soft, made = with_soft_tyres(v), oracle.drive(slalom(0.09, 0.5), 8.0)
+    tyres = Tyres(**{name: tyre.model_copy(update={"B": 0.5 * tyre.B}) for name, tyre in v.tyres})
+    soft, made = v.model_copy(update={"tyres": tyres}), oracle.drive(slalom(0.09, 0.5), 8.0)
     noisy = with_noise(made.signals, 1)
     plain, yields = (sideslip_rmse(VehicleUkf(soft, limit_gain=gain), made, noisy) for gain in (0.0, 6.0))
     assert yields < 0.9 * plain
@@ -296,17 +293,85 @@ def test_the_mixture_has_the_moments_of_its_samples():
         for m, p in zip(means, P, strict=True)
     ]
     mixed = mix(np.array([[0.7, 0.3]]), tracks)
-    n = 400_000
-    drawn = np.concatenate(
-        [rng.multivariate_normal(m, p, int(share * n)) for m, p, share in zip(means, P, (0.7, 0.3), strict=True)]
-    )
-    np.testing.assert_allclose(
-        [mixed.vx_m_s[0], mixed.vy_m_s[0], mixed.yaw_rate_rad_s[0]], drawn.mean(axis=0), atol=2e-3
-    )
-    np.testing.assert_allclose(mixed.covariance[0], np.cov(drawn.T), atol=1e-3)
-    assert mixed.sideslip_std_rad[0] == pytest.approx(np.arctan2(drawn[:, 1], drawn[:, 0]).std(), rel=0.02)
+    weights = np.array([0.7, 0.3])
+    mean = weights @ means
+    away = means - mean
+    covariance = np.einsum("k,kij->ij", weights, P + away[:, :, None] * away[:, None, :])
+    found = [mixed.vx_m_s[0], mixed.vy_m_s[0], mixed.yaw_rate_rad_s[0], mixed.sideslip_rad[0]]
+    np.testing.assert_allclose(found, [*mean, np.arctan2(mean[1], mean[0])], rtol=1e-12)
+    np.testing.assert_allclose(mixed.covariance[0], covariance, rtol=1e-12)
+    slope = np.array([-mean[1], mean[0], 0.0]) / (mean[0] ** 2 + mean[1] ** 2)
+    assert mixed.sideslip_std_rad[0] == pytest.approx(np.sqrt(slope @ covariance @ slope))
     lone = replace(tracks[0], valid=np.array([False]), vy_m_s=np.array([np.nan]))
     for weights in ([[0.7, 0.3]], [[1.0, 0.0]]):
         assert mix(np.array(weights), [lone, tracks[1]]).vy_m_s[0] == tracks[1].vy_m_s[0]
     assert mix(np.array([[0.7, 0.3]]), [tracks[1], lone]).vy_m_s[0] == tracks[1].vy_m_s[0]
     assert not mix(np.array([[0.7, 0.3]]), [lone, lone]).valid[0]
+
+
+SEDAN = default_vehicle()
+
+
+def taught_car(residual: LadderModel | None, *, calibrated: bool = False) -> Car:
+    model = CarModel(physics_sha256=Car(SEDAN).physics_sha256, residual=residual, calibrated=calibrated)
+    return replace(Car(SEDAN), model=model)
+
+
+def acts(estimator: Any) -> bool:
+    """Whether an estimator uses the taught residual."""
+    return isinstance(estimator.network, LadderModel) and estimator.trust == 1.0
+
+
+@pytest.fixture(scope="module")
+def driven():
+    s = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
+    return replace(s, friction=np.full(len(s), 0.85))
+
+
+def track_of(name: str, car: Car, driven: Signals) -> StateTrack:
+    return run_estimator(make_estimator(name, car), driven)
+
+
+def test_its_response_is_the_one_that_teaching_uses(driven):
+    estimator = make_estimator("physics", taught_car(None))
+    assert isinstance(estimator, AdaptivePhysics)
+    response = residual_response(estimator, driven, np.arange(len(driven)))
+    rate = 0.2 * np.sin(np.arange(len(driven)) / 30.0)
+    tracks = []
+    for given in (0.0, 1.0):
+        rates = np.stack([given * rate, np.zeros(len(rate))], axis=1)
+        steps, _ = estimator.physics.run(driven, None, rates)
+        tracks.append(np.arctan2(steps.x[:, 1], steps.x[:, 0]))
+    expected = tracks[1] - tracks[0]
+    assert np.nanmax(np.abs(expected)) > 1e-4
+    late = slice(50, None)
+    assert np.allclose(response(rate[:, None])[late, 0], expected[late], atol=0.1 * np.nanmax(np.abs(expected)))
+
+
+def test_beyond_the_taught_speed_it_is_physics(driven):
+    car = taught_car(linear_residual(fastest_m_s=10.0))
+    physics, hybrid = (track_of(name, car, driven) for name in ("physics", "pd-hef"))
+    assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
+    assert np.nanmax(hybrid.network_trust) == 0.0
+
+
+def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(driven):
+    calibration = Posterior(SEDAN)
+    for calibrated in (False, True):
+        car = taught_car(linear_residual(), calibrated=calibrated)
+        plain, of_log = (make_estimator("pd-hef", c) for c in (car, replace(car, self_calibrated=calibration)))
+        assert acts(plain) is not calibrated
+        assert acts(of_log) is calibrated
+        without = of_log if not calibrated else plain
+        assert any("residual gain 0" in note for note in without.notes)
+    track = track_of(
+        "pd-hef", replace(taught_car(linear_residual(), calibrated=True), self_calibrated=calibration), driven
+    )
+    assert np.nanmax(track.network_trust) == 1.0
+
+
+def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it():
+    assert not acts(make_estimator("pd-hef", taught_car(None)))
+    assert make_estimator("pd-hef", taught_car(linear_residual())).causal
+    with_network = replace(taught_car(linear_residual()), network=random_network())
+    assert not acts(make_estimator("pd-hef:gain=1", with_network)) and acts(make_estimator("pd-hef", with_network))

@@ -1,7 +1,5 @@
 """Peers recover a simulated car within what their equations allow."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -38,7 +36,7 @@ def linear_sedan() -> VehicleParameters:
 
 
 @pytest.fixture(scope="module")
-def simulated() -> tuple[Signals, np.ndarray]:
+def simulated():
     """Signals of a linear single track on a slow sine of steering, and its sideslip [N]."""
     car = single_track(linear_sedan())
 

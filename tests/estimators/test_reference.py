@@ -1,7 +1,5 @@
 """The sideslip reference: comparison with an independent car and dense matrices, interval coverage, rejected inputs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

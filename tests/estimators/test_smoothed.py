@@ -1,14 +1,12 @@
 """The smoother: against an independent one, better than its filter, and bounded in look-ahead and memory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import test_estimators as properties
 from made_models import random_network
-from reference_car import cut, drive, keep, slalom, with_noise
+from reference_car import drive, keep, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
@@ -53,7 +51,7 @@ def on_time(signals: Signals) -> Signals:
 
 
 @pytest.fixture(scope="module")
-def rough() -> Signals:
+def rough():
     """Noise, irregular stamps, missing samples, a gap that restarts the filter, messages late, a gyro that jumps."""
     rng = np.random.default_rng(12)
     s = with_noise(drive(slalom(0.035, 0.5), speed=22.0, step_s=rng.uniform(0.004, 0.022, 700)).signals, seed=6)
@@ -89,7 +87,7 @@ def test_an_empty_drive_has_an_empty_track(rough):
 
 def test_nothing_behind_a_gap_tells_of_before(rough):
     gap = int(np.argmax(np.diff(rough.stamps_ns))) + 1
-    first = cut(rough, 0, gap)
+    first = rough.rows(0, gap)
     whole, before = smoother().smooth(rough), smoother().smooth(first)
     properties.same_bits(whole, before, gap)
     filtered = run_estimator(smoother().filtered, on_time(first))

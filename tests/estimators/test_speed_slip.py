@@ -1,7 +1,5 @@
 """Speed gating: the filters receive no speed from spinning or locked wheels, but every other speed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

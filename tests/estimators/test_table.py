@@ -1,7 +1,5 @@
 """The table of estimators: every row builds its estimator, and the identity follows from the estimator object."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any
 
@@ -37,7 +35,7 @@ pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
 NOISE = FilterNoise(q_std=(0.1, 0.2, 0.1), r_std={"ay_m_s2": 0.9})
-#: All rows except the estimator on a self-calibrated car (``test_calibrated_band``).
+#: All rows except the estimator on a self-calibrated car (``tests/model/test_intervals.py``).
 LINES = tuple(s for s in all_specs() if s.name != OPEN_LOOP)
 every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 
@@ -48,7 +46,7 @@ CAR = Car(VEHICLE, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOIS
 
 
 @pytest.fixture(scope="module")
-def signals() -> Signals:
+def signals():
     s = with_noise(drive(slalom(0.03, 0.5), 4.0, speed=22.0).signals, seed=3)
     return replace(s, friction=np.full(len(s), 0.85), ready_ns=s.stamps_ns + 10_000_000)
 
@@ -65,13 +63,13 @@ def same(a: StateTrack, b: StateTrack, upto: int | None = None) -> bool:
 # --- the lines -------------------------------------------------------------------------------------------------------
 
 
-def test_no_two_lines_share_a_name_or_a_colour() -> None:
+def test_no_two_lines_share_a_name_or_a_colour():
     assert len({s.name for s in SPECS}) == len({s.colour for s in SPECS}) == len({s.text for s in SPECS}) == len(SPECS)
     assert all(0 < s.colour <= 0xFFFFFF for s in SPECS)
 
 
 @every_spec
-def test_a_line_builds_what_it_says(spec: Any) -> None:
+def test_a_line_builds_what_it_says(spec):
     estimator = make_estimator(spec.name, CAR)
     assert (estimator.name, estimator.causal) == (spec.name, spec.causal)
     assert isinstance(estimator, Smoother) == (not spec.causal)
@@ -81,7 +79,7 @@ def test_a_line_builds_what_it_says(spec: Any) -> None:
 
 
 @every_spec
-def test_what_it_needs_is_what_it_needs(spec: Any, signals: Signals) -> None:
+def test_what_it_needs_is_what_it_needs(spec, signals):
     """An estimator runs with only its required signals, is skipped if one is missing, and uses every one of them."""
     dt = np.diff(signals.stamps_ns) * 1e-9
     given = spec.needs | frozenset(sorted(spec.one_of)[-1:])  # with the yaw rate, where any lateral signal will do
@@ -101,7 +99,7 @@ def test_what_it_needs_is_what_it_needs(spec: Any, signals: Signals) -> None:
 
 
 @every_spec
-def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
+def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec):
     everything = frozenset(ALIGNED_SIGNALS)
     estimators, skipped = runnable((spec.name,), Car(VEHICLE), everything)
     lacks = spec.network not in ("", "optional") or spec.needs_noise
@@ -129,12 +127,12 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
         ("zero", "zero"),
     ],
 )
-def test_an_unknown_name_or_option_is_answered_with_those_that_exist(name: str, message: str) -> None:
+def test_an_unknown_name_or_option_is_answered_with_those_that_exist(name, message):
     with pytest.raises(UsageError, match=message):
         check_names(("zero", name))
 
 
-def test_a_group_names_its_estimators_and_each_runs_once() -> None:
+def test_a_group_names_its_estimators_and_each_runs_once():
     everything = frozenset(ALIGNED_SIGNALS)
     peers = [s.name for s in SPECS if s.group == PEERS]
     assert [e.name for e in runnable((PEERS,), CAR, everything)[0]] == peers
@@ -145,7 +143,7 @@ def test_a_group_names_its_estimators_and_each_runs_once() -> None:
     assert [e.name for e in both] == [*all_names(CAR), *peers]
 
 
-def test_a_name_states_the_gain() -> None:
+def test_a_name_states_the_gain():
     assert ran("pd-hef:gain=0.5").options["trust"] == 0.5
     assert make_estimator("pd-hef:gain=0.5", CAR).name == "pd-hef:gain=0.5"
     _, skipped = runnable(("pd-hef:gain=0.5",), Car(VEHICLE), frozenset(ALIGNED_SIGNALS))
@@ -164,7 +162,7 @@ def ran(name: str, car: Car = CAR, **options: Any) -> Algorithm:
 BARE = replace(CAR, network_gain=None, noise={})
 
 
-def test_the_gain_decides_what_pd_hef_is() -> None:
+def test_the_gain_decides_what_pd_hef_is():
     trusted, cautious = make_estimator("pd-hef", CAR), make_estimator("pd-hef", BARE)
     assert trusted.name == cautious.name == "pd-hef"
     assert resolve(trusted).identity != resolve(cautious).identity

@@ -1,7 +1,5 @@
 """Linear algebra of the filters against numpy; transform and update are in the filter that filterpy checks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,7 +27,7 @@ def root_of(P: np.ndarray) -> np.ndarray:
 
 @random_cases
 @given(SEEDS, st.integers(1, 6), st.integers(0, 5))
-def test_the_root_is_that_of_numpy_and_zero_for_an_entry_without_variance(seed: int, n: int, known: int) -> None:
+def test_the_root_is_that_of_numpy_and_zero_for_an_entry_without_variance(seed, n, known):
     P = random_covariance(np.random.default_rng(seed), n)
     np.testing.assert_allclose(root_of(P), np.linalg.cholesky(P), rtol=1e-8, atol=1e-12)
     P[known % n, :] = P[:, known % n] = 0.0
@@ -40,7 +38,7 @@ def test_the_root_is_that_of_numpy_and_zero_for_an_entry_without_variance(seed: 
 
 @random_cases
 @given(SEEDS, st.integers(2, 6), st.floats(-6, 6))
-def test_repair_gives_the_nearest_positive_definite_matrix(seed: int, n: int, log_size: float) -> None:
+def test_repair_gives_the_nearest_positive_definite_matrix(seed, n, log_size):
     rng = np.random.default_rng(seed)
     broken = 10.0**log_size * rng.standard_normal((n, n))  # neither symmetric nor definite
     P = broken.copy()
@@ -54,13 +52,13 @@ def test_repair_gives_the_nearest_positive_definite_matrix(seed: int, n: int, lo
 
 
 @pytest.mark.parametrize("size", [np.inf, np.nan])
-def test_repair_keeps_non_finite_values_for_the_filter(size: float) -> None:
+def test_repair_keeps_non_finite_values_for_the_filter(size):
     P = np.diag([size, 1.0])
     repair_covariance(P)
     assert not np.isfinite(P).all()
 
 
-def test_the_root_after_an_update_that_rounds_to_zero_is_definite() -> None:
+def test_the_root_after_an_update_that_rounds_to_zero_is_definite():
     # A measurement 1e16 times better than the prior: P - K S K' is zero in one direction, to rounding.
     x, P = np.zeros(2), np.array([[1e8, 1e8 - 1.0], [1e8 - 1.0, 1e8]])
     H = np.array([[1.0, 0.0]])
@@ -77,45 +75,36 @@ def _spd(rng, n):
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 5), steps=st.integers(1, 8), restart=st.booleans())
-def test_smoothed_states_are_those_of_the_joint_gaussian(seed, n, steps, restart):
+def test_smoothed_states_are_those_of_dense_least_squares(seed, n, steps, restart):
     rng = np.random.default_rng(seed)
-    transitions, noises = rng.standard_normal((steps, n, n)), [_spd(rng, n) for _ in range(steps)]
-    jacobians, variances = rng.standard_normal((steps, n)), rng.uniform(0.1, 2.0, steps)
+    transitions, noises = rng.standard_normal((steps, n, n)), np.array([_spd(rng, n) for _ in range(steps)])
+    jacobians, stds = rng.standard_normal((steps, n)), rng.uniform(0.3, 1.4, steps)
     measured, offsets = rng.standard_normal(steps), rng.standard_normal((steps, n))
-    if restart:  # the middle state does not depend on the previous one
-        transitions[steps // 2] = 0.0
-    predicted_x, x = np.empty((steps, n)), np.empty((steps, n))
+    transitions[[0, *([steps // 2] if restart else [])]] = 0.0  # these states do not depend on the one before
+    predicted_x, x = np.empty((steps, n)), np.zeros((steps, n))
     predicted_P, P, cross = (np.zeros((steps, n, n)) for _ in range(3))
-    mean, joint = np.zeros(steps * n), np.zeros((steps * n, steps * n))
+    rows, wanted = np.zeros((steps, n + 1, steps, n)), np.zeros((steps, n + 1))  # in standard deviations
     for k in range(steps):
-        now, last = slice(k * n, (k + 1) * n), slice((k - 1) * n, k * n)
-        if k == 0:
-            predicted_x[0], predicted_P[0] = offsets[0], noises[0]
-            mean[now], joint[now, now] = offsets[0], noises[0]
-        else:
-            f = transitions[k]
-            predicted_x[k], cross[k] = f @ x[k - 1] + offsets[k], P[k - 1] @ f.T
-            predicted_P[k] = f @ cross[k] + noises[k]
-            mean[now] = f @ mean[last] + offsets[k]
-            joint[now, : k * n] = f @ joint[last, : k * n]
-            joint[: k * n, now] = joint[now, : k * n].T
-            joint[now, now] = f @ joint[last, last] @ f.T + noises[k]
-        h = jacobians[k]
-        gain = predicted_P[k] @ h / (h @ predicted_P[k] @ h + variances[k])
+        f, h = transitions[k], jacobians[k]
+        predicted_x[k], cross[k] = f @ x[k - 1] + offsets[k], P[k - 1] @ f.T
+        predicted_P[k] = f @ cross[k] + noises[k]
+        gain = predicted_P[k] @ h / (h @ predicted_P[k] @ h + stds[k] ** 2)
         x[k] = predicted_x[k] + gain * (measured[k] - h @ predicted_x[k])
         P[k] = predicted_P[k] - np.outer(gain, h @ predicted_P[k])
-    sensing = np.zeros((steps, steps * n))
-    for k in range(steps):
-        sensing[k, k * n : (k + 1) * n] = jacobians[k]
-    gain = np.linalg.solve(sensing @ joint @ sensing.T + np.diag(variances), sensing @ joint).T
-    expected, covariance = mean + gain @ (measured - sensing @ mean), joint - gain @ sensing @ joint
-    scale = max(1.0, float(np.abs(joint).max()))
+        white = np.linalg.inv(np.linalg.cholesky(noises[k]))
+        rows[k, :n, k - 1] = -white @ f
+        rows[k, :n, k] += white
+        rows[k, n, k] = h / stds[k]
+        wanted[k] = *(white @ offsets[k]), measured[k] / stds[k]
+    dense = rows.reshape(-1, steps * n)
+    covariance = np.linalg.inv(dense.T @ dense).reshape(steps, n, steps, n)
+    expected = np.linalg.lstsq(dense, wanted.ravel(), rcond=None)[0]
+    scale = max(1.0, float(np.abs(predicted_P).max()))
     smoothed = rts.smooth_states(x, predicted_x, predicted_P, cross)
     np.testing.assert_allclose(smoothed.ravel(), expected, rtol=1e-9, atol=1e-9 * scale)
     covariances = rts.smooth_covariances(P, predicted_P, cross)
     for k in range(steps):
-        now = slice(k * n, (k + 1) * n)
-        np.testing.assert_allclose(covariances[k], covariance[now, now], rtol=1e-9, atol=1e-9 * scale)
+        np.testing.assert_allclose(covariances[k], covariance[k, :, k], rtol=1e-9, atol=1e-9 * scale)
 
 
 def test_a_state_without_variance_keeps_its_value():

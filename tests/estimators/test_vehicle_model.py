@@ -1,7 +1,5 @@
 """The models of the vehicle filter against an ODE in plain Python, the nominal model and closed forms."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -31,7 +29,6 @@ from pdhef_logtool.estimators.vehicle_model import (
     physics_parameters,
     push,
     read_ay,
-    settle_forces,
     step_count,
 )
 from pdhef_logtool.estimators.vehicle_ukf import HeldInputs
@@ -86,13 +83,6 @@ def ay_of(v: VehicleParameters, x: np.ndarray, steer: float) -> float:
     reading = np.zeros(WIDTH)
     read_ay(block_of(layout, x[None]).ravel(), 1, steer, FRICTION, 0.0, layout, p, f, reading)
     return float(reading[0])
-
-
-def settled(v: VehicleParameters, x: list[float], steer: float, ax: float = 0.0) -> np.ndarray:
-    layout, p, f = models(v)
-    state = np.append(x, np.zeros(layout.size - len(x)))
-    settle_forces(state, steer, ax, FRICTION, layout, p, f)
-    return state
 
 
 # --- without axle forces: the nominal model --------------------------------------------------------------------------

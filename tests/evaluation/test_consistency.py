@@ -1,9 +1,6 @@
 """Consistency without truth: known residuals are found, a healthy drive shows none, and gaps are left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,13 +31,7 @@ def drive() -> Signals:
     return signals_at(STAMPS, steer_rad=0.0, speed_m_s=measured, **columns)
 
 
-def rows_of(tracks, signals=None, names=None, masks=None) -> list[MetricRow]:
-    signals = drive() if signals is None else signals
-    evaluated = EvaluatedDrive("drive", {t.name: t for t in tracks}, None, signals, masks or {}, 3.0)
-    return evaluate_drive(evaluated, names)
-
-
-def test_figures_of_a_segment_are_formulas_over_its_stamps_and_steps() -> None:
+def test_figures_of_a_segment_are_formulas_over_its_stamps_and_steps():
     n = T.size
     rng = np.random.default_rng(1)
     nis, dof = rng.chisquare(2, n), rng.choice([0.0, 1.0, 2.0], n)
@@ -57,7 +48,8 @@ def test_figures_of_a_segment_are_formulas_over_its_stamps_and_steps() -> None:
         "exposure_s": (mask.sum() * step_s, mask.sum()),
         "exposure_m": (held[mask].sum() * step_s, mask.sum()),
     }
-    rows = {r.metric: (r.value, r.n) for r in rows_of([track], masks={"turn": mask}) if r.segment == "turn"}
+    found = evaluate_drive(EvaluatedDrive("drive", {"e": track}, None, drive(), {"turn": mask}, 3.0))
+    rows = {r.metric: (r.value, r.n) for r in found if r.segment == "turn"}
     for metric, (value, count) in expected.items():
         assert rows[metric] == (pytest.approx(value, rel=1e-9), count)
 
@@ -67,7 +59,7 @@ VEHICLE = SALOON.physics_vehicle
 
 
 @pytest.fixture(scope="module")
-def lane_change(sample_logs_dir: Path) -> WholeDrive:
+def lane_change(sample_logs_dir):
     with read_drive(sample_logs_dir / "dlc.mcap", SALOON) as drive:
         return drive.whole()
 
@@ -81,10 +73,9 @@ def figure(
     return [row.value for row in evaluate_drive(evaluated, ("yaw_consistency",))]
 
 
-def test_the_true_sideslip_explains_the_yaw_rate_and_zero_does_not(sample_logs_dir: Path) -> None:
+def test_the_true_sideslip_explains_the_yaw_rate_and_zero_does_not(sample_logs_dir):
     with read_drive(sample_logs_dir / "road.mcap", SALOON) as drive:
         whole = drive.whole()
-    assert whole.truth is not None
     road = replace(whole, signals=whole.signals.rows(0, 6000), truth=whole.truth.rows(0, 6000))
     assert road.truth is not None
     zero = run_estimator(make_estimator("zero", SALOON), road.signals)
@@ -93,7 +84,7 @@ def test_the_true_sideslip_explains_the_yaw_rate_and_zero_does_not(sample_logs_d
     assert none > 3.0 * true
 
 
-def test_a_gyro_bias_and_a_steering_delay_that_the_log_calibrated_are_taken_off(lane_change: WholeDrive) -> None:
+def test_a_gyro_bias_and_a_steering_delay_that_the_log_calibrated_are_taken_off(lane_change):
     assert lane_change.truth is not None
     signals, delay = lane_change.signals, 5
     late = np.concatenate([np.full(delay, signals.steer_rad[0]), signals.steer_rad[:-delay]])
@@ -111,7 +102,7 @@ def test_a_gyro_bias_and_a_steering_delay_that_the_log_calibrated_are_taken_off(
     assert corrected < 1.3 * clean < ignored
 
 
-def test_there_is_no_figure_without_steering_or_speed(lane_change: WholeDrive) -> None:
+def test_there_is_no_figure_without_steering_or_speed(lane_change):
     assert lane_change.truth is not None
     nothing = np.full(len(lane_change.signals), np.nan)
     for name in ("steer_rad", "speed_m_s"):
@@ -147,7 +138,7 @@ def driven(of: Signals, vy: np.ndarray) -> float:
     return driven_consistency(track(vy), CalibratedSignals(of, LEANING), 3.0)
 
 
-def test_what_a_wrong_model_does_goes_with_the_driving_and_a_rough_road_does_not() -> None:
+def test_what_a_wrong_model_does_goes_with_the_driving_and_a_rough_road_does_not():
     wrong = VY + 0.02 * SPEED * RATE
     assert driven(signals(), VY) < 2e-3
     assert driven(signals(), wrong) == pytest.approx(d2(signals(), wrong).value, rel=0.02)
@@ -156,20 +147,20 @@ def test_what_a_wrong_model_does_goes_with_the_driving_and_a_rough_road_does_not
     assert driven(road, VY) < 0.1 * d2(road, VY).value
 
 
-def test_it_is_not_told_of_too_little_driving() -> None:
+def test_it_is_not_told_of_too_little_driving():
     short = CalibratedSignals(signals().rows(0, 900), LEANING)
     assert np.isnan(driven_consistency(track(VY).rows(0, 900), short, 3.0))
     assert np.isnan(driven(signals(), np.full(T.size, np.nan)))
 
 
-def test_the_true_lateral_velocity_contradicts_nothing_once_the_sensors_are_known() -> None:
+def test_the_true_lateral_velocity_contradicts_nothing_once_the_sensors_are_known():
     row = d2(signals(), VY)
     assert (row.signal, row.metric, row.unit, row.segment) == ("vy_m_s", "d2", "m/s", "all")
     assert row.value < 2e-3
     assert row.n == T.size - 200 - 4  # two seconds before the first, and no speed behind the last sample
 
 
-def test_it_is_the_change_of_the_error_over_two_seconds() -> None:
+def test_it_is_the_change_of_the_error_over_two_seconds():
     error = 0.3 * np.sin(0.4 * T)
     change = error[200:] - error[:-200]
     found = d2(signals(), VY + error).value

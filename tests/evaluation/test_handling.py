@@ -1,7 +1,5 @@
 """Key figures of manoeuvres against responses in closed form, of estimates and of ground truth alike."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Metrics against one-line numpy formulas, known lags, calibrated Gaussians and closed-form positions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -163,28 +161,15 @@ def test_the_constant_and_the_shift_of_ground_truth_are_taken_out_and_no_other_e
 # ---- uncertainty ----
 
 
-def gaussian_case(n=20000, scale=1.0, seed=0):
-    rng = np.random.default_rng(seed)
+def test_truth_covariance_counts_too():
+    rng, n = np.random.default_rng(0), 20000
     a = rng.normal(size=(3, 3))
     p = a @ a.T * 0.01 + 0.001 * np.eye(3)
-    e = rng.multivariate_normal(np.zeros(3), p, size=n)
-    zeros = np.zeros(n)
-    truth = track(n=n, vx_m_s=zeros + 20, vy_m_s=zeros, yaw_rate_rad_s=zeros)
-    estimate = make_track(
-        "e",
-        truth.stamps_ns,
-        vx_m_s=20 + e[:, 0],
-        vy_m_s=e[:, 1],
-        yaw_rate_rad_s=e[:, 2],
-        covariance=np.tile(p * scale, (n, 1, 1)),
-    )
-    return estimate, truth
-
-
-def test_truth_covariance_counts_too():
-    estimate, truth = gaussian_case(scale=0.5)
-    truth = replace(truth, covariance=estimate.covariance)
-    rows = score(estimate, truth)
+    truth = {"vx_m_s": np.full(n, 20.0), "vy_m_s": np.zeros(n), "yaw_rate_rad_s": np.zeros(n)}
+    errors = rng.multivariate_normal(np.zeros(3), p, size=n).T
+    half = {"covariance": np.tile(0.5 * p, (n, 1, 1))}  # of each side
+    estimate = {name: values + e for (name, values), e in zip(truth.items(), errors, strict=True)}
+    rows = score(*(make_track(name, stamps_of(n), **of, **half) for name, of in (("e", estimate), ("truth", truth))))
     assert rows["state", "all", "nees"].value == pytest.approx(3.0, abs=0.07)
     assert rows["vx_m_s", "all", "coverage95"].value == pytest.approx(0.95, abs=0.006)
 

@@ -1,11 +1,8 @@
 """A metric is one file and one line: the example of the package's docstring, added that way, is in every output."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,14 +20,13 @@ from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.run_result import RunResult
 from tests.command_line import rendered
 
 NAME, LABEL = "interval_width", "interval width"
 
 
 @pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def toy(tmp_path_factory):
     """Add the example as a file beside the package's and as a line of its list; return its name."""
     folder = tmp_path_factory.mktemp("metrics")
     example = re.sub(r"^    ", "", str(metrics.__doc__).partition("::\n\n")[2], flags=re.MULTILINE)
@@ -45,7 +41,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def result(toy: str, sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+def result(toy, sample_logs_dir, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
     limits = f'metric = "{toy}"\nstatistic = "worst drive"\nestimator = "physics"\nlimit_deg = 0.001\n'
     text = f'[[requirement]]\nid = "toy"\nsignal = "sideslip_rad"\n{limits}'
@@ -56,7 +52,7 @@ def result(toy: str, sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFac
     return run_logs([str(sample_logs_dir / "dlc.mcap")], out / "out", config)
 
 
-def test_figures_are_in_parquet_json_and_mcap(toy: str, result: RunResult) -> None:
+def test_figures_are_in_parquet_json_and_mcap(toy, result):
     assert result.place is not None
     folder = Path(result.place) / "logs" / "dlc"
     rows = pl.read_parquet(folder / "metrics.parquet").filter(metric=toy, estimator="physics")
@@ -75,15 +71,14 @@ def test_figures_are_in_parquet_json_and_mcap(toy: str, result: RunResult) -> No
     assert record[f"physics/sideslip_rad/all/{toy}"] == f"{row['value']:.9g} rad n={row['n']}"
 
 
-def test_it_has_a_column_in_the_terminal_and_on_the_page_with_its_definition(toy: str, result: RunResult) -> None:
+def test_it_has_a_column_in_the_terminal_and_on_the_page_with_its_definition(toy, result):
     assert re.search(r"interval\s*\n?.*width °", rendered(render_run, result, 200))
     page = (Path(str(result.place)) / "logs" / "dlc" / "report.html").read_text(encoding="utf-8")
     assert f'<th class="n">{LABEL}</th>' in page
     assert registered()[toy].definition in page
 
 
-def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
-    assert result.requirements is not None
+def test_plans_and_compare_accept_it(toy, result):
     (verdict,) = result.requirements.verdicts
     assert (verdict.outcome, result.exit_code) == ("FAIL", 4)
     assert verdict.requirement.label == f"sideslip {LABEL} ≤ 0.001° (worst drive, physics)"
@@ -97,14 +92,14 @@ def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
     assert LABEL.encode() in comparison_page(changed)
 
 
-def test_units_of_all_figures_are_those_that_the_metrics_name(result: RunResult) -> None:
+def test_units_of_all_figures_are_those_that_the_metrics_name(result):
     rows = result.results[0].rows
     assert {(r.metric, r.signal, r.unit) for r in rows} == {
         (r.metric, r.signal, registered()[r.metric].unit_of(r.signal)) for r in rows
     }
 
 
-def test_a_name_is_registered_once(toy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_is_registered_once(toy, monkeypatch):
     monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, toy))
     registered.cache_clear()
     with pytest.raises(ValueError, match="registered twice"):

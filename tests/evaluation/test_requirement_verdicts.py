@@ -1,13 +1,10 @@
 """Verdicts on synthetic drives: they flip at the right limits, with the promised error rates, and say what to drive."""
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,7 +40,7 @@ def blocks(values: Sequence[float], baseline: Sequence[float] = (), std: Sequenc
 
 
 @pytest.mark.parametrize(("spread", "count"), [(0.3, 5), (0.8, 5), (0.5, 100)])
-def test_the_bound_covers_the_true_value_as_often_as_it_says(spread: float, count: int) -> None:
+def test_the_bound_covers_the_true_value_as_often_as_it_says(spread, count):
     rng = np.random.default_rng(count)
     true = 0.01 * math.exp(spread**2)  # √ mean of squares of a lognormal
     covered = 0
@@ -56,7 +53,7 @@ def test_the_bound_covers_the_true_value_as_often_as_it_says(spread: float, coun
 
 
 @pytest.mark.parametrize(("limit", "outcome"), [(0.0130, "PASS"), (0.0100, "INCONCLUSIVE"), (0.0080, "FAIL")])
-def test_the_verdict_flips_with_the_limit(limit: float, outcome: str) -> None:
+def test_the_verdict_flips_with_the_limit(limit, outcome):
     values = 0.01 * np.exp(np.random.default_rng(1).normal(0.0, 0.2, 20))
     verdict = judge(replace(LIMIT, limit=limit), drives(values))
     assert verdict.outcome == outcome and verdict.basis == "drives"
@@ -66,7 +63,7 @@ def test_the_verdict_flips_with_the_limit(limit: float, outcome: str) -> None:
         assert (verdict.reason[:6], verdict.next) == ("0.596°", "") or verdict.next == ""
 
 
-def test_an_inconclusive_verdict_says_how_much_driving_would_decide() -> None:
+def test_an_inconclusive_verdict_says_how_much_driving_would_decide():
     values = 0.01 * np.exp(np.random.default_rng(1).normal(0.0, 0.3, 8))
     verdict = judge(replace(LIMIT, limit=0.0119), drives(values))
     assert verdict.outcome == "INCONCLUSIVE" and "includes the limit" in verdict.reason
@@ -81,7 +78,7 @@ def test_an_inconclusive_verdict_says_how_much_driving_would_decide() -> None:
         ({"exposure_km": 100.0}, "20.0 of 100 km", "drive 80.0 km more"),
     ],
 )
-def test_too_little_driving_is_inconclusive_whatever_the_value(needs: dict[str, Any], reason: str, to_do: str) -> None:
+def test_too_little_driving_is_inconclusive_whatever_the_value(needs, reason, to_do):
     for value in (0.001, 1.0):
         verdict = judge(replace(LIMIT, **needs), drives([value] * 20))
         assert verdict.outcome == "INCONCLUSIVE"
@@ -91,7 +88,7 @@ def test_too_little_driving_is_inconclusive_whatever_the_value(needs: dict[str, 
     assert judge(LIMIT, unknown).outcome == "PASS"
 
 
-def test_below_five_drives_blocks_decide_and_the_verdict_says_so() -> None:
+def test_below_five_drives_blocks_decide_and_the_verdict_says_so():
     rng = np.random.default_rng(2)
     values = 0.01 * np.exp(rng.normal(0.0, 0.2, 30))
     whole = float(np.sqrt(np.mean(values**2)))
@@ -106,7 +103,7 @@ def test_below_five_drives_blocks_decide_and_the_verdict_says_so() -> None:
     assert none.outcome == "INCONCLUSIVE" and none.next == "run the logs again with this plan"
 
 
-def test_against_an_estimated_reference_no_small_margin_decides() -> None:
+def test_against_an_estimated_reference_no_small_margin_decides():
     values, std = [0.0100, 0.0101] * 10, 0.006
     near = drives(values, std=std)
     assert judge(replace(LIMIT, limit=0.0150), drives(values)).outcome == "PASS"
@@ -119,7 +116,7 @@ def test_against_an_estimated_reference_no_small_margin_decides() -> None:
     assert judge(ratio, drives(values, [0.06] * 20, std=std)).outcome == "PASS"
 
 
-def test_minimum_bias_worst_drive_and_quantile() -> None:
+def test_minimum_bias_worst_drive_and_quantile():
     share = replace(LIMIT, metric="coverage95", limit=0.9)
     assert judge(share, drives([0.94, 0.95, 0.96] * 4)).outcome == "PASS"
     assert judge(share, drives([0.60, 0.65, 0.70] * 4)).outcome == "FAIL"
@@ -142,7 +139,7 @@ def read(*tables: dict[str, Any]) -> Any:
     return plan_from_dict({"requirement": list(tables)}, where="plan.toml").requirements
 
 
-def test_the_example_is_valid_and_is_read(tmp_path: Path) -> None:
+def test_the_example_is_valid_and_is_read(tmp_path):
     follows(tomllib.loads(example_plan()), "plan.schema.json")
     (tmp_path / "plan.toml").write_text(example_plan(), encoding="utf-8")
     plan = load_plan(tmp_path / "plan.toml")
@@ -153,13 +150,13 @@ def test_the_example_is_valid_and_is_read(tmp_path: Path) -> None:
     assert not default_plan().file
 
 
-def test_a_condition_contains_its_lower_edge_and_one_car() -> None:
+def test_a_condition_contains_its_lower_edge_and_one_car():
     need = validation_plan.ExposureNeed(speed_m_s=[10.0, 20.0], car="a", minutes=1.0)
     space = {(5.0, 0.0): 1.0, (10.0, 0.0): 3.0, (20.0, 0.0): 5.0}
     assert (need.seconds_of(space, 0.9, "a"), need.seconds_of(space, 0.9, "b")) == (3.0, 0.0)
 
 
-def test_degrees_manoeuvres_and_quantiles() -> None:
+def test_degrees_manoeuvres_and_quantiles():
     rate, quantile = read(
         {"id": "A", "signal": "yaw_rate_rad_s", "limit_deg_s": 1.0, "manoeuvre": "slalom"},
         {**WHOLE, "id": "B", "metric": "p95_abs", "statistic": "quantile 0.9"},
@@ -187,22 +184,21 @@ def test_degrees_manoeuvres_and_quantiles() -> None:
         ({**WHOLE, "segment": "all", "manoeuvre": "slalom"}, "give segment or manoeuvre, not both"),
     ],
 )
-def test_a_wrong_entry_is_named(table: dict[str, Any], problem: str) -> None:
-    with pytest.raises(UsageError) as error:
+def test_a_wrong_entry_is_named(table, problem):
+    with pytest.raises(UsageError, match=re.escape(problem)):
         read(table)
-    assert problem in str(error.value) and error.value.exit_code == 2
 
 
 @pytest.mark.parametrize(
     ("given", "meant"),
     [("beta", "sideslip_rad"), ("slip_angle", "sideslip_rad"), ("psi_dot", "yaw_rate_rad_s"), ("ay", "ay_m_s2")],
 )
-def test_a_signal_by_its_symbol_is_told_its_name(given: str, meant: str) -> None:
+def test_a_signal_by_its_symbol_is_told_its_name(given, meant):
     with pytest.raises(UsageError, match=rf"signal = {given}: unknown, did you mean {meant}\?"):
         read({**WHOLE, "signal": given})
 
 
-def test_ids_are_unique_and_a_missing_file_is_a_usage_error(tmp_path: Path) -> None:
+def test_ids_are_unique_and_a_missing_file_is_a_usage_error(tmp_path):
     with pytest.raises(UsageError, match="id 'A' is used 2 times"):
         read(WHOLE, WHOLE)
     with pytest.raises(UsageError, match=r"pdhef plan init -o plan\.toml writes an example"):

@@ -1,7 +1,5 @@
 """Segments: a drive staged from known manoeuvres, mirror symmetry, gaps, and intervals that give the masks back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -154,21 +152,16 @@ def stamps(count: int) -> np.ndarray:
 
 
 def by_hand(stamps_ns: np.ndarray, reason: np.ndarray, bit: int) -> list[Interval]:
-    """One stamp after the other."""
-    spans: list[list[int]] = []
-    for t, mask in zip(stamps_ns.tolist(), reason.tolist(), strict=True):
-        if mask & bit:
-            if spans and t - spans[-1][1] <= RUN_GAP_S * 1e9:
-                spans[-1][1] = t
-            else:
-                spans.append([t, t])
-    return [Interval(a, b + 1) for a, b in spans]
+    """Split the stamps that have the bit where they are far apart."""
+    marked = stamps_ns[reason & bit > 0]
+    parts = np.split(marked, np.flatnonzero(np.diff(marked) > RUN_GAP_S * 1e9) + 1)
+    return [Interval(int(part[0]), int(part[-1]) + 1) for part in parts if len(part)]
 
 
 @pytest.mark.slow
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 40), st.integers(0, 15)), min_size=1, max_size=60))
-def test_intervals_are_those_found_by_hand(samples: list[tuple[int, int]]) -> None:
+def test_intervals_are_those_found_by_hand(samples):
     # Steps of 20 to 800 ms, masks of the first four bits.
     steps, masks = zip(*samples, strict=True)
     stamps_ns = START_NS + np.cumsum(np.array(steps, dtype=np.int64)) * 20_000_000
@@ -178,7 +171,7 @@ def test_intervals_are_those_found_by_hand(samples: list[tuple[int, int]]) -> No
     assert reason_intervals(track) == {name: spans for name, spans in expected.items() if spans}
 
 
-def test_faults_are_told_by_sensor_and_kind_with_the_longest_intervals() -> None:
+def test_faults_are_told_by_sensor_and_kind_with_the_longest_intervals():
     n = 40_000
     reason = np.zeros(n, dtype=np.int64)
     reason[np.arange(0, 35_000, 500)] |= SPIKE_AY  # 70 single ones
@@ -200,7 +193,7 @@ def steady_signals(speed: float, ay: float, seconds: float = 20.0) -> Signals:
 
 
 @pytest.mark.parametrize(("speed", "ay", "cell"), [(0.0, 0.5, (0, 0)), (27.0, -4.5, (5, 4)), (90.0, 30.0, (12, 12))])
-def test_a_steady_drive_is_in_one_cell_for_as_long_as_it_lasts(speed: float, ay: float, cell: tuple[int, int]) -> None:
+def test_a_steady_drive_is_in_one_cell_for_as_long_as_it_lasts(speed, ay, cell):
     made = steady_signals(speed, ay)
     (found,) = operating_space(made, None, None, VEHICLE)["cells"]
     assert (found["speed"], found["ay"]) == cell
@@ -210,7 +203,7 @@ def test_a_steady_drive_is_in_one_cell_for_as_long_as_it_lasts(speed: float, ay:
     assert found["scored"] == 0 and np.isnan(found["sideslip_mse_rad2"])
 
 
-def test_cells_have_the_error_of_their_stamps() -> None:
+def test_cells_have_the_error_of_their_stamps():
     made = steady_signals(20.0, 0.2)
     n, at = len(made), np.arange(len(made))
     vx, ay = np.where(at < n // 2, 12.0, 33.0), np.where(at < n // 4, 0.5, 3.5)
@@ -225,7 +218,7 @@ def test_cells_have_the_error_of_their_stamps() -> None:
     assert sum(c["seconds"] for c in whole) == pytest.approx(20.0)
 
 
-def test_the_top_speed_is_that_of_the_drive_also_where_other_signals_are_unknown() -> None:
+def test_the_top_speed_is_that_of_the_drive_also_where_other_signals_are_unknown():
     made = steady_signals(20.0, 2.0)
     n, at = len(made), np.arange(len(made))
     columns = {"speed_m_s": np.where(at == n // 2, 41.0, 20.0), "ay_m_s2": np.where(at > n // 4, np.nan, 2.0)}
@@ -237,7 +230,7 @@ def test_the_top_speed_is_that_of_the_drive_also_where_other_signals_are_unknown
         assert (space["speed_max_m_s"], space["ay_max_m_s2"]) == (41.0, pytest.approx(2.0, abs=0.11))
 
 
-def test_a_gap_is_no_driving() -> None:
+def test_a_gap_is_no_driving():
     made = steady_signals(10.0, 1.5, 4.0)
     stamps = made.stamps_ns + np.where(np.arange(len(made)) < 200, 0, 60_000_000_000)
     late = Signals(**{**{f: getattr(made, f) for f in made.__slots__}, "stamps_ns": stamps})

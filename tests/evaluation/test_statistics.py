@@ -1,7 +1,5 @@
 """Statistics over drives: dependence, bounds of quantiles, the paired change of a figure and its verdict."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -13,7 +11,7 @@ from scipy import stats
 from pdhef_logtool.evaluation.statistics import decided, dependence, deviate, holm, paired_change, quantile
 
 
-def test_bounds_are_those_of_resampled_medians() -> None:
+def test_bounds_are_those_of_resampled_medians():
     ratios = np.random.default_rng(4).normal(0.0, 0.2, 31)
     found = paired_change(ratios)
     reference = stats.bootstrap((ratios,), np.median, n_resamples=9999, method="percentile", rng=1).confidence_interval
@@ -22,7 +20,7 @@ def test_bounds_are_those_of_resampled_medians() -> None:
     assert found.low <= found.least <= found.median <= found.most <= found.high
 
 
-def test_the_sign_test_is_that_of_scipy_and_holm_corrects_for_being_several() -> None:
+def test_the_sign_test_is_that_of_scipy_and_holm_corrects_for_being_several():
     ratios = np.array([0.1] * 9 + [-0.1] * 3 + [0.0] * 5)  # the unchanged do not vote
     assert paired_change(ratios).sign_p == pytest.approx(stats.binomtest(3, 12).pvalue)
     assert paired_change(np.zeros(8)).sign_p == 1.0
@@ -30,7 +28,7 @@ def test_the_sign_test_is_that_of_scipy_and_holm_corrects_for_being_several() ->
     assert holm([]) == []
 
 
-def test_the_bounds_of_a_quantile_are_exact() -> None:
+def test_the_bounds_of_a_quantile_are_exact():
     rng = np.random.default_rng(0)
     found = [quantile(rng.uniform(size=60), 0.9, 0.95) for _ in range(400)]
     assert np.mean([f.low <= 0.9 for f in found]) >= 0.95
@@ -49,7 +47,7 @@ def test_the_bounds_of_a_quantile_are_exact() -> None:
         ((math.nan, 2.0, math.nan), 1.0, None, "INCONCLUSIVE"),
     ],
 )
-def test_an_interval_decides(interval: tuple[float, float, float], bound: float, least: float, outcome: str) -> None:
+def test_an_interval_decides(interval, bound, least, outcome):
     assert decided(*interval, bound, least) == outcome
 
 
@@ -61,7 +59,7 @@ def _of_days(rng: np.random.Generator, days: int, each: int, shared: float) -> t
 
 
 @pytest.mark.parametrize(("shared", "each"), [(0.1, 20), (0.9, 10)])
-def test_equal_runs_with_drives_of_six_days_are_seldom_called_worse(shared: float, each: int) -> None:
+def test_equal_runs_with_drives_of_six_days_are_seldom_called_worse(shared, each):
     rng = np.random.default_rng(11)
     alone = together = 0
     for _ in range(2000):
@@ -72,7 +70,7 @@ def test_equal_runs_with_drives_of_six_days_are_seldom_called_worse(shared: floa
     assert alone >= 200  # the result of treating the drives as independent
 
 
-def test_the_design_effect_is_that_of_the_simulated_correlation() -> None:
+def test_the_design_effect_is_that_of_the_simulated_correlation():
     rng = np.random.default_rng(12)
     effects = []
     for _ in range(200):
@@ -82,7 +80,7 @@ def test_the_design_effect_is_that_of_the_simulated_correlation() -> None:
     assert deviate(0.975, 1e15) == pytest.approx(deviate(0.975, math.inf))  # in no time
 
 
-def test_factors_that_are_nested_or_equal_count_once_and_crossed_ones_add() -> None:
+def test_factors_that_are_nested_or_equal_count_once_and_crossed_ones_add():
     rng = np.random.default_rng(13)
     day = np.repeat(np.arange(12), 10)
     scores = rng.normal(size=12)[day] + 0.5 * rng.normal(size=120)
@@ -101,7 +99,7 @@ def test_factors_that_are_nested_or_equal_count_once_and_crossed_ones_add() -> N
     groups=st.integers(1, 8),
 )
 @example(ratios=[math.inf] * 3 + [-math.inf] * 3, groups=1)
-def test_bounds_enclose_the_median_and_follow_the_sign(ratios: list[float], groups: int) -> None:
+def test_bounds_enclose_the_median_and_follow_the_sign(ratios, groups):
     values = np.array(ratios)
     factors = {"day": [i % groups for i in range(len(values))], "car": [None] * len(values)}
     one, other = paired_change(values, None, factors), paired_change(-values, None, factors)

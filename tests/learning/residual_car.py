@@ -1,7 +1,5 @@
 """Drives of the car of ``reference_car`` under a side force that its model lacks: the residual, known exactly."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

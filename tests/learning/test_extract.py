@@ -1,7 +1,5 @@
 """``pdhef extract``: from logs to a residual dataset on disk, and back."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -87,7 +85,7 @@ def _extract(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: FakeLog, **se
 
 
 @pytest.mark.slow
-def test_noisy_truth_is_smoothed_and_unbiased(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noisy_truth_is_smoothed_and_unbiased(tmp_path, monkeypatch):
     result = _extract(tmp_path, monkeypatch, _log(weaving(30.0), 0.01))
     (entry,) = result.manifest["drives"]
     assert entry["truth"]["smoothing_half_s"] == 0.15
@@ -102,9 +100,7 @@ def test_noisy_truth_is_smoothed_and_unbiased(tmp_path: Path, monkeypatch: pytes
     assert smoothed[0] < 0.12, "the noise of one-step differences is above 1"
 
 
-def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(tmp_path, monkeypatch):
     result = _extract(tmp_path, monkeypatch, _log(weaving(4.0, speed=2.0)))
     (one,) = result.results
     assert one.entry is not None and one.entry["rows"] == 401 and one.entry["usable_rows"] == 0
@@ -116,13 +112,13 @@ def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
 
 
 @pytest.fixture(scope="module")
-def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> ExtractResult:
+def dataset(sample_logs_dir, tmp_path_factory):
     out = tmp_path_factory.mktemp("dataset")
     logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
     return extract(logs, out, ExtractSettings(RunConfig()))
 
 
-def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Path) -> None:
+def test_manifest_follows_its_schema(dataset, sample_logs_dir):
     document = json.loads((dataset.output / MANIFEST).read_text(encoding="utf-8"))
     follows(document, "dataset.schema.json")
     assert is_sealed(document) and {k: v for k, v in document.items() if k != "digest"} == dataset.manifest
@@ -135,7 +131,7 @@ def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Pa
     assert by_log["dlc"]["vehicle_sha256"] != by_log["sweep"]["vehicle_sha256"]
 
 
-def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
+def test_rows_are_whole_and_in_order(dataset):
     (file,) = dataset.output.glob("split=*/car=truthsim-saloon-*/part-dlc.parquet")
     frame = pl.read_parquet(file, hive_partitioning=False)
     assert frame.columns == [
@@ -151,7 +147,7 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
         "segment",
         "chosen",
     ]
-    assert frame["stamp_ns"].diff().drop_nulls().min() > 0  # type: ignore[operator]
+    assert frame["stamp_ns"].diff().drop_nulls().min() > 0
     entry = next(d for d in dataset.manifest["drives"] if d["log"] == "dlc")
     assert (len(frame), int((frame["weight"] > 0).sum())) == (entry["rows"], entry["usable_rows"])
     usable = frame.filter(pl.col("weight") > 0)
@@ -165,7 +161,7 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
     }  # fmt: skip
 
 
-def test_a_taught_car_is_calibrated_on_each_drive(sample_logs_dir: Path, bare_vehicle: str, tmp_path: Path) -> None:
+def test_a_taught_car_is_calibrated_on_each_drive(sample_logs_dir, bare_vehicle, tmp_path):
     car = tmp_path / "car"
     car.mkdir()
     (car / "vehicle.toml").write_text(bare_vehicle)
@@ -178,7 +174,7 @@ def test_a_taught_car_is_calibrated_on_each_drive(sample_logs_dir: Path, bare_ve
     assert bare["drives"][0]["calibration"] == "" and "stiffness" in taught_set["drives"][0]["calibration"]
 
 
-def test_damaged_dataset_is_told(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_damaged_dataset_is_told(dataset, sample_logs_dir, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(dataset.output, copy)
     files = {d.entry["name"]: d.path for d in read_dataset(copy).drives}
@@ -202,7 +198,7 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, sample_logs_dir: Path, 
 
 
 @pytest.mark.slow
-def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_processes_and_order_change_no_byte(dataset, sample_logs_dir, tmp_path):
     logs = [str(sample_logs_dir / name) for name in ("sweep.mcap", "dlc.mcap")]
     again = extract(logs, tmp_path / "out", ExtractSettings(RunConfig()), jobs=2)
     assert again.manifest == dataset.manifest
@@ -212,7 +208,7 @@ def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_
 
 
 @pytest.mark.slow
-def test_resume_keeps_what_is_as_it_was(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_resume_keeps_what_is_as_it_was(dataset, sample_logs_dir, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(dataset.output, out)
     (out / MANIFEST).unlink()  # a killed command leaves none
@@ -229,7 +225,7 @@ def test_resume_keeps_what_is_as_it_was(dataset: ExtractResult, sample_logs_dir:
     assert not any(r.kept for r in afresh.results)
 
 
-def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_one_bad_log_stops_no_other(sample_logs_dir, tmp_path):
     logs = tmp_path / "logs"
     logs.mkdir()
     shutil.copy(sample_logs_dir / "dlc.mcap", logs / "good.mcap")
@@ -246,7 +242,7 @@ def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_extract_chooses_rows_and_leaves_copies_out(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_extract_chooses_rows_and_leaves_copies_out(sample_logs_dir, tmp_path):
     out = tmp_path / "out"
     for name in ("a", "b"):
         shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / f"{name}.mcap")
@@ -273,7 +269,7 @@ def test_extract_chooses_rows_and_leaves_copies_out(sample_logs_dir: Path, tmp_p
 # ---- split ----
 
 
-def test_hash_split_is_stable_and_about_70_15_15() -> None:
+def test_hash_split_is_stable_and_about_70_15_15():
     names = [f"{i:064x}" for i in range(4000)]
     splits = [choose_split(n)[0] for n in names]
     shares = [splits.count(s) / len(splits) for s in SPLITS]
@@ -284,7 +280,7 @@ def test_hash_split_is_stable_and_about_70_15_15() -> None:
 
 
 @pytest.mark.slow
-def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir, tmp_path):
     shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "a.mcap")
     shutil.copy(sample_logs_dir / "sweep.mcap", tmp_path / "b.mcap")
     suite = {"format": 1, "drives": [{"file": "a.mcap", "split": "extrapolation"}, {"file": "c.mcap", "split": "test"}]}
@@ -309,14 +305,14 @@ def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: P
         for text in ("sideslip_rad > 1", "truth.vx_m_s > 1", "vx_m_s > 1 and (select 1)", "vx_m_s", "friction > 1 and")
     ],
 )
-def test_wrong_settings_are_told_before_any_log_is_read(tmp_path: Path, wrong: dict[str, Any]) -> None:
+def test_wrong_settings_are_told_before_any_log_is_read(tmp_path, wrong):
     with pytest.raises(UsageError):
         extract([str(tmp_path / "none.mcap")], tmp_path / "out", ExtractSettings(RunConfig(), **wrong))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
-def test_calls_add_up_by_log_and_slice(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_calls_add_up_by_log_and_slice(sample_logs_dir, tmp_path):
     out, log = tmp_path / "out", str(sample_logs_dir / "road.mcap")
     first = ExtractSettings(RunConfig(end=8.0), split="train")
     second = ExtractSettings(RunConfig(start=10.0, end=14.0), split="validation")
@@ -345,7 +341,7 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir: Path, tmp_path: Path) ->
 # ---- command line ----
 
 
-def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir, tmp_path):
     log = tmp_path / "dlc.mcap"
     shutil.copy(sample_logs_dir / "dlc.mcap", log)
     file = tmp_path / "manifest.json"
@@ -360,7 +356,7 @@ def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir: Path, tm
     assert file.read_text() == '{"format": 1, "drives": []}'
 
 
-def test_a_dataset_is_written_by_one_command_at_a_time(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_a_dataset_is_written_by_one_command_at_a_time(sample_logs_dir, tmp_path):
     with OutputFolder(tmp_path), pytest.raises(OutputError, match="another command is writing to"):
         extract([str(sample_logs_dir / "dlc.mcap")], tmp_path, ExtractSettings(RunConfig()))
     assert list(tmp_path.iterdir()) == []

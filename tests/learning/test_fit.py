@@ -1,7 +1,5 @@
 """Training: it learns learnable targets, resumes bit for bit, and rejects unusable data."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -11,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from made_models import full_network
+from scipy.signal import lfilter
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.learning.network.train_command import (
@@ -23,9 +21,8 @@ from pdhef_logtool.learning.network.train_command import (
     train,
 )
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
-from pdhef_logtool.residual_model.bundle import LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER, load_bundle
+from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.storage.documents import seal
@@ -55,7 +52,7 @@ def make_sequences(seed: int, count: int, steps: int = 400) -> list[FeatureSeque
     return out
 
 
-def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path: Path) -> None:
+def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path):
     training, validation = make_sequences(0, 24), make_sequences(1, 4)
     bundle, history = train(training, validation, replace(SMALL, epochs=12), tmp_path)
     assert history[-1].validation_loss < 0.15 * history[0].validation_loss or history[-1].validation_loss < 0.05
@@ -65,7 +62,7 @@ def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path: Path) -> 
     assert np.all(error < 0.35 * np.sqrt(np.mean(test.target**2, axis=0)))
 
 
-def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path: Path) -> None:
+def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path):
     training, validation = make_sequences(0, 6), make_sequences(1, 2)
     whole, history = train(training, validation, SMALL, tmp_path / "whole")
 
@@ -80,7 +77,7 @@ def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path: Path) ->
     assert [e.validation_loss for e in again] == [e.validation_loss for e in history]
 
 
-def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path: Path) -> None:
+def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path):
     """Validation targets have the other sign, so that their error grows while the network learns."""
     training = make_sequences(0, 6)
     validation = [replace(s, target=-s.target) for s in make_sequences(1, 2)]
@@ -92,7 +89,7 @@ def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path: Pa
     assert bundle.provenance["test_loss"] == pytest.approx(losses[best])
 
 
-def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path: Path) -> None:
+def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path):
     training, validation = make_sequences(0, 4), make_sequences(1, 2)
     train(training, validation, replace(SMALL, epochs=1), tmp_path)
     with pytest.raises(ModelError, match="checkpoint"):
@@ -107,14 +104,14 @@ def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path: Path) -
                 train(training, validation, replace(SMALL, epochs=1), tmp_path)
 
 
-def test_paper_recipe_is_table_1() -> None:
+def test_paper_recipe_is_table_1():
     r = PAPER_RECIPE
     assert (r.batch, r.epochs, r.learning_rate, r.dropout) == (64, 200, 1e-3, 0.2)
     assert (r.hidden, r.layers, r.head, len(r.feature_names)) == (128, 2, (64, 32), 6)
 
 
 @pytest.fixture(scope="module")
-def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(sample_logs_dir, tmp_path_factory):
     return extracted(sample_logs_dir, tmp_path_factory.mktemp("sets") / "physics")
 
 
@@ -129,9 +126,7 @@ def extracted(sample_logs_dir: Path, folder: Path, *options: str) -> Path:
     return folder
 
 
-def test_train_writes_a_model_that_runs(
-    sample_logs_dir: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_train_writes_a_model_that_runs(sample_logs_dir, dataset, tmp_path, capsys):
     joined = dataset
     done = called("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
     assert done.returncode == 0, done.stderr
@@ -163,7 +158,7 @@ def test_train_writes_a_model_that_runs(
         run_training(joined, tmp_path / "paper", paper=True, epochs=1)
 
 
-def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
+def test_wrong_calls_are_one_line(dataset, tmp_path):
     with pytest.raises(UsageError, match="epoch"):
         run_training(dataset, tmp_path / "m", epochs=0)
     with pytest.raises(OutputError, match="extract"):
@@ -184,12 +179,9 @@ NAMES = ("vx_m_s", "ay_m_s2", "steer_rad", "friction")
 
 
 def smoothed(values: np.ndarray, dt: float, corner_hz: float) -> np.ndarray:
-    """The textbook recursion in plain Python."""
-    share = 1.0 - math.exp(-2.0 * math.pi * corner_hz * dt)
-    out = [values[0]]
-    for v in values[1:]:
-        out.append(out[-1] + share * (v - out[-1]))
-    return np.array(out)
+    """Return values behind a low-pass of first order that starts at the first one."""
+    kept = math.exp(-2.0 * math.pi * corner_hz * dt)
+    return lfilter([1.0 - kept], [1.0, -kept], values, zi=[kept * values[0]])[0]
 
 
 def make_features(seed: int, steps: int = 600) -> np.ndarray:
@@ -216,58 +208,3 @@ def test_regression_recovers_known_coefficients():
     noisy = fit_linear([make_sequence(s, 0.01) for s in range(8)], NAMES)
     assert noisy.coefficients[:3] == pytest.approx((0.002, -0.03, 0.5), abs=0.004)
     assert noisy.coefficients[3] == 0.0  # a constant feature gets no weight
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network with its baselines."""
-    folder, network = tmp_path_factory.mktemp("model"), full_network()
-    assert network.pure_lstm is not None
-    network.save(folder)
-    network.pure_lstm.save(folder / PURE_LSTM_FOLDER)
-    model = LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
-    (folder / LINEAR_REGRESSION_FILE).write_text(model.to_json())
-    return folder
-
-
-@pytest.fixture
-def saved(tmp_path: Path, whole: Path) -> Path:
-    """A copy of it."""
-    return Path(shutil.copytree(whole, tmp_path / "model"))
-
-
-def test_baselines_come_with_the_model(whole):
-    bundle = load_bundle(whole)
-    assert bundle.pure_lstm.sha256 == full_network().pure_lstm.sha256
-    assert bundle.linear_regression == LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0)
-    assert bundle.linear_regression.provenance == {"dataset_sha256": "a"}
-    alone = replace(bundle, pure_lstm=None, linear_regression=None)
-    assert alone.sha256 == bundle.sha256  # the network's own
-
-
-@pytest.mark.parametrize(
-    ("file", "damage"),
-    [
-        (LINEAR_REGRESSION_FILE, {"version": 99}),
-        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1, 0.2, 0.3, 0.5]}),
-        (LINEAR_REGRESSION_FILE, {"features": ["truth", *NAMES[1:]]}),
-        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1]}),
-        (f"{PURE_LSTM_FOLDER}/model.json", {"target": None}),
-        (f"{PURE_LSTM_FOLDER}/model.json", {"normalisation": {"target_std": []}}),
-        (f"{PURE_LSTM_FOLDER}/weights.safetensors", "missing"),
-        (f"{PURE_LSTM_FOLDER}/weights.safetensors", "the network's"),
-    ],
-)
-def test_a_damaged_baseline_is_one_clear_error(saved, file, damage):
-    path = saved / file
-    if damage == "missing":
-        path.unlink()
-    elif damage == "the network's":
-        shutil.copy(saved / path.name, path)
-    else:
-        document = json.loads(path.read_text())
-        changed = {k: {**document[k], **v} if isinstance(v, dict) else v for k, v in damage.items()}
-        path.write_text(json.dumps({k: v for k, v in (document | changed).items() if v is not None}))
-    with pytest.raises(ModelError, match=file.partition("/")[0]) as caught:
-        load_bundle(saved)
-    assert len(str(caught.value).splitlines()) == 1

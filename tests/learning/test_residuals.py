@@ -1,7 +1,5 @@
 """Residuals of drives with a residual in closed form."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -37,12 +35,12 @@ def state_of(made: Drive) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def made() -> Drive:
+def made():
     return weaving()
 
 
 @pytest.fixture(scope="module")
-def noisy(made: Drive) -> tuple[Signals, StateTrack]:
+def noisy(made):
     """With noise, a lost stretch of 0.8 s, single lost stamps, and truth and steering that fail for a while."""
     signals, state = with_noise(made.signals, 3, 0.5), state_of(made)
     signals.steer_rad[900:905] = np.nan
@@ -60,7 +58,7 @@ def rates(rows: ResidualRows) -> np.ndarray:
     return rows.targets / rows.step_s[:, None]
 
 
-def test_residual_is_taken_at_the_true_state_not_at_the_estimate(made: Drive) -> None:
+def test_residual_is_taken_at_the_true_state_not_at_the_estimate(made):
     signals, truth = made.signals, truth_of(made.signals.stamps_ns, state_of(made))
     lost = replace(signals, ay_m_s2=signals.ay_m_s2 + 3.0, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.1)
     good, bad = rows_of(signals, truth), rows_of(lost, truth)
@@ -68,7 +66,7 @@ def test_residual_is_taken_at_the_true_state_not_at_the_estimate(made: Drive) ->
     np.testing.assert_array_equal(bad.targets, good.targets)
 
 
-def test_no_target_across_gaps_or_without_truth_or_steering(noisy: tuple[Signals, StateTrack]) -> None:
+def test_no_target_across_gaps_or_without_truth_or_steering(noisy):
     rows = rows_of(*noisy)
     index = np.round((rows.stamps_ns - START_NS) / 1e7).astype(int)
     gone = set(index[np.isnan(rows.targets).any(axis=1)].tolist())
@@ -77,7 +75,7 @@ def test_no_target_across_gaps_or_without_truth_or_steering(noisy: tuple[Signals
     assert not rows.weight[np.isin(index, list(expected))].any()
 
 
-def test_features_do_not_see_the_truth(noisy: tuple[Signals, StateTrack]) -> None:
+def test_features_do_not_see_the_truth(noisy):
     signals, truth = noisy
     state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
     a, b = rows_of(*noisy), rows_of(signals, truth_of(truth.stamps_ns, np.random.default_rng(1).permutation(state)))
@@ -96,7 +94,7 @@ def oracle_window(made: Drive, **signals: np.ndarray) -> tuple[Signals, StateTra
 
 @pytest.mark.slow
 @pytest.mark.parametrize("names", [("lag",), ("lag", "roll", "load_transfer")], ids="+".join)
-def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_comes_out(names: tuple[str, ...]) -> None:
+def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_comes_out(names):
     """Drive the oracle's car by its equations; with 10 % less grip, the model lacks a force in proportion to a_y."""
     oracle = Oracle(parts(*names))
     made = oracle.drive(lambda t: 0.03 * np.sin(3.0 * t), 6.0)
@@ -112,7 +110,7 @@ def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_come
 
 
 @pytest.mark.slow
-def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
+def test_an_offset_of_the_steering_angle_is_no_residual():
     """The effect of the offset is removed before training; an alternating residual is not."""
     oracle = Oracle(parts("lag"))
     made = oracle.drive(lambda t: 0.02 * np.sin(3.0 * t), 12.0)
@@ -154,7 +152,7 @@ def sequence(count: int, value: float = 1.0) -> FeatureSequence:
     return FeatureSequence(features, np.tile([value, -2.0 * value], (count, 1)), np.ones(count))
 
 
-def test_normalisation_is_by_weight_and_keeps_the_targets_zero() -> None:
+def test_normalisation_is_by_weight_and_keeps_the_targets_zero():
     one = sequence(4, 3.0)
     one.weight[3] = 0.0
     found = normalisation_of([one, sequence(1, 1.0)], FEATURES[:2])
@@ -167,7 +165,7 @@ def test_normalisation_is_by_weight_and_keeps_the_targets_zero() -> None:
         normalisation_of([replace(one, weight=np.zeros(4))], FEATURES[:2])
 
 
-def test_runs_end_at_new_segments_and_short_or_worthless_ones_are_left_out() -> None:
+def test_runs_end_at_new_segments_and_short_or_worthless_ones_are_left_out():
     segment = np.repeat([0, 1, 2, 3], [50, 49, 51, 50])
     weight = np.ones(200, dtype=np.float32)
     weight[150:] = 0.0
@@ -177,7 +175,7 @@ def test_runs_end_at_new_segments_and_short_or_worthless_ones_are_left_out() -> 
     assert list(gap_free_runs(drive)) == [slice(0, 50)]
 
 
-def test_a_recipe_is_the_papers_or_methods_with_the_callers_seed_and_epochs() -> None:
+def test_a_recipe_is_the_papers_or_methods_with_the_callers_seed_and_epochs():
     own, paper = (make_recipe(paper=p, seed=5, epochs=None, device="cpu") for p in (False, True))
     assert own == Recipe(seed=5) and (paper.hidden, paper.seed, paper.epochs) == (128, 5, 200)
     assert make_recipe(paper=False, seed=0, epochs=1, device="cpu").epochs == 1
@@ -188,7 +186,7 @@ def test_a_recipe_is_the_papers_or_methods_with_the_callers_seed_and_epochs() ->
             make_recipe(paper=False, seed=0, epochs=None, device="cuda")
 
 
-def test_what_is_not_chosen_teaches_nothing_and_only_what_leads_to_the_chosen_is_run() -> None:
+def test_what_is_not_chosen_teaches_nothing_and_only_what_leads_to_the_chosen_is_run():
     chosen = np.zeros(2000, dtype=np.bool_)
     chosen[[700, 740]] = True
     chosen[1500] = True

@@ -1,7 +1,5 @@
 """``pdhef learn``: prior and residual from drives with ground truth, and the car that they make."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from functools import partial
@@ -24,14 +22,14 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning import learn as learning
 from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, exit_code, tell_drive
-from pdhef_logtool.learning.learn import LearnResult, OpenedDrive, learn, learn_from, open_drive
+from pdhef_logtool.learning.learn import OpenedDrive, learn, learn_from, open_drive
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.model.priors import REAR_STIFFNESS, TYRES, prior_of
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 from tests.command_line import rendered
 from tests.fake_drive_log import FakeLog, FakeTopic
@@ -40,7 +38,7 @@ SPAN = {"start": "60", "end": "130"}
 
 
 @pytest.fixture(scope="module")
-def bare(bare_vehicle: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare(bare_vehicle, tmp_path_factory):
     """Return the vehicle file of the sample logs with a front axle that is too soft, and without a network."""
     path = tmp_path_factory.mktemp("car") / "vehicle.toml"
     path.write_text(bare_vehicle.replace("B = 11.146", "B = 7.0"))
@@ -55,19 +53,17 @@ def opened(log: Path, bare: Path, **span: str) -> OpenedDrive:
 
 
 @pytest.fixture(scope="module")
-def drive(sample_logs_dir: Path, bare: Path) -> OpenedDrive:
+def drive(sample_logs_dir, bare):
     return opened(sample_logs_dir / "road.mcap", bare, **SPAN)
 
 
 @pytest.fixture(scope="module")
-def result(sample_logs_dir: Path, bare: Path, tmp_path_factory: pytest.TempPathFactory) -> LearnResult:
+def result(sample_logs_dir, bare, tmp_path_factory):
     settings = LearnSettings(config=RunConfig(car=bare, **SPAN))
     return learn([str(sample_logs_dir / "road.mcap")], tmp_path_factory.mktemp("out") / "car", settings)
 
 
-def test_a_drive_teaches_a_prior_that_later_drives_start_from(
-    result: LearnResult, drive: OpenedDrive, sample_logs_dir: Path
-) -> None:
+def test_a_drive_teaches_a_prior_that_later_drives_start_from(result, drive, sample_logs_dir):
     car = Car.load(result.car, network="none")
     assert car.model is not None and not car.has_evidence and car.notes == ()
     by_name = {p.name: p for p in car.taught_prior}
@@ -84,7 +80,7 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(
     assert abs(np.log(taught.prior / true)) < abs(np.log(alone.prior / true)) and taught.prior_sd < alone.prior_sd
 
 
-def test_the_figures_say_which_rung_is_used(result: LearnResult) -> None:
+def test_the_figures_say_which_rung_is_used(result):
     figures = result.figures
     assert [t["rung"] for t in figures["rungs"]][:2] == ["none", "linear"]
     assert figures["rung"] in ("none", "linear", "random") and figures["evidence"] in result.text
@@ -94,7 +90,7 @@ def test_the_figures_say_which_rung_is_used(result: LearnResult) -> None:
     assert [d.name for d in model.drives] == ["road"] and model.evidence == figures["evidence"]
 
 
-def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive: OpenedDrive) -> None:
+def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive):
     truth, offset = drive.truth, 0.01
     moved = replace(truth, sideslip_rad=truth.sideslip_rad + offset, vy_m_s=truth.vy_m_s + offset * truth.vx_m_s)
     assert drive.driving.slopes is not None
@@ -107,9 +103,7 @@ def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive:
         assert np.allclose(second.residual.weights, first.residual.weights, rtol=1e-4, atol=1e-9)
 
 
-def test_a_model_takes_the_place_of_a_fit_unless_the_vehicle_file_has_changed(
-    result: LearnResult, tmp_path: Path
-) -> None:
+def test_a_model_takes_the_place_of_a_fit_unless_the_vehicle_file_has_changed(result, tmp_path):
     car = tmp_path / "car"
     car.mkdir()
     for name in ("vehicle.toml", MODEL_FILE):
@@ -124,7 +118,7 @@ def test_a_model_takes_the_place_of_a_fit_unless_the_vehicle_file_has_changed(
     assert loaded.model is None and MODEL_FILE in loaded.notes[0]
 
 
-def test_what_cannot_be_taught_is_refused(sample_logs_dir: Path, bare: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_taught_is_refused(sample_logs_dir, bare, tmp_path):
     road = [str(sample_logs_dir / "road.mcap")]
     short = LearnSettings(config=RunConfig(car=bare, start="60", end="70"))
     with pytest.raises(EstimatorError, match="at least 20 s"):
@@ -139,7 +133,7 @@ def record(name: str, **changes: Any) -> DriveRecord:
     return replace(DriveRecord(name, f"{name}.mcap", sha256=name * 64, seconds=6.0, span_s=(1.5, 7.5)), **changes)
 
 
-def test_what_a_user_must_know_of_a_drive_is_told_in_order_and_decides_the_exit_code() -> None:
+def test_what_a_user_must_know_of_a_drive_is_told_in_order_and_decides_the_exit_code():
     lost = Loss("gap", "2 s are gone", "/imu")
     note = Loss("late", "late", "/imu", severity="note")
     told: list[str] = []
@@ -149,27 +143,12 @@ def test_what_a_user_must_know_of_a_drive_is_told_in_order_and_decides_the_exit_
     assert [exit_code(r) for r in ([good], [good, bad], [good, record("c", losses=(lost,))], [bad])] == [0, 3, 3, 1]
 
 
-@pytest.fixture(scope="module")
-def config(bare_vehicle: str, tmp_path_factory: pytest.TempPathFactory) -> RunConfig:
-    """Return the sample logs' car with a front axle that is half as stiff."""
-    path = tmp_path_factory.mktemp("car") / "vehicle.toml"
-    path.write_text(bare_vehicle.replace("B = 11.146", "B = 5.6"))
-    return RunConfig(car=path)
-
-
-@pytest.fixture(scope="module")
-def pool(sample_logs_dir: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> LearnResult:
-    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step", "fishhook")]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            learning, "read_drive", partial(read_drive, adjust=lambda _log, mapping, _tell: replace(mapping, truth={}))
-        )
-        return learn(logs, tmp_path_factory.mktemp("out") / "car", LearnSettings(config=config))
-
-
 @pytest.mark.slow
-def test_a_pool_of_logs_mends_the_file_without_ground_truth(pool: LearnResult, sample_logs_dir: Path) -> None:
+def test_a_pool_of_logs_mends_the_file_without_ground_truth(bare, sample_logs_dir, tmp_path, monkeypatch):
+    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step", "fishhook")]
+    without_truth = partial(read_drive, adjust=lambda _log, mapping, _tell: replace(mapping, truth={}))
+    monkeypatch.setattr(learning, "read_drive", without_truth)
+    pool = learn(logs, tmp_path / "car", LearnSettings(config=RunConfig(car=bare)))
     right, car = Car.load(sample_logs_dir / "vehicle.toml").vehicle, Car.load(pool.car)
     text = (pool.car / "model.toml").read_text()
     assert "calibrated without ground truth on" in text and car.model is not None and car.model.truth == ""
@@ -195,13 +174,12 @@ MAPPING = "".join(
 
 
 @pytest.fixture(scope="module")
-def recorded(sample_logs_dir: Path) -> tuple[FakeLog, IntArray, FloatArray]:
+def recorded(sample_logs_dir):
     """Return a fishhook with a GNSS velocity at 10 Hz in place of its ground truth, and the true sideslip at stamps."""
     car = Car.load(sample_logs_dir / "vehicle.toml", network="none")
     with reading.read_drive(sample_logs_dir / "fishhook.mcap", car) as drive:
         whole = drive.whole()
     signals, truth = whole.signals, whole.truth
-    assert truth is not None
     stamps, heading = signals.stamps_ns, np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s)) * 0.01
     velocity = (truth.vx_m_s + 1j * truth.vy_m_s) * np.exp(1j * (heading + 0.7))
     known = np.flatnonzero(np.isfinite(velocity))[::10]
@@ -217,9 +195,7 @@ def recorded(sample_logs_dir: Path) -> tuple[FakeLog, IntArray, FloatArray]:
 
 
 @pytest.fixture
-def reference_config(
-    recorded: tuple[FakeLog, IntArray, FloatArray], bare_vehicle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> RunConfig:
+def reference_config(recorded, bare_vehicle, tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "open_log", lambda *_, **__: recorded[0])
     monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
     monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
@@ -229,14 +205,12 @@ def reference_config(
     return RunConfig(car=tmp_path / "vehicle.toml", mapping=tmp_path / "m.toml", reference="on")
 
 
-def test_the_weight_is_one_over_the_variance_of_sideslip_and_model() -> None:
+def test_the_weight_is_one_over_the_variance_of_sideslip_and_model():
     std = np.radians([0.0, 0.3, 0.6])
     assert weight_of(std) == pytest.approx([1.0, 0.5, 0.2])
 
 
-def test_extract_takes_it_where_it_is_independent_and_says_so(
-    reference_config: RunConfig, recorded: tuple[FakeLog, IntArray, FloatArray], tmp_path: Path
-) -> None:
+def test_extract_takes_it_where_it_is_independent_and_says_so(reference_config, recorded, tmp_path):
     log = [str(tmp_path / "drive.mcap")]
     with pytest.raises(EstimatorError, match="expected ground truth"):
         extract(
@@ -258,9 +232,7 @@ def test_extract_takes_it_where_it_is_independent_and_says_so(
     assert np.mean(np.abs(error) < 1.96 * used["truth_std_rad"].to_numpy()) > 0.8
 
 
-def test_learn_is_taught_by_it_on_request_alone(
-    reference_config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_learn_is_taught_by_it_on_request_alone(reference_config, tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "LEAST_S", 3.0)
     log = [str(tmp_path / "drive.mcap")]
     off = learn(
@@ -275,9 +247,7 @@ def test_learn_is_taught_by_it_on_request_alone(
     assert any(f"taught by {ESTIMATED}" in note for note in Car.load(tmp_path / "car").notes)
 
 
-def test_ground_truth_has_priority(
-    reference_config: RunConfig, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ground_truth_has_priority(reference_config, sample_logs_dir, monkeypatch):
     monkeypatch.undo()
     car = Car.load(reference_config.car, network="none")
     with reading.read_drive(sample_logs_dir / "step.mcap", car) as drive:

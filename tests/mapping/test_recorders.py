@@ -24,7 +24,7 @@ from pdhef_logtool.mapping.clocks import apply_clock
 from pdhef_logtool.records.errors import MappingError, MappingFileError
 from tests.command_line import called
 from tests.fake_drive_log import FakeLog, FakeTopic
-from tests.runs.test_inspection_page import car, write_log
+from tests.runs.test_inspection_report import car, write_log
 
 STAMPS = list(range(0, 10**9, 10**7))
 A = '[signals.yaw_rate_rad_s]\ntopic = "/imu"\nfield = "wz"\n'

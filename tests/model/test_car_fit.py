@@ -1,7 +1,5 @@
 """Fit of a car to a drive: recovered parameters of a known car, rejected drives, and what earlier drives change."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -74,7 +72,7 @@ def stiffness_errors(posterior: Posterior) -> list[tuple[float, float]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("front", "rear"), [(1.0, 1.0), (2.0, 0.5), (0.5, 0.7)])
-def test_a_sweep_finds_the_stiffness_within_its_own_posterior_whatever_the_file_says(front: float, rear: float) -> None:
+def test_a_sweep_finds_the_stiffness_within_its_own_posterior_whatever_the_file_says(front, rear):
     calibration = found(with_noise(wide().signals, 3), wrong(front, rear))
     assert not calibration.refused
     for error, sd in stiffness_errors(calibration):
@@ -82,7 +80,7 @@ def test_a_sweep_finds_the_stiffness_within_its_own_posterior_whatever_the_file_
         assert sd < 0.15
 
 
-def test_biases_offset_and_gain_of_the_sensors_are_found() -> None:
+def test_biases_offset_and_gain_of_the_sensors_are_found():
     signals = with_noise(wide().signals, 4)
     signals = replace(signals, ay_m_s2=1.05 * signals.ay_m_s2 + 0.1, steer_rad=signals.steer_rad + 0.005)
     file = RIGHT.model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
@@ -92,7 +90,7 @@ def test_biases_offset_and_gain_of_the_sensors_are_found() -> None:
 
 
 @pytest.mark.parametrize("metres", [-1.71, 0.0, 1.0])
-def test_the_position_of_the_accelerometer_is_found(metres: float) -> None:
+def test_the_position_of_the_accelerometer_is_found(metres):
     """The first one is at the rear axle, where v_y is small and a_y alone agrees with no sideslip at all."""
     signals = with_noise(wide().signals, 7)
     turning = np.gradient(wide().r, signals.stamps_ns * 1e-9)
@@ -104,7 +102,7 @@ def test_the_position_of_the_accelerometer_is_found(metres: float) -> None:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.3])
-def test_a_slippery_road_is_found_although_the_file_is_of_a_dry_one(share: float) -> None:
+def test_a_slippery_road_is_found_although_the_file_is_of_a_dry_one(share):
     """The file's tyres have the stiffness of the car's and more grip, as a file for asphalt has of a car on ice."""
     dry = Tyres(**{n: t.model_copy(update={"B": share * t.B, "D_n": t.D_n / share}) for n, t in RIGHT.tyres})
     file = RIGHT.model_copy(update={"tyres": dry, "friction": None})
@@ -115,7 +113,7 @@ def test_a_slippery_road_is_found_although_the_file_is_of_a_dry_one(share: float
     assert abs(math.log(peak.value / (share * FRICTION))) < min(3.0 * peak.sd, 0.2)
 
 
-def test_errors_that_no_parameter_explains_leave_the_prior() -> None:
+def test_errors_that_no_parameter_explains_leave_the_prior():
     signals = with_noise(wide().signals, 10)
     rng = np.random.default_rng(11)
     rate, ay = (std * rng.standard_normal(len(signals)) for std in (1.0, 15.0))
@@ -125,7 +123,7 @@ def test_errors_that_no_parameter_explains_leave_the_prior() -> None:
         assert abs(distance) < 2.0 * p.prior_sd, p.name
 
 
-def test_slow_driving_calibrates_and_very_slow_driving_is_refused() -> None:
+def test_slow_driving_calibrates_and_very_slow_driving_is_refused():
     file = wrong(0.6, 0.6).model_copy(update={"relaxation_length_m": 0.1})  # the forces of this car do not lag
     slow = found(with_noise(drive(sweep(0.08), 60.0, speed=7.0).signals, 9), file)
     assert not slow.refused
@@ -138,7 +136,7 @@ def test_slow_driving_calibrates_and_very_slow_driving_is_refused() -> None:
     assert short.vehicle is RIGHT
 
 
-def test_what_straight_driving_does_not_excite_keeps_its_prior() -> None:
+def test_what_straight_driving_does_not_excite_keeps_its_prior():
     straight = found(with_noise(drive(lambda _t: 0.0, 60.0).signals, 5), RIGHT)
     assert not straight.refused
     for p in straight.parameters:
@@ -148,7 +146,7 @@ def test_what_straight_driving_does_not_excite_keeps_its_prior() -> None:
     assert "rear cornering stiffness" in straight.text.partition("not excited: ")[2]
 
 
-def test_a_right_file_decides_what_gentle_driving_cannot_and_a_wrong_one_does_not() -> None:
+def test_a_right_file_decides_what_gentle_driving_cannot_and_a_wrong_one_does_not():
     signals = with_noise(drive(sweep(0.001), 20.0).signals, 3)
 
     def level_error(file: VehicleParameters) -> float:
@@ -159,7 +157,7 @@ def test_a_right_file_decides_what_gentle_driving_cannot_and_a_wrong_one_does_no
     assert wrong_level < 0.7 * math.log(2.0)
 
 
-def test_a_noisy_accelerometer_is_accepted_and_one_of_another_sensor_refused() -> None:
+def test_a_noisy_accelerometer_is_accepted_and_one_of_another_sensor_refused():
     """Vibration of 4 m/s² in samples of 20 Hz exceeds the lateral acceleration, but not its gain of 1."""
     signals, noise = wide().signals, np.random.default_rng(2).normal(0.0, 4.0, len(wide().signals))
     slow = np.repeat(noise[::5], 5)[: len(noise)]
@@ -168,7 +166,7 @@ def test_a_noisy_accelerometer_is_accepted_and_one_of_another_sensor_refused() -
     assert "the lateral acceleration" in found(replace(signals, ay_m_s2=slow), RIGHT).refused
 
 
-def test_a_car_that_slides_all_the_time_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_car_that_slides_all_the_time_is_refused(monkeypatch):
     monkeypatch.setattr(rules, "SLIDING_RAD", 0.001)
     signals = wide().signals
     slides = found(signals, RIGHT)
@@ -176,7 +174,7 @@ def test_a_car_that_slides_all_the_time_is_refused(monkeypatch: pytest.MonkeyPat
     assert slides.reached_friction == pytest.approx(np.abs(signals.ay_m_s2).max() / 9.81, rel=0.1)
 
 
-def test_a_drive_overrules_earlier_drives_that_it_contradicts() -> None:
+def test_a_drive_overrules_earlier_drives_that_it_contradicts():
     log, rear = driving(wide().signals, RIGHT), RIGHT.cornering_stiffness_n_per_rad(False, FRICTION)
     absurd = TaughtParameter(name=REAR_STIFFNESS, value=0.06 * rear, std=1e-4)
     posterior = fit_car(log, RIGHT, [absurd] * 9)
@@ -184,7 +182,7 @@ def test_a_drive_overrules_earlier_drives_that_it_contradicts() -> None:
     assert posterior.vehicle.cornering_stiffness_n_per_rad(False, FRICTION) == pytest.approx(rear, rel=0.2)
 
 
-def test_earlier_drives_determine_a_parameter_as_random_effects_do() -> None:
+def test_earlier_drives_determine_a_parameter_as_random_effects_do():
     """A drive is its car plus a deviation: one has the share ρ of its change in the next drive, many have all of it."""
     before = next(p for p in parameters_of(RIGHT) if p.name == REAR_STIFFNESS)
 
@@ -200,7 +198,7 @@ def test_earlier_drives_determine_a_parameter_as_random_effects_do() -> None:
     assert theta(2000, 4.0) == pytest.approx((0.5, math.sqrt(1.0 - rho)), abs=1e-3)
 
 
-def test_drives_at_other_lateral_accelerations_inform_less_and_none_leaves_the_prior_of_the_file() -> None:
+def test_drives_at_other_lateral_accelerations_inform_less_and_none_leaves_the_prior_of_the_file():
     softer = [TaughtParameter(name=REAR_STIFFNESS, value=4e4, std=0.05, ay_m_s2=8.0)]
     stds = [prior_of(RIGHT_FILE, softer, level).of_cars[1].std for level in (8.0, 4.0, 0.1)]
     assert stds == sorted(stds) and stds[0] < 0.7 * stds[2]
@@ -210,12 +208,12 @@ def test_drives_at_other_lateral_accelerations_inform_less_and_none_leaves_the_p
     assert near.file_share < 0.7 * without.file_share
 
 
-def test_steering_that_does_not_explain_the_yaw_rate_is_refused() -> None:
+def test_steering_that_does_not_explain_the_yaw_rate_is_refused():
     signals = wide().signals
     assert "of the yaw rate" in found(replace(signals, steer_rad=-2.0 * signals.steer_rad), RIGHT).refused
 
 
-def test_a_pause_of_a_day_costs_no_memory() -> None:
+def test_a_pause_of_a_day_costs_no_memory():
     signals = wide().signals
     day = np.where(np.arange(len(signals)) < 3000, 0, 86_400 * 10**9)
     paused = driving(replace(signals, stamps_ns=signals.stamps_ns + day, ready_ns=signals.ready_ns + day), RIGHT)
@@ -225,7 +223,7 @@ def test_a_pause_of_a_day_costs_no_memory() -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**31), share=st.floats(0.05, 0.98))
-def test_any_losses_give_a_grid_whose_stretches_are_whole(seed: int, share: float) -> None:
+def test_any_losses_give_a_grid_whose_stretches_are_whole(seed, share):
     rng = np.random.default_rng(seed)
     signals = keep(wide().signals, rng.uniform(size=len(wide().signals)) < share)
     lost = np.where(rng.uniform(size=len(signals)) < 0.1, np.nan, signals.ay_m_s2)
@@ -236,7 +234,7 @@ def test_any_losses_give_a_grid_whose_stretches_are_whole(seed: int, share: floa
     assert (np.diff(d.stretches.ravel()) > 0).all()
 
 
-def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:
+def test_the_vehicles_of_the_band_spread_as_the_posterior_does():
     """Their joint spread is 70 % to 105 % of the posterior standard deviation of the cornering stiffness."""
     calibration = found(with_noise(wide().signals, 3), wrong(2.0, 0.5))
     assert len(calibration.varied) == 5

@@ -1,7 +1,5 @@
 """Confidence intervals: own standard deviation, uncertainty of the parameters, and contradictions of the sensors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -63,7 +61,7 @@ def identified() -> Car:
 
 
 @pytest.fixture(scope="module")
-def signals() -> Signals:
+def signals():
     s = with_noise(drive(slalom(0.03, 0.5), 12.0, speed=22.0).signals, seed=3)
     return replace(s, friction=np.full(len(s), 0.85))
 
@@ -89,7 +87,7 @@ def assert_alike(got: np.ndarray, expected: np.ndarray) -> None:
     np.testing.assert_allclose(got, expected, atol=0.15 * median)
 
 
-def test_an_interval_changes_no_estimate(signals: Signals) -> None:
+def test_an_interval_changes_no_estimate(signals):
     plain, wide = tracks_of("physics", calibrated(VARIED), signals)
     for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "nis", "yaw_rate_std_rad_s"):
         np.testing.assert_array_equal(getattr(wide, column), getattr(plain, column))
@@ -97,9 +95,7 @@ def test_an_interval_changes_no_estimate(signals: Signals) -> None:
 
 
 @pytest.mark.parametrize("varied", [(), VARIED])
-def test_on_a_car_that_was_fitted_to_the_drive_it_is_the_sum_of_its_parts(
-    signals: Signals, varied: tuple[VehicleParameters, ...]
-) -> None:
+def test_on_a_car_that_was_fitted_to_the_drive_it_is_the_sum_of_its_parts(signals, varied):
     plain, wide = tracks_of("physics", calibrated(varied, 2.0), signals)
     read = CalibratedSignals(corrected_anew(signals, OWN, FOUND), FOUND)
     consistency = DRIVE_SHARE * driven_consistency(plain, read, FOUND.low_speed_blend_m_s)
@@ -113,7 +109,7 @@ def test_on_a_car_that_was_fitted_to_the_drive_it_is_the_sum_of_its_parts(
         np.testing.assert_allclose(wide.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
 
 
-def test_on_an_identified_car_it_is_the_sum_of_its_parts(signals: Signals) -> None:
+def test_on_an_identified_car_it_is_the_sum_of_its_parts(signals):
     """The filter runs on varied vehicles, without the states that would compensate the variation."""
     car = identified()
     plain, wide = tracks_of("physics", car, signals)
@@ -127,7 +123,7 @@ def test_on_an_identified_car_it_is_the_sum_of_its_parts(signals: Signals) -> No
     assert_alike(wide.vy_std_m_s[fast], np.sqrt(expected[fast]))
 
 
-def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prior() -> None:
+def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prior():
     """Errors of a file with a wrong rear axle are inside; the interval of an identified car is narrower."""
     true = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
     signals = replace(true, friction=np.full(len(true), 0.85))
@@ -144,7 +140,7 @@ def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prio
     assert len({vehicle.model_dump_json() for vehicle in (OWN, *prior_variations(OWN))}) == 7
 
 
-def test_the_interval_contains_where_the_centre_of_gravity_is_only_assumed(signals: Signals) -> None:
+def test_the_interval_contains_where_the_centre_of_gravity_is_only_assumed(signals):
     """At a yaw rate r the rear axle determines v_y up to the error of its distance times r."""
     car = calibrated(VARIED)
     guessed = replace(car, vehicle=OWN.model_copy(update={"name": default_vehicle().name}))
@@ -171,7 +167,7 @@ def _motion(count: int = 900) -> tuple[Signals, StateTrack]:
 
 
 @pytest.mark.parametrize("at", [100, 460, 700])
-def test_samples_that_have_not_arrived_change_nothing(at: int) -> None:
+def test_samples_that_have_not_arrived_change_nothing(at):
     signals, track = _motion()
     late = signals.ready_ns > signals.stamps_ns[at]
     changed = replace(signals, ay_m_s2=np.where(late, 30.0, signals.ay_m_s2))
@@ -180,7 +176,7 @@ def test_samples_that_have_not_arrived_change_nothing(at: int) -> None:
     assert not np.array_equal(before, after)
 
 
-def test_a_wrong_sideslip_contradicts_the_sensors() -> None:
+def test_a_wrong_sideslip_contradicts_the_sensors():
     signals, track = _motion()
     right = running_consistency(track, signals, 0.0)[200:440]
     wrong = running_consistency(replace(track, vy_m_s=0.5 * track.vy_m_s), signals, 0.0)[200:440]
@@ -190,7 +186,7 @@ def test_a_wrong_sideslip_contradicts_the_sensors() -> None:
     assert np.median(wrong) == pytest.approx(expected, rel=0.25)
 
 
-def test_a_sensor_that_the_estimator_reports_as_faulty_widens_nothing() -> None:
+def test_a_sensor_that_the_estimator_reports_as_faulty_widens_nothing():
     signals, track = _motion()
     stuck = np.arange(900) >= 200
     signals = replace(signals, yaw_rate_rad_s=np.where(stuck, 0.4, signals.yaw_rate_rad_s))
@@ -202,14 +198,14 @@ def test_a_sensor_that_the_estimator_reports_as_faulty_widens_nothing() -> None:
 # ---- estimators on a car that its log has calibrated ----
 
 
-def test_the_open_loop_model_runs_once_more_only_on_a_calibrated_car() -> None:
+def test_the_open_loop_model_runs_once_more_only_on_a_calibrated_car():
     assert OPEN_LOOP in all_names(calibrated())
     assert OPEN_LOOP not in all_names(Car(OWN))
     with pytest.raises(UsageError, match="has not calibrated"):
         make_estimator(OPEN_LOOP, Car(OWN))
 
 
-def test_the_centre_of_gravity_is_assumed_without_a_file_or_weight_split() -> None:
+def test_the_centre_of_gravity_is_assumed_without_a_file_or_weight_split():
     assert Car(default_vehicle()).cg_std_m == pytest.approx(DEFAULT_CG_SPREAD * 1.71)
     assert Car(OWN.model_copy(update={"name": "mine"})).cg_std_m == 0.0
     given = vehicle_of_entries({"name": "mine", "mass_kg": 1500.0, "wheelbase_m": 2.7}, where="test")

@@ -1,7 +1,5 @@
 """A model file determines sensors and car before the drive: later data do not change them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -61,7 +59,7 @@ def signals(log: Path, options: ReadOptions) -> tuple[Signals, CarModel]:
 
 
 @pytest.fixture
-def file(road: Path, tmp_path: Path) -> Path:
+def file(road, tmp_path):
     """Return the model of the drive before the change."""
     _, model = signals(road, ReadOptions(end=str(CHANGE_S - 5.0)))
     path = tmp_path / "model.toml"
@@ -70,12 +68,12 @@ def file(road: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def road(sample_logs_dir: Path) -> Path:
+def road(sample_logs_dir):
     return sample_logs_dir / "road.mcap"
 
 
 @pytest.mark.slow
-def test_no_causal_estimate_depends_on_the_future(road: Path, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_causal_estimate_depends_on_the_future(road, file, monkeypatch):
     """Of every estimator, with a model file."""
     options = ReadOptions(model=file, end="60")
 
@@ -100,7 +98,7 @@ def test_no_causal_estimate_depends_on_the_future(road: Path, file: Path, monkey
         assert same == spec_of(name).causal, name
 
 
-def test_a_model_is_read_back_as_it_was_written_and_gives_the_same_signals(road: Path, tmp_path: Path) -> None:
+def test_a_model_is_read_back_as_it_was_written_and_gives_the_same_signals(road, tmp_path):
     whole, model = signals(road, ReadOptions())
     model = model.model_copy(update={"parameters": (TaughtParameter(name="yaw inertia", value=1510.0, std=0.02),)})
     path = tmp_path / "model.toml"
@@ -121,7 +119,7 @@ def test_a_model_is_read_back_as_it_was_written_and_gives_the_same_signals(road:
         with_earlier_drive(Car.load(), path)
 
 
-def test_a_model_that_does_not_fit_is_refused_in_one_line(road: Path, file: Path) -> None:
+def test_a_model_that_does_not_fit_is_refused_in_one_line(road, file):
     text = file.read_text().replace("/imu/data", "/imu/other")
     file.write_text(text)
     with pytest.raises(MappingError, match="/imu/other"):
@@ -130,10 +128,10 @@ def test_a_model_that_does_not_fit_is_refused_in_one_line(road: Path, file: Path
     with pytest.raises(VehicleError, match="decided_s"):
         signals(road, ReadOptions(model=file))
     with pytest.raises(VehicleError, match=r"auto, off or a model\.toml"):
-        signals(road, ReadOptions(model="of"))  # type: ignore[arg-type]
+        signals(road, ReadOptions(model="of"))
 
 
-def test_sensors_show_a_model_car_without_a_vehicle_file_and_its_model_belongs_to_later_drives(tmp_path: Path) -> None:
+def test_sensors_show_a_model_car_without_a_vehicle_file_and_its_model_belongs_to_later_drives(tmp_path):
     time = np.arange(0.0, 40.0, 0.01)
     speed, angle = 2.0 + 0.5 * np.sin(0.3 * time), 0.15 * np.sin(1.5 * time) + 0.05 * np.sin(0.4 * time)
     rate = speed * np.tan(angle) / 0.4
@@ -166,25 +164,21 @@ def slalom(folder: Path, noise: SensorNoise) -> Path:
     return log
 
 
-def test_noisy_sensors_are_taken_as_noisy(tmp_path: Path) -> None:
+def test_noisy_sensors_are_taken_as_noisy(tmp_path):
     with read_drive(slalom(tmp_path, NOISY), Car.load(None), None, ReadOptions()) as drive:
         posterior = DriveModel.fit(drive).posterior
-    assert posterior is not None
     assert posterior.r_std["yaw_rate_rad_s"] == pytest.approx(NOISY.yaw_rate_rad_s, rel=0.4)
     assert "yaw_rate_rad_s 0.0" in posterior.text
 
 
-def test_sound_sensors_keep_their_noise(tmp_path: Path) -> None:
+def test_sound_sensors_keep_their_noise(tmp_path):
     with read_drive(slalom(tmp_path, SensorNoise()), Car.load(None), None, ReadOptions()) as drive:
         posterior = DriveModel.fit(drive).posterior
-    assert posterior is not None
     assert posterior.r_std == {}
     assert "noise" not in posterior.text
 
 
-def test_a_model_that_explains_the_yaw_rate_worse_with_more_noise_keeps_its_noise(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_that_explains_the_yaw_rate_worse_with_more_noise_keeps_its_noise(tmp_path, monkeypatch):
     with read_drive(slalom(tmp_path, SensorNoise()), Car.load(None), None, ReadOptions()) as drive:
         model = DriveModel.fit(drive)
         calibrated = model.calibrated(drive.whole().signals)

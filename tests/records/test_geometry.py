@@ -1,7 +1,5 @@
 """Geometry against scipy, known places and closed forms."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -138,13 +136,13 @@ def test_dead_reckoning_of_a_circle_converges_with_the_square_of_the_step():
         assert math.log2(coarse / fine) == pytest.approx(2.0, abs=0.1)
 
 
-def test_dead_reckoning_stands_still_where_an_end_of_a_step_is_unknown() -> None:
+def test_dead_reckoning_stands_still_where_an_end_of_a_step_is_unknown():
     vx = np.array([2.0, 2.0, np.nan, 2.0, 2.0])
     x, _, _ = dead_reckon(np.arange(5) * 10**9, vx, np.zeros(5), np.zeros(5), (1.0, 0.0, 0.0))
     assert x.tolist() == [1.0, 3.0, 3.0, 3.0, 5.0]
 
 
-def test_angles_beyond_a_turn_change_none_beside_them() -> None:
+def test_angles_beyond_a_turn_change_none_beside_them():
     within = np.array([-np.pi, -1e-300, -0.0, 0.0, 3.0, np.nextafter(np.pi, 0.0), np.nan])
     alone, beside = wrap_angle(within), wrap_angle(np.append(within, [7.0, -9.0]))
     assert alone.tobytes() == beside[:-2].tobytes()
@@ -152,11 +150,11 @@ def test_angles_beyond_a_turn_change_none_beside_them() -> None:
 
 
 @given(st.floats(0.6, 0.9999), st.integers(1, 3000))
-def test_quantiles_are_those_of_scipy(share: float, freedom: int) -> None:
+def test_quantiles_are_those_of_scipy(share, freedom):
     assert student_quantile(share, freedom) == pytest.approx(stdtrit(freedom, share), rel=1e-9)
     assert student_quantile(share, math.inf) == pytest.approx(ndtri(share), rel=1e-12)
 
 
-def test_a_running_mean_is_of_the_finite_rows_around_by_their_weights() -> None:
+def test_a_running_mean_is_of_the_finite_rows_around_by_their_weights():
     mean = running_mean(np.array([1.0, 2.0, np.nan, 6.0]), 1, np.array([1.0, 3.0, 1.0, 1.0]))
     np.testing.assert_allclose(mean, [1.75, 1.75, 3.0, 6.0])

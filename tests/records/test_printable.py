@@ -1,7 +1,5 @@
 """Printing of text from input files: control characters and markup are escaped."""
 
-from __future__ import annotations
-
 import io
 import json
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ _HOSTILE = "\x1b[31m\nwarning: forged\r\x9b2J\u202e\u2066\u200f\x00\x7f\u2028\ud
 
 
 @given(_ANY, st.integers(10, 60))
-def test_what_is_shown_is_one_printable_line_of_limited_length(text: str, most: int) -> None:
+def test_what_is_shown_is_one_printable_line_of_limited_length(text, most):
     line = printable(text, most)
     assert line.isprintable()
     assert len(line) <= most
@@ -33,24 +31,24 @@ def test_what_is_shown_is_one_printable_line_of_limited_length(text: str, most: 
         assert line == text
 
 
-def test_a_text_of_the_largest_length_is_whole_and_names_beyond_the_most_are_counted() -> None:
+def test_a_text_of_the_largest_length_is_whole_and_names_beyond_the_most_are_counted():
     assert printable("abcde", 5) == "abcde"
     assert listed("abcdefgh") == "a, b, c, d, e and 3 more"
     assert listed("abc", 2, count=7) == "a, b and 5 more"
 
 
 @given(_ANY)
-def test_every_document_of_ours_is_utf8(text: str) -> None:
+def test_every_document_of_ours_is_utf8(text):
     utf8(text).encode()
     json.dumps(jsonable({text: [text, Path("a") / text.replace("\0", "")]}), ensure_ascii=False).encode()
 
 
 @given(_ANY, _ANY)
-def test_an_error_is_one_line(got: str, where: str) -> None:
+def test_an_error_is_one_line(got, where):
     assert str(PdhefError(expected="x", got=got, where=where)).isprintable()
 
 
-def test_records_are_shown_whole() -> None:
+def test_records_are_shown_whole():
     @dataclass(frozen=True, slots=True)
     class Record:
         losses: tuple[Loss, ...]
@@ -64,7 +62,7 @@ def test_records_are_shown_whole() -> None:
     assert seen.path == Path("a\\nb")
 
 
-def test_the_console_obeys_nothing_and_forges_no_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_console_obeys_nothing_and_forges_no_line(capsys):
     console.warn(f"topic {_HOSTILE}")
     console.print_json({"topic": _HOSTILE})
     console.print_facts({"topic": _HOSTILE})
@@ -76,9 +74,7 @@ def test_the_console_obeys_nothing_and_forges_no_line(capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_an_inspection_of_hostile_names_is_plain(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, as_json: bool
-) -> None:
+def test_an_inspection_of_hostile_names_is_plain(tmp_path, capsys, monkeypatch, as_json):
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start(profile="", library="test")

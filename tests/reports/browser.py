@@ -1,7 +1,5 @@
 """A headless Chromium, controlled over its debugging pipe: no port is opened and only the file is loaded."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import fcntl
@@ -64,7 +62,7 @@ class Browser:
             self.call(f"{domain}.enable")
         self.show(width, height)
 
-    def __enter__(self) -> Browser:
+    def __enter__(self):
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,7 +1,5 @@
 """Finished runs as files, made without estimating: the input of a page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +10,8 @@ from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.results.parquet_sink import write_estimates
 from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.results.sink import Event
-from pdhef_logtool.storage.documents import seal
 from tests import run_report
-from tests.results.made_run import write_tables
+from tests.results import made_run
 from tests.run_report import figures, ran, report
 
 START_NS = 1_700_000_000_000_000_000
@@ -99,12 +96,11 @@ def write_run(
     folder: Path, tracks: list[StateTrack], label: str = "drive", outcome: str = "ok", **changes: Any
 ) -> Path:
     """Write a finished run of one log and return its folder."""
-    place = folder / "logs" / label
+    place, reports = folder / "logs" / label, {}
     place.mkdir(parents=True)
     if tracks:
+        reports[label] = report_of(tracks, label, **changes)
         write_estimates(place / "estimates.parquet", tracks)
-        write_json(place / "report.json", report_of(tracks, label, **changes))
-    entry = {"log": label, "file": f"{label}.mcap", "sha256": None, "outcome": outcome, "car": None}
-    write_tables(folder, [entry], [], {label: report_of(tracks, label, **changes)} if tracks else {})
-    write_json(folder / "run.json", seal({"format": "pdhef.run", "version": 1, "logs": [entry]}))
-    return folder
+        write_json(place / "report.json", reports[label])
+    entries = [made_run.entry(label, sha256=None, outcome=outcome, car=None)]
+    return made_run.write_run(folder, {}, entries=entries, reports=reports)

@@ -1,7 +1,5 @@
 """Writes the pictures of docs/report.md: the pages of the sample logs, as a browser shows them (make pages)."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

@@ -1,25 +1,19 @@
 """The pages in a browser: messages, requests, figures, and drawing time."""
 
-from __future__ import annotations
-
 import base64
-import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
-from made_runs import NAMES, drive_tracks, write_run
-from test_drive import hostile_run, plan_of
-from test_fleet_page import run_of
 
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
+from tests.reports.browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
+from tests.reports.made_runs import NAMES, drive_tracks, write_run
+from tests.reports.test_drive import hostile_run, plan_of
+from tests.reports.test_fleet_page import run_of
 from tests.results import made_run
 
 pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT), pytest.mark.slow]
@@ -31,7 +25,7 @@ _DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     with Browser() as made:
         yield made
 
@@ -43,7 +37,7 @@ def page_of(folder: Path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _usual_window(browser: Browser) -> None:
+def _usual_window(browser):
     browser.show()
 
 

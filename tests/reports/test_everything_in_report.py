@@ -1,7 +1,5 @@
 """Every number that a page shows is in report.json (or run.json, for a failed log), rounded alike."""
 
-from __future__ import annotations
-
 import html
 import json
 import math
@@ -11,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_runs import drive_tracks, write_run
-from test_fleet_page import run_of
 
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.reports.page import DASH, degrees, duration, number
@@ -20,6 +16,8 @@ from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.reports.made_runs import drive_tracks, write_run
+from tests.reports.test_fleet_page import run_of
 
 #: Units of the page over units of report.json: degrees, percent, minutes, hours, kilometres, milliseconds.
 FACTORS = (1.0, math.degrees(1.0), 100.0, 1 / 60, 1 / 3600, 1e-3, 1e3)
@@ -100,13 +98,13 @@ def check(folder: Path) -> int:
     return len(pages)
 
 
-def test_figures_are_shown_in_units_and_digits_by_their_size() -> None:
+def test_figures_are_shown_in_units_and_digits_by_their_size():
     assert [number(v) for v in (0.12345, 1234.6, None)] == ["0.123", "1235", DASH]
     assert [degrees(math.radians(v)) for v in (0.5, 2.0)] == ["0.500°", "2.00°"]
     assert [duration(v) for v in (5.0, 600.0, 9000.0)] == ["5.0 s", "10.0 min", "2.5 h"]
 
 
-def test_a_number_that_is_not_in_the_report_is_found() -> None:
+def test_a_number_that_is_not_in_the_report_is_found():
     document = {"log": {"start_ns": 5, "duration_s": 61.24}, "x_rad": 0.01}
     assert missing("<p>61.2 s, 0.573°, of 2026-01-01 00:00 UTC</p><td>1.02 min</td>", document) == []
     (absent,) = missing("<p>61.2 s and 0.574°</p>", document)
@@ -114,13 +112,13 @@ def test_a_number_that_is_not_in_the_report_is_found() -> None:
 
 
 @pytest.mark.parametrize("truth", [True, False])
-def test_pages_of_one_drive(tmp_path: Path, truth: bool) -> None:
+def test_pages_of_one_drive(tmp_path, truth):
     folder = write_run(tmp_path, drive_tracks(truth=truth))
     write_pages(open_run(folder))
     assert check(folder) == 2
 
 
-def test_pages_of_a_fleet_and_of_a_failed_log(tmp_path: Path) -> None:
+def test_pages_of_a_fleet_and_of_a_failed_log(tmp_path):
     drives: dict[str, dict[str, Any]] = {f"d{i}": {"errors": (0.001 + 0.0007 * i, 0.002)} for i in range(9)}
     folder = run_of(tmp_path, drives, {"bad": "expected a whole file, got one cut at byte 4711"})
     write_pages(open_run(folder))
@@ -128,7 +126,7 @@ def test_pages_of_a_fleet_and_of_a_failed_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pages_of_sample_logs(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_pages_of_sample_logs(sample_logs_dir, tmp_path):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes((sample_logs_dir / "dlc.mcap").read_bytes()[:2000])
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "no_truth", "faults")]

@@ -1,7 +1,5 @@
 """The page of a run: its content and links, and that text from a log is never executed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,14 +7,12 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.reports.fleet import fleet_page
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.storage.documents import seal
-from tests.results.made_run import entry, write_run, write_tables
+from tests.results.made_run import entry, row, write_run
 from tests.run_report import text_of
 
 HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u202egnp"
@@ -24,13 +20,13 @@ HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u2
 
 def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str] | None = None) -> Path:
     """Write a run: ``drives`` with RMSE in rad of pd-hef and physics, and changes of the report; ``failed`` reasons."""
-    logs, rows, reports = [], [], {}
+    rows, reports = [], {}
+    cells = [{"speed": 1, "ay": 0, "seconds": 90.0, "scored": 9, "sideslip_mse_rad2": 1e-4}]
     for label, drive in drives.items():
         given = dict(drive)
-        for name, value in zip(("pd-hef", "physics"), given.pop("errors", ()), strict=False):
-            rows.append(MetricRow(label, name, "sideslip_rad", "all", "rmse", value, "rad", 9))
-        cells = [{"speed": 1, "ay": 0, "seconds": 90.0, "scored": 9, "sideslip_mse_rad2": 1e-4}]
-        report = {
+        errors = zip(("pd-hef", "physics"), given.pop("errors", ()), strict=False)
+        rows += [row(label, value, estimator=name) for name, value in errors]
+        reports[label] = {
             "format": "pdhef.report",
             "log": {"name": label, "duration_s": 100.0, "kind": "mcap"},
             "vehicle": {"name": "golf"},
@@ -41,21 +37,18 @@ def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mappin
         }
         place = folder / "logs" / label
         place.mkdir(parents=True)
-        (place / "report.json").write_text(json.dumps(report))
-        reports[label] = report
+        (place / "report.json").write_text(json.dumps(reports[label]))
         (place / "report.html").write_text("x")
-        logs.append({"log": label, "outcome": "ok", "car": None, "main": "pd-hef"})
-    logs += [{"log": label, "outcome": f"failed: {reason}", "car": None} for label, reason in (failed or {}).items()]
-    write_tables(folder, logs, rows, reports)
-    (folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": logs, "versions": {"a": "1"}})))
-    return folder
+    entries = [entry(label, car=None) for label in drives]
+    entries += [entry(label, car=None, outcome=f"failed: {why}") for label, why in (failed or {}).items()]
+    return write_run(folder, {}, entries=entries, rows=rows, reports=reports)
 
 
 def words(folder: Path, **options: Any) -> str:
     return fleet_page(open_run(folder), **options).html.decode()
 
 
-def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
+def test_a_run_with_everything_says_everything(tmp_path):
     drives: dict[str, dict[str, Any]] = {
         f"d{i}": {"errors": (0.001 * (1 + i), 0.0015 * (1 + i)), "metadata": {"road": "ab"[i // 5]}} for i in range(10)
     }
@@ -72,12 +65,12 @@ def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("drives", [{}, {"a": {"truth": {"available": False, "not_independent": []}}}])
-def test_without_a_score_there_is_no_verdict_and_no_empty_figure(tmp_path: Path, drives: dict[str, Any]) -> None:
+def test_without_a_score_there_is_no_verdict_and_no_empty_figure(tmp_path, drives):
     page = words(run_of(tmp_path, drives, {"bad": "empty"}))
     assert "No verdict" in page and "<figure" not in page.split("<script type")[0]
 
 
-def test_what_logs_say_is_text(tmp_path: Path) -> None:
+def test_what_logs_say_is_text(tmp_path):
     drives = {f"d{i}": {"errors": (0.001, 0.002), "metadata": {HOSTILE: HOSTILE[: 20 + i % 2]}} for i in range(4)}
     page = words(run_of(tmp_path, drives, {"bad": HOSTILE}))
     assert "<script>alert" not in page and "<img" not in page and "\u202e" not in page
@@ -85,7 +78,7 @@ def test_what_logs_say_is_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
+def test_every_page_of_a_run_is_written_and_removed(tmp_path):
     drives: dict[str, dict[str, Any]] = {f"d{i}": {"errors": (0.001, 0.002)} for i in range(4)}
     folder = run_of(tmp_path, drives, {"bad": "empty"})
     written = write_pages(open_run(folder))
@@ -97,7 +90,7 @@ def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
     assert not [*folder.rglob("*.html")]
 
 
-def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path: Path) -> None:
+def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path):
     folder = run_of(tmp_path, {"a": {"errors": (0.001, 0.002)}}, {"bad": "empty"})
     (folder / "tables/metrics.parquet").write_bytes(b"PAR1 no")
     written = write_pages(open_run(folder))
@@ -114,7 +107,7 @@ def _page(a: Path, b: Path, limit: float | None = 0.05) -> str:
     return comparison_page(compare_runs(open_run(a), open_run(b), (figure(limit=limit),))).decode()
 
 
-def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
+def test_a_page_says_what_the_terminal_says(tmp_path):
     a = write_run(tmp_path / "a", TEN)
     worse = {label: value * (1.1 + 0.01 * i) for i, (label, value) in enumerate(TEN.items())}
     page = _page(a, write_run(tmp_path / "b", {**worse, "new": 0.1}, config={"friction": 0.3}))
@@ -126,7 +119,7 @@ def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
     assert page.count('data-figure="') == 2
 
 
-def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp_path: Path) -> None:
+def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp_path):
     a = write_run(tmp_path / "a", {MARKUP: float("nan"), "d": 0.1}, config={MARKUP: 1})
     entries = [entry(MARKUP), entry("d", main=MARKUP)]
     b = write_run(tmp_path / "b", {MARKUP: 0.1, "d": float("nan")}, entries=entries)

@@ -1,7 +1,5 @@
 """The ladder of residual models: symmetry, constants, region of validity, choice of the rung, and its document."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -47,7 +45,7 @@ def taught(seconds: float, seed: int, lacking: object = None, noise_rad: float =
     found = features(driving(seconds, seed))
     rng = np.random.default_rng(seed + 100)
     noise = np.convolve(rng.normal(size=len(found.odd) + 24), np.ones(25) / 5.0, "valid") * noise_rad
-    error = np.zeros(len(found.odd)) if lacking is None else lacking(found)  # type: ignore[operator]
+    error = np.zeros(len(found.odd)) if lacking is None else lacking(found)
     stamps = np.round(np.arange(len(noise)) * 1e9 / RATE_HZ).astype(np.int64)
     return TaughtDrive(f"drive {seed}", stamps, found, error + noise + 0.003)
 
@@ -67,7 +65,7 @@ def linear_model() -> LadderModel:
     return model
 
 
-def test_a_linear_error_is_found_on_a_drive_that_was_not_taught() -> None:
+def test_a_linear_error_is_found_on_a_drive_that_was_not_taught():
     fit, other = linear_fit(), taught(60.0, 7, linear)
     assert fit.rung == "linear" and fit.model is not None
     correction = fit.model.evaluate(other.features)
@@ -77,7 +75,7 @@ def test_a_linear_error_is_found_on_a_drive_that_was_not_taught() -> None:
     assert np.mean(correction.gain > 0.0) > 0.8
 
 
-def test_a_product_of_odd_and_even_takes_the_random_rung() -> None:
+def test_a_product_of_odd_and_even_takes_the_random_rung():
     def product(found: SlowFeatures) -> np.ndarray:
         return 0.3 * found.odd[:, 4] * np.tanh(found.even[:, 3])
 
@@ -86,10 +84,9 @@ def test_a_product_of_odd_and_even_takes_the_random_rung() -> None:
 
 
 @pytest.mark.parametrize("offset_rad", [0.02, -0.5])
-def test_a_constant_of_the_ground_truth_is_not_learned(offset_rad: float) -> None:
+def test_a_constant_of_the_ground_truth_is_not_learned(offset_rad):
     drive = taught(600.0, 1, linear)
     moved = fit_ladder([replace(drive, lacking_rad=drive.lacking_rad + offset_rad)], rungs=("linear",)).model
-    assert moved is not None
     found = drive.features
     expected, got = linear_model().evaluate(found), moved.evaluate(found)
     assert np.allclose(got.rate, expected.rate, atol=1e-9)
@@ -98,7 +95,7 @@ def test_a_constant_of_the_ground_truth_is_not_learned(offset_rad: float) -> Non
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.1, 3.0))
-def test_the_mirrored_drive_has_the_mirrored_residual(seed: int, size: float) -> None:
+def test_the_mirrored_drive_has_the_mirrored_residual(seed, size):
     found = features(driving(2.0, seed) * np.array([size] * 4 + [1.0, 1.0]))
     mirrored = SlowFeatures(-found.odd, found.even)
     for model in (linear_model(), random_model()):
@@ -123,7 +120,7 @@ def random_model() -> LadderModel:
     )
 
 
-def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds() -> None:
+def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds():
     inside = driving(20.0, 3)
     for outside in (driving(10.0, 3, speed=60.0), inside[:500] * np.array([8.0] * 4 + [1.0, 1.0])):
         found = linear_model().evaluate(features(np.concatenate([inside, outside])))
@@ -134,7 +131,7 @@ def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds()
     assert np.all(fast.gain == 0.0)
 
 
-def test_unknown_features_have_gain_zero_and_the_next_ones_go_on() -> None:
+def test_unknown_features_have_gain_zero_and_the_next_ones_go_on():
     signals = driving(8.0, 3)
     signals[50:60, 2] = np.nan
     found = linear_model().evaluate(features(signals))
@@ -142,7 +139,7 @@ def test_unknown_features_have_gain_zero_and_the_next_ones_go_on() -> None:
     assert np.all(np.isfinite(found.rate)) and np.mean(found.gain[60:] > 0.0) > 0.5
 
 
-def test_a_model_survives_its_document_and_damage_is_refused() -> None:
+def test_a_model_survives_its_document_and_damage_is_refused():
     model = random_model()
     text = model.model_dump_json()
     assert LadderModel.model_validate_json(text).sha256 == model.sha256

@@ -1,8 +1,7 @@
 """Features, bundle, and the network in service."""
 
-from __future__ import annotations
-
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_models import random_network
+from made_models import full_network, random_network
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import physics_sha256
@@ -22,7 +21,9 @@ from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
+    LINEAR_REGRESSION_FILE,
     OUTPUT_COUNT,
+    PURE_LSTM_FOLDER,
     SHIPPED_FOLDERS,
     WEIGHTS_FILE,
     ModelBundle,
@@ -31,12 +32,13 @@ from pdhef_logtool.residual_model.bundle import (
 )
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.interface import LIMITS
+from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import ResidualNetwork
 
 make_bundle = partial(random_network, hidden=16, layers=2, head=(8,), scales=(2.0, 0.7))
 
 
-def test_features_by_hand() -> None:
+def test_features_by_hand():
     physics, stamps = (
         VehicleUkf(default_vehicle().model_copy(update={"physics": PhysicsParts(roll=True)})),
         np.arange(1),
@@ -58,7 +60,7 @@ def test_features_by_hand() -> None:
     assert len(FEATURES) == len(expected)
 
 
-def test_an_odd_network_is_odd_to_the_last_digits() -> None:
+def test_an_odd_network_is_odd_to_the_last_digits():
     plain = make_bundle()
     centred = replace(plain.normalisation, feature_mean=(0.0,) * len(FEATURES))
     bundle = replace(plain, odd=True, normalisation=centred)
@@ -75,7 +77,7 @@ def test_an_odd_network_is_odd_to_the_last_digits() -> None:
     np.testing.assert_array_equal(np.concatenate([first, second]), out)
 
 
-def test_bundle_round_trip_and_hash(tmp_path: Path) -> None:
+def test_bundle_round_trip_and_hash(tmp_path):
     bundle = replace(make_bundle(), provenance={"seed": 0})
     bundle.save(tmp_path / "model")
     back = load_bundle(tmp_path / "model")
@@ -85,23 +87,60 @@ def test_bundle_round_trip_and_hash(tmp_path: Path) -> None:
     assert make_bundle(seed=1).sha256 != bundle.sha256
 
 
-@pytest.mark.parametrize("damage", ["weights", "document", "missing", "version", "feature"])
-def test_wrong_bundles_are_one_clear_error(tmp_path: Path, damage: str) -> None:
-    make_bundle().save(tmp_path)
-    document = json.loads((tmp_path / DOCUMENT_FILE).read_text())
-    if damage == "weights":
-        make_bundle(seed=9).save(tmp_path / "other")
-        (tmp_path / WEIGHTS_FILE).write_bytes((tmp_path / "other" / WEIGHTS_FILE).read_bytes())
-    elif damage == "document":
-        (tmp_path / DOCUMENT_FILE).write_text("{")
-    elif damage == "missing":
-        (tmp_path / WEIGHTS_FILE).unlink()
-    elif damage == "version":
-        (tmp_path / DOCUMENT_FILE).write_text(json.dumps({**document, "version": 99}))
+BASELINE = LinearModel(FEATURES[:4], (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """Return a folder with a network and its baselines."""
+    network = full_network()
+    network.save(tmp_path)
+    network.pure_lstm.save(tmp_path / PURE_LSTM_FOLDER)
+    (tmp_path / LINEAR_REGRESSION_FILE).write_text(BASELINE.to_json())
+    return tmp_path
+
+
+def test_baselines_come_with_the_model(saved):
+    bundle = load_bundle(saved)
+    assert bundle.pure_lstm.sha256 == full_network().pure_lstm.sha256
+    assert (bundle.linear_regression, bundle.linear_regression.provenance) == (BASELINE, BASELINE.provenance)
+    assert replace(bundle, pure_lstm=None, linear_regression=None).sha256 == bundle.sha256  # the network's own
+
+
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        *(
+            (f"{folder}{WEIGHTS_FILE}", how)
+            for folder in ("", f"{PURE_LSTM_FOLDER}/")
+            for how in ("missing", "another's")
+        ),
+        (DOCUMENT_FILE, "cut"),
+        (DOCUMENT_FILE, {"version": 99}),
+        (DOCUMENT_FILE, {"features": ["truth"] * 8}),
+        (f"{PURE_LSTM_FOLDER}/{DOCUMENT_FILE}", {"target": None}),
+        (f"{PURE_LSTM_FOLDER}/{DOCUMENT_FILE}", {"normalisation": {"target_std": []}}),
+        (LINEAR_REGRESSION_FILE, {"version": 99}),
+        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1, 0.2, 0.3, 0.5]}),
+        (LINEAR_REGRESSION_FILE, {"features": ["truth", *FEATURES[1:4]]}),
+        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1]}),
+    ],
+)
+def test_a_damaged_network_or_baseline_is_one_clear_error(saved, file, damage):
+    path = saved / file
+    if damage == "missing":
+        path.unlink()
+    elif damage == "cut":
+        path.write_text("{")
+    elif damage == "another's":
+        random_network(9).save(saved / "other")
+        shutil.copy(saved / "other" / WEIGHTS_FILE, path)
     else:
-        (tmp_path / DOCUMENT_FILE).write_text(json.dumps({**document, "features": ["truth"] * 8}))
-    with pytest.raises(ModelError, match=tmp_path.name):
-        load_bundle(tmp_path)
+        document = json.loads(path.read_text())
+        changed = {k: {**document[k], **v} if isinstance(v, dict) else v for k, v in damage.items()}
+        path.write_text(json.dumps({k: v for k, v in (document | changed).items() if v is not None}))
+    with pytest.raises(ModelError, match=file.partition("/")[0] if "/" in file else saved.name):
+        load_bundle(saved)
 
 
 def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
@@ -115,7 +154,7 @@ def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("hidden", [12, 64])  # widths that fill the compiled blocks, and widths that do not
-def test_service_equals_torch(hidden: int) -> None:
+def test_service_equals_torch(hidden):
     bundle = make_bundle(hidden=hidden)
     features = np.random.default_rng(0).normal(size=(300, len(FEATURES)))
     rates, _ = bundle.run(features, np.zeros(len(features), dtype=np.bool_), None)
@@ -123,7 +162,7 @@ def test_service_equals_torch(hidden: int) -> None:
     np.testing.assert_allclose(rates, expected, atol=2e-6)
 
 
-def test_shipped_networks_say_what_torch_makes_of_them() -> None:
+def test_shipped_networks_say_what_torch_makes_of_them():
     for folder in SHIPPED_FOLDERS.values():
         whole = load_bundle(folder)
         for bundle in (whole, whole.pure_lstm, whole.paper_network):
@@ -141,14 +180,14 @@ def test_shipped_networks_say_what_torch_makes_of_them() -> None:
             np.testing.assert_allclose(said / np.array(n.target_std), expected, rtol=0, atol=1e-5)
 
 
-def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
+def test_weights_of_another_shape_are_refused(tmp_path):
     # Compiled code would read beyond them.
     replace(make_bundle(), hidden=32).save(tmp_path)
     with pytest.raises(ModelError, match="architecture"):
         load_bundle(tmp_path)
 
 
-def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
+def test_a_restart_forgets_and_unknown_rows_give_nothing():
     service = make_bundle()
     rng = np.random.default_rng(2)
     features = rng.normal(size=(300, len(FEATURES)))
@@ -163,7 +202,7 @@ def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
     np.testing.assert_array_equal(rates[101:200], behind)
 
 
-def test_causality_and_limits() -> None:
+def test_causality_and_limits():
     bundle = make_bundle()
     service = bundle
     features = np.random.default_rng(3).normal(size=(400, len(FEATURES)))
@@ -176,7 +215,7 @@ def test_causality_and_limits() -> None:
     assert np.isfinite(after).all()
 
 
-def test_models_are_found_by_name() -> None:
+def test_models_are_found_by_name():
     default = load_bundle(SHIPPED_FOLDERS["default"])
     assert default.feature_names == FEATURES
     assert None not in (default.pure_lstm, default.linear_regression, default.paper_network)
@@ -186,12 +225,12 @@ def test_models_are_found_by_name() -> None:
         load_bundle(Path("elsewhere"))
 
 
-def test_all_of_it_is_below_three_megabytes() -> None:
+def test_all_of_it_is_below_three_megabytes():
     folder = SHIPPED_FOLDERS["default"].parents[1]
     assert sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) < 3_000_000
 
 
-def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
+def test_noise_evidence_and_calibration_are_of_the_shipped_network():
     model, car = load_bundle(SHIPPED_FOLDERS["default"]), Car.load("saloon")
     assert car.network is not None and car.network.sha256 == model.sha256
     assert (car.residual_gain, model.physics_sha256) == (0.75, physics_sha256(car.physics_vehicle))

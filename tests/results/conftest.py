@@ -1,7 +1,3 @@
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from reference_car import signals_at
@@ -16,8 +12,6 @@ RADIUS_M = 40.0
 SPEED_M_S = 10.0
 SIDESLIP_RAD = 0.05
 
-TrackMaker = Callable[..., StateTrack]
-
 
 def adaptive_columns(at: np.ndarray) -> dict[str, np.ndarray]:
     """Return further columns of an adaptive estimator: gyro stuck at 100 to 149, spikes of a_y at 30 and 400."""
@@ -26,7 +20,7 @@ def adaptive_columns(at: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture
-def circle() -> TrackMaker:
+def circle():
     """Return a maker of a window of a steady circle drive; rows [first, first + n) of it."""
 
     def make(
@@ -66,7 +60,7 @@ def circle() -> TrackMaker:
 
 
 @pytest.fixture
-def circle_signals() -> Callable[..., Signals]:
+def circle_signals():
     """Return a maker of the inputs of the same drive."""
 
     def make(first: int = 0, n: int = 200) -> Signals:

@@ -1,7 +1,5 @@
 """Folders of finished runs with figures set by a test."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """A small MCAP with everything that a full copy must keep, written by the mcap library."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

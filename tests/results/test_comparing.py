@@ -1,7 +1,5 @@
 """Two runs held against each other."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -33,7 +31,7 @@ def _scaled(factor: float, **changed: float) -> dict[str, float]:
     return {label: changed.get(label, value * factor * (1 + 0.001 * i)) for i, (label, value) in enumerate(TEN.items())}
 
 
-def test_the_same_run_is_equal_and_nothing_else_is_looked_at(tmp_path: Path) -> None:
+def test_the_same_run_is_equal_and_nothing_else_is_looked_at(tmp_path):
     run = write_run(tmp_path / "a", TEN)
     for gate in (ASKED, GATE):
         found = _compare(run, run, gate, strict=True)
@@ -42,7 +40,7 @@ def test_the_same_run_is_equal_and_nothing_else_is_looked_at(tmp_path: Path) -> 
         assert found.others == found.differences == ()
 
 
-def test_drives_pair_by_signals_then_content_then_name(tmp_path: Path) -> None:
+def test_drives_pair_by_signals_then_content_then_name(tmp_path):
     a = [entry("slim"), entry("moved"), entry("same"), entry("gone"), entry("twin1"), entry("twin2")]
     b = [
         entry("full", signals_sha256=digest("signals slim")),
@@ -65,7 +63,7 @@ def test_drives_pair_by_signals_then_content_then_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_gate_closes_on_a_regression_and_not_on_an_improvement(tmp_path: Path) -> None:
+def test_the_gate_closes_on_a_regression_and_not_on_an_improvement(tmp_path):
     a = write_run(tmp_path / "a", TEN)
     worse = _compare(a, write_run(tmp_path / "b", _scaled(1.2)), GATE)
     assert (worse.verdict, worse.exit_code) == ("worse", 4)
@@ -77,7 +75,7 @@ def test_the_gate_closes_on_a_regression_and_not_on_an_improvement(tmp_path: Pat
     json.dumps(jsonable(worse.to_dict()), allow_nan=False)
 
 
-def test_cannot_tell_is_an_answer_and_strict_refuses_it(tmp_path: Path) -> None:
+def test_cannot_tell_is_an_answer_and_strict_refuses_it(tmp_path):
     a = write_run(tmp_path / "a", TEN)
     b = write_run(tmp_path / "b", {k: v * (1.5 if i % 2 else 0.7) for i, (k, v) in enumerate(TEN.items())})
     for gate in (ASKED, GATE):
@@ -87,7 +85,7 @@ def test_cannot_tell_is_an_answer_and_strict_refuses_it(tmp_path: Path) -> None:
         assert replace(found, strict=True).exit_code == 4
 
 
-def test_drives_of_six_days_that_change_together_are_no_evidence_unless_the_user_says_so(tmp_path: Path) -> None:
+def test_drives_of_six_days_that_change_together_are_no_evidence_unless_the_user_says_so(tmp_path):
     rmse = {f"d{i}": 0.01 for i in range(60)}
     changed = {label: 0.01 * (1.1 if i // 10 < 4 else 0.95) * (1 + 1e-4 * i) for i, label in enumerate(rmse)}
     of_days = [entry(label, day=f"2026-01-0{1 + i // 10}") for i, label in enumerate(rmse)]
@@ -106,7 +104,7 @@ def test_drives_of_six_days_that_change_together_are_no_evidence_unless_the_user
     assert "--cluster none" in "".join(notes_of(alone))
 
 
-def test_the_others_are_corrected_for_being_several(tmp_path: Path) -> None:
+def test_the_others_are_corrected_for_being_several(tmp_path):
     def rows(factor: float) -> list[Any]:
         signals = ("vx_m_s", "ay_m_s2", "yaw_rate_rad_s")
         return [row(k, factor, signal=s) for k in TEN for s in signals] + [row(k, 1, signal="vy_m_s") for k in TEN]
@@ -118,7 +116,7 @@ def test_the_others_are_corrected_for_being_several(tmp_path: Path) -> None:
     assert (by_signal["vy_m_s"].corrected_p, by_signal["vy_m_s"].verdict) == (1.0, "equal")
 
 
-def test_what_else_differs_is_said(tmp_path: Path) -> None:
+def test_what_else_differs_is_said(tmp_path):
     changed = {
         "d0": {"car": {"name": "golf", "sha256": digest("tuned"), "network_sha256": digest("net")}},
         "d1": {"truth_sha256": digest("rtk")},
@@ -144,7 +142,7 @@ def test_what_else_differs_is_said(tmp_path: Path) -> None:
     assert "outcome of d4: ok → lost: a chunk" in text
 
 
-def test_no_pair_and_unknown_names_are_errors(tmp_path: Path) -> None:
+def test_no_pair_and_unknown_names_are_errors(tmp_path):
     a = write_run(tmp_path / "a", TEN)
     b = write_run(tmp_path / "b", {"other": 0.1})
     with pytest.raises(OutputError, match="none of 10 and 1 by signals, content or name") as error:
@@ -159,7 +157,7 @@ def test_no_pair_and_unknown_names_are_errors(tmp_path: Path) -> None:
     assert _compare(scored, a, (figure(estimator="pd-hef"),)).figures[0].change.drives == 10
 
 
-def test_a_history_has_a_row_per_run_and_reads_only_tables(tmp_path: Path) -> None:
+def test_a_history_has_a_row_per_run_and_reads_only_tables(tmp_path):
     versions = [{"versions": {"pdhef-logtool": version}} for version in ("1", "2", "3", "4")]
     rmse = [TEN, TEN, _scaled(1.2), {**_scaled(1.0), "new": 0.1}]
     runs = [
@@ -184,7 +182,7 @@ def test_a_history_has_a_row_per_run_and_reads_only_tables(tmp_path: Path) -> No
     changed=st.sets(st.sampled_from(["asked", "other signal", "other estimator", "stamps"])),
     gated=st.booleans(),
 )
-def test_verdict_and_number_of_changed_drives_never_contradict(changed: set[str], gated: bool) -> None:
+def test_verdict_and_number_of_changed_drives_never_contradict(changed, gated):
     def rows(of: set[str]) -> list[Any]:
         more = [row(k, 1.0 + ("other signal" in of), signal="vx_m_s") for k in TEN]
         more += [row(k, 1.0 + ("other estimator" in of), estimator="zero") for k in TEN]

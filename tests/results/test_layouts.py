@@ -1,10 +1,7 @@
-from __future__ import annotations
-
 import dataclasses
+import functools
 import json
 import re
-import types
-import typing
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +10,8 @@ from xml.etree import ElementTree as ET
 import pytest
 from foxglove import layouts as fl
 from mcap.reader import make_reader
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.alias_generators import to_camel
 from rosbags.typesys import get_types_from_msg
 
 from pdhef_logtool.records.tracks import StateTrack
@@ -34,7 +33,7 @@ def write(folder: Path, tracks: Sequence[StateTrack]) -> Path:
 
 
 @pytest.fixture
-def written(tmp_path: Path, circle: Any) -> Path:
+def written(tmp_path, circle):
     """Write a sidecar and the layouts of three tracks."""
     return write(tmp_path, [circle(name, 0, 200) for name in ("truth", "pd-hef", "2nd try")])
 
@@ -61,7 +60,7 @@ def panels_of(node: Any) -> list[str]:
     return panels_of(node["first"]) + panels_of(node["second"])
 
 
-def test_every_path_of_foxglove_is_in_the_log(written: Path) -> None:
+def test_every_path_of_foxglove_is_in_the_log(written):
     layout = json.loads((written / "foxglove.json").read_text())
     assert layout.keys() == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
     topics = fields_by_topic(written / "annotated.mcap")
@@ -88,29 +87,21 @@ def test_every_path_of_foxglove_is_in_the_log(written: Path) -> None:
     assert not any("truth" in p["label"] for p in layout["configById"]["Plot!sideslip_error_deg"]["paths"])
 
 
+for published in filter(dataclasses.is_dataclass, vars(fl).values()):
+    published.__pydantic_config__ = ConfigDict(alias_generator=to_camel, extra="forbid", strict=True)
+adapter = functools.cache(TypeAdapter)
+
+
 def conforms(value: Any, kind: Any) -> bool:
     """Return whether a value of JSON is of a type of ``foxglove.layouts``; objects have no further keys."""
-    if dataclasses.is_dataclass(kind):
-        hints = typing.get_type_hints(kind, vars(fl))
-        names = {re.sub("_(.)", lambda m: m[1].upper(), field.name): field.name for field in dataclasses.fields(kind)}
-        return isinstance(value, dict) and all(
-            name in names and conforms(v, hints[names[name]]) for name, v in value.items()
-        )
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
-        return any(conforms(value, arg) for arg in args)
-    if origin is typing.Literal:
-        return value in args
-    if origin is list:
-        return isinstance(value, list) and all(conforms(v, args[0]) for v in value)
-    if origin is tuple:
-        return isinstance(value, list) and len(value) == len(args) and all(map(conforms, value, args))
-    if origin is dict:
-        return isinstance(value, dict) and all(conforms(v, args[1]) for v in value.values())
-    return isinstance(value, (int, float) if kind is float else kind) and isinstance(value, bool) == (kind is bool)
+    try:
+        adapter(kind).validate_json(json.dumps(value))
+    except ValidationError:
+        return False
+    return True
 
 
-def test_panels_have_the_settings_that_foxglove_publishes(written: Path) -> None:
+def test_panels_have_the_settings_that_foxglove_publishes(written):
     layout = json.loads((written / "foxglove.json").read_text())
     published = {
         "Plot": fl.PlotConfig,
@@ -149,7 +140,7 @@ PLOTJUGGLER = {
 }
 
 
-def test_elements_are_those_that_plotjuggler_reads(written: Path) -> None:
+def test_elements_are_those_that_plotjuggler_reads(written):
     root = ET.fromstring((written / "plotjuggler.xml").read_bytes())
     assert root.tag == "root"
     for element in root.iter():
@@ -160,7 +151,7 @@ def test_elements_are_those_that_plotjuggler_reads(written: Path) -> None:
     assert all(re.fullmatch("#[0-9a-f]{6}", c.attrib["color"]) for c in root.iter("curve"))
 
 
-def test_every_curve_of_plotjuggler_is_in_the_log(written: Path) -> None:
+def test_every_curve_of_plotjuggler_is_in_the_log(written):
     topics = fields_by_topic(written / "annotated.mcap")
     root = ET.fromstring((written / "plotjuggler.xml").read_bytes())
     curves = [curve.attrib["name"].rpartition("/") for curve in root.iter("curve")]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 from collections import Counter
 from contextlib import ExitStack, closing
@@ -15,7 +13,6 @@ from written import as_written
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
 from pdhef_logtool.results.sink import Event
 from tests.mcap_files import copied, mcap_writer
@@ -76,19 +73,19 @@ def annotate(path: Path, source: Path | None, tracks, report=REPORT, events=(), 
 
 
 @pytest.fixture
-def tracks(circle) -> list[StateTrack]:
+def tracks(circle):
     return [circle(name, 0, 600) for name in NAMES.values()]
 
 
 @pytest.fixture
-def source(tmp_path) -> Path:
+def source(tmp_path):
     path = tmp_path / "drive.mcap"
     write_source(path)
     return path
 
 
 @pytest.fixture
-def annotated(tmp_path, source, tracks) -> Path:
+def annotated(tmp_path, source, tracks):
     path = tmp_path / "annotated.mcap"
     annotate(path, source, tracks)
     return path
@@ -182,7 +179,7 @@ def cdr_only(path: Path, source: Path) -> None:
 
 
 @pytest.fixture
-def ros_only(tmp_path, source, tracks) -> Path:
+def ros_only(tmp_path, source, tracks):
     drive, path = tmp_path / "ros.mcap", tmp_path / "ros_annotated.mcap"
     cdr_only(drive, source)
     annotate(path, drive, tracks)

@@ -1,7 +1,5 @@
 """``--no-position``: no output of a run contains a place, copied topics included."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator

@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -43,7 +40,7 @@ def tracks(circle):
 
 
 @pytest.fixture
-def path(tmp_path, tracks, monkeypatch) -> Path:
+def path(tmp_path, tracks, monkeypatch):
     monkeypatch.setattr(parquet_sink, "ROWS_A_GROUP", 256)
     write_estimates(tmp_path / "estimates.parquet", list(tracks.values()))
     return tmp_path / "estimates.parquet"
@@ -145,7 +142,7 @@ _COLUMNS = ("x_m", "yaw_rad", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_
 
 @settings(derandomize=True, deadline=None)
 @given(st.sampled_from(_COLUMNS), hnp.arrays(np.float64, 8, elements=st.floats(-1e6, 1e6)))
-def test_no_number_moves_further_than_is_said_and_none_moves_twice(column: str, values: np.ndarray) -> None:
+def test_no_number_moves_further_than_is_said_and_none_moves_twice(column, values):
     # Numbers below the smallest normal number of single precision have fewer bits; they are not tested here.
     values = np.where(np.abs(values) < np.finfo(np.float32).tiny, 0.0, values)
     once = rounded(column, values)
@@ -157,7 +154,7 @@ def test_no_number_moves_further_than_is_said_and_none_moves_twice(column: str, 
 
 
 @pytest.mark.parametrize("column", _COLUMNS)
-def test_what_is_no_number_stays_as_it_is(column: str) -> None:
+def test_what_is_no_number_stays_as_it_is(column):
     odd = np.array([0x7FFFFFFFFFFFFFFF, 0xFFF8000000000000, 0x7FF0000000000001], dtype=np.uint64).view(np.float64)
     assert np.isnan(rounded(column, odd)).all()
     infinite = np.array([np.inf, -np.inf])

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 import os
 import subprocess
@@ -57,16 +55,11 @@ def record(path: Path, tracks, signals=None, report=REPORT, events=(), shown=SHO
     write_recording(path, signals, tracks, report, events, shown=shown, **facts)
 
 
-def write(path: Path, circle, circle_signals) -> None:
-    names = ("phy-ukf", "truth", "zero")
+@pytest.fixture
+def recording(tmp_path, circle, circle_signals):
+    path, names = tmp_path / "recording.rrd", ("phy-ukf", "truth", "zero")
     tracks = [circle(name, 0, 600, bias=0.0 if name == "truth" else 0.02) for name in names]
     record(path, tracks, circle_signals(0, 600), events=EVENTS, colours=COLOURS)
-
-
-@pytest.fixture
-def recording(tmp_path, circle, circle_signals) -> Path:
-    path = tmp_path / "recording.rrd"
-    write(path, circle, circle_signals)
     return path
 
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import importlib.metadata
 import json
 from dataclasses import replace
@@ -106,7 +104,7 @@ def test_json_is_sorted_and_the_same_each_time_and_versions_are_installed(tmp_pa
     assert versions["numpy"] == importlib.metadata.version("numpy") and "python" in versions
 
 
-def test_colours_are_red_green_blue_and_a_names_own() -> None:
+def test_colours_are_red_green_blue_and_a_names_own():
     assert colour_rgb("phy-ukf", {"phy-ukf": 0x12_34_56}) == (0x12, 0x34, 0x56)
     assert colour_rgb("truth", {}) == (0x8A, 0x8A, 0x8A)
     palette = "d55e00 0072b2 e69f00 009e73 cc79a7 56b4e9"
@@ -121,7 +119,7 @@ def _report(**changes: Any) -> dict[str, Any]:
     return report(None, **content)
 
 
-def test_the_report_for_people_is_this() -> None:
+def test_the_report_for_people_is_this():
     spans = [
         Event("ukf diverged", 5 * SECOND, 6 * SECOND, ""),
         Event("ukf diverged", 2 * SECOND, 2 * SECOND + 250_000_000, ""),
@@ -151,7 +149,7 @@ def texts(main: MainFacts = MAIN, **changes: Any) -> dict[str, str]:
     return found
 
 
-def test_the_result_says_how_good_against_which_truth_and_against_whom() -> None:
+def test_the_result_says_how_good_against_which_truth_and_against_whom():
     said = texts(metrics=errors_deg(pd_hef=0.1, physics=0.12, zero=1.0))["result"]
     assert said == (
         "Sideslip RMSE of pd-hef: 0.100° (ground truth: /ins), 17 % lower than physics (0.120°), "
@@ -159,7 +157,7 @@ def test_the_result_says_how_good_against_which_truth_and_against_whom() -> None
     )
 
 
-def test_the_interval_of_the_error_needs_six_blocks_of_time() -> None:
+def test_the_interval_of_the_error_needs_six_blocks_of_time():
     def said(count: int) -> str:
         value = np.deg2rad(np.linspace(0.08, 0.12, count)).tolist()
         blocks = RequirementBlocks(SIDESLIP.measured, 10.0, range(count), [9] * count, (), (), value)
@@ -178,13 +176,13 @@ def test_the_interval_of_the_error_needs_six_blocks_of_time() -> None:
         (3.0, "3.0 times zero sideslip"),
     ],
 )
-def test_an_estimate_that_is_worse_than_none_is_said_to_be_of_no_use(own: float, said: str) -> None:
+def test_an_estimate_that_is_worse_than_none_is_said_to_be_of_no_use(own, said):
     result = texts(metrics=errors_deg(pd_hef=own, zero=1.0))["result"]
     assert said in result
     assert ("worse than a constant" in result) == (own > 1.1)
 
 
-def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
+def test_a_truth_that_is_an_input_is_no_independent_check():
     metrics = errors_deg(pd_hef=0.1)
     assert (
         "not an independent check"
@@ -202,13 +200,13 @@ def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
         (0.7, "(nominal 95 %), too narrow"),
     ],
 )
-def test_whether_the_band_holds(share: float, said: str) -> None:
+def test_whether_the_band_holds(share, said):
     band = texts(metrics=[*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", share))])["band"]
     assert band.startswith(f"coverage {100 * share:.0f} % {said}")
     assert band.endswith("(intervals: own, parameters and sensors)")
 
 
-def test_a_truth_of_gnss_alone_says_why_there_is_no_figure() -> None:
+def test_a_truth_of_gnss_alone_says_why_there_is_no_figure():
     said = texts(truth=GNSS, metrics=figures(("pd-hef", "vx_m_s", "rmse", 0.05)))
     assert "not the heading" in said["result"]
     assert "v_x 0.05 m/s" in said["result"]
@@ -216,7 +214,7 @@ def test_a_truth_of_gnss_alone_says_why_there_is_no_figure() -> None:
 
 
 @pytest.mark.parametrize(("d2", "proof"), [(0.1, "not a proof"), (0.95, "inconclusive")])
-def test_without_truth_the_consistency_is_put_in_words(d2: float, proof: str) -> None:
+def test_without_truth_the_consistency_is_put_in_words(d2, proof):
     metrics = figures(
         ("pd-hef", "vy_m_s", "d2", d2), ("zero", "vy_m_s", "d2", 1.0),
         ("pd-hef", "state", "nis", 6.0), ("pd-hef", "state", "nis_dof", 2.0),
@@ -228,7 +226,7 @@ def test_without_truth_the_consistency_is_put_in_words(d2: float, proof: str) ->
     assert texts(metrics=metrics)["consistency"] == ""
 
 
-def test_what_was_assumed_of_car_friction_and_network() -> None:
+def test_what_was_assumed_of_car_friction_and_network():
     assert texts()["assumed"] == (
         "car golf, validated on drives with ground truth; friction given (option, 0.9); "
         "residual gain 0.5 within the region of validity"
@@ -247,7 +245,7 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
     }  # fmt: skip
 
 
-def test_the_next_steps_are_few_and_the_most_important_first() -> None:
+def test_the_next_steps_are_few_and_the_most_important_first():
     lacking = [
         ran("physics", outcome="skipped", reason="the log has no steer_rad", algorithm=None),
         ran("zero", algorithm=None),
@@ -264,6 +262,6 @@ def test_the_next_steps_are_few_and_the_most_important_first() -> None:
 
 
 @pytest.mark.parametrize(("own", "zero"), [(0.3, 0.0), (0.0, 0.3), (0.0, 0.0)])
-def test_an_error_of_nothing_is_no_division(own: float, zero: float) -> None:
+def test_an_error_of_nothing_is_no_division(own, zero):
     result = texts(metrics=errors_deg(pd_hef=own, zero=zero))["result"]
     assert ("the sideslip of the ground truth is 0 throughout" in result) == (zero == 0.0)

@@ -1,7 +1,5 @@
 """Number formats of files, defined a second time: steps for state values, single precision for inputs, else 12 bits."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Work on a drive that takes no time: a report and a figure that follow from the log's name."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,31 +1,37 @@
-"""A run of several logs: its journal, resumed drives, repeated drives, and aborted drives."""
-
-from __future__ import annotations
+"""A run of several logs: its journal, resumed, repeated and aborted drives; nodes of Ray (``make fleet``)."""
 
 import json
 import os
 import shutil
+import signal
+import threading
+import time
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 import pytest
 
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.evaluation.validation_plan import default_plan
+from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.fleet import summarise
-from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, METRICS_FILE, open_run
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs import fleet
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import Schedule, run_logs
-from pdhef_logtool.runs.working import DriveEnd, DriveTask
+from pdhef_logtool.runs.working import DriveEnd, DriveTask, run_on_node
 from pdhef_logtool.workers.supervisor import Limits, Tell
 from tests.run_report import follows
-from tests.runs.stub_drives import planted_stub, stub_drive
+from tests.runs.stub_drives import planted_stub, stub_drive, waiting_drive
+from tests.s3_store import s3_store
+from tests.workers.ray_nodes import START_S, cluster_of_one, grow, processes_of
 
 
 def named_logs(folder: Path, *names: str) -> Path:
@@ -63,7 +69,7 @@ def run(folder: Path | list[str], output: Path, config: RunConfig | None = None,
     return run_logs(arguments, output, config, reporter=Reporter(warn=warn, note=note), **options)
 
 
-def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_path: Path) -> None:
+def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_path):
     day = named_logs(tmp_path / "logs/day", "a", "b")
     out, work = tmp_path / "out", Counted()
     run(day, out, work=work)
@@ -79,7 +85,7 @@ def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_
     assert parts.collect().sort("log").equals(metrics.sort("log"))
 
 
-def test_a_log_is_known_by_what_it_holds(tmp_path: Path) -> None:
+def test_a_log_is_known_by_what_it_holds(tmp_path):
     logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
     run(logs, out, work=work)
     (logs / "later").mkdir()
@@ -94,7 +100,7 @@ def test_a_log_is_known_by_what_it_holds(tmp_path: Path) -> None:
     assert said == ["1 of 2 drives are run again: their logs have changed"]
 
 
-def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path: Path) -> None:
+def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path):
     logs, out, work = named_logs(tmp_path / "logs", "a"), tmp_path / "out", Counted()
     shutil.copy(logs / "a.mcap", logs / "b.mcap")
     warned: list[str] = []
@@ -104,7 +110,7 @@ def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path: P
     assert warned == ["b.mcap has the same content as a.mcap: the drive is run once"] * 2
 
 
-def test_resuming_reads_no_log_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resuming_reads_no_log_again(tmp_path, monkeypatch):
     logs, out = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out"
     run(logs, out)
 
@@ -117,7 +123,7 @@ def test_resuming_reads_no_log_again(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert work.asked == []
 
 
-def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path) -> None:
+def test_what_is_run_anew_is_said_and_why(tmp_path, sample_logs_dir):
     car = tmp_path / "car.toml"
     text = (sample_logs_dir / "vehicle.toml").read_text()
     car.write_text(text)
@@ -135,7 +141,7 @@ def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path)
     assert len(list((out / "tables/parts").iterdir())) == 2
 
 
-def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> None:
+def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path):
     logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
     run(logs, out, RunConfig(keep="metrics"), work=work)
     run(logs, out, RunConfig(keep="metrics"), work=work, repeat=["b"])
@@ -149,9 +155,7 @@ def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> Non
         run(logs, out, RunConfig(keep="metrics", friction=0.4), repeat=["a"])
 
 
-def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(tmp_path, monkeypatch):
     for module in ("fleet", "run_result"):
         monkeypatch.setattr(f"pdhef_logtool.runs.{module}.FEW_LOGS", 7)
     logs = named_logs(tmp_path / "logs", *(f"drive{i:02d}" for i in range(8)))
@@ -169,7 +173,7 @@ def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(
     assert again.asked == []
 
 
-def test_a_run_that_is_ended_tells_of_what_is_done_and_goes_on(tmp_path: Path) -> None:
+def test_a_run_that_is_ended_tells_of_what_is_done_and_goes_on(tmp_path):
     logs = named_logs(tmp_path / "logs", "a", "b", "c", "d")
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
     run(logs, undisturbed)
@@ -197,7 +201,7 @@ def contents(output: Path, *without: str) -> dict[str, bytes]:
     return {p.relative_to(output).as_posix(): p.read_bytes() for p in files}
 
 
-def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: Path) -> None:
+def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path):
     logs, out = named_logs(tmp_path / "logs", "a", "full", "bad"), tmp_path / "out"
 
     def failing(task: DriveTask, tell: Tell) -> DriveEnd:
@@ -216,9 +220,7 @@ def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(tmp_path, monkeypatch):
     monkeypatch.setattr(fleet, "_PRELOAD", ("tests.runs.stub_drives",))  # all that a stub needs
     logs, out = named_logs(tmp_path / "logs", "a", "hangs", "b", "kills"), tmp_path / "out"
     result = run(logs, out, work=planted_stub, jobs=2, limits=Limits(2.0))
@@ -235,7 +237,7 @@ def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(
 
 
 @pytest.mark.fleet
-def test_memory_is_flat_to_3000_logs(tmp_path: Path) -> None:
+def test_memory_is_flat_to_3000_logs(tmp_path):
     memory: list[int] = []
 
     def noted(*_: object) -> None:
@@ -248,7 +250,7 @@ def test_memory_is_flat_to_3000_logs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir, tmp_path):
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
     config = RunConfig(car=Path("saloon"), keep="metrics", end="4")
     result = run_logs(logs, tmp_path, replace(config, full_worst=1))
@@ -266,7 +268,7 @@ def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path,
     assert [(r.document, r.rows) for r in result.results] == [(None, ())] * 2  # no drive stays in memory
 
 
-def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:
+def test_a_fleets_summary_counts_what_the_figures_say(tmp_path):
     logs, out = named_logs(tmp_path / "logs", "a", "b", "c"), tmp_path / "out"
 
     def failing(task: DriveTask, tell: Tell) -> DriveEnd:
@@ -282,3 +284,81 @@ def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:
     assert [w["log"] for w in told["worst"]] == sorted(values, key=lambda log: -values[log])
     assert told["failed"][0]["labels"] == ("b",)
     assert [e["estimator"] for e in told["errors"]] == ["physics"]  # the only one that was asked for is named
+
+
+@pytest.mark.fleet
+def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(tmp_path, monkeypatch):
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'pdhef-logtool[ray]'")
+    named_logs(tmp_path / "logs", *(f"drive_{i}" for i in range(12)))
+    monkeypatch.chdir(tmp_path)
+    go, lost = tmp_path / "go", []
+    with cluster_of_one() as cluster:
+        nodes = grow(cluster)
+
+        def kill_one() -> None:
+            ends = time.monotonic() + 2 * START_S
+            while not lost and time.monotonic() < ends:
+                time.sleep(0.05)
+                for node in nodes:
+                    pids = processes_of(node)
+                    if here := [p for p in pids if (tmp_path / f"{p}.begun").exists()]:
+                        for pid in pids:
+                            os.kill(pid, signal.SIGKILL)
+                        cluster.remove_node(node, allow_graceful=False)
+                        lost.extend(here)
+                        break
+            go.touch()
+
+        killer = threading.Thread(target=kill_one)
+        killer.start()
+        work = partial(waiting_drive, tmp_path)
+        # Folders are named as from here: nodes work in the same one.
+        run = partial(run_logs, ["logs"], config=RunConfig(keep="metrics"), report=False)
+        result = run(output=Path("out"), schedule=Schedule(ray=cluster.address), work=work)
+        killer.join()
+    assert lost, "a node went while its drive was worked on"
+    assert result.exit_code == 0
+    assert [log.label for log in open_run(Path("out")).logs] == sorted(f"drive_{i}" for i in range(12))
+    run(output=Path("here"), work=stub_drive)
+    assert contents(Path("out"), "run.json") == contents(Path("here"), "run.json")
+    assert METRICS_FILE in contents(Path("out"), "run.json")
+    again = Schedule(ray="127.0.0.1:1", resume=True)
+    assert run(output=Path("out"), schedule=again, work=work).exit_code == 0, (
+        "nothing is left to do: no cluster is asked for"
+    )
+
+
+@pytest.mark.fleet
+def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(tmp_path, monkeypatch):
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'pdhef-logtool[ray]'")
+    logs = named_logs(tmp_path / "logs", *(f"drive_{i}" for i in range(6)))
+    run = partial(run_logs, [str(logs)], config=RunConfig(keep="metrics"), report=False, work=stub_drive)
+    with s3_store() as store, cluster_of_one() as cluster:
+        assert run(output=f"{store.url}/out", schedule=Schedule(ray=cluster.address)).exit_code == 0
+        named_logs(logs, "later")
+        assert run(output=f"{store.url}/out", schedule=Schedule(ray=cluster.address, resume=True)).exit_code == 0
+        found = store.objects("out")
+    run(output=tmp_path / "out")
+    timed = ("run.json", "journal.jsonl")
+    assert {name: data for name, data in found.items() if name not in timed} == contents(tmp_path / "out", "run.json")
+
+
+def test_an_output_that_a_node_does_not_see_is_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (log,) = find_logs([str(named_logs(tmp_path / "logs", "a"))])
+    task = DriveTask(log, Path("out"), RunConfig(), default_plan(), page=False, run="")
+    told = run_on_node(stub_drive, tmp_path, True, task, lambda *_: None)
+    assert isinstance(told, OutputError)
+    assert "a folder that all nodes of the cluster see" in str(told)
+
+
+def test_without_ray_or_a_cluster_there_is_one_line(tmp_path):
+    logs = named_logs(tmp_path / "logs", "a", "b")
+    with pytest.raises(UsageError, match="--ray: expected"):
+        run_logs(
+            [str(logs)],
+            tmp_path / "out",
+            RunConfig(),
+            schedule=Schedule(ray="127.0.0.1:1", limits=Limits()),
+            work=stub_drive,
+        )

@@ -1,14 +1,16 @@
-"""The whole inspection of a log, as record, as JSON, as tables and as a mapping to edit."""
+"""The inspection of a log as record, JSON, tables, a page with pictures, and a mapping to edit or paste."""
 
-from __future__ import annotations
-
+import html
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
@@ -28,10 +30,14 @@ from pdhef_logtool.runs.inspection import (
     render_inspection,
     write_mapping,
 )
+from pdhef_logtool.runs.inspection.page import inspection_page, sparkline
 from pdhef_logtool.runs.inspection.report import Inspection
 from pdhef_logtool.storage.documents import jsonable
-from tests.command_line import rendered
+from tests.command_line import called, rendered
 from tests.counting_server import serving
+from tests.mcap_files import mcap_writer
+from tests.reports.browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
+from tests.run_report import text_of
 from tests.runs.wrong_mapping import wrong_sign
 
 T0 = 1_700_000_000_000_000_000
@@ -59,7 +65,7 @@ def small_log(n: int = 3000, period_ms: int = 10) -> FakeLog:
     return FakeLog({"/imu": imu, "/vendor": vendor}, lost=lost)
 
 
-def test_topics_are_measured() -> None:
+def test_topics_are_measured():
     log = small_log()
     found = inspect_drive_log(log)
     imu = next(t for t in found.topics if t.name == "/imu")
@@ -72,7 +78,7 @@ def test_topics_are_measured() -> None:
     assert found.duration_s == pytest.approx(31.49, abs=1e-6)
 
 
-def test_signals_are_measured() -> None:
+def test_signals_are_measured():
     log = small_log()
     found = inspect_drive_log(log)
     ay = found.signals["ay_m_s2"]
@@ -93,7 +99,7 @@ def test_signals_are_measured() -> None:
     assert found.is_partial
 
 
-def test_an_empty_log_is_reported() -> None:
+def test_an_empty_log_is_reported():
     found = inspect_drive_log(FakeLog({}))
     assert found.topics == ()
     json.dumps(found.to_dict(), allow_nan=False)
@@ -101,7 +107,7 @@ def test_an_empty_log_is_reported() -> None:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_tables_fit_and_say_what_matters(width: int) -> None:
+def test_tables_fit_and_say_what_matters(width):
     text = rendered(render_inspection, inspect_drive_log(small_log()), width)
     assert max(len(line) for line in text.splitlines()) <= width
     for part in (
@@ -118,7 +124,7 @@ def test_tables_fit_and_say_what_matters(width: int) -> None:
     assert "the file ends early" in text
 
 
-def test_the_written_mapping_loads_and_names_the_candidates(tmp_path: Path) -> None:
+def test_the_written_mapping_loads_and_names_the_candidates(tmp_path):
     found = inspect_drive_log(small_log())
     path = tmp_path / "m.toml"
     write_mapping(found, path)
@@ -131,7 +137,7 @@ def test_the_written_mapping_loads_and_names_the_candidates(tmp_path: Path) -> N
     assert [p.name for p in tmp_path.iterdir()] == ["m.toml"]
 
 
-def test_a_drive_has_its_checks_and_tells_the_failed_ones(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_a_drive_has_its_checks_and_tells_the_failed_ones(sample_logs_dir, tmp_path):
     told: list[str] = []
     log, car = sample_logs_dir / "sweep.mcap", Car.load(sample_logs_dir / "vehicle.toml")
     mapping = load_mapping(wrong_sign(log, tmp_path))
@@ -147,7 +153,7 @@ def test_a_drive_has_its_checks_and_tells_the_failed_ones(sample_logs_dir: Path,
 
 
 @pytest.mark.slow
-def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
+def test_a_log_with_a_dropout_and_losses(shared_dir):
     found = inspect_log(shared_dir / "data" / "drives" / "faulty" / "revs_250lm_a_disorder.mcap")
     imu = next(t for t in found.topics if t.name == "/imu/data")
     assert imu.largest_gap_s == pytest.approx(30.01, abs=0.02)
@@ -165,7 +171,7 @@ def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
     assert found.is_partial
 
 
-def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
+def test_covariances_do_not_hide_the_gyro(sample_logs_dir):
     found = fields_of_log(sample_logs_dir / "dlc.mcap", "/imu/data")
     (topic,) = found["topics"]
     paths = [f["path"] for f in topic["fields"]]
@@ -180,7 +186,7 @@ def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
     json.dumps(jsonable(found), allow_nan=False)
 
 
-def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path) -> None:
+def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir):
     found = fields_of_log(sample_logs_dir / "dlc.mcap")
     assert len(found["topics"]) > 5
     with pytest.raises(UsageError, match="topics: "):
@@ -188,9 +194,7 @@ def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path)
 
 
 @pytest.mark.slow
-def test_missing_signals_are_named_and_doubtful_candidates_stand_in_the_file_as_comments(
-    shared_dir: Path, tmp_path: Path
-) -> None:
+def test_missing_signals_are_named_and_doubtful_candidates_stand_in_the_file_as_comments(shared_dir, tmp_path):
     found = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
     text = rendered(render_inspection, found, 200)
     assert "speed_m_s" in next(line for line in text.splitlines() if line.startswith("missing"))
@@ -203,7 +207,7 @@ def test_missing_signals_are_named_and_doubtful_candidates_stand_in_the_file_as_
     assert set(load_mapping(tmp_path / "m.toml").signals) == {"steer_rad"}
 
 
-def test_a_mapping_by_question_and_answer(shared_dir: Path) -> None:
+def test_a_mapping_by_question_and_answer(shared_dir):
     found = inspect_log(shared_dir / "data" / "drives" / "lunda_v40")
     said: list[str] = []
     answers = iter(
@@ -224,7 +228,7 @@ UNSEEN, SEEN = 15, 3
 
 
 @pytest.fixture
-def _small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small_windows(monkeypatch):
     """Make a log of 300 s a large one: of it the first minute is checked, and four times 3 s are looked at."""
     monkeypatch.setattr("pdhef_logtool.runs.inspection.report.WHOLE_BYTES", 1 << 20)
     monkeypatch.setattr("pdhef_logtool.runs.inspection.report.WINDOW_NS", 60 * S)
@@ -241,10 +245,9 @@ def _by_times(found: Inspection) -> list[dict[str, object]]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small_windows")
-def test_a_sample_tells_what_the_whole_tells(sample_logs_dir: Path) -> None:
+def test_a_sample_tells_what_the_whole_tells(sample_logs_dir):
     some, whole = (inspect_log(sample_logs_dir / "road.mcap", whole=w) for w in (False, True))
     assert whole.sample is None
-    assert some.sample is not None
     assert (some.sample.of_chunks, some.sample.times) == (41, "index")
     assert 10 <= some.sample.chunks <= 25
     assert _by_times(some) == _by_times(whole)
@@ -263,7 +266,7 @@ def test_a_sample_tells_what_the_whole_tells(sample_logs_dir: Path) -> None:
     assert "--all" not in rendered(render_inspection, whole)
 
 
-def test_a_small_log_is_read_whole(sample_logs_dir: Path) -> None:
+def test_a_small_log_is_read_whole(sample_logs_dir):
     assert inspect_log(sample_logs_dir / "dlc.mcap").sample is None
 
 
@@ -272,7 +275,6 @@ def _flip_in_chunk(number: int) -> Callable[[Path], None]:
         source = LocalFile(file)
         index = read_index(source)
         source.close()
-        assert index is not None
         data = bytearray(file.read_bytes())
         extent, _ = index.chunks[number]
         data[(extent.start + extent.end) // 2] ^= 1
@@ -290,9 +292,7 @@ def _cut(file: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "seen"), [(_flip_in_chunk(SEEN), True), (_flip_in_chunk(UNSEEN), False), (_cut, True)]
 )
-def test_damage_that_is_met_has_all_of_it_read(
-    tmp_path: Path, sample_logs_dir: Path, spoil: Callable[[Path], None], seen: bool
-) -> None:
+def test_damage_that_is_met_has_all_of_it_read(tmp_path, sample_logs_dir, spoil, seen):
     file = tmp_path / "damaged.mcap"
     file.write_bytes((sample_logs_dir / "road.mcap").read_bytes())
     spoil(file)
@@ -306,12 +306,11 @@ def test_damage_that_is_met_has_all_of_it_read(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_small_windows")
-def test_of_a_far_log_only_the_sample_is_fetched(sample_logs_dir: Path) -> None:
+def test_of_a_far_log_only_the_sample_is_fetched(sample_logs_dir):
     pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
     data = (sample_logs_dir / "road.mcap").read_bytes()
     with serving(**{"road.mcap": data, "again.mcap": data, "fields.mcap": data}) as server:
         far = inspect_log(RemotePlace(server.place("road.mcap")))
-        assert far.sample is not None
         assert (far.sample.times, far.sample.of_chunks) == ("sample", 41)
         assert 0.3 < server.bytes_sent / len(data) < 0.65
         assert len(server.requests) <= 12
@@ -328,3 +327,129 @@ def test_of_a_far_log_only_the_sample_is_fetched(sample_logs_dir: Path) -> None:
         server.requests.clear()
         fields_of_log(RemotePlace(server.place("fields.mcap")), "/imu/data")
         assert server.bytes_sent < 0.6 * len(data)
+
+
+HOSTILE = "/<script>document.title='ran'</script>\x1b[31m\u202e&quot;\"'"
+_MOST_BYTES = 500_000
+_VALUES = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
+
+
+def write_log(
+    path: Path, topics: dict[str, dict[str, np.ndarray]], stamps_ns: dict[str, np.ndarray] | None = None
+) -> Path:
+    """Write JSON messages, at 20 Hz if no stamps are given."""
+    with mcap_writer(path) as writer:
+        for topic, columns in topics.items():
+            kinds = {name: {"type": "number"} for name in columns}
+            schema = writer.register_schema(f"t{topic}", "jsonschema", json.dumps({"properties": kinds}).encode())
+            channel = writer.register_channel(topic, "json", schema)
+            count = len(next(iter(columns.values())))
+            stamps = (stamps_ns or {}).get(topic, 10**18 + np.arange(count) * 50_000_000)
+            for i, stamp in enumerate(stamps.tolist()):
+                data = json.dumps({name: float(column[i]) for name, column in columns.items()}).encode()
+                writer.add_message(channel, stamp, data, stamp)
+    return path
+
+
+def car(count: int = 300) -> dict[str, np.ndarray]:
+    time_s = np.arange(count) * 0.05
+    yaw_rate = 0.3 * np.sin(time_s)
+    return {
+        "yaw_rate_rad_s": yaw_rate,
+        "ay_mps2": 20.0 * yaw_rate,
+        "steering_angle_deg": np.degrees(yaw_rate * 2.7 / 20.0),
+        "speed_kmh": np.full(count, 72.0) + 0.1 * np.sin(3.0 * time_s),
+        "yaw_rate_2": 1.01 * yaw_rate,
+    }
+
+
+@given(st.lists(_VALUES, min_size=1, max_size=100))
+def test_a_sparkline_shows_each_run_of_finite_values_within_its_box(values):
+    v = np.array(values)
+    drawn = str(sparkline(v))
+    finite = np.isfinite(v)
+    runs = int(np.count_nonzero(np.diff(np.concatenate([[False], finite]).astype(int)) == 1))
+    assert drawn.count("M") == runs
+    width = float(re.search(r'viewBox="0 0 (\d+) 60"', drawn)[1])
+    for x, y, down in re.findall(r"[ML](\d+) (\d+)(?:V(\d+))?", drawn):
+        assert 0 <= float(x) <= width
+        assert 0 <= float(y) <= 60
+        assert down == "" or 0 <= float(down) <= 60
+    if finite.sum() > 1 and np.ptp(v[finite]) > 0.0:
+        ys = {int(y) for y in re.findall(r"[ML]\d+ (\d+)", drawn)}
+        assert {2, 58} <= ys
+
+
+def _page(path: Path) -> str:
+    """Return the page of a log, written while the log is open."""
+    pages: list[bytes] = []
+    inspect_log(path, then=lambda inspection, log: pages.append(inspection_page(inspection, log)))
+    return pages[0].decode()
+
+
+def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path):
+    log = write_log(tmp_path / "car.mcap", {"/car": car(), "/other": {"temperature": np.arange(300.0)}})
+    file = tmp_path / "page.html"
+    assert called("inspect", str(log), "--report", str(file)).returncode == 0
+    page, inspection = file.read_text(), inspect_log(log)
+    text = text_of(page)
+    assert inspection.signals
+    for report in inspection.signals.values():
+        assert f"{report.topic}.{report.field}" in text
+    for candidate in inspection.candidates:
+        assert f"taken {candidate.score:.2f}" in text if candidate.taken else f"{candidate.score:.2f} /car" in text
+        assert " ".join(candidate.reason.split()) in text
+    assert "scale 0.277778" in text
+    assert "71.9 to 72.1" not in text  # SI, as it is used
+    assert "range 20 to 20 m/s" in text
+    assert "rate 20 Hz" in text
+    assert "temperature range" not in text
+    drawn = [n for n in re.findall(r'<path d="([^"]*)"', page) if n]
+    assert len(drawn) == len(inspection.signals) + len([c for c in inspection.candidates if not c.taken])
+    pasted = tmp_path / "mapping.toml"
+    pasted.write_text(html.unescape(re.search(r'<pre class="paste"[^>]*>(.*?)</pre>', page, re.DOTALL)[1]))
+    assert load_mapping(pasted).signals == inspection.mapping.signals
+    assert len(page) < _MOST_BYTES
+    called("inspect", str(log), "--mapping", str(pasted), "--report", str(file))
+    assert "named by the mapping file" in text_of(file.read_text())
+
+
+def test_a_log_of_many_fields_stays_below_the_limit(tmp_path):
+    rng = np.random.default_rng(1)
+    topics = {f"/ecu{k}": {f"signal_{i}_{'x' * 200}": rng.normal(size=120) for i in range(60)} for k in range(8)}
+    log = write_log(tmp_path / "many.mcap", {"/car": car(120), **topics})
+    page = _page(log)
+    assert len(page) < _MOST_BYTES
+
+
+def test_the_log_is_never_replaced_and_fields_stand_alone(tmp_path):
+    log = write_log(tmp_path / "car.mcap", {"/car": car()})
+    before = log.read_bytes()
+    result = called("inspect", str(log), "--report", str(log))
+    assert result.returncode == 2
+    assert "would replace the input" in result.stderr
+    assert log.read_bytes() == before
+    assert called("inspect", str(log), "--fields", "--report", str(tmp_path / "x.html")).returncode == 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
+def test_hostile_names_run_nothing_and_a_narrow_dark_page_is_readable(tmp_path):
+    log = write_log(tmp_path / "hostile.mcap", {HOSTILE: car(), "/car": {"<img src=x>": np.arange(300.0)}})
+    file = tmp_path / "page.html"
+    file.write_text(_page(log))
+    with Browser() as browser:
+        for width, scheme in ((390, "dark"), (1280, "light")):
+            browser.show(width, scheme=scheme)
+            browser.open(file)
+            browser.value("document.querySelectorAll('details').forEach(n => { n.open = true })")
+            assert browser.value("document.documentElement.scrollWidth") <= width
+            assert AXE is None or serious(browser) == []
+            assert "ran" not in browser.value("document.title").split()
+            assert browser.value("document.images.length") == 0
+            browser.value("document.querySelector('button.copy').click()")
+            assert browser.value("document.querySelector('.copied').textContent").startswith(("Copied", "Selected"))
+            chosen = browser.value("getSelection().toString()")
+            assert "[signals.yaw_rate_rad_s]" in chosen
+            assert browser.messages == []
+            assert len(browser.requests) == 1

@@ -1,7 +1,5 @@
 """report.json: at most 120 paths, and 40 kB of a drive of 10 s; terminal, page and PDF say the same of it first."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,9 +47,7 @@ def paths(value: Any, at: str = "") -> Iterator[str]:
         pytest.param("faults", {"end": "10"}, marks=pytest.mark.slow),
     ],
 )
-def test_the_document_of_ten_seconds_is_short(
-    log: str, settings: dict[str, Any], sample_logs_dir: Path, tmp_path: Path
-) -> None:
+def test_the_document_of_ten_seconds_is_short(log, settings, sample_logs_dir, tmp_path):
     run_logs([str(sample_logs_dir / f"{log}.mcap")], tmp_path, RunConfig(keep="estimates", **settings), report=False)
     text = (tmp_path / "logs" / log / "report.json").read_bytes()
     document = json.loads(text)
@@ -73,9 +69,7 @@ def told(result: RunResult) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("logs", [("sweep",), ()])
-def test_first_screen_and_first_sheet_name_what_the_terminal_names(
-    logs: tuple[str, ...], sample_logs_dir: Path, tmp_path: Path
-) -> None:
+def test_first_screen_and_first_sheet_name_what_the_terminal_names(logs, sample_logs_dir, tmp_path):
     fails = logs == ("sweep",)
     if logs:
         config = RunConfig(mapping=wrong_sign(sample_logs_dir / "sweep.mcap", tmp_path) if fails else None)
@@ -100,7 +94,7 @@ def estimates():
         return pdhef.estimate(drive, ["zero", "kinematic"])
 
 
-def test_the_errors_have_the_rmse_of_the_figures(estimates) -> None:
+def test_the_errors_have_the_rmse_of_the_figures(estimates):
     errors = estimates.frame(errors=True)
     assert errors.columns[:-5] == estimates.frame().columns
     figures = pdhef.score(estimates).filter(segment="all", metric="rmse")
@@ -114,17 +108,17 @@ def test_the_errors_have_the_rmse_of_the_figures(estimates) -> None:
     )
 
 
-def test_records_print_as_one_line(estimates) -> None:
+def test_records_print_as_one_line(estimates):
     records = (estimates, estimates.drive, estimates.drive.car, estimates.signals, *estimates.tracks.values())
     assert all(len(repr(record)) < 300 and "\n" not in repr(record) for record in records)
     assert "zero, kinematic" in repr(estimates)
 
 
-def test_the_package_lists_its_public_names() -> None:
+def test_the_package_lists_its_public_names():
     assert dir(pdhef) == sorted(pdhef.__all__)
 
 
-def test_the_plot_has_a_line_of_each_track_in_degrees(estimates) -> None:
+def test_the_plot_has_a_line_of_each_track_in_degrees(estimates):
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("agg")
     lines = estimates.plot().get_lines()
@@ -132,7 +126,7 @@ def test_the_plot_has_a_line_of_each_track_in_degrees(estimates) -> None:
     assert lines[0].get_xdata()[0] == pytest.approx(0.0, abs=0.1) and max(abs(lines[0].get_ydata())) > 1.0
 
 
-def test_a_car_that_no_drive_has_validated_is_calibrated_as_by_a_run(bare_vehicle: str, tmp_path: Path) -> None:
+def test_a_car_that_no_drive_has_validated_is_calibrated_as_by_a_run(bare_vehicle, tmp_path):
     car = tmp_path / "car.toml"
     car.write_text(bare_vehicle)
     with pdhef.read_drive(_SAMPLE, car) as drive:

@@ -1,7 +1,5 @@
 """The whole way on sample logs: outputs, windows, slices, failures."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib
@@ -28,7 +26,6 @@ from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.run_result import RunResult
 from tests.command_line import rendered
 from tests.run_report import follows
 
@@ -55,19 +52,8 @@ def _config(sample_logs_dir: Path, **changes: Any) -> RunConfig:
     return RunConfig(**values)
 
 
-def _value(metrics: pl.DataFrame, estimator: str, signal: str, metric: str, segment: str = "all") -> float:
-    rows = metrics.filter(
-        (pl.col("estimator") == estimator)
-        & (pl.col("signal") == signal)
-        & (pl.col("metric") == metric)
-        & (pl.col("segment") == segment)
-    )
-    assert rows.height == 1, rows
-    return float(rows["value"][0])
-
-
 @pytest.fixture(scope="module")
-def dlc_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dlc_run(sample_logs_dir, tmp_path_factory):
     out = tmp_path_factory.mktemp("dlc")
     result = run_logs(
         [str(sample_logs_dir / "dlc.mcap")],
@@ -78,14 +64,14 @@ def dlc_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return out
 
 
-def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path) -> None:
+def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run):
     assert {p.name for p in (dlc_run / "logs" / "dlc").iterdir()} == OUTPUTS
     assert {p.name for p in dlc_run.iterdir()} == {
         "logs", "metrics.parquet", "report.html", "report.json", "run.json", "tables",
     }  # fmt: skip
 
 
-def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
+def test_documents_follow_their_schemas(dlc_run, sample_logs_dir):
 
     report = json.loads((dlc_run / "logs/dlc/report.json").read_text())
     run = json.loads((dlc_run / "run.json").read_text())
@@ -95,20 +81,7 @@ def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) ->
     assert [e["name"] for e in report["estimators"]] == list(all_names(Car.load(sample_logs_dir / "vehicle.toml")))
 
 
-def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> None:
-    estimates = pl.read_parquet(dlc_run / "logs/dlc/estimates.parquet")
-    metrics = pl.read_parquet(dlc_run / "metrics.parquet")
-    truth = estimates.filter(pl.col("estimator") == "truth")
-    for name in ("zero", "kinematic", "open-loop", "phy-ukf"):
-        both = estimates.filter(pl.col("estimator") == name).join(truth, on="stamp_ns", suffix="_truth")
-        both = both.filter(pl.col("valid") & pl.col("valid_truth") & (pl.col("vx_m_s_truth") > 3.0))
-        error = (both["sideslip_rad"] - both["sideslip_rad_truth"]).to_numpy()
-        error = error[np.isfinite(error)]
-        rmse = float(np.sqrt(np.mean(error**2)))
-        assert _value(metrics, name, "sideslip_rad", "rmse") == pytest.approx(rmse, rel=1e-4)  # the file is rounded
-
-
-def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_same_input_gives_the_same_bytes(sample_logs_dir, tmp_path):
     config = _config(sample_logs_dir, keep="full", annotate="full", estimators=("zero", "physics"), end="4")
     for folder in ("a", "b"):
         run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / folder, config)
@@ -116,7 +89,7 @@ def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path) 
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
-def test_slice_scores_the_slice_alone(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_slice_scores_the_slice_alone(sample_logs_dir, tmp_path):
     log = sample_logs_dir / "dlc.mcap"
     run_logs(
         [str(log)], tmp_path, _config(sample_logs_dir, start="2", end="end-3s", estimators=("phy-ukf",)), report=False
@@ -127,9 +100,7 @@ def test_slice_scores_the_slice_alone(sample_logs_dir: Path, tmp_path: Path) -> 
     assert report["log"]["start_ns"] - 20_000_000 <= stamps.min() <= stamps.max() < report["log"]["end_ns"]
 
 
-def test_estimates_do_not_depend_on_whether_truth_is_mapped(
-    sample_logs_dir: Path, tmp_path: Path, dlc_run: Path
-) -> None:
+def test_estimates_do_not_depend_on_whether_truth_is_mapped(sample_logs_dir, tmp_path, dlc_run):
     (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING)
     config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("kinematic", "phy-ukf"))
     full_wheels = pl.read_parquet(dlc_run / "logs/dlc/estimates.parquet").filter(pl.col("estimator") == "phy-ukf")
@@ -148,7 +119,7 @@ def test_estimates_do_not_depend_on_whether_truth_is_mapped(
     assert not without.drop(pose).equals(full_wheels.drop(pose), null_equal=True)  # four wheels are not two
 
 
-def test_all_logs_bad_is_a_failure(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_all_logs_bad_is_a_failure(sample_logs_dir, tmp_path):
     for name in ("a.mcap", "b.mcap"):
         (tmp_path / name).write_bytes(b"no log")
     assert run_logs([str(tmp_path)], tmp_path / "out", _config(sample_logs_dir)).exit_code == 1
@@ -156,7 +127,7 @@ def test_all_logs_bad_is_a_failure(sample_logs_dir: Path, tmp_path: Path) -> Non
         run_logs([str(tmp_path / "a.mcap")], tmp_path / "out1", _config(sample_logs_dir))
 
 
-def test_what_ran_under_a_name_stands_in_every_record(dlc_run: Path) -> None:
+def test_what_ran_under_a_name_stands_in_every_record(dlc_run):
     from mcap.reader import make_reader
 
     folder = dlc_run / "logs" / "dlc"
@@ -184,7 +155,7 @@ field = "friction"
 
 
 @pytest.fixture(scope="module")
-def files(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def files(sample_logs_dir, tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
     vehicle = read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle.model_copy(update={"friction": None})
     (folder / "car.toml").write_text(part_toml(vehicle))
@@ -213,9 +184,8 @@ def run(log: Path, out: Path, **changes: Any) -> tuple[dict[str, Any], pl.DataFr
     ],
 )
 def test_what_is_asked_for_is_told_to_the_estimators(
-    choice: Any, with_topic: bool, car: str | None, source: str, value: float,
-    files: Path, sample_logs_dir: Path, tmp_path: Path,
-) -> None:  # fmt: skip
+    choice, with_topic, car, source, value, files, sample_logs_dir, tmp_path
+):
     file = {"sample": sample_logs_dir / "vehicle.toml", "car": files / "car.toml", None: None}[car]
     mapping = files / "told.toml" if with_topic else None
     report, track = run(sample_logs_dir / "sweep.mcap", tmp_path, car=file, mapping=mapping, friction=choice, end="+3s")
@@ -233,13 +203,13 @@ START_S, END_S = FAULTS["ay_m_s2", "stuck"]
 
 
 @pytest.fixture(scope="module")
-def result(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+def result(sample_logs_dir, tmp_path_factory):
     config = RunConfig(car=Path("saloon"), estimators=("phy-ukf", "pd-hef"), keep="estimates", end="20")
     return run_logs([str(sample_logs_dir / "faults.mcap")], tmp_path_factory.mktemp("out"), config, report=False)
 
 
 @pytest.fixture(scope="module")
-def report(result: RunResult) -> dict[str, Any]:
+def report(result):
     document = json.loads((Path(str(result.place)) / "logs/faults/report.json").read_text())
     follows(document)
     return dict(document)
@@ -251,7 +221,7 @@ def told(text: str) -> tuple[float, float]:
     return float(found[1]), float(found[2])
 
 
-def test_the_report_names_the_faults_with_their_times(report: dict[str, Any]) -> None:
+def test_the_report_names_the_faults_with_their_times(report):
     assert report["plan"] is None  # nobody gave one, and one drive decides little
     start_ns = report["log"]["start_ns"]
     found = {
@@ -264,9 +234,7 @@ def test_the_report_names_the_faults_with_their_times(report: dict[str, Any]) ->
     assert told(report_markdown(report)) == pytest.approx((START_S, END_S), abs=0.11)
 
 
-def test_the_track_has_the_bit_where_the_sensor_stuck_and_nowhere_else(
-    result: RunResult, report: dict[str, Any]
-) -> None:
+def test_the_track_has_the_bit_where_the_sensor_stuck_and_nowhere_else(result, report):
     track = read_track(Path(str(result.place)) / "logs/faults/estimates.parquet", "pd-hef")
     times = (track.stamps_ns - report["log"]["start_ns"]) * 1e-9
     stuck = track.reason & STUCK_AY > 0
@@ -275,7 +243,7 @@ def test_the_track_has_the_bit_where_the_sensor_stuck_and_nowhere_else(
     assert np.isfinite(track.mixture_weight[track.valid]).all()
 
 
-def test_the_terminal_says_it_in_one_line(result: RunResult) -> None:
+def test_the_terminal_says_it_in_one_line(result):
     (line,) = [one for one in rendered(render_run, result, 200).splitlines() if "a_y stuck" in one]
     assert line.strip().startswith("faults of the sensors: ")
     assert told(line) == pytest.approx((START_S, END_S), abs=0.11)
@@ -293,7 +261,7 @@ def _run(log: Path, out: Path) -> tuple[pl.DataFrame, int]:
 
 
 @pytest.fixture(scope="module")
-def whole(shared_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> pl.DataFrame:
+def whole(shared_dir, tmp_path_factory):
     return _run(shared_dir / "data/drives/revs_250lm_a.mcap", tmp_path_factory.mktemp("intact"))[0]
 
 
@@ -302,9 +270,7 @@ FAULTY = {"revs_250lm_a_flipped_byte.mcap": (146.2, 154.8), "revs_250lm_a_disord
 
 
 @pytest.mark.parametrize("name", FAULTY)
-def test_damage_costs_what_it_hit_and_nothing_else(
-    shared_dir: Path, tmp_path: Path, whole: pl.DataFrame, name: str
-) -> None:
+def test_damage_costs_what_it_hit_and_nothing_else(shared_dir, tmp_path, whole, name):
     hurt, code = _run(shared_dir / "data/drives/faulty" / name, tmp_path)
     assert code == 3
     first_loss_s, last_gap_s = FAULTY[name]
@@ -341,7 +307,7 @@ NAMES = ("zero", "open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 
 
 @pytest.fixture(scope="module")
-def wrong_car(bare_vehicle: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wrong_car(bare_vehicle, tmp_path_factory):
     """Return a bare vehicle file of the sample logs' car with half the front axle stiffness."""
     path = tmp_path_factory.mktemp("car") / "vehicle.toml"
     path.write_text(bare_vehicle.replace("B = 11.146", "B = 5.6"))
@@ -355,7 +321,7 @@ def run_with(log: Path, car: Path, out: Path, **changes: Any) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def calibrated(sample_logs_dir: Path, wrong_car: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def calibrated(sample_logs_dir, wrong_car, tmp_path_factory):
     out = tmp_path_factory.mktemp("log")
     run_with(sample_logs_dir / "road.mcap", wrong_car, out)
     return out
@@ -372,7 +338,7 @@ def rmse(out: Path, estimator: str) -> float:
     return float(pl.read_parquet(out / "metrics.parquet").filter(**chosen)["value"].item())
 
 
-def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the_file(calibrated: Path) -> None:
+def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the_file(calibrated):
     report = json.loads((calibrated / "logs/road/report.json").read_text())
     follows(report)
     told = {e["name"]: e for e in report["estimators"]}
@@ -388,19 +354,17 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     assert not causal_rows(calibrated / "logs/road")["zero"].any(), "settings and model are those of the whole log"
 
 
-def test_a_wrong_file_is_mended(calibrated: Path) -> None:
+def test_a_wrong_file_is_mended(calibrated):
     assert rmse(calibrated, "physics") < 0.65 * rmse(calibrated, "phy-ukf")
 
 
-def test_off_is_the_prior_about_the_file_and_causal(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+def test_off_is_the_prior_about_the_file_and_causal(sample_logs_dir, wrong_car, tmp_path):
     report = run_with(sample_logs_dir / "road.mcap", wrong_car, tmp_path, model="off", end="30", estimators=NAMES[:2])
     assert (report["self_calibration"]["parameters"], report["self_calibration"]["refused"]) == ([], None)
     assert all(e["causal"] for e in report["estimators"])
 
 
-def test_a_model_of_an_earlier_drive_is_causal_and_mends_the_file(
-    sample_logs_dir: Path, wrong_car: Path, calibrated: Path, tmp_path: Path
-) -> None:
+def test_a_model_of_an_earlier_drive_is_causal_and_mends_the_file(sample_logs_dir, wrong_car, calibrated, tmp_path):
     model = calibrated / "logs/road/model.toml"
     report = run_with(sample_logs_dir / "dlc.mcap", wrong_car, tmp_path, model=model, end=None)
     follows(report)
@@ -415,7 +379,7 @@ def test_a_model_of_an_earlier_drive_is_causal_and_mends_the_file(
     assert passed_on["parameters"] == tomllib.loads(model.read_text())["parameters"] != []
 
 
-def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
+def test_no_truth_is_read(sample_logs_dir, wrong_car):
     """The same log with its truth made unreadable gives the same bits."""
     log, car, options = sample_logs_dir / "road.mcap", Car.load(wrong_car), ReadOptions(end=END)
     with read_drive(log, car, options=options) as drive:
@@ -425,11 +389,10 @@ def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
         assert drive.plan.truth is None
         np.testing.assert_array_equal(read_driving(drive).columns, found.columns)
         alone = DriveModel.fit(drive).posterior
-    assert with_truth is not None and alone is not None
     assert alone.to_dict() == with_truth.to_dict()
 
 
-def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir, wrong_car, tmp_path):
     report = run_with(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, end="4")
     assert "are needed" in report["self_calibration"]["refused"]
     told = {e["name"]: e for e in report["estimators"]}
@@ -439,8 +402,8 @@ def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_
 
 @pytest.mark.parametrize("given", [None, 0.8])
 def test_a_car_that_slides_has_the_friction_that_it_reaches_if_none_is_given(
-    sample_logs_dir: Path, wrong_car: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: float | None
-) -> None:
+    sample_logs_dir, wrong_car, tmp_path, monkeypatch, given
+):
     monkeypatch.setattr(fit, "SLIDING_RAD", 0.001)
     car = tmp_path / "vehicle.toml"
     car.write_text("\n".join(x for x in wrong_car.read_text().splitlines() if not x.startswith("friction =")))
@@ -457,15 +420,15 @@ def test_a_car_that_slides_has_the_friction_that_it_reaches_if_none_is_given(
         assert first.car.self_calibrated is not None and again.car.self_calibrated is not None
 
 
-def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir: Path) -> None:
+def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir):
     with read_drive(sample_logs_dir / "road.mcap", Car.load(sample_logs_dir / "vehicle.toml")) as drive:
         assert drive.car.has_evidence
         assert DriveModel.fit(drive).posterior is None
 
 
 def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_name(
-    sample_logs_dir: Path, wrong_car: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    sample_logs_dir, wrong_car, tmp_path, monkeypatch
+):
     """Whatever pd-hef is on this car, it stands for a large d2 here."""
     if Car.load().network is None:
         pytest.skip("no network is shipped, without which there is no pd-hef")

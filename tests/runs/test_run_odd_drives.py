@@ -1,7 +1,5 @@
 """Drives that give no estimate: exit codes, notes and losses."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +39,7 @@ class _Silent:
 
 
 @pytest.fixture
-def silenced(monkeypatch: pytest.MonkeyPatch) -> None:
+def silenced(monkeypatch):
     """Put the silent estimator in the place of ``phy-ukf``."""
 
     def runnable(*arguments: Any) -> Any:
@@ -56,7 +54,7 @@ def _run(log: Path, out: Path, *estimators: str) -> RunResult:
     return run_logs([str(log)], out, config, report=False)
 
 
-def test_standstill_alone_is_no_failure_and_is_said(tmp_path: Path) -> None:
+def test_standstill_alone_is_no_failure_and_is_said(tmp_path):
     names = "time [s],speed [m/s],steering_angle [rad],accel_x [m/s^2],accel_y [m/s^2],yaw_rate [rad/s]"
     noise = np.random.default_rng(0).normal(0.0, 0.01, (1000, 5))
     log = tmp_path / "odd.csv"
@@ -64,24 +62,20 @@ def test_standstill_alone_is_no_failure_and_is_said(tmp_path: Path) -> None:
     result = _run(log, tmp_path / "out", "zero", "phy-ukf")
     assert result.exit_code == 0
     (log,) = result.results
-    assert log.report is not None
     assert any("the car is never faster than" in text for text in log.report["warnings"])
 
 
 @pytest.mark.usefixtures("silenced")
-def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sample_logs_dir: Path) -> None:
+def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path, sample_logs_dir):
     result = _run(sample_logs_dir / "step.mcap", tmp_path, "zero", "phy-ukf")
     (log,) = result.results
     assert result.exit_code == 3
-    assert log.report is not None
     silent = [x["what"] for x in log.report["losses"] if x["kind"] == "no-valid-row"]
     assert silent == [f"silent {SAID}"]
 
 
 @pytest.mark.usefixtures("silenced")
-def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
-    tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(tmp_path, sample_logs_dir, monkeypatch):
     monkeypatch.setattr(estimating, "default_names", lambda _car, _available: ())  # physics has valid rows
     words = ("run", sample_logs_dir / "step.mcap", "-o", tmp_path, "-e", "phy-ukf", "--car", "saloon")
     done = called(*words, "--network", "none", "--keep", "estimates", "--no-report", "--json")
@@ -92,7 +86,7 @@ def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
     assert done.stderr.splitlines()[-1] == f"pdhef: step: {said}"
 
 
-def test_a_signal_that_ends_before_the_car_moves_is_named_as_the_cause() -> None:
+def test_a_signal_that_ends_before_the_car_moves_is_named_as_the_cause():
     stamps = np.arange(200, dtype=np.int64) * 10_000_000
     moving = stamps > stamps[99]
     signals = signals_at(stamps, ay_m_s2=np.where(moving, np.nan, 0.1), yaw_rate_rad_s=0.1, speed_m_s=10.0)
@@ -100,7 +94,7 @@ def test_a_signal_that_ends_before_the_car_moves_is_named_as_the_cause() -> None
 
 
 @pytest.mark.parametrize(("share", "code"), [(0.005, 0), (0.03, 3)])
-def test_the_share_of_dropped_samples_decides(share: float, code: int, tmp_path: Path, sample_logs_dir: Path) -> None:
+def test_the_share_of_dropped_samples_decides(share, code, tmp_path, sample_logs_dir):
     """Some samples of the IMU have the stamp of the one before."""
     drive = [*messages(sample_logs_dir / "step.mcap")]
     imu = [i for i, m in enumerate(drive) if m.topic == "/imu/data"]
@@ -109,7 +103,6 @@ def test_the_share_of_dropped_samples_decides(share: float, code: int, tmp_path:
     result = _run(write_log(tmp_path / "odd.mcap", drive, "ros2"), tmp_path / "out", "zero")
     assert result.exit_code == code
     (log,) = result.results
-    assert log.report is not None
     (count,) = [c for c in log.report["ledger"]["samples"] if c["name"] == "ay_m_s2"]
     assert count["used"] + sum(count["dropped"].values()) == count["total"]
     assert count["dropped"] == {"duplicate-stamp": round(share * count["total"])}

@@ -1,9 +1,6 @@
 """Default estimators and the selected estimate: by the car's evidence, else by consistency, never by ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,7 +46,7 @@ def main(names: str, rows: Sequence[MetricRow] = (), *, proven: bool = False, na
     return choose_main(names.split(), rows, proven=proven, named=named)
 
 
-def test_a_proven_car_runs_three_and_an_unproven_one_what_guards_it_as_well() -> None:
+def test_a_proven_car_runs_three_and_an_unproven_one_what_guards_it_as_well():
     assert default_names(Car.load("saloon"), EVERY) == ("zero", "physics", "pd-hef")
     unproven = default_names(Car(default_vehicle()), EVERY)
     assert set(unproven) == {"zero", "open-loop", "phy-ukf", "physics", "pd-hef"}
@@ -58,13 +55,11 @@ def test_a_proven_car_runs_three_and_an_unproven_one_what_guards_it_as_well() ->
 
 @pytest.mark.parametrize(("lacks", "instead"), [({"steer_rad"}, {"kinematic"}), ({"steer_rad", "ay_m_s2"}, set())])
 @pytest.mark.parametrize("car", ["saloon", None])
-def test_a_log_that_lacks_what_physics_needs_runs_what_does_with_less(
-    lacks: set[str], instead: set[str], car: str | None
-) -> None:
+def test_a_log_that_lacks_what_physics_needs_runs_what_does_with_less(lacks, instead, car):
     assert set(default_names(Car.load(car), EVERY - lacks)) == {"zero", "physics", "pd-hef", *instead}
 
 
-def test_the_main_one_is_the_best_of_its_kind_whatever_the_order() -> None:
+def test_the_main_one_is_the_best_of_its_kind_whatever_the_order():
     assert main("zero kinematic physics pd-hef", proven=True).name == "pd-hef"
     assert main("zero phy-ukf open-loop").name == "phy-ukf"
     assert main("zero kinematic").name == "kinematic"
@@ -72,7 +67,7 @@ def test_the_main_one_is_the_best_of_its_kind_whatever_the_order() -> None:
     assert main("zero:no-lateral zero").name == "zero"
 
 
-def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:
+def test_evidence_goes_before_d2_and_d2_before_the_order():
     rows = d2(pd_hef=0.5, physics=0.5, open_loop=0.1, zero=0.9)
     names = "zero open-loop physics pd-hef"
     proven = main(names, rows, proven=True)
@@ -85,13 +80,13 @@ def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:
     assert "the log's signals" in main(names).why
 
 
-def test_what_integrates_the_residual_is_no_better_one_and_zero_counts_only_where_it_ran() -> None:
+def test_what_integrates_the_residual_is_no_better_one_and_zero_counts_only_where_it_ran():
     rows = d2(pd_hef=0.11, kinematic=0.01, open_loop=0.1)
     without = main("kinematic open-loop pd-hef", rows)
     assert (without.name, without.distrusted, without.naive) == ("pd-hef", False, None)
 
 
-def test_zero_sideslip_is_a_baseline_and_never_chosen_by_its_agreement() -> None:
+def test_zero_sideslip_is_a_baseline_and_never_chosen_by_its_agreement():
     """At the rear axle of a car the lateral velocity is small: an accelerometer there agrees with ``zero``."""
     names = "zero open-loop physics pd-hef"
     least_bad = main(names, d2(pd_hef=0.5, physics=0.5, open_loop=0.6, zero=0.1))
@@ -101,7 +96,7 @@ def test_zero_sideslip_is_a_baseline_and_never_chosen_by_its_agreement() -> None
     assert not main(names, d2(pd_hef=0.5, zero=0.1), proven=True).distrusted
 
 
-def test_three_are_shown_the_answer_first_unless_they_were_named() -> None:
+def test_three_are_shown_the_answer_first_unless_they_were_named():
     names = "zero open-loop phy-ukf physics pd-hef"
     assert list(main(names).shown) == ["pd-hef", "physics", "zero"]
     assert list(main(names, named=True).shown) == names.split()
@@ -109,9 +104,7 @@ def test_three_are_shown_the_answer_first_unless_they_were_named() -> None:
 
 
 @pytest.mark.slow
-def test_the_truth_of_a_log_never_chooses(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_truth_of_a_log_never_chooses(sample_logs_dir, tmp_path, monkeypatch):
     """The best estimator by consistency is always selected here, so that a choice by ground truth would show."""
     monkeypatch.setattr(selection, "FACTOR", 0.0)
     answers, best = [], set()
@@ -119,7 +112,6 @@ def test_the_truth_of_a_log_never_chooses(
         (tmp_path / f"{name}.toml").write_text(text)
         config = RunConfig(mapping=tmp_path / f"{name}.toml", keep="estimates", end="+4s")
         result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, report=False).results[0]
-        assert result.report is not None
         answer = result.report["answer"] | {"name": result.report["selected_estimate"]}
         best.add(min(m["value"] for m in result.report["metrics"] if m["metric"] == "rmse" and m["segment"] == "all"))
         answers.append({key: answer[key] for key in ("name", "why", "shown")})
@@ -130,7 +122,7 @@ def test_the_truth_of_a_log_never_chooses(
 
 
 @pytest.mark.parametrize("lacks", [{"ay_m_s2"}, {"yaw_rate_rad_s"}, {"ay_m_s2", "yaw_rate_rad_s"}])
-def test_physics_runs_without_a_measurement(lacks: set[str]) -> None:
+def test_physics_runs_without_a_measurement(lacks):
     assert {"physics", "pd-hef"} <= set(default_names(Car.load("saloon"), EVERY - lacks))
 
 

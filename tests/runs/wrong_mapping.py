@@ -1,7 +1,5 @@
 """A mapping with a mistake that the checks find."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pdhef_logtool.logs.open_log import open_log

@@ -1,6 +1,4 @@
-"""Every document that is read: whatever stands in it, a valid record or one line that says why not."""
-
-from __future__ import annotations
+"""Every document that is read is a valid record or one line that says why not; TOML that is written is read back."""
 
 import json
 import shutil
@@ -32,6 +30,7 @@ from pdhef_logtool.storage.documents import (
     seal,
     unknown,
 )
+from pdhef_logtool.storage.toml_text import toml_text
 
 SHIPPED, CAR = SHIPPED_FOLDERS["default"], SHIPPED_CARS["saloon"]
 VALID_CONFIG = {
@@ -102,20 +101,8 @@ LOADERS = [
 every_loader = pytest.mark.parametrize("loader", LOADERS, ids=lambda loader: loader.name)
 
 
-def to_toml(value: Any, top: bool = False) -> str:
-    if top:
-        return "".join(f"{json.dumps(k, ensure_ascii=False)} = {to_toml(v)}\n" for k, v in value.items())
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k, ensure_ascii=False)} = {to_toml(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(to_toml(v) for v in value) + "]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    return str(value).lower()  # true, 1e+300, nan and inf are TOML
-
-
 def write(path: Path, document: Any) -> Path:
-    path.write_text(json.dumps(document) if path.suffix == ".json" else to_toml(document, top=True), encoding="utf-8")
+    path.write_text(json.dumps(document) if path.suffix == ".json" else toml_text(document), encoding="utf-8")
     return path
 
 
@@ -169,9 +156,7 @@ def changed(data: st.DataObject, document: Any, anything: st.SearchStrategy[Any]
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(data=st.data())
 @pytest.mark.slow
-def test_any_document_is_a_record_or_one_line(
-    loader: Loader, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_any_document_is_a_record_or_one_line(loader, tmp_path_factory, data):
     folder = tmp_path_factory.getbasetemp() / loader.name
     folder.mkdir(exist_ok=True)
     anything = documents(keys_of(loader.valid))
@@ -182,12 +167,12 @@ def test_any_document_is_a_record_or_one_line(
 
 
 @every_loader
-def test_the_document_that_the_others_are_made_of_is_taken(loader: Loader, tmp_path: Path) -> None:
+def test_the_document_that_the_others_are_made_of_is_taken(loader, tmp_path):
     assert outcome(loader, write(tmp_path / loader.name, loader.valid)) == ""
 
 
 @every_loader
-def test_what_cannot_be_read_is_one_line(loader: Loader, tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_one_line(loader, tmp_path):
     path = tmp_path / loader.name
     # A car needs none of its parts.
     assert ("no such file" in outcome(loader, path)) == (loader.load is not _part)
@@ -210,7 +195,7 @@ def test_what_cannot_be_read_is_one_line(loader: Loader, tmp_path: Path) -> None
     assert any(word in outcome(loader, path) for word in ("directory", "folder"))
 
 
-def test_nesting_up_to_the_limit_is_read(tmp_path: Path) -> None:
+def test_nesting_up_to_the_limit_is_read(tmp_path):
     depth = MAX_DEPTH - 1
     nested = "[" * depth + "]" * depth
     (tmp_path / "a.toml").write_text(f"a = {nested}")
@@ -219,7 +204,7 @@ def test_nesting_up_to_the_limit_is_read(tmp_path: Path) -> None:
     assert read_json(tmp_path / "a.json", "a file", UsageError)["n"] == 2**64 - 1
 
 
-def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path):
     path, document = tmp_path / "own.json", {"a": [1, 0.1, None, "é"], "b": {"c": True}}
     data = json.dumps(seal(document)).encode()
     path.write_bytes(data)
@@ -234,12 +219,12 @@ def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path: Pat
         read_sealed(path, "ours", UsageError)
 
 
-def test_errors_say_what_was_wanted_where_and_what_to_do(tmp_path: Path) -> None:
+def test_errors_say_what_was_wanted_where_and_what_to_do(tmp_path):
     with pytest.raises(VehicleError, match=r"none\.toml: expected a car, got no such file; write one"):
         read_toml(tmp_path / "none.toml", "a car", VehicleError, "write one")
 
 
-def test_the_nearest_name_is_told() -> None:
+def test_the_nearest_name_is_told():
     known = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
     assert unknown("ay", known, "r_std") == "r_std.ay: unknown, did you mean r_std.ay_m_s2?"
     assert unknown("yaw_rate_rads", known) == "yaw_rate_rads: unknown, did you mean yaw_rate_rad_s?"
@@ -259,14 +244,12 @@ def test_the_nearest_name_is_told() -> None:
         (LOADERS[4], "[filter.physics]\nq_sdt = [0.1, 0.1, 0.1]", "filter.physics.q_sdt", "filter.physics.q_std"),
     ],
 )
-def test_misspelt_entries_are_told_with_the_nearest_name(
-    loader: Loader, line: str, wrong: str, right: str, tmp_path: Path
-) -> None:
+def test_misspelt_entries_are_told_with_the_nearest_name(loader, line, wrong, right, tmp_path):
     (tmp_path / loader.name).write_text(line)
     assert f"{wrong}: unknown, did you mean {right}?" in outcome(loader, tmp_path / loader.name)
 
 
-def test_hashes_that_stand_in_files_stay_what_they_were() -> None:
+def test_hashes_that_stand_in_files_stay_what_they_were():
     """Hashes of version 0.2.0. Journals, caches, datasets and cars identify their sources by these hashes."""
     document = {"b": [1, 2.5, None, True], "a": {"ü\udc80": "/", "": (1e-9, 1e22)}}
     assert digest(document) == "67b92e78790c0c9feafdf6c5b26ff7e18525bc442921e21ed792a5d1dbcc28d6"
@@ -275,3 +258,40 @@ def test_hashes_that_stand_in_files_stay_what_they_were() -> None:
     assert mapping.sha256 == "95bc15effd8048a668853de7ce24f1e84c771acd8e1692d120c193d57d689937"
     linear = LinearModel(("ay_m_s2",), (0.5,), 0.25, 2.0)
     assert linear.sha256 == "47076088d4172941685a059bf407bb89750dff940ccc307b7ca6278cb1868aed"
+
+
+_TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+_PLAIN = st.one_of(st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), _TEXTS)
+_TABLES: Any = st.recursive(
+    st.dictionaries(_TEXTS, st.one_of(_PLAIN, st.lists(_PLAIN, max_size=3))),
+    lambda inner: st.dictionaries(_TEXTS, st.one_of(_PLAIN, st.lists(inner, max_size=2), inner), max_size=4),
+    max_leaves=8,
+)
+
+
+@given(_TABLES)
+def test_a_document_is_read_back(entries):
+    assert tomllib.loads(toml_text(entries, "A head\nof two lines")) == entries
+
+
+def test_the_layout_is_for_readers():
+    entries = {"t": {"n": [1, 2.0], "u": {"x": True}}, "names": ["a", 'b"'], "rows": [{"k v": 1e-9}], "v": 1}
+    text = """# Head
+v = 1
+names = [
+    "a",
+    "b\\"",
+]
+rows = [
+    {"k v" = 1e-09},
+]
+
+[t]
+n = [1, 2.0]
+
+[t.u]
+x = true
+"""
+    assert toml_text(entries, "Head") == text
+    with pytest.raises(TypeError, match="NoneType"):
+        toml_text({"a": None})

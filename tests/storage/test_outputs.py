@@ -1,7 +1,5 @@
 """A folder that one command holds, changes to it that happen whole or not at all, and outputs that are no inputs."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os
@@ -9,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -17,6 +16,7 @@ from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.storage.files import PendingFile, scratch_folder, write_bytes
 from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction, OutputFolder, check_no_input
+from tests.failing_writes import CALLS, failing_writes
 
 OLD = {"a.txt": "old a", "b.txt": "old b"}
 
@@ -37,7 +37,7 @@ def without_exchange(*_: object, **__: object) -> object:
 
 
 @pytest.fixture(params=[True, False], ids=["exchange", "renames"])
-def exchange(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+def exchange(request, monkeypatch):
     if not request.param:
         monkeypatch.setattr(ctypes, "CDLL", without_exchange)
     return bool(request.param)
@@ -46,7 +46,7 @@ def exchange(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 # ------------------------------------------------------------------------------------------------ transactions
 
 
-def test_a_new_folder_appears_whole(tmp_path: Path) -> None:
+def test_a_new_folder_appears_whole(tmp_path):
     with FolderTransaction(tmp_path / "out" / "x") as change:
         write_bytes(change.file("a.txt"), b"a")
         assert not (tmp_path / "out" / "x").exists()
@@ -54,7 +54,7 @@ def test_a_new_folder_appears_whole(tmp_path: Path) -> None:
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["x"]
 
 
-def test_an_old_folder_is_replaced_at_once(tmp_path: Path, exchange: bool) -> None:
+def test_an_old_folder_is_replaced_at_once(tmp_path, exchange):
     make(tmp_path / "x", OLD)
     with FolderTransaction(tmp_path / "x", keep=False) as change:
         write_bytes(change.file("a.txt"), b"new a")
@@ -62,7 +62,7 @@ def test_an_old_folder_is_replaced_at_once(tmp_path: Path, exchange: bool) -> No
     assert texts(tmp_path) == {"x/a.txt": "new a"}
 
 
-def test_what_the_new_folder_has_not_is_kept_with_its_identity(tmp_path: Path, exchange: bool) -> None:
+def test_what_the_new_folder_has_not_is_kept_with_its_identity(tmp_path, exchange):
     notes = {"notes.txt": "mine", "pictures/1/p.png": "p", ".hidden": "h"}
     make(tmp_path / "x", {**OLD, **notes})
     (tmp_path / "x" / "link").symlink_to("../elsewhere")
@@ -78,7 +78,7 @@ def test_what_the_new_folder_has_not_is_kept_with_its_identity(tmp_path: Path, e
 
 
 @pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt])
-def test_an_exception_leaves_the_old_folder(tmp_path: Path, failure: type[BaseException]) -> None:
+def test_an_exception_leaves_the_old_folder(tmp_path, failure):
     make(tmp_path / "x", OLD)
     with pytest.raises(failure), FolderTransaction(tmp_path / "x") as change:
         write_bytes(change.file("a.txt"), b"new a")
@@ -87,64 +87,38 @@ def test_an_exception_leaves_the_old_folder(tmp_path: Path, failure: type[BaseEx
     assert [p.name for p in tmp_path.iterdir()] == ["x"]
 
 
-def test_a_file_in_the_way_is_one_line_and_stays(tmp_path: Path) -> None:
+def test_a_file_in_the_way_is_one_line_and_stays(tmp_path):
     (tmp_path / "x").write_text("mine")
     with pytest.raises(OutputError, match="something else has that name"):
         FolderTransaction(tmp_path / "x")
     assert texts(tmp_path) == {"x": "mine"}
 
 
-#: Every call to the system that a commit makes and that can fail on a full or broken disk.
-CALLS = ("fsync", "link", "rename", "replace", "mkdir", "chmod", "open")
-
-
-def test_whichever_call_fails_one_of_the_two_is_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchange: bool
-) -> None:
-    done = False
-    number = 0
-    while not done:
-        number += 1
+def test_whichever_call_fails_one_of_the_two_is_whole(tmp_path, exchange):
+    before = {**OLD, "notes.txt": "mine"}
+    for number in count(1):
         folder = tmp_path / f"{number}" / "x"
-        make(folder, {**OLD, "notes.txt": "mine"})
-        left = number
-
-        with monkeypatch.context() as patch:
-
-            def failing(real, *, once=patch):
-                def call(*arguments, **options):
-                    nonlocal left
-                    left -= 1
-                    if left == 0:
-                        raise OSError(errno.EIO, "Input/output error")
-                    return real(*arguments, **options)
-
-                return call
-
-            for name in CALLS:
-                patch.setattr(os, name, failing(getattr(os, name)))
+        make(folder, before)
+        with failing_writes(number, errno.EIO, (*CALLS, "chmod", "open")) as failing:
             try:
                 with FolderTransaction(folder) as change:
                     write_bytes(change.file("a.txt"), b"new a")
-                done = left > 0
             except OutputError as error:
                 assert "Input/output error" in str(error)
-            except OSError as error:
-                pytest.fail(f"call {number}: {error!r} is not given as an error of writing")
-        found = texts(folder)
-        new = {**OLD, "a.txt": "new a", "notes.txt": "mine"}
-        assert found in ({**OLD, "notes.txt": "mine"}, new), number
-        assert found == new or not done
+        found, new, done = texts(folder), {**before, "a.txt": "new a"}, failing.count < number
+        assert found == new or (found == before and not done), number
         FolderTransaction(folder).discard()  # the next command removes the remains of a failed clean-up
         assert [p.name for p in folder.parent.iterdir()] == ["x"], number
+        if done:
+            break
     assert number > 8
 
 
-def test_a_kill_between_the_two_renames_is_repaired(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_between_the_two_renames_is_repaired(tmp_path, monkeypatch):
     make(tmp_path / "logs" / "x", OLD)
     child = os.fork()
     if child == 0:  # ends like a killed process, without clean-up
-        ctypes.CDLL = without_exchange  # type: ignore[misc,assignment]
+        ctypes.CDLL = without_exchange
         rename = Path.rename
 
         def dies(self: Path, target: Path) -> Path:
@@ -152,7 +126,7 @@ def test_a_kill_between_the_two_renames_is_repaired(tmp_path: Path, monkeypatch:
                 os._exit(9)
             return rename(self, target)
 
-        Path.rename = dies  # type: ignore[method-assign,assignment]
+        Path.rename = dies
         with FolderTransaction(tmp_path / "logs" / "x") as change:
             write_bytes(change.file("a.txt"), b"new a")
         os._exit(0)
@@ -185,15 +159,14 @@ def _no_kernel_lock(*_: int) -> None:
 
 
 @pytest.fixture(params=["kernel", "file"])
-def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+def kind(request, monkeypatch):
     if request.param == "file":
         monkeypatch.setattr("fcntl.flock", _no_kernel_lock)
     return str(request.param)
 
 
-def test_a_held_folder_is_refused_and_free_again_when_its_holder_is_dead(tmp_path: Path, kind: str) -> None:
+def test_a_held_folder_is_refused_and_free_again_when_its_holder_is_dead(tmp_path, kind):
     with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path), kind], stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
         holder.stdout.readline()
         before = texts(tmp_path)
         with pytest.raises(OutputError, match="got one that another command is writing to") as caught:
@@ -207,21 +180,21 @@ def test_a_held_folder_is_refused_and_free_again_when_its_holder_is_dead(tmp_pat
     assert [p.name for p in tmp_path.iterdir()] == ["logs"]
 
 
-def test_the_same_process_is_refused_too(tmp_path: Path, kind: str) -> None:
+def test_the_same_process_is_refused_too(tmp_path, kind):
     with OutputFolder(tmp_path), pytest.raises(OutputError):
         OutputFolder(tmp_path).__enter__()
     with OutputFolder(tmp_path):
         pass
 
 
-def test_a_lock_file_of_another_host_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_file_of_another_host_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setattr("fcntl.flock", _no_kernel_lock)
     (tmp_path / LOCK_FILE).write_text("00000000-1-1")
     with pytest.raises(OutputError, match=f"remove {LOCK_FILE}"):
         FolderLock(tmp_path).acquire()
 
 
-def test_a_lock_is_on_the_folder_that_has_the_name_now(tmp_path: Path) -> None:
+def test_a_lock_is_on_the_folder_that_has_the_name_now(tmp_path):
     folder = tmp_path / "x"
     one, two = FolderLock(folder), FolderLock(folder)
     one.acquire()
@@ -233,7 +206,7 @@ def test_a_lock_is_on_the_folder_that_has_the_name_now(tmp_path: Path) -> None:
     two.release()
 
 
-def test_what_killed_processes_left_is_swept_and_what_others_own_is_not(tmp_path: Path) -> None:
+def test_what_killed_processes_left_is_swept_and_what_others_own_is_not(tmp_path):
     host, pid, start = process_name().split("-")
     dead, foreign = f"{host}-{pid}-{int(start) + 1}", "00000000-1-1"
     mine = {"notes.partial": "mine", ".notes.partial": "mine", "logs/x/.vimrc": "mine", "logs/x/a.part": "mine"}
@@ -248,7 +221,7 @@ def test_what_killed_processes_left_is_swept_and_what_others_own_is_not(tmp_path
     assert texts(tmp_path) == {n: t for n, t in (mine | alive).items() if "/" not in n} | {"other.txt": ""}
 
 
-def test_scratch_folders_of_killed_processes_are_swept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scratch_folders_of_killed_processes_are_swept(tmp_path, monkeypatch):
     import tempfile
 
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -264,7 +237,7 @@ def test_scratch_folders_of_killed_processes_are_swept(tmp_path: Path, monkeypat
 # ----------------------------------------------------------------------------------------- inputs and outputs
 
 
-def test_an_output_that_is_an_input_is_refused_by_whatever_name(tmp_path: Path) -> None:
+def test_an_output_that_is_an_input_is_refused_by_whatever_name(tmp_path):
     make(tmp_path, {"d/logs/x/x.mcap": "log", "car/vehicle.toml": "car", "free/y.mcap": "log"})
     log = tmp_path / "d" / "logs" / "x" / "x.mcap"
     (tmp_path / "symlink").symlink_to(tmp_path / "d")
@@ -292,7 +265,7 @@ def test_an_output_that_is_an_input_is_refused_by_whatever_name(tmp_path: Path) 
     check_no_input([log], [folder / "report.json"], [tmp_path / "d" / "logs" / "xx"])
 
 
-def test_without_hard_links_what_is_kept_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_hard_links_what_is_kept_is_copied(tmp_path, monkeypatch):
     def no_links(*_: object, **__: object) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
 
@@ -310,7 +283,7 @@ def folder(path: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in path.iterdir()}
 
 
-def test_what_was_there_stays_until_the_new_file_is_complete(tmp_path: Path) -> None:
+def test_what_was_there_stays_until_the_new_file_is_complete(tmp_path):
     (tmp_path / "out.bin").write_bytes(b"old")
     with PendingFile(tmp_path / "out.bin") as pending:
         pending.path.write_bytes(b"new")
@@ -318,7 +291,7 @@ def test_what_was_there_stays_until_the_new_file_is_complete(tmp_path: Path) -> 
     assert folder(tmp_path) == DONE
 
 
-def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path: Path) -> None:
+def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path):
     script = "import sys, pathlib; from pdhef_logtool.storage.files import PendingFile as P\n"
     script += "P(pathlib.Path(sys.argv[1])).path.write_bytes(b'half of an old one')"
     subprocess.run([sys.executable, "-c", script, str(tmp_path / "out.bin")], check=True)
@@ -330,7 +303,7 @@ def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path: Path) -> None:
     assert folder(tmp_path) == DONE
 
 
-def test_the_content_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_content_is_on_the_disk_before_the_name_is(tmp_path, monkeypatch):
     events: list[str] = []
     partial = PendingFile(tmp_path / "out.bin").path
     fsync, rename = os.fsync, Path.replace
@@ -354,9 +327,7 @@ def test_the_content_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("broken", ["fsync", "replace"])
-def test_a_commit_that_fails_says_where_and_removes_what_was_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
-) -> None:
+def test_a_commit_that_fails_says_where_and_removes_what_was_written(tmp_path, monkeypatch, broken):
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -369,7 +340,7 @@ def test_a_commit_that_fails_says_where_and_removes_what_was_written(
     assert folder(tmp_path) == {"out.bin": b"old"}
 
 
-def test_a_file_in_the_way_of_the_folder_is_an_output_error_at_once(tmp_path: Path) -> None:
+def test_a_file_in_the_way_of_the_folder_is_an_output_error_at_once(tmp_path):
     (tmp_path / "a").write_bytes(b"")
     with pytest.raises(OutputError, match=r"a/out\.bin"):
         PendingFile(tmp_path / "a" / "out.bin")

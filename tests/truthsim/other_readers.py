@@ -1,7 +1,5 @@
 """Logs of the simulator as other libraries read them: mcap and rosbags."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mcap.reader import make_reader

@@ -1,7 +1,5 @@
 """Suites and condition tables: the same whatever works on them, inside their ranges, and resumable."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import operator
@@ -28,14 +26,14 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+def suite(tmp_path_factory):
     folder = tmp_path_factory.mktemp("suite")
     options = ("--count", 4, "--seed", 3, "--duration", 5, "--vehicles", "randomised", "--jobs", 2)
     pdhef("simulate", "suite", "-o", folder, *options)
     return folder, json.loads((folder / "manifest.json").read_text())
 
 
-def test_a_suite_does_not_depend_on_the_processes(suite: tuple[Path, dict], tmp_path: Path) -> None:
+def test_a_suite_does_not_depend_on_the_processes(suite, tmp_path):
     folder, manifest = suite
     alone = write_suite(tmp_path, count=4, seed=3, duration_s=5.0, processes=1, vehicles="randomised")
     assert alone == manifest
@@ -44,7 +42,7 @@ def test_a_suite_does_not_depend_on_the_processes(suite: tuple[Path, dict], tmp_
     assert not [p for p in folder.iterdir() if p.suffix not in (".mcap", ".json")]
 
 
-def test_a_suite_s_manifest_tells_what_is_there(suite: tuple[Path, dict], tmp_path: Path) -> None:
+def test_a_suite_s_manifest_tells_what_is_there(suite, tmp_path):
     folder, manifest = suite
     assert manifest["complete"] and manifest["written"] == len(manifest["drives"]) == 4
     assert sum(manifest["splits"].values()) == 4
@@ -59,7 +57,7 @@ def test_a_suite_s_manifest_tells_what_is_there(suite: tuple[Path, dict], tmp_pa
     assert hashlib.sha256((tmp_path / "x.mcap").read_bytes()).hexdigest() == manifest["drives"][1]["sha256"]
 
 
-def test_draws_fill_the_range_and_the_splits() -> None:
+def test_draws_fill_the_range_and_the_splits():
     jobs = plan_suite(750, 1)
     specs = [job.candidates[0] for job in jobs]
     speeds, frictions = np.array([s.speed_km_h for s in specs]), np.array([s.friction for s in specs])
@@ -79,7 +77,7 @@ def test_draws_fill_the_range_and_the_splits() -> None:
         assert splits[name] / inside == pytest.approx(share, abs=0.04)
 
 
-def test_held_out_cells_are_never_trained_on_not_even_in_place_of_a_spun_drive() -> None:
+def test_held_out_cells_are_never_trained_on_not_even_in_place_of_a_spun_drive():
     for job in plan_suite(300, 2):
         apart = dict(job.facts)["split"] == "extrapolation"
         for spec in job.candidates:
@@ -91,7 +89,7 @@ def test_held_out_cells_are_never_trained_on_not_even_in_place_of_a_spun_drive()
         assert len(cells) == 2 and all(s in (50.0, 110.0) or f in (0.4, 0.9) for s, f in cells)
 
 
-def test_what_is_there_is_kept_and_what_is_spoilt_is_made_again(suite: tuple[Path, dict]) -> None:
+def test_what_is_there_is_kept_and_what_is_spoilt_is_made_again(suite):
     folder, manifest = suite
     before = digests(folder)
     names = [entry["file"] for entry in manifest["drives"]]
@@ -104,7 +102,7 @@ def test_what_is_there_is_kept_and_what_is_spoilt_is_made_again(suite: tuple[Pat
     assert kept == [names[0], *names[3:]]
 
 
-def test_an_interrupted_batch_goes_on(tmp_path: Path) -> None:
+def test_an_interrupted_batch_goes_on(tmp_path):
     jobs = plan_suite(3, 3, duration_s=4.0)
 
     def stop(_text: str, share: float) -> None:
@@ -120,7 +118,7 @@ def test_an_interrupted_batch_goes_on(tmp_path: Path) -> None:
     assert done == ["3 of 3 drives"] and whole["complete"] and len(whole["drives"]) == 3
 
 
-def test_a_drive_that_spins_gives_way_to_the_next_and_is_reported(tmp_path: Path) -> None:
+def test_a_drive_that_spins_gives_way_to_the_next_and_is_reported(tmp_path):
     # Swapped tyres with soft rears spin in the severe lane change.
     spun = DriveSpec("dlc-3888-2", 70.0, 0.2, 1, 8.0, vehicle="sedan,cg=0.45")
     calm = DriveSpec("step-steer", 60.0, 0.8, 1, 4.0)
@@ -132,7 +130,7 @@ def test_a_drive_that_spins_gives_way_to_the_next_and_is_reported(tmp_path: Path
     assert "sha256" not in lost and len(lost["dropped"]) == 1 and not (tmp_path / "y.mcap").exists()
 
 
-def test_every_row_of_the_table_has_its_drives_in_every_bin(tmp_path: Path) -> None:
+def test_every_row_of_the_table_has_its_drives_in_every_bin(tmp_path):
     rows = ("in-domain", "paper-b", "low-friction", "friction-plus-20")
     manifest = write_conditions(tmp_path, drives=1, seed=1, rows=rows)
     assert [row["name"] for row in manifest["rows"]] == [*rows]
@@ -145,7 +143,7 @@ def test_every_row_of_the_table_has_its_drives_in_every_bin(tmp_path: Path) -> N
     assert paper_b["peak_share"] > 0.89
 
 
-def test_rows_are_the_same_drives_with_one_thing_wrong() -> None:
+def test_rows_are_the_same_drives_with_one_thing_wrong():
     jobs, rows = plan_conditions(1, 1)
     assert tuple(row.name for row in rows) == ROW_NAMES
     assert {row.name: row.assume for row in rows if row.assume} == {
@@ -176,7 +174,6 @@ def test_rows_are_the_same_drives_with_one_thing_wrong() -> None:
         lambda p: write_conditions(p, drives=0),
     ],
 )
-def test_bad_requests_are_refused(wrong, tmp_path: Path) -> None:
-    with pytest.raises(UsageError) as caught:
+def test_bad_requests_are_refused(wrong, tmp_path):
+    with pytest.raises(UsageError):
         wrong(tmp_path / "x")
-    assert "\n" not in str(caught.value)

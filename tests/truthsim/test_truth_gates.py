@@ -5,8 +5,6 @@ Each gate must pass on the unmodified simulator. It must fail with every injecte
 10 % in a value of the car, in the slope of the road or in a recorded quantity.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -362,13 +360,13 @@ GATES: dict[Gate, tuple[Wrong, ...]] = {
 
 
 @pytest.mark.parametrize("gate", GATES, ids=lambda g: g.__name__)
-def test_gate(gate: Gate) -> None:
+def test_gate(gate):
     gate(simulate_motion, CAR)
 
 
 @pytest.mark.parametrize(
     ("gate", "wrong"), [pytest.param(g, w, id=f"{g.__name__}-{w}") for g, all_wrong in GATES.items() for w in all_wrong]
 )
-def test_gate_sees_the_error(gate: Gate, wrong: Wrong) -> None:
+def test_gate_sees_the_error(gate, wrong):
     with pytest.raises(AssertionError), np.errstate(all="ignore"):
         gate(wrong.simulate, wrong.spoilt_car())

@@ -1,7 +1,5 @@
 """The written log, read back by other libraries; and the sample logs of the repository."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import operator
@@ -15,7 +13,7 @@ from other_readers import read_with_other_libraries
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from studies.defaults import fit_nominal_tyres
-from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
+from truthsim.drive import START_NS, simulate_drive, write_drive
 from truthsim.samples import SAMPLES, write_sample
 
 pytestmark = pytest.mark.slow
@@ -38,18 +36,18 @@ def nanoseconds(stamp) -> int:
 
 
 @pytest.fixture(scope="module")
-def drive() -> Drive:
+def drive():
     return simulate_drive("step-steer", seed=2)
 
 
 @pytest.fixture(scope="module")
-def read_back(drive: Drive, tmp_path_factory: pytest.TempPathFactory):
+def read_back(drive, tmp_path_factory):
     path = tmp_path_factory.mktemp("log") / "step.mcap"
     write_drive(drive, path)
     return read_with_other_libraries(path)
 
 
-def test_other_libraries_find_every_topic_with_its_type(read_back, drive: Drive) -> None:
+def test_other_libraries_find_every_topic_with_its_type(read_back, drive):
     messages, types, _ = read_back
     assert types == TYPES
     n = drive.times_s.shape[0]
@@ -58,7 +56,7 @@ def test_other_libraries_find_every_topic_with_its_type(read_back, drive: Drive)
     }
 
 
-def test_stamps_are_measurement_times_and_log_times_arrivals(read_back) -> None:
+def test_stamps_are_measurement_times_and_log_times_arrivals(read_back):
     messages, _, _ = read_back
     for topic in TYPES:
         delay_ns = 0 if "truth" in topic else 20_000_000 if "rtk" in topic else 10_000_000
@@ -83,7 +81,7 @@ FIELDS = [
 ]
 
 
-def test_values_survive(read_back, drive: Drive) -> None:
+def test_values_survive(read_back, drive):
     messages, _, _ = read_back
     for topic, path, channel, name in FIELDS:
         found = [operator.attrgetter(path)(m) for _, _, m in messages[topic]]
@@ -98,13 +96,9 @@ def test_values_survive(read_back, drive: Drive) -> None:
     assert messages["/rtk/quality"][-1][2].quality == 4
 
 
-@pytest.fixture(scope="module")
-def manifest() -> list[dict]:
-    return tomllib.loads((ROOT / "sample_logs" / "manifest.toml").read_text(encoding="utf-8"))["log"]
-
-
-def test_manifest_lists_the_sample_logs_with_their_hashes(manifest: list[dict]) -> None:
+def test_manifest_lists_the_sample_logs_with_their_hashes():
     folder = ROOT / "sample_logs"
+    manifest = tomllib.loads((folder / "manifest.toml").read_text(encoding="utf-8"))["log"]
     assert [entry["file"] for entry in manifest] == [s.file for s in SAMPLES]
     assert {"dlc.mcap", "sweep.mcap", "road.mcap", "fishhook.mcap", "faults.mcap"} <= {e["file"] for e in manifest}
     for entry in manifest:
@@ -120,13 +114,12 @@ def test_manifest_lists_the_sample_logs_with_their_hashes(manifest: list[dict]) 
 def message_counts(path: Path) -> dict[str, int]:
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    assert summary is not None and summary.statistics is not None
     return {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
 
 
 #: The longest log and the rosbag2 take too long to read; the others are made in the same way.
 @pytest.mark.parametrize("sample", [s for s in SAMPLES if s.file in ("dlc.mcap", "faults.mcap")], ids=lambda s: s.file)
-def test_a_sample_log_is_what_the_code_makes(sample, tmp_path: Path) -> None:
+def test_a_sample_log_is_what_the_code_makes(sample, tmp_path):
     paths = {
         "/imu/data": "linear_acceleration.y",
         "/vehicle/status/steering_status": "steering_tire_angle",
@@ -149,7 +142,7 @@ def test_a_sample_log_is_what_the_code_makes(sample, tmp_path: Path) -> None:
         assert np.mean(difference > 1e-6) < 1e-3 and difference.max() < 5e-3, topic
 
 
-def test_the_samples_are_what_they_are_for() -> None:
+def test_the_samples_are_what_they_are_for():
     folder = ROOT / "sample_logs"
     for name, low, high in (("dlc.mcap", 0.65, 0.75), ("sweep.mcap", 0.9 * 0.3, 0.3)):
         messages, _, metadata = read_with_other_libraries(folder / name, "/truth/perfect/state")
@@ -161,7 +154,7 @@ def test_the_samples_are_what_they_are_for() -> None:
 
 
 @pytest.mark.parametrize(("name", "friction"), [("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)])
-def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(name: str, friction: float) -> None:
+def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(name, friction):
     vehicle = read_vehicle_file(ROOT / "sample_logs" / name).vehicle
     for axle, (alpha, force) in fit_nominal_tyres.axle_curves(fit_nominal_tyres.ramp(friction)).items():
         b, c, d, e = vehicle.magic_formula(axle == "front", friction)

@@ -1,7 +1,5 @@
 """Sensor errors have the size, shape, delay and independence that docs/method.md#sensors gives them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -30,17 +28,17 @@ def record(plan: Plan, friction: float = 0.85) -> Motion:
 
 
 @pytest.fixture(scope="module")
-def lane_change() -> Motion:
+def lane_change():
     return record(MANOEUVRES["dlc"].plan(Request(100.0 / 3.6, 0.85, 1, 9.5, 0.76)))
 
 
 @pytest.fixture(scope="module")
-def straight() -> Motion:
+def straight():
     return record(Plan(20.0, 200.0, steer_rad=np.zeros(200_001)))
 
 
 @pytest.mark.slow
-def test_white_noise_of_each_channel_has_the_stated_sigma(straight: Motion) -> None:
+def test_white_noise_of_each_channel_has_the_stated_sigma(straight):
     clean, noisy = (sense(straight, Vehicle(), n, 5, 100) for n in (NO_NOISE, WHITE_ONLY))
     for channel, field, sigma in (
         ("imu", "ax_m_s2", 0.12),
@@ -61,7 +59,7 @@ def test_white_noise_of_each_channel_has_the_stated_sigma(straight: Motion) -> N
     assert np.abs(np.corrcoef(errors) - np.eye(3)).max() < 0.03
 
 
-def test_messages_arrive_late_by_the_bus_and_keep_their_order(lane_change: Motion) -> None:
+def test_messages_arrive_late_by_the_bus_and_keep_their_order(lane_change):
     channels = sense(lane_change, Vehicle(), SensorNoise(), 1, 100)
     for name in ("imu", "steering", "wheels"):
         delay = channels[name].arrival_ns(0) - channels[name].stamps_ns(0)
@@ -73,7 +71,7 @@ def test_messages_arrive_late_by_the_bus_and_keep_their_order(lane_change: Motio
     assert np.all(np.diff(late.arrival_ns(0)) >= 0)
 
 
-def test_imu_reads_gravity_by_the_body_s_tilt(lane_change: Motion) -> None:
+def test_imu_reads_gravity_by_the_body_s_tilt(lane_change):
     imu = sense(lane_change, Vehicle(), NO_NOISE, 1, 100)["imu"].fields
     a_y, roll = lane_change.column("ay_m_s2"), lane_change.column("roll_rad")
     assert imu["ay_m_s2"] - a_y == pytest.approx(G * np.sin(roll) - a_y * (1.0 - np.cos(roll)), abs=0.015)
@@ -84,7 +82,7 @@ def test_imu_reads_gravity_by_the_body_s_tilt(lane_change: Motion) -> None:
     assert imu["az_m_s2"].mean() == pytest.approx(np.mean(G * np.cos(roll) - a_y * np.sin(roll)), abs=0.02)
 
 
-def test_sensors_sample_at_their_own_times(lane_change: Motion) -> None:
+def test_sensors_sample_at_their_own_times(lane_change):
     channels = sense(lane_change, Vehicle(), NO_NOISE, 1, 100)
     steering = channels["steering"]
     assert (steering.times_s - channels["imu"].times_s) == pytest.approx(0.003)
@@ -104,7 +102,7 @@ def test_sensors_sample_at_their_own_times(lane_change: Motion) -> None:
     assert np.abs(wheels.fields["fl_m_s"] - rim)[inside].max() < 0.003
 
 
-def test_rtk_is_good_to_centimetres_and_consistent_in_itself(lane_change: Motion) -> None:
+def test_rtk_is_good_to_centimetres_and_consistent_in_itself(lane_change):
     errors: dict[str, list[float]] = {"x_m": [], "vx_m_s": [], "vy_m_s": [], "yaw_rad": []}
     for seed in range(40):
         rtk = sense(lane_change, Vehicle(), SensorNoise(), seed, 100)["rtk"].fields
@@ -118,7 +116,7 @@ def test_rtk_is_good_to_centimetres_and_consistent_in_itself(lane_change: Motion
     assert rms["vy_m_s"] == pytest.approx(np.hypot(0.012, 27.7 * 0.0005), rel=0.2)
 
 
-def test_an_imu_away_from_the_cg_feels_the_turning() -> None:
+def test_an_imu_away_from_the_cg_feels_the_turning():
     # Steady bend: a place ahead is pulled inward by r² p, one to the left away from the middle, and a place ahead
     # gains the yaw acceleration times its lever while the bend begins.
     steer = 0.03 * np.clip((np.arange(8001) * 0.001 - 1.0) / 1.0, 0.0, 1.0)
@@ -138,7 +136,7 @@ def test_an_imu_away_from_the_cg_feels_the_turning() -> None:
 
 
 @pytest.mark.slow
-def test_the_bus_loses_its_share_of_messages(straight: Motion) -> None:
+def test_the_bus_loses_its_share_of_messages(straight):
     usual = sense(straight, Vehicle(), SensorNoise(), 3, 100)
     lossy = sense(straight, Vehicle(), SensorNoise(message_loss=0.1), 3, 100)
     for name in ("imu", "steering", "wheels"):
@@ -150,7 +148,7 @@ def test_the_bus_loses_its_share_of_messages(straight: Motion) -> None:
     assert np.array_equal(lossy["rtk"].times_s, usual["rtk"].times_s)
 
 
-def test_an_ins_with_an_offset_sees_sideslip_where_none_is(lane_change: Motion) -> None:
+def test_an_ins_with_an_offset_sees_sideslip_where_none_is(lane_change):
     usual = sense(lane_change, Vehicle(), NO_NOISE, 1, 100)["rtk"].fields
     turned = sense(lane_change, Vehicle(), NO_NOISE._replace(rtk_heading_offset_rad=0.004), 1, 100)["rtk"].fields
     slip = [np.arctan2(f["vy_m_s"], f["vx_m_s"]) for f in (usual, turned)]

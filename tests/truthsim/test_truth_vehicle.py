@@ -1,7 +1,5 @@
 """The truth vehicle beyond the gates, and its files: wheel lift, other simulators, shipped, wrong and random cars."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -30,7 +28,7 @@ def loads(motion: Motion) -> np.ndarray:
     return np.stack([motion.column(f"fz_{w}_n") for w in ("fl", "fr", "rl", "rr")], axis=1)
 
 
-def test_a_wheel_leaves_the_road_and_comes_back() -> None:
+def test_a_wheel_leaves_the_road_and_comes_back():
     # A tall car thrown into a bend on a grippy road lifts its inner wheels, and stands on all four afterwards.
     steer = np.concatenate([np.linspace(0.0, 0.14, 300), np.full(400, 0.14), np.linspace(0.14, 0.0, 300)])
     steer = np.concatenate([steer, np.zeros(3001)])
@@ -74,6 +72,7 @@ def check_bands(found: dict, bands: dict[str, tuple[float, float, float]]) -> No
         assert correlation > alike, (column, correlation)
 
 
+OTHER_TYRE = {"stiffness_friction_power": 0.0, "lateral_relaxation_m": 0.2, "lateral_relaxation_min_m": 0.2}
 #: The sedan with the known values of the other car: no bars, short relaxation, no compliance, its axle stiffness.
 LIKE_THE_OTHER = CAR._replace(
     front_anti_roll_n_m_per_rad=0.0,
@@ -82,12 +81,8 @@ LIKE_THE_OTHER = CAR._replace(
     front_compliance_rad_per_n=0.0,
     rear_compliance_rad_per_n=0.0,
     ackermann=0.0,
-    front_tyre=CAR.front_tyre._replace(
-        stiffness_peak=15.80, stiffness_friction_power=0.0, lateral_relaxation_m=0.2, lateral_relaxation_min_m=0.2
-    ),
-    rear_tyre=CAR.rear_tyre._replace(
-        stiffness_peak=20.81, stiffness_friction_power=0.0, lateral_relaxation_m=0.2, lateral_relaxation_min_m=0.2
-    ),
+    front_tyre=CAR.front_tyre._replace(stiffness_peak=15.80, **OTHER_TYRE),
+    rear_tyre=CAR.rear_tyre._replace(stiffness_peak=20.81, **OTHER_TYRE),
 )
 CLOSE = {
     "ay": (0.94, 1.03, 0.999),
@@ -97,7 +92,7 @@ CLOSE = {
 }
 
 
-def test_with_the_other_s_values_the_difference_goes(shared_dir) -> None:
+def test_with_the_other_s_values_the_difference_goes(shared_dir):
     step = ("step_100kmh_mu100", 1.0)
     check_bands(against_another_simulator(shared_dir, *step, LIKE_THE_OTHER), CLOSE)
     for run, friction in (("sinesweep_0p6_1Hz_60kmh_mu030", 0.3), ("sinesweep_0p5_2Hz_100kmh_mu100", 1.0)):
@@ -118,13 +113,13 @@ SEDAN = (SHIPPED / "sedan.toml").read_text()
 DEG_PER_G = np.degrees(1.0) * 9.80665
 
 
-def test_the_default_is_the_sedan_s_file() -> None:
+def test_the_default_is_the_sedan_s_file():
     assert load_vehicle("sedan") == Vehicle()
     assert {p.stem for p in SHIPPED.glob("*.toml")} == set(VEHICLES)
 
 
 @pytest.mark.parametrize("name", VEHICLES)
-def test_shipped_vehicles_handle_like_cars_of_their_kind(name: str) -> None:
+def test_shipped_vehicles_handle_like_cars_of_their_kind(name):
     car = load_vehicle(name)
     assert 1.5 < understeer_gradient_rad_per_m_s2(car, 0.85) * DEG_PER_G < 4.0
     angle, (front, rear) = steady_roll(car)
@@ -149,17 +144,16 @@ def test_shipped_vehicles_handle_like_cars_of_their_kind(name: str) -> None:
         ("lateral_relaxation_min_m = 0.3", "lateral_relaxation_min_m = 0.9", ("front_tyre", "lateral_relaxation")),
     ],
 )
-def test_a_wrong_file_is_one_clear_line(tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
+def test_a_wrong_file_is_one_clear_line(tmp_path, old, new, words):
     assert old in SEDAN
     path = tmp_path / "car.toml"
     path.write_text(SEDAN.replace(old, new, 1))
-    with pytest.raises(VehicleError) as caught:
+    with pytest.raises(VehicleError, match=r"car\.toml") as caught:
         load_vehicle(path)
-    assert "\n" not in str(caught.value) and "car.toml" in str(caught.value)
     assert all(word in str(caught.value) for word in words)
 
 
-def test_an_own_file_is_read_and_a_missing_one_named(tmp_path: Path) -> None:
+def test_an_own_file_is_read_and_a_missing_one_named(tmp_path):
     path = tmp_path / "car.toml"
     path.write_text(SEDAN.replace("mass_kg = 1440.0", "mass_kg = 1500"))
     assert load_vehicle(path) == Vehicle()._replace(mass_kg=1500.0)
@@ -169,7 +163,7 @@ def test_an_own_file_is_read_and_a_missing_one_named(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", VEHICLES)
-def test_randomised_cars_drive(name: str) -> None:
+def test_randomised_cars_drive(name):
     steer = 0.03 * np.sin(2.0 * np.pi * 0.7 * np.arange(0.0, 4.0, 1e-3))
     for seed in range(8):
         motion = simulate_motion(Plan(22.0, 3.9, steer_rad=steer), 0.7, vehicle=randomise(load_vehicle(name), seed))
@@ -184,13 +178,13 @@ tyre_loads = st.floats(500.0, 8000.0)
 roads = st.floats(0.1, 1.2)
 
 
-def test_cornering_stiffness_is_that_of_a_mid_size_tyre() -> None:
+def test_cornering_stiffness_is_that_of_a_mid_size_tyre():
     # 205/55 R16 at 3.5 kN: 15 to 17 times the load per radian; pinned, so that a wrong gain is seen.
     assert cornering_stiffness_n_per_rad(TYRE, 3530.0, 0.85) == pytest.approx(55_650.0, rel=2e-3)
     assert 14.0 < cornering_stiffness_n_per_rad(TYRE, 3530.0, 0.85) / 3530.0 < 17.0
 
 
-def test_peak_force_is_friction_times_load_and_lies_at_a_usual_slip_angle() -> None:
+def test_peak_force_is_friction_times_load_and_lies_at_a_usual_slip_angle():
     alpha = np.linspace(0.0, 0.4, 4001)
     force = np.array([forces_n(TYRE, 0.0, math.tan(a), 3530.0, 0.85)[1] for a in alpha])
     assert force.max() == pytest.approx(0.85 * 3530.0, rel=1e-4)
@@ -200,7 +194,7 @@ def test_peak_force_is_friction_times_load_and_lies_at_a_usual_slip_angle() -> N
 
 @given(tyre_loads, slips, slips, roads)
 @settings(derandomize=True, max_examples=200)
-def test_resultant_never_exceeds_friction_and_mirrors(load: float, kappa: float, alpha: float, mu: float) -> None:
+def test_resultant_never_exceeds_friction_and_mirrors(load, kappa, alpha, mu):
     fx, fy, _ = forces_n(TYRE, kappa, alpha, load, mu)
     assert math.hypot(fx, fy) <= 1.15 * mu * load
     assert forces_n(TYRE, kappa, -alpha, load, mu)[:2] == pytest.approx((fx, -fy), abs=1e-9)

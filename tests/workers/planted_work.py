@@ -1,7 +1,5 @@
 """Fault injection for workers: each work item selects the fault."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -22,17 +20,15 @@ def note_call() -> None:
     called.append(os.getpid())
 
 
-#: Names the file to which :func:`die_at_start` notes how often it killed the fork server, and how often it does so.
-DEATHS, MOST_DEATHS = "PDHEF_TEST_DEATHS", "PDHEF_TEST_MOST_DEATHS"
+#: Names the file to which :func:`die_at_start` notes how often it killed the fork server.
+DEATHS = "PDHEF_TEST_DEATHS"
 
 
 def die_at_start() -> None:
-    """Kill the fork server while it loads, as many times as the environment requests."""
-    file = Path(os.environ[DEATHS])
-    if len(file.read_bytes()) < int(os.environ[MOST_DEATHS]):
-        with file.open("ab") as opened:
-            opened.write(b"x")
-        os.kill(os.getpid(), signal.SIGKILL)
+    """Kill the fork server while it loads."""
+    with Path(os.environ[DEATHS]).open("ab") as opened:
+        opened.write(b"x")
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Odd:

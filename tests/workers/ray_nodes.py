@@ -1,7 +1,5 @@
 """A Ray cluster on this machine with nodes that tests can kill."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator
