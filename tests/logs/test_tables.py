@@ -52,90 +52,85 @@ NOON_NS = DAY_NS + 12 * 3600 * 10**9
 SECONDS = [f"{t:.2f}" for t in TIME_S]
 UNITS = {"ay": "m/s²", "speed": "km/h"}
 _HEAD = "time,ay [m/s²],speed (km/h)"
-DIALECTS = {
-    "seconds": (_csv(SECONDS, _HEAD).encode(), RELATIVE_NS),
-    "bom": (b"\xef\xbb\xbf" + _csv(SECONDS, _HEAD).encode(), RELATIVE_NS),
-    "carriage-returns": (_csv(SECONDS, _HEAD).replace("\n", "\r\n").encode(), RELATIVE_NS),
+DIALECTS: dict[str, tuple[bytes | str, int]] = {
+    "seconds": (_csv(SECONDS, _HEAD), RELATIVE_NS),
+    "bom": ("\ufeff" + _csv(SECONDS, _HEAD), RELATIVE_NS),
+    "carriage-returns": (_csv(SECONDS, _HEAD).replace("\n", "\r\n"), RELATIVE_NS),
     "utf-16": (_csv(SECONDS, _HEAD).encode("utf-16"), RELATIVE_NS),
     "european": (
         ("Messung 12\n\n" + _csv(SECONDS, "time;ay;speed\n[s];[m/s²];[km/h]", ";", comma=True)).encode("latin-1"),
         RELATIVE_NS,
     ),
-    "tabs": (_csv(SECONDS, "# time\tay [m/s²]\tspeed [km/h]", "\t").encode(), RELATIVE_NS),
-    "spaces": (_csv(SECONDS, "time  ay[m/s²]  speed[km/h]", "  ").encode(), RELATIVE_NS),
-    "milliseconds": (_csv([f"{1e3 * t:.0f}" for t in TIME_S], _HEAD.replace("time", "Time_ms")).encode(), RELATIVE_NS),
-    "milliseconds-by-step": (_csv([f"{1e3 * t:.0f}" for t in TIME_S], _HEAD).encode(), RELATIVE_NS),
-    "date": (_csv([f"{1714564800 + t:.2f}" for t in TIME_S], _HEAD.replace("time", "timestamp")).encode(), NOON_NS),
-    "nanoseconds": (_csv([str(NOON_NS + round(t * 1e9)) for t in TIME_S], _HEAD).encode(), NOON_NS),
-    "iso": (_csv(_iso("Z"), _HEAD).encode(), NOON_NS),
-    "iso-without-zone": (_csv([t.replace("T", " ") for t in _iso()], _HEAD).encode(), NOON_NS),
-    "iso-offset": (_csv(_iso("+02:00"), _HEAD).encode(), NOON_NS - 7200 * 10**9),
+    "tabs": (_csv(SECONDS, "# time\tay [m/s²]\tspeed [km/h]", "\t"), RELATIVE_NS),
+    "spaces": (_csv(SECONDS, "time  ay[m/s²]  speed[km/h]", "  "), RELATIVE_NS),
+    "milliseconds": (_csv([f"{1e3 * t:.0f}" for t in TIME_S], _HEAD.replace("time", "Time_ms")), RELATIVE_NS),
+    "milliseconds-by-step": (_csv([f"{1e3 * t:.0f}" for t in TIME_S], _HEAD), RELATIVE_NS),
+    "date": (_csv([f"{1714564800 + t:.2f}" for t in TIME_S], _HEAD.replace("time", "timestamp")), NOON_NS),
+    "nanoseconds": (_csv([str(NOON_NS + round(t * 1e9)) for t in TIME_S], _HEAD), NOON_NS),
+    "iso": (_csv(_iso("Z"), _HEAD), NOON_NS),
+    "iso-without-zone": (_csv([t.replace("T", " ") for t in _iso()], _HEAD), NOON_NS),
+    "iso-offset": (_csv(_iso("+02:00"), _HEAD), NOON_NS - 7200 * 10**9),
     "german-date": (
-        _csv([f"01.05.2024 {t.partition('T')[2]}" for t in _iso()], "Time;ay [m/s²];speed [km/h]", ";", comma=True)
-        .replace("01,05,2024", "01.05.2024")
-        .encode(),
+        _csv(
+            [f"01.05.2024 {t.partition('T')[2]}" for t in _iso()], "Time;ay [m/s²];speed [km/h]", ";", comma=True
+        ).replace("01,05,2024", "01.05.2024"),
         NOON_NS,
     ),
     "motec": (
-        '"Format","MoTeC CSV File"\n"Venue","a track"\n\n"Time","ay","speed"\n"s","m/s²","km/h"\n\n\n'.encode()
-        + "\n".join(f'"{t:.2f}","{a:.4f}","{v:.3f}"' for t, a, v in zip(TIME_S, AY, SPEED, strict=True)).encode(),
+        '"Format","MoTeC CSV File"\n"Venue","a track"\n\n"Time","ay","speed"\n"s","m/s²","km/h"\n\n\n'
+        + "\n".join(f'"{t:.2f}","{a:.4f}","{v:.3f}"' for t, a, v in zip(TIME_S, AY, SPEED, strict=True)),
         RELATIVE_NS,
     ),
-    "date-and-time": (_csv([t.replace("T", ",") for t in _iso()], "Date," + _HEAD).encode(), NOON_NS),
-    "clock": (_csv([t.partition("T")[2] for t in _iso()], _HEAD).encode(), RELATIVE_NS + 12 * 3600 * 10**9),
+    "date-and-time": (_csv([t.replace("T", ",") for t in _iso()], "Date," + _HEAD), NOON_NS),
+    "clock": (_csv([t.partition("T")[2] for t in _iso()], _HEAD), RELATIVE_NS + 12 * 3600 * 10**9),
     "gps-week": (
-        _csv([f"2312,{302418 - 43200 + t:.2f}" for t in TIME_S], "GPS_Week,tow," + _HEAD.partition(",")[2]).encode(),
+        _csv([f"2312,{302418 - 43200 + t:.2f}" for t in TIME_S], "GPS_Week,tow," + _HEAD.partition(",")[2]),
         DAY_NS,
     ),
     "units-and-sources": (
-        b"made by a phone\nFormat,3\n\n"
-        + _csv([f"{t:.2f},7" for t in TIME_S], "time,lap,ay,speed\ns,,m/s\xc2\xb2,km/h\n,,100: acc,calc").encode(
-            "latin-1"
-        ),
+        "made by a phone\nFormat,3\n\n"
+        + _csv([f"{t:.2f},7" for t in TIME_S], "time,lap,ay,speed\ns,,m/s²,km/h\n,,100: acc,calc"),
         RELATIVE_NS,
     ),
-    "bars": (_csv(SECONDS, '"time"|"s"|0|1,"ay"|"m/s²"|-3.0|3.0|100,"speed"|"km/h"|0.0|9.0|50').encode(), RELATIVE_NS),
-    "channel-numbers": (
-        _csv(SECONDS, "[Channels]\n0,12,13\ntime,ay,speed\ns,m/s²,km/h\n\n[Data]").encode(),
-        RELATIVE_NS,
-    ),
+    "bars": (_csv(SECONDS, '"time"|"s"|0|1,"ay"|"m/s²"|-3.0|3.0|100,"speed"|"km/h"|0.0|9.0|50'), RELATIVE_NS),
+    "channel-numbers": (_csv(SECONDS, "[Channels]\n0,12,13\ntime,ay,speed\ns,m/s²,km/h\n\n[Data]"), RELATIVE_NS),
     "labview": (
         _csv(
             SECONDS,
             "LabVIEW Measurement\t\nDate\t2024/05/01\n***End_of_Header***\t\nSamples\t1\t1\t\n"
             "Y_Unit_Label\tm/s²\tkm/h\t\nDelta_X\t0.01\t0.01\t\n***End_of_Header***\t\t\t\nX_Value\tay\tspeed\tComment",
             "\t",
-        ).encode(),
+        ),
         RELATIVE_NS,
     ),
-    "labels": (_csv([f",{t}" for t in SECONDS], "unit,s,m/s²,km/h\nname,XAxis,ay,speed").encode(), RELATIVE_NS),
-    "rate-in-head": (_csv([""] * N, "SampleRate,100,100\nVUnit,m/s²,km/h\nTraceName,ay,speed").encode(), RELATIVE_NS),
-    "metadata": (_csv(SECONDS, "time,ay,speed\n,Unit: m/s²,Unit: km/h").encode(), RELATIVE_NS),
-    "aligned": (_csv(SECONDS, "Run 1\nElapsed time (s)   ay (m/s²)   speed (km/h)", "   ").encode(), RELATIVE_NS),
-    "list": (_csv(_iso(), "Channel : ay (m/s²)\nChannel : speed (km/h)\nLog : 1").encode(), NOON_NS),
-    "row-names": (_csv([f"{i},{t}" for i, t in enumerate(SECONDS)], _HEAD).encode(), RELATIVE_NS),
-    "sep": (_csv(SECONDS, f"sep=,\n{_HEAD}").encode(), RELATIVE_NS),
-    "compact": (_csv([t.replace("-", "").replace(":", "") for t in _iso("Z")], _HEAD).encode(), NOON_NS),
-    "named-month": (_csv([f"May 1 2024 {t.partition('T')[2]}" for t in _iso()], _HEAD).encode(), NOON_NS),
+    "labels": (_csv([f",{t}" for t in SECONDS], "unit,s,m/s²,km/h\nname,XAxis,ay,speed"), RELATIVE_NS),
+    "rate-in-head": (_csv([""] * N, "SampleRate,100,100\nVUnit,m/s²,km/h\nTraceName,ay,speed"), RELATIVE_NS),
+    "metadata": (_csv(SECONDS, "time,ay,speed\n,Unit: m/s²,Unit: km/h"), RELATIVE_NS),
+    "aligned": (_csv(SECONDS, "Run 1\nElapsed time (s)   ay (m/s²)   speed (km/h)", "   "), RELATIVE_NS),
+    "list": (_csv(_iso(), "Channel : ay (m/s²)\nChannel : speed (km/h)\nLog : 1"), NOON_NS),
+    "row-names": (_csv([f"{i},{t}" for i, t in enumerate(SECONDS)], _HEAD), RELATIVE_NS),
+    "sep": (_csv(SECONDS, f"sep=,\n{_HEAD}"), RELATIVE_NS),
+    "compact": (_csv([t.replace("-", "").replace(":", "") for t in _iso("Z")], _HEAD), NOON_NS),
+    "named-month": (_csv([f"May 1 2024 {t.partition('T')[2]}" for t in _iso()], _HEAD), NOON_NS),
     "colon-milliseconds": (
-        _csv([t.partition("T")[2].replace(".", ":") for t in _iso()], _HEAD).encode(),
+        _csv([t.partition("T")[2].replace(".", ":") for t in _iso()], _HEAD),
         RELATIVE_NS + 12 * 3600 * 10**9,
     ),
     "calendar": (
         _csv(
             [f"{100_000_000 * (i % 10)},2024,5,1,12,0,{i // 10}" for i in range(N)],
             "UTC_Nano,UTC_Year,UTC_Month,UTC_Day,UTC_Hour,UTC_Minute,UTC_Second," + _HEAD.partition(",")[2],
-        ).encode(),
+        ),
         NOON_NS,
     ),
     "clock-by-its-cells": (
-        _csv([t.partition("T")[2] for t in _iso()], _HEAD.replace("time", "Ώρα")).encode(),
+        _csv([t.partition("T")[2] for t in _iso()], _HEAD.replace("time", "Ώρα")),
         RELATIVE_NS + 12 * 3600 * 10**9,
     ),
-    "minutes": (_csv([f"05:{t:06.3f}" for t in TIME_S], _HEAD).encode(), RELATIVE_NS + 300 * 10**9),
-    "month-first": (_csv([f"5/1/2024 {t.partition('T')[2]}" for t in _iso()], _HEAD).encode(), NOON_NS),
-    "dead-clock": (_csv([f"0,{t}" for t in SECONDS], "utc," + _HEAD).encode(), RELATIVE_NS),
-    "extra-comma": (_csv(SECONDS, _HEAD).replace("\n", ",\n").encode(), RELATIVE_NS),
+    "minutes": (_csv([f"05:{t:06.3f}" for t in TIME_S], _HEAD), RELATIVE_NS + 300 * 10**9),
+    "month-first": (_csv([f"5/1/2024 {t.partition('T')[2]}" for t in _iso()], _HEAD), NOON_NS),
+    "dead-clock": (_csv([f"0,{t}" for t in SECONDS], "utc," + _HEAD), RELATIVE_NS),
+    "extra-comma": (_csv(SECONDS, _HEAD).replace("\n", ",\n"), RELATIVE_NS),
 }
 
 
