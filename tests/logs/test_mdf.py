@@ -25,9 +25,9 @@ from pdhef_logtool.logs.mdf_conversions import conversion_rule, formula_rule
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
-from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from tests.command_line import called
+from tests.table_contents import parsed
 
 asammdf = pytest.importorskip("asammdf")
 from asammdf.blocks import v2_v3_blocks, v4_blocks  # noqa: E402
@@ -40,29 +40,7 @@ START_NS = 1_714_564_800 * 10**9
 START = dt.datetime.fromtimestamp(START_NS // 10**9, tz=dt.UTC)
 
 
-@dataclass
-class Contents:
-    """A file as the reader returns it, with all columns loaded."""
-
-    read: Tables
-    columns: dict[str, NDArray[Any]]
-    stamps_ns: dict[str, NDArray[np.int64]]
-
-    def losses(self, severity: str = "lost") -> str:
-        return "; ".join(f"{loss.where}: {loss.what}" for loss in self.read.losses if loss.severity == severity)
-
-
-def contents(path: Path) -> Contents:
-    with path.open("rb") as stream:
-        read = open_mdf(TableFile(stream, path.stat().st_size, path.name, DEFAULT_LIMITS))
-        rows = {t.name: slice(0, len(t.stamps_ns)) for t in read.tables}
-        columns = {f"{t.name}.{f.path}": t.load(f.path, rows[t.name]) for t in read.tables for f in t.fields}
-    return Contents(read, columns, {t.name: t.stamps_ns for t in read.tables})
-
-
-def of_bytes(folder: Path, data: bytes) -> Contents:
-    (folder / "a.mf4").write_bytes(data)
-    return contents(folder / "a.mf4")
+read_mdf = partial(parsed, open_mdf)
 
 
 def written(path: Path, signals: Sequence[Any], version: str = "4.10", start: dt.datetime = START) -> Path:
@@ -211,8 +189,8 @@ def test_a_file_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None
 
 def test_links_beyond_the_end_are_a_loss(tmp_path: Path) -> None:
     data = imu()
-    read = of_bytes(tmp_path, patched(data, block(data, b"CN", 0) + 24, len(data) + 64))
-    assert "1 blocks are beyond the end of the file" in read.losses()
+    read = read_mdf(patched(data, block(data, b"CN", 0) + 24, len(data) + 64))
+    assert "1 blocks are beyond the end of the file" in read.what()
 
 
 # ---- conversions ----
@@ -294,10 +272,10 @@ def test_a_formula_of_a_file_runs_nothing(version: str, tmp_path: Path) -> None:
     hostile = {"formula": f"__import__('pathlib').Path('{canary}').touch() or X"}
     ours = [signal("bad", AY, conversion=hostile), signal("good", AY, conversion={"formula": "2*X+1"})]
     path = written(tmp_path / "a.mf4", ours, version)
-    read = contents(path)
-    np.testing.assert_allclose(read.columns["car.good"], 2.0 * AY + 1.0)
-    assert set(read.columns) == {"car.good"}
-    assert "bad cannot be read: its formula" in read.losses()
+    read = read_mdf(path)
+    np.testing.assert_allclose(read.columns["good"], 2.0 * AY + 1.0)
+    assert set(read.columns) == {"good"}
+    assert "bad cannot be read: its formula" in read.what()
     assert called("inspect", path).returncode == 3
     assert not canary.exists()
 
@@ -312,13 +290,13 @@ def test_conversions_of_a_file_are_applied(version: str, tmp_path: Path) -> None
         signal("tab", raw, conversion={"raw_0": 0, "phys_0": 0, "raw_1": 300, "phys_1": 3, "interpolation": True}),
         signal("text", np.asarray([b"a"] * N), encoding="utf-8"),
     ]  # fmt: skip
-    read = contents(written(tmp_path / "a.mf4", ours, version))
-    assert {name: unit for t in read.read.tables for name, unit in ((f.path, f.unit) for f in t.fields)}["lin"] == "g"
-    np.testing.assert_allclose(read.columns["car.lin"], raw * 0.5 + 1.0)
-    np.testing.assert_allclose(read.columns["car.gear"], raw % 3)
-    np.testing.assert_allclose(read.columns["car.tab"], raw / 100.0)
-    assert "no columns of numbers: text" in read.losses("note")
-    assert "car.text" not in read.columns
+    read = read_mdf(written(tmp_path / "a.mf4", ours, version))
+    assert read.units["lin"] == "g"
+    np.testing.assert_allclose(read.columns["lin"], raw * 0.5 + 1.0)
+    np.testing.assert_allclose(read.columns["gear"], raw % 3)
+    np.testing.assert_allclose(read.columns["tab"], raw / 100.0)
+    assert "no columns of numbers: text" in read.what("note")
+    assert "text" not in read.columns
 
 
 # ---- invalid samples ----
@@ -354,9 +332,9 @@ def test_a_local_start_does_not_depend_on_the_time_zone_of_the_machine(
     version: str, tmp_path: Path, time_zone: str
 ) -> None:
     start = START.replace(tzinfo=None) if version[0] == "4" else START
-    read = contents(written(tmp_path / "a.mf4", [signal("ay", AY)], version, start))
+    read = read_mdf(written(tmp_path / "a.mf4", [signal("ay", AY)], version, start))
     assert read.stamps_ns["car"][0] == START_NS
-    assert "local time without a time zone" in read.losses("note")
+    assert "local time without a time zone" in read.what("note")
 
 
 @pytest.mark.parametrize(("sync", "what"), [(2, "an angle"), (3, "a distance"), (4, "an index")])
@@ -364,9 +342,9 @@ def test_a_master_that_is_no_time_is_no_clock(sync: int, what: str, tmp_path: Pa
     samples = np.column_stack([TIME_S, AY]).tobytes()
     distance = Ch("s", kind=2, sync=sync)
     with pytest.raises(LogError, match=f"its master is {what}, no time"):
-        of_bytes(tmp_path, mdf4([distance, Ch("AccY", 8)], samples, N, 16))
-    read = of_bytes(tmp_path, mdf4([distance, Ch("AccY", 8), TIME], samples, N, 16))
-    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY)
+        read_mdf(mdf4([distance, Ch("AccY", 8)], samples, N, 16))
+    read = read_mdf(mdf4([distance, Ch("AccY", 8), TIME], samples, N, 16))
+    np.testing.assert_array_equal(read.columns["AccY"], AY)
 
 
 # ---- bus logging of newer loggers ----
@@ -486,7 +464,7 @@ HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
 @pytest.mark.parametrize(("make", "match"), HARMFUL.values(), ids=HARMFUL)
 def test_a_file_that_is_made_to_harm_is_one_line(make: Callable[[], bytes], match: str, tmp_path: Path) -> None:
     with pytest.raises(LogError, match=match):
-        of_bytes(tmp_path, make())
+        read_mdf(make())
 
 
 def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(
@@ -500,9 +478,9 @@ def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(
     (tmp_path / "a.mf4").write_bytes(data)
     (tmp_path / "t").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "t"))
-    read = contents(tmp_path / "a.mf4")
-    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY)
-    assert "has not finished" in read.losses("note")
+    read = read_mdf(tmp_path / "a.mf4")
+    np.testing.assert_array_equal(read.columns["AccY"], AY)
+    assert "has not finished" in read.what("note")
     del read
     gc.collect()
     assert list((tmp_path / "t").iterdir()) == []

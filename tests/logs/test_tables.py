@@ -8,7 +8,6 @@ import io
 import json
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,8 +27,8 @@ from pdhef_logtool.logs.text_logs import open_json_lines
 from pdhef_logtool.mapping.choosing import tables_for
 from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_to_toml
 from pdhef_logtool.records.errors import LogError, MappingFileError, PdhefError
-from pdhef_logtool.records.signals import IntArray, Loss
 from tests.command_line import called
+from tests.table_contents import opened
 
 N = 200
 TIME_S = np.arange(N) * 0.01
@@ -138,40 +137,10 @@ DIALECTS: dict[str, tuple[bytes | str, int]] = {
 ASSUMED = {n: [("clock", "note")] for n in ("milliseconds-by-step", "month-first", "rate-in-head", "labview")}
 
 
-@dataclasses.dataclass
-class Contents:
-    """A log as a whole: messages and stamps by topic, units and columns by field."""
-
-    kind: str
-    topics: dict[str, int]
-    stamps_ns: dict[str, IntArray]
-    units: dict[str, str]
-    columns: dict[str, np.ndarray]
-    lost: tuple[Loss, ...]
-
-    @property
-    def counts(self) -> list[tuple[str, int | None]]:
-        return [(x.kind, x.count) for x in self.lost]
-
-
-def _read(path: Path, data: bytes | str | None = None, **settings: Any) -> Contents:
-    if data is not None:
-        path.parent.mkdir(exist_ok=True)
-        path.write_bytes(data.encode() if isinstance(data, str) else data)
-    with closing(open_log(path, settings=TableSettings(**settings))) as log:
-        fields = {topic.name: log.fields(topic.name) for topic in log.topics}
-        read = log.read({name: [f.path for f in its] for name, its in fields.items()})
-        units = {f.path: f.unit for its in fields.values() for f in its}
-        columns = {path: values for its in read.values() for path, values in its.fields.items()}
-        stamps = {name: its.log_time_ns for name, its in read.items()}
-        topics = {t.name: t.messages for t in log.topics}
-        return Contents(log.kind, topics, stamps, units, columns, log.lost)
-
-
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_every_dialect_of_csv_gives_the_same_columns(dialect: str, tmp_path: Path) -> None:
     data, start_ns = DIALECTS[dialect]
-    read = _read(tmp_path / "drive.csv", data)
+    read = opened(tmp_path / "drive.csv", data)
     assert [*read.topics] == ["csv"]
     assert {name: read.units[name] for name in UNITS} == UNITS
     assert [(x.kind, x.severity) for x in read.lost] == ASSUMED.get(dialect, [])
@@ -195,7 +164,7 @@ def test_any_numbers_come_back(
     rows = [[f"{i * 0.02:.2f}", f"{v:.6f}"] for i, v in enumerate(values)]
     cells = [[c.replace(".", ",") if comma else c for c in row] for row in rows]
     text = "\n".join(separator.join(f'"{c}"' if quoted else c for c in row) for row in [["t", "a"], *cells])
-    np.testing.assert_array_equal(_read(tmp_path_factory.mktemp("csv") / "a.csv", text).columns["a"], values)
+    np.testing.assert_array_equal(opened(tmp_path_factory.mktemp("csv") / "a.csv", text).columns["a"], values)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +185,7 @@ def test_any_numbers_come_back(
 )
 def test_a_number_in_any_spelling(texts: list[str], numbers: list[float], tmp_path: Path) -> None:
     rows = [f"{i};{text}" for i, text in enumerate(texts * 9)]
-    read = _read(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
+    read = opened(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
     np.testing.assert_array_equal(read.columns["a"], numbers * 9)
     assert read.lost == ()
 
@@ -231,14 +200,14 @@ UNREADABLE = [
 
 def test_cells_without_a_number_are_empty_or_a_loss(tmp_path: Path) -> None:
     rows = [f"{i};{text}" for i, text in enumerate(["1.5", *EMPTY, *UNREADABLE, *["0.25"] * 200])]
-    read = _read(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
+    read = opened(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
     assert read.columns["a"][np.isfinite(read.columns["a"])].tolist() == [1.5, *[0.25] * 200]
     assert read.counts == [("bad-cell", len(UNREADABLE))]
 
 
 def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_number(tmp_path: Path) -> None:
     rows = [f"{t:.2f},{AY[i]},{SPEED[i] if i % 10 == 0 else ''},{2 * AY[i]}" for i, t in enumerate(TIME_S)]
-    read = _read(tmp_path / "a.csv", "\n".join(["t,ay,speed,ay", *rows]))
+    read = opened(tmp_path / "a.csv", "\n".join(["t,ay,speed,ay", *rows]))
     assert read.topics == {"csv": N, "csv_2": N // 10}
     np.testing.assert_array_equal(read.columns["ay_2"], 2 * AY)
     np.testing.assert_array_equal(read.columns["speed"], SPEED[::10])
@@ -262,13 +231,13 @@ def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_numbe
 )
 def test_the_bytes_of_the_titles_show_their_encoding(encoding: str, title: str, name: str, tmp_path: Path) -> None:
     rows = [f"{t:.2f},{a:.4f}" for t, a in zip(TIME_S, AY, strict=True)]
-    assert [*_read(tmp_path / "a.csv", "\n".join([f"t,{title}", *rows]).encode(encoding)).columns] == [name]
+    assert [*opened(tmp_path / "a.csv", "\n".join([f"t,{title}", *rows]).encode(encoding)).columns] == [name]
 
 
 def test_columns_behind_times_of_their_own_have_these_and_a_lap_time_is_none(tmp_path: Path) -> None:
     rows = [f"{t:.2f};{a:.4f};{t % 0.5:.2f};" for t, a in zip(TIME_S, AY, strict=True)]
     rows = [row + (f"{0.003 + 0.05 * i:.3f};{SPEED[i]}" if i < N // 5 else ";") for i, row in enumerate(rows)]
-    read = _read(tmp_path / "a.csv", "\n".join(["time;ay;time;time;speed", *rows]))
+    read = opened(tmp_path / "a.csv", "\n".join(["time;ay;time;time;speed", *rows]))
     assert (read.topics, read.lost, [*read.columns]) == ({"csv_1": N, "csv_2": N // 5}, (), ["ay", "time_2", "speed"])
     np.testing.assert_array_equal(read.columns["ay"], AY)
     np.testing.assert_array_equal(read.columns["speed"], SPEED[: N // 5])
@@ -280,7 +249,7 @@ def test_damaged_rows_are_losses_and_the_others_are_read(tmp_path: Path) -> None
     lines = _csv(SECONDS, _HEAD).splitlines()
     lines[10], lines[20], lines[30] = "0.09,1", "0.19,2,3,4,5", ",1.0,2.0"
     text = "\n".join([*lines[:-1], "1.99,1.2"])  # cut within the last row
-    read = _read(tmp_path / "a.csv", text)
+    read = opened(tmp_path / "a.csv", text)
     assert {*read.counts} == {("bad-row", 2), ("truncated", 1), ("bad-stamp", 1)}
     assert read.topics == {"csv": N - 4}
     done = called("inspect", tmp_path / "a.csv", "--json")
@@ -291,7 +260,7 @@ def test_damaged_rows_are_losses_and_the_others_are_read(tmp_path: Path) -> None
 def test_rows_without_a_quoted_cell_shift_no_columns(tmp_path: Path) -> None:
     lines = ["time,note,ay,speed", *(f'{t},"ok, {i}",{AY[i]},{SPEED[i]}' for i, t in enumerate(SECONDS))]
     lines[1], lines[50], lines[60] = '0.0,"ok",1.0', '0.49,"ok",1,2,3', '0.59,"two\nlines",1.5,2.5'
-    read = _read(tmp_path / "a.csv", "\n".join([*lines, ""]))
+    read = opened(tmp_path / "a.csv", "\n".join([*lines, ""]))
     others = [i for i in range(N) if i not in (0, 49, 59)]
     for name, values, inserted in (("ay", AY, 1.5), ("speed", SPEED, 2.5)):
         np.testing.assert_array_equal(np.delete(read.columns[name], 57), values[others])
@@ -302,7 +271,7 @@ def test_rows_without_a_quoted_cell_shift_no_columns(tmp_path: Path) -> None:
 def test_a_cell_without_an_end_costs_only_the_cells_behind_it(tmp_path: Path) -> None:
     lines = ["time,ay,speed", *(f"{0.01 * i:.2f},1.5,{i}" for i in range(40_000))]
     lines[10] = '0.09,"1.5,9'
-    read = _read(tmp_path / "a.csv", "\n".join([*lines, ""]))
+    read = opened(tmp_path / "a.csv", "\n".join([*lines, ""]))
     assert read.counts == [("bad-row", 1)]
     assert read.columns["speed"][-1] == 39_999
     assert len(read.columns["speed"]) > 20_000
@@ -315,7 +284,7 @@ def test_a_cell_without_an_end_costs_only_the_cells_behind_it(tmp_path: Path) ->
 def test_rows_that_begin_with_a_hash_are_counted(row: str, kinds: set[str], tmp_path: Path) -> None:
     lines = ["# made by hand", "# time,ay,speed", *(f"{t},{a},{v}" for t, a, v in zip(SECONDS, AY, SPEED, strict=True))]
     lines.insert(30, row)
-    read = _read(tmp_path / "a.csv", "\n".join([*lines, ""]))
+    read = opened(tmp_path / "a.csv", "\n".join([*lines, ""]))
     assert read.topics == {"csv": N}
     assert set(read.counts) == {(kind, 1) for kind in kinds}
 
@@ -324,7 +293,7 @@ def test_a_decimal_comma_counts_in_whichever_row_it_is(tmp_path: Path) -> None:
     steer = [0.0] * 1500 + [-0.125, 0.25]
     rows = [f"{0.01 * i:.2f};{v:g};1.{i % 10}00,5".replace(".", ",", 1) for i, v in enumerate(steer)]
     text = "\n".join(["time;steer;rpm", *(r.replace("-0.125", "-0,125").replace("0.25", "0,25") for r in rows), ""])
-    read = _read(tmp_path / "a.csv", text)
+    read = opened(tmp_path / "a.csv", text)
     np.testing.assert_array_equal(read.columns["steer"], steer)
     np.testing.assert_array_equal(read.columns["rpm"][:3], [1000.5, 1100.5, 1200.5])
     assert read.lost == ()
@@ -347,7 +316,7 @@ def test_other_columns_decide_what_a_mark_between_digits_is(
     separator: str, other: str, cell: str, value: float, note: bool, tmp_path: Path
 ) -> None:
     rows = [separator.join([str(i), other, cell, str(i)]) for i in range(30)]
-    read = _read(tmp_path / "a.csv", "\n".join([separator.join(["time [s]", "a", "b", "c"]), *rows, ""]))
+    read = opened(tmp_path / "a.csv", "\n".join([separator.join(["time [s]", "a", "b", "c"]), *rows, ""]))
     assert set(read.columns["b"]) == {value}
     assert read.counts == ([("ambiguous-number", None)] if note else [])
 
@@ -363,7 +332,7 @@ def test_other_columns_decide_what_a_mark_between_digits_is(
 )
 def test_a_csv_without_header_or_times_is_refused_in_one_line(text: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(PdhefError, match=words) as refused:
-        _read(tmp_path / "a.csv", text)
+        opened(tmp_path / "a.csv", text)
     assert "\n" not in str(refused.value)
 
 
@@ -385,7 +354,7 @@ def vbo(clock: list[str], *, units: str = "g\n\n°/s\n", created: str = "11/04/2
 
 def test_a_vbo_file_keeps_minutes_units_and_the_clock_over_midnight(tmp_path: Path) -> None:
     clock = ["235959.980", "235959.990", "000000.000", "000000.010", "000003.000"]
-    read = _read(tmp_path / "a.vbo", vbo(clock))
+    read = opened(tmp_path / "a.vbo", vbo(clock))
     assert (read.topics, read.lost) == ({"vbox": 5}, ())
     assert {name: unit for name, unit in read.units.items() if unit} == {
         "latitude": "min", "longitude": "min", "latitude_raw": "min", "Y_Accel": "g", "YawRate": "°/s",
@@ -407,7 +376,7 @@ def test_a_vbo_file_keeps_minutes_units_and_the_clock_over_midnight(tmp_path: Pa
 def test_of_too_many_or_too_few_units_those_that_belong_to_one_quantity_are_used(
     lines: str, units: dict[str, str], tmp_path: Path
 ) -> None:
-    read = _read(tmp_path / "a.vbo", vbo(["100000.00", "100000.01"], units=lines))
+    read = opened(tmp_path / "a.vbo", vbo(["100000.00", "100000.01"], units=lines))
     assert {name: read.units[name] for name in units} == units
     (loss,) = read.lost
     assert (loss.kind, loss.severity, loss.count) == ("units", "note", list(units.values()).count(""))
@@ -422,7 +391,7 @@ def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp
         f"1000{i // 100:02d}.{i % 100:02d} {3420 + n:+.6f} {east * (720 + 1.84 * e):+.6f} {h:.3f}"
         for i, (n, e, h) in enumerate(zip(north, to_east, heading, strict=True))
     ]
-    read = _read(tmp_path / "a.vbo", head + "\n".join([*rows, ""]))
+    read = opened(tmp_path / "a.vbo", head + "\n".join([*rows, ""]))
     is_clear = turn == 90  # a drive to the north does not show the sign
     assert read.counts == ([("mirrored", None)] if is_clear and east > 0 else [])
     assert (read.columns["longitude"][0] < 0.0) == (is_clear or east < 0)
@@ -430,11 +399,11 @@ def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp
 
 def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     data = vbo([f"1000{i // 100:02d}.{i % 100:02d}" for i in range(N)])
-    read = _read(tmp_path / "a.vbo", data[:-40])
+    read = opened(tmp_path / "a.vbo", data[:-40])
     assert [(x.kind, x.severity) for x in read.lost] == [("truncated", "lost")]
     assert read.topics == {"vbox": N - 1}
     with pytest.raises(PdhefError, match=r"\[header\] and \[data\]"):
-        _read(tmp_path / "b.vbo", data[: data.index(b"[data]")])
+        opened(tmp_path / "b.vbo", data[: data.index(b"[data]")])
 
 
 @pytest.mark.parametrize(("turned_deg", "recognised"), [(0.0, True), (3.0, True), (90.0, False), (180.0, False)])
@@ -476,7 +445,7 @@ def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path
         clock = (np.array(times) * 1e9).round().astype("datetime64[ns]")
         columns = {"signal_name": pa.array(names).dictionary_encode(), "recorded": clock, "value": values}
         pq.write_table(pa.table(columns), path)
-    read = _read(path)
+    read = opened(path)
     assert read.topics == {suffix[1:]: N, f"{suffix[1:]}_2": N // 10}
     assert read.units == {"Lat_Acc": "m/s²", "speed": "km/h", "gnss": ""}
     for name, values in (("Lat_Acc", AY), ("speed", SPEED), ("gnss", 2.0 * TIME_S[::10])):
@@ -488,7 +457,7 @@ def test_a_clock_is_dates_before_times_since_a_start(clock: str, tmp_path: Path)
     start = 1.7e9 if "1970" in clock else 0.0
     factor = 1.0 if "1970" in clock else 1e3
     rows = [f"{(start + t) * factor:.6f},{100.0 + t:.3f},{v:.4f}" for t, v in zip(TIME_S, SPEED, strict=True)]
-    read = _read(tmp_path / "a.txt", "\n".join([f"{clock},gyroTimestamp_sinceReboot(s),speed (km/h)", *rows, ""]))
+    read = opened(tmp_path / "a.txt", "\n".join([f"{clock},gyroTimestamp_sinceReboot(s),speed (km/h)", *rows, ""]))
     assert read.stamps_ns["csv"][0] == (RELATIVE_NS if start == 0.0 else round(start * 1e9))
 
 
@@ -502,7 +471,7 @@ def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them
         "Y": [entry("a_y", AY, "m/s^2"), entry("v_veh", SPEED[::2], "km/h")],
     }
     savemat(tmp_path / "a.mat", {"rec": record})
-    read = _read(tmp_path / "a.mat")
+    read = opened(tmp_path / "a.mat")
     assert read.units == {"a_y": "m/s^2", "v_veh": "km/h"}
     np.testing.assert_allclose(read.columns["v_veh"], SPEED[::2])
     stamps = min(read.stamps_ns.values(), key=len)
@@ -511,20 +480,20 @@ def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them
 
 def test_texts_that_name_no_signals_make_no_columns(tmp_path: Path) -> None:
     rows = [f"{t:.2f},entry {i},{v:.3f}" for i, (t, v) in enumerate(zip(TIME_S, SPEED, strict=True))]
-    assert [*_read(tmp_path / "a.csv", "\n".join(["time,name,value", *rows, ""])).columns] == ["value"]
+    assert [*opened(tmp_path / "a.csv", "\n".join(["time,name,value", *rows, ""])).columns] == ["value"]
 
 
 def test_a_clock_in_two_columns_or_with_named_months(tmp_path: Path) -> None:
     rows = [(1_700_000_000 + i // 4, 250_000 * (i % 4)) for i in range(1, 40)]
     parts = "stamp.sec;stamp.usec;speed\n" + "".join(f"{s};{u};{i}\n" for i, (s, u) in enumerate(rows))
-    assert _read(tmp_path / "a.csv", parts).stamps_ns["csv"].tolist() == [s * 10**9 + u * 1000 for s, u in rows]
+    assert opened(tmp_path / "a.csv", parts).stamps_ns["csv"].tolist() == [s * 10**9 + u * 1000 for s, u in rows]
     named = "Device Time,speed\n" + "".join(f"05-Nov-2025 10:00:{i:02}.500,{i}\n" for i in range(20))
-    assert _read(tmp_path / "b.csv", named).stamps_ns["csv"][0] == 1_762_336_800_500_000_000
+    assert opened(tmp_path / "b.csv", named).stamps_ns["csv"][0] == 1_762_336_800_500_000_000
 
 
 def test_rows_that_share_whole_seconds_are_spread(tmp_path: Path) -> None:
     rows = "time,speed\n" + "".join(f"10:00:{(i + 3) // 5:02},{i}\n" for i in range(99))
-    assert {*np.diff(_read(tmp_path / "a.csv", rows).stamps_ns["csv"]).tolist()} == {200_000_000}
+    assert {*np.diff(opened(tmp_path / "a.csv", rows).stamps_ns["csv"]).tolist()} == {200_000_000}
 
 
 START_S = 1_714_564_800
@@ -540,7 +509,7 @@ def _json_lines(*records: object) -> str:
 def test_wide_json_lines_are_columns_with_exact_integers(tmp_path: Path) -> None:
     first_ns = START_S * 10**9 + 1
     records = [{"time": first_ns + i * 10**7, "imu": {"ay": [0.5 * i, i]}, "v [km/h]": i or None} for i in range(40)]
-    read = _read(tmp_path / "a.jsonl", _json_lines(*records))
+    read = opened(tmp_path / "a.jsonl", _json_lines(*records))
     assert (read.kind, read.stamps_ns["json"][0], read.lost) == ("json-lines", first_ns, ())
     assert read.units == {"imu_ay_0": "", "imu_ay_1": "", "v": "km/h"}
     np.testing.assert_array_equal(read.columns["imu_ay_0"], 0.5 * np.arange(40))
@@ -549,7 +518,7 @@ def test_wide_json_lines_are_columns_with_exact_integers(tmp_path: Path) -> None
 
 def test_json_lines_in_long_form_have_a_column_for_each_name(tmp_path: Path) -> None:
     records = [{"name": n, "value": i + k, "time": START_S + 0.1 * i} for i in range(40) for k, n in enumerate("ab")]
-    read = _read(tmp_path / "a.ndjson", _json_lines(*records, [1], "x"))
+    read = opened(tmp_path / "a.ndjson", _json_lines(*records, [1], "x"))
     np.testing.assert_array_equal(read.columns["b"], np.arange(40) + 1)
     assert read.counts == [("bad-row", 2)]
 
@@ -557,7 +526,7 @@ def test_json_lines_in_long_form_have_a_column_for_each_name(tmp_path: Path) -> 
 @pytest.mark.parametrize("text", ["", '[{"a": 1}]\n', "{\n", "x\n"])
 def test_a_file_without_objects_in_lines_is_one_line(text: str, tmp_path: Path) -> None:
     with pytest.raises(LogError, match="a JSON object a line"):
-        _read(tmp_path / "a.json", text or "\n")
+        opened(tmp_path / "a.json", text or "\n")
 
 
 @pytest.mark.parametrize(
@@ -572,7 +541,7 @@ def test_a_file_without_objects_in_lines_is_one_line(text: str, tmp_path: Path) 
     ],
 )
 def test_documents_line_protocol_and_rows_of_several_kinds(name: str, text: str, tmp_path: Path) -> None:
-    read = _read(tmp_path / name, text)
+    read = opened(tmp_path / name, text)
     assert len(read.topics) == 1
     (values,) = [values for name, values in read.columns.items() if name.endswith("ay")]
     np.testing.assert_allclose(values, AY)
@@ -604,19 +573,19 @@ def test_limits_of_json_lines() -> None:
 def test_a_table_without_times_asks_for_its_rate(tmp_path: Path) -> None:
     text = "ax,ay\n" + "".join(f"{i}.5,{i}\n" for i in range(100))
     with pytest.raises(LogError, match="--set rate_hz=100, or rate_hz in the mapping file"):
-        _read(tmp_path / "a.csv", text)
-    read = _read(tmp_path / "a.csv", rate_hz=50.0)
+        opened(tmp_path / "a.csv", text)
+    read = opened(tmp_path / "a.csv", rate_hz=50.0)
     assert np.diff(read.stamps_ns["csv"]).tolist() == [20_000_000] * 99
     assert [loss.severity for loss in read.lost] == ["note"]
     long = "signal,value\n" + "".join(f"{n},{i}\n" for i in range(50) for n in "ab")
     with pytest.raises(LogError, match="a column of times"):
-        _read(tmp_path / "b.csv", long, rate_hz=50.0)
+        opened(tmp_path / "b.csv", long, rate_hz=50.0)
 
 
 def test_a_rate_decides_a_unit_that_is_not_stated(tmp_path: Path) -> None:
     text = "time,ay\n" + "".join(f"{100 * i},{i}\n" for i in range(600))
     for rate_hz, length_s in ((None, 59.9), (100.0, 5.99), (1e4, 0.0599)):
-        read = _read(tmp_path / "a.csv", text, rate_hz=rate_hz)
+        read = opened(tmp_path / "a.csv", text, rate_hz=rate_hz)
         assert np.ptp(read.stamps_ns["csv"]) * 1e-9 == pytest.approx(length_s, abs=1e-6)
         assert "rate_hz" in read.lost[0].what
 
@@ -627,16 +596,16 @@ def test_speed_and_positions_decide_the_unit_of_a_clock(ticks_per_s: int, unit_m
     t = np.arange(0, 60, 0.1)
     rows = zip(np.round(t * ticks_per_s, 1), 48.0 + 20.0 * t / 111_195.0, np.full(600, 20.0 / unit_m_s), strict=True)
     text = "time,latitude,longitude,speed\n" + "".join(f"{k:g},{lat:.8f},9.5,{v}\n" for k, lat, v in rows)
-    assert np.ptp(_read(tmp_path / "a.csv", text).stamps_ns["csv"]) * 1e-9 == pytest.approx(59.9, abs=1e-6)
+    assert np.ptp(opened(tmp_path / "a.csv", text).stamps_ns["csv"]) * 1e-9 == pytest.approx(59.9, abs=1e-6)
 
 
 def test_a_group_is_the_beginning_or_the_end_of_names(tmp_path: Path) -> None:
     imu = {"time": TIME_S, "ay": AY}
     savemat(tmp_path / "a.mat", {"run_1": {"imu": imu}, "run_2": {"imu": imu, "gps": imu}})
     for group, names in (("run_2", ["run_2_gps", "run_2_imu"]), ("imu", ["run_1_imu", "run_2_imu"])):
-        assert [*_read(tmp_path / "a.mat", group=group).topics] == names
+        assert [*opened(tmp_path / "a.mat", group=group).topics] == names
     with pytest.raises(LogError, match="tables of the group run_3, got run_1_imu, run_2_imu, run_2_gps"):
-        _read(tmp_path / "a.mat", group="run_3")
+        opened(tmp_path / "a.mat", group="run_3")
 
 
 def test_rate_and_group_of_a_mapping_file_apply_where_the_user_gives_none(tmp_path: Path) -> None:
@@ -672,7 +641,7 @@ def _telephone(folder: Path, start_s: float = START_S) -> Path:
 def test_files_of_one_recording_are_one_log(start_s: float, tmp_path: Path) -> None:
     folder = _telephone(tmp_path / "telephone", start_s)
     assert [log.path for log in find_logs(str(tmp_path))] == [folder]
-    read = _read(folder)
+    read = opened(folder)
     assert read.topics == {"Accelerometer": 1000, "Gyroscope": 1000, "Location": 20}
     np.testing.assert_array_equal(read.columns["x"], np.arange(1000))
     assert {loss.kind for loss in read.lost} >= {"folder", "bad-file"}
@@ -693,13 +662,13 @@ def test_files_of_the_same_columns_or_other_times_are_drives(
         open_log(folder)
     forced = TableSettings(folder="recording")
     assert [log.path for log in find_logs(str(folder), settings=forced)] == [folder]
-    assert [*_read(folder, folder="recording").topics] == ["n_0", "n_1"]
+    assert [*opened(folder, folder="recording").topics] == ["n_0", "n_1"]
 
 
 def test_a_damaged_file_of_a_recording_is_a_loss(tmp_path: Path) -> None:
     folder = _telephone(tmp_path / "telephone")
     (folder / "Gravity.csv").write_text("\n".join("damaged" * 3 for _ in range(9)))
-    assert [loss.where for loss in _read(folder).lost if loss.severity == "lost"] == [str(folder / "Gravity.csv")]
+    assert [loss.where for loss in opened(folder).lost if loss.severity == "lost"] == [str(folder / "Gravity.csv")]
 
 
 @pytest.mark.parametrize(
@@ -722,14 +691,14 @@ def test_a_search_takes_general_files_only_where_there_are_no_others(files: str,
 
 def test_bytes_that_are_no_utf_8_cost_no_other_character(tmp_path: Path) -> None:
     data = _csv(SECONDS, "time,ay [m/s²],speed [km/h]").encode() + "2.00,1.0,caf\xe9\n".encode("latin-1")
-    read = _read(tmp_path / "a.csv", data)
+    read = opened(tmp_path / "a.csv", data)
     assert (len(read.columns["ay"]), read.units["ay"]) == (N + 1, "m/s²")
     assert ("bad-cell", 1) in read.counts
 
 
 def test_a_title_may_have_two_lines(tmp_path: Path) -> None:
     text = _csv(SECONDS, '"time","ay\n[m/s²]","speed, measured"') + '"2.0","1","2"\n'
-    read = _read(tmp_path / "a.csv", text)
+    read = opened(tmp_path / "a.csv", text)
     assert (read.units, read.lost) == ({"ay": "m/s²", "speed_measured": ""}, ())
 
 
@@ -737,13 +706,13 @@ def test_more_columns_than_the_limit_are_refused_before_they_are_read(tmp_path: 
     width = 70_000
     text = "\n".join([",".join(["time", *(f"c{i}" for i in range(width))]), *(f"{i}" + "," * width for i in range(30))])
     with pytest.raises(PdhefError, match="array width"):
-        _read(tmp_path / "a.csv", text)
+        opened(tmp_path / "a.csv", text)
 
 
 def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:
     data = vbo(["100000.00", "100000.01"], units="\n\n\n")
     data = data.replace(b"YawRate\r", b"YawRate [deg/s]\r").replace(b"Y_Accel\r", b"Y_Accel (g)\r")
-    read = _read(tmp_path / "a.vbo", data)
+    read = opened(tmp_path / "a.vbo", data)
     assert [read.units[name] for name in ("YawRate", "Y_Accel", "latitude")] == ["deg/s", "g", "min"]
     assert read.lost == ()
 
@@ -753,10 +722,10 @@ def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
     data = bytearray((tmp_path / "a.mat").read_bytes())
     second = 128 + 8 + int.from_bytes(data[132:136], "little")
     data[second + 40 : second + 80] = b"\x00" * 40
-    read = _read(tmp_path / "b.mat", bytes(data))
+    read = opened(tmp_path / "b.mat", bytes(data))
     assert [(x.kind, x.severity) for x in read.lost] == [("bad-variable", "lost")]
     assert [*read.columns] == ["speed"]
-    assert [*_read(tmp_path / "c.mat", (tmp_path / "a.mat").read_bytes()[:-30]).columns] == ["ay"]
+    assert [*opened(tmp_path / "c.mat", (tmp_path / "a.mat").read_bytes()[:-30]).columns] == ["ay"]
     assert called("inspect", tmp_path / "c.mat").returncode == 3
 
 
@@ -776,7 +745,7 @@ def test_of_a_table_that_starts_again_the_first_pass_is_kept_and_rows_that_share
     seconds = [f"{1_700_000_000 + i // 5},{i}\n" for i in range(150)]
     seconds[70] = "1699999999,0\n"
     for name, rows, kept, kind in (("a", passes, 150, "time-jump"), ("b", seconds, 149, "out-of-order")):
-        read = _read(tmp_path / f"{name}.csv", "time,speed\n" + "".join(rows))
+        read = opened(tmp_path / f"{name}.csv", "time,speed\n" + "".join(rows))
         stamps = read.stamps_ns["csv"]
         (left_out,) = [loss for loss in read.lost if loss.kind != "clock"]
         assert (len(stamps), len({*stamps.tolist()})) == (kept, kept)
