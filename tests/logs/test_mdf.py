@@ -27,7 +27,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
 from pdhef_logtool.records.errors import LogError
 from tests.command_line import called
-from tests.table_contents import parsed
+from tests.table_contents import opened, parsed
 
 asammdf = pytest.importorskip("asammdf")
 from asammdf.blocks import v2_v3_blocks, v4_blocks  # noqa: E402
@@ -157,33 +157,24 @@ def mdf(path: Path, version: str = "4.10") -> Path:
 
 @pytest.mark.parametrize("version", ["4.10", "4.11", "3.30"])
 def test_channel_groups_keep_their_clocks_and_units(version: str, tmp_path: Path) -> None:
-    with closing(open_log(mdf(tmp_path / "a.mf4", version))) as log:
-        assert log.kind == f"mdf-{version[0]}"
-        imu, other = sorted(log.topics, key=lambda t: -t.messages)
-        assert (imu.messages, other.messages) == (N, N // 10)
-        assert {f.path: f.unit for t in log.topics for f in log.fields(t.name)} == {
-            "IMU_AccY": "g", "IMU_AccX": "g", "Speed": "km/h",
-        }  # fmt: skip
-        read = log.read({imu.name: ["IMU_AccY"], other.name: ["Speed"]})
-        assert log.lost == ()
-    np.testing.assert_array_equal(read[imu.name].fields["IMU_AccY"], AY)
-    np.testing.assert_array_equal(read[other.name].fields["Speed"], SPEED[::10].astype(np.float32))
-    assert np.abs(np.diff(read[imu.name].log_time_ns) - 10_000_000).max() <= 1
-    assert read[imu.name].log_time_ns[0] == read[other.name].log_time_ns[0] == START_NS
+    read = opened(mdf(tmp_path / "a.mf4", version))
+    assert (read.kind, sorted(read.topics.values()), read.lost) == (f"mdf-{version[0]}", [N // 10, N], ())
+    assert read.units == {"IMU_AccY": "g", "IMU_AccX": "g", "Speed": "km/h"}
+    np.testing.assert_array_equal(read.columns["IMU_AccY"], AY)
+    np.testing.assert_array_equal(read.columns["Speed"], SPEED[::10].astype(np.float32))
+    other, imu = sorted(read.stamps_ns.values(), key=len)
+    assert np.abs(np.diff(imu) - 10_000_000).max() <= 1
+    assert imu[0] == other[0] == START_NS
 
 
 def test_a_file_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None:
-    (tmp_path / "a.mf4").write_bytes(imu())
-    (tmp_path / "b.mf4").write_bytes(imu()[: -16 * 100 - 5])
-    with closing(open_log(tmp_path / "a.mf4")) as log:
-        assert log.lost == ()
-        np.testing.assert_array_equal(log.read({"IMU": ["AccY"]})["IMU"].fields["AccY"], AY)
-    with closing(open_log(tmp_path / "b.mf4")) as log:
-        read = log.read({"IMU": ["AccY"]})["IMU"].fields["AccY"]
-        (loss,) = log.lost
-    assert (loss.kind, loss.severity, loss.count) == ("truncated", "lost", N - len(read))
-    np.testing.assert_array_equal(read, AY[: len(read)])
-    assert N - 102 <= len(read) <= N - 100
+    whole, cut = opened(tmp_path / "a.mf4", imu()), opened(tmp_path / "b.mf4", imu()[: -16 * 100 - 5])
+    assert whole.lost == ()
+    np.testing.assert_array_equal(whole.columns["AccY"], AY)
+    rows, (loss,) = len(cut.columns["AccY"]), cut.lost
+    assert (loss.kind, loss.severity, loss.count) == ("truncated", "lost", N - rows)
+    np.testing.assert_array_equal(cut.columns["AccY"], AY[:rows])
+    assert N - 102 <= rows <= N - 100
     assert called("inspect", tmp_path / "b.mf4").returncode == 3
 
 
@@ -405,11 +396,9 @@ LONG = [bytes(range(1, 13)), bytes(range(64))] * 2
 def test_frames_of_newer_loggers(
     length: list[Ch], numbers: dict[str, list[int]], frames: list[bytes], is_variable: bool, tmp_path: Path
 ) -> None:
-    (tmp_path / "a.mf4").write_bytes(can_file(length, numbers, frames, is_variable))
-    with closing(open_log(tmp_path / "a.mf4")) as log:
-        names = [f.path for f in log.fields("can")]
-        read = log.read({"can": names})["can"].fields
-        assert log.lost == ()
+    contents = opened(tmp_path / "a.mf4", can_file(length, numbers, frames, is_variable))
+    read = contents.columns
+    assert ([*contents.topics], contents.lost) == (["can"], ())
     assert read["id"].tolist() == [291] * 4
     assert read["is_extended"].tolist() == [0, 1, 0, 1]
     assert read["bus"].tolist() == [2] * 4
