@@ -10,10 +10,10 @@ import math
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,8 @@ _BLOCK = len("block0")
 _FILTERS = frozenset({1, 2, 3})
 #: Names of the values of a struct that has the name of the signal. What separates the parts of a path.
 _DATA, _SLASH = frozenset({"data", "value", "values"}), "/"
+#: Path of a struct, and length of some of its vectors.
+_Place: TypeAlias = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,22 +284,21 @@ def _mat_tables(
 ) -> Iterator[Table]:
     """Yield the tables of the structs; vectors without a clock of their length are noted."""
     where = file.name
-    sheets = []
+    sheets: dict[_Place, Sheet] = {}
     for struct_, variables in arrays.items():
-        lengths = dict.fromkeys(len(v) for v in variables.values() if len(v) > 1)
-        for length in sorted(lengths, reverse=True):
+        name = field_name(struct_) if struct_ else "mat"
+        for length in sorted({len(v) for v in variables.values() if len(v) > 1}, reverse=True):
             columns = {n: v for n, v in variables.items() if len(v) == length}
-            name = field_name(struct_) if struct_ else "mat"
-            sheets.append((struct_, length, Sheet(name, columns, units[struct_])))
+            sheets[struct_, length] = Sheet(name, columns, units[struct_])
     clocks = _clocks(sheets, where, rate_hz)
     rows: list[tuple[Sheet, IntArray]] = []
-    for struct_, length, sheet in sheets:
-        clock = _clock_of(struct_, length, clocks)
+    for place, sheet in sheets.items():
+        clock = _clock_of(place, clocks)
         if clock is None:
-            text = f"{', '.join([*sheet.columns][:5])} ({length} values) have no times of their length, or several"
+            text = f"{', '.join([*sheet.columns][:5])} ({place[1]} values) have no times of their length, or several"
             losses.append(Loss("no-clock", text, where, severity="note"))
             continue
-        is_own = clocks.get((struct_, length)) is clock
+        is_own = clocks.get(place) is clock
         if is_own:
             losses += clock_notes(clock.notes, f"{where}, {sheet.name}")
         signals = {n: v for n, v in sheet.columns.items() if not is_own or n not in clock.columns}
@@ -306,31 +307,27 @@ def _mat_tables(
         yield from tables_of(Sheet(name, sheet.columns, sheet.units), where, losses, stamps)
 
 
-def _clocks(
-    sheets: Sequence[tuple[str, int, Sheet]], where: str, rate_hz: float | None
-) -> dict[tuple[str, int], Clock]:
+def _clocks(sheets: Mapping[_Place, Sheet], where: str, rate_hz: float | None) -> dict[_Place, Clock]:
     """Return the clocks of sheets; those without a unit are read beside certain ones, or the longest one.
 
     Without any clock, ``rate_hz`` applies to the length that most vectors have.
     """
-    clocks: dict[tuple[str, int], Clock] = {}
-    for struct_, length, sheet in sheets:
+    clocks: dict[_Place, Clock] = {}
+    for place, sheet in sheets.items():
         with suppress(LogError):
-            clocks[struct_, length] = find_clock(sheet, where)
+            clocks[place] = find_clock(sheet, where)
     if not clocks and rate_hz:
-        counts = Counter(length for _, length, sheet in sheets for _ in sheet.columns)
-        return {(s, n): rate_clock(n, rate_hz) for s, n, _ in sheets if n == counts.most_common(1)[0][0]}
-    certain = {key for key, clock in clocks.items() if clock.is_certain}
-    certain = certain or set(sorted(clocks, key=lambda key: -key[1])[:1])
-    others = [clocks[key] for key in clocks if key in certain]
-    for struct_, length, sheet in sheets:
-        if (struct_, length) in clocks and (struct_, length) not in certain:
-            clocks[struct_, length] = find_clock(sheet, where, others, rate_hz)
-    return clocks
+        counts = Counter(length for (_, length), sheet in sheets.items() for _ in sheet.columns)
+        return {p: rate_clock(p[1], rate_hz) for p in sheets if p[1] == counts.most_common(1)[0][0]}
+    certain = {place: clock for place, clock in clocks.items() if clock.is_certain}
+    certain = certain or dict(sorted(clocks.items(), key=lambda item: -item[0][1])[:1])
+    beside = [*certain.values()]
+    return {p: certain.get(p) or find_clock(sheets[p], where, beside, rate_hz) for p in clocks}
 
 
-def _clock_of(struct_: str, length: int, clocks: Mapping[tuple[str, int], Clock]) -> Clock | None:
+def _clock_of(place: _Place, clocks: Mapping[_Place, Clock]) -> Clock | None:
     """Return the clock of a struct, or of the nearest struct around it or beside it, for vectors of a length."""
+    struct_, length = place
     while (struct_, length) not in clocks:
         if not struct_:
             return None

@@ -11,7 +11,7 @@ import logging
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from io import BytesIO
@@ -83,18 +83,20 @@ def open_mdf(file: TableFile) -> Tables:
         source = _opened(asammdf, repaired)
     if isinstance(source, str):
         raise LogError(expected="an MDF file with readable channels", got=source, where=file.name)
-    groups = Groups(file, source)
+    start_ns, is_local = _start(source.header)
+    groups: list[_Group] = []
+    groups += [_Group(file, source, number, groups) for number in range(len(source.groups))]
     tables: list[Table] = []
-    for number, name in enumerate(unique(map(groups.name, range(len(source.groups))))):
+    for group, name in zip(groups, unique(group.name for group in groups), strict=True):
         try:
-            tables += groups.tables(number, name, losses)
+            tables += group.tables(name, start_ns, losses)
         except Exception as error:  # noqa: BLE001  any error of a damaged block
             what = f"the channel group cannot be read: {describe_damage(error)[1]}"
             losses.append(Loss("bad-group", what, name))
     if not tables:
         got = next((f"{loss.where}: {loss.what}" for loss in losses if loss.kind == "bad-group"), "none with samples")
         raise LogError(expected="a channel group with times", got=got, where=file.name)
-    if groups.is_local:
+    if is_local:
         what = "the start is a local time without a time zone, read as UTC"
         losses.append(Loss("no-clock", what, file.name, severity="note"))
     return Tables(f"mdf-{str(source.version)[:1]}", tables, losses)
@@ -196,163 +198,165 @@ def _start(header: Any) -> tuple[int, bool]:
     return (start, flags == _LOCAL) if 0 < start < _MDF["last_date_ns"] else (0, False)
 
 
-class Groups:
-    """The channel groups of an opened file, by number, and their channels, by number within the group.
+class _Group:
+    """A channel group of an opened file; its channels are named by their numbers.
 
     This class removes the conversions from asammdf's channels, because asammdf would run their formulas.
+
+    Parameters
+    ----------
+    number : of the group among ``groups``, which are all of the file.
     """
 
-    def __init__(self, file: TableFile, source: Any) -> None:
-        self._file, self._source, self._groups = file, source, source.groups
-        self._version = 4 if str(source.version) >= "4" else 3
-        self._start_ns, self.is_local = _start(source.header)
-        self._conversions: dict[tuple[int, int], Any] = {}
-        for place, channel in (((g, i), c) for g, of in enumerate(source.groups) for i, c in enumerate(of.channels)):
-            self._conversions[place], channel.conversion = channel.conversion, None
-        self._rows: dict[int, int] = {}
-        self._last: tuple[tuple[int, int] | None, FloatArray] = None, np.empty(0)
+    def __init__(self, file: TableFile, source: Any, number: int, groups: Sequence[_Group]) -> None:
+        self._file, self._source, self._number, self._groups = file, source, number, groups
+        self._version, self._group = 4 if str(source.version) >= "4" else 3, source.groups[number]
+        self._block, self._channels = self._group.channel_group, self._group.channels
+        self._conversions = [channel.conversion for channel in self._channels]
+        for channel in self._channels:
+            channel.conversion = None
+        self._contains_frames = any(channel.name == _FRAMES for channel in self._channels)
+        self._rows = 0
+        self._last: tuple[int, FloatArray] = -1, np.empty(0)
 
-    def name(self, number: int) -> str:
-        """Return the name of a group by its acquisition, comment or source."""
-        group = self._groups[number].channel_group
-        source = getattr(group, "acq_source", None)
-        texts = (getattr(group, "acq_name", ""), getattr(group, "comment", ""), getattr(source, "name", ""))
+    @property
+    def name(self) -> str:
+        """Name by the acquisition, comment or source."""
+        source = getattr(self._block, "acq_source", None)
+        texts = (getattr(self._block, "acq_name", ""), getattr(self._block, "comment", ""), getattr(source, "name", ""))
         plain = (re.sub(r"<[^>]*>|\s+", " ", text or "").strip() for text in texts)
-        if self._contains_frames(number):
+        if self._contains_frames:
             return "can"
-        return field_name(next((t for t in plain if t and len(t) <= _LONGEST_NAME), f"group {number + 1}"))
+        return field_name(next((t for t in plain if t and len(t) <= _LONGEST_NAME), f"group {self._number + 1}"))
 
-    def _contains_frames(self, number: int) -> bool:
-        return any(channel.name == _FRAMES for channel in self._groups[number].channels)
-
-    def tables(self, number: int, name: str, losses: list[Loss]) -> Iterator[Table]:
+    def tables(self, name: str, start_ns: int, losses: list[Loss]) -> Iterator[Table]:
         """Yield the table of a group, none without samples; channels that cannot be read become losses.
 
         Raises
         ------
         SpanDamageError : the group has no times, or its layout is damaged.
         """
-        group, channels, file = self._groups[number].channel_group, self._groups[number].channels, self._file
-        if not channels or not group.cycles_nr:
+        group, file = self._block, self._file
+        if not self._channels or not group.cycles_nr:
             return
         row_bytes = group.samples_byte_nr + getattr(group, "invalidation_bytes_nr", 0) + 8
         file.limits.check_table(group.cycles_nr * row_bytes, file.size, f"{file.name}, {name}")
-        self._check_layout(number)
-        stamps, rows = self._stamps(number, name, losses)
-        if self._contains_frames(number):
-            yield self._frames(number, stamps, rows).table(name)
+        self._check_layout()
+        stamps, rows = self._stamps(name, start_ns, losses)
+        if self._contains_frames:
+            yield self._frames(stamps, rows).table(name)
             return
         indices, texts = [], []
-        for i, channel in enumerate(channels):
-            is_compound = self._groups[number].channel_dependencies[i] or self._is(number, i, _VARIABLE)
+        for i, channel in enumerate(self._channels):
+            is_compound = self._group.channel_dependencies[i] or self._is(i, _VARIABLE)
             if is_compound or channel.dtype_fmt.kind not in "iuf":
                 texts.append(channel.name)
             elif channel.channel_type not in _MASTERS[self._version]:
                 try:
-                    conversion_rule(self._conversions[number, i], self._version)
+                    conversion_rule(self._conversions[i], self._version)
                     indices.append(i)
                 except ValueError as error:
                     losses.append(Loss("bad-column", f"{channel.name} cannot be read: {error}", name))
         if texts:
             what = f"no columns of numbers: {', '.join(texts)}"
             losses.append(Loss("bad-column", what, name, count=len(texts), severity="note"))
-        titles = dict(zip(unique(field_name(channels[i].name) for i in indices), indices, strict=True))
-        fields = tuple(FieldInfo(title, "number", unit=self._unit(number, i)) for title, i in titles.items())
-        yield Table(name, stamps, fields, partial(self._load, number, titles, rows))
+        titles = dict(zip(unique(field_name(self._channels[i].name) for i in indices), indices, strict=True))
+        fields = tuple(FieldInfo(title, "number", unit=self._unit(i)) for title, i in titles.items())
+        yield Table(name, stamps, fields, partial(self._load, titles, rows))
 
-    def _unit(self, number: int, index: int) -> str:
-        of_conversion = getattr(self._conversions[number, index], "unit", "")
-        return of_conversion or getattr(self._groups[number].channels[index], "unit", "")
+    def _unit(self, index: int) -> str:
+        of_conversion = getattr(self._conversions[index], "unit", "")
+        return of_conversion or getattr(self._channels[index], "unit", "")
 
-    def _is(self, number: int, index: int, types: tuple[int, ...]) -> bool:
+    def _is(self, index: int, types: tuple[int, ...]) -> bool:
         """Return whether a channel is of one of these types of MDF 4."""
-        return self._version == 4 and self._groups[number].channels[index].channel_type in types
+        return self._version == 4 and self._channels[index].channel_type in types
 
-    def _check_layout(self, number: int) -> None:
+    def _check_layout(self) -> None:
         """Raise SpanDamageError for a channel outside of its record: asammdf would read and write memory of others."""
-        group = self._groups[number].channel_group
-        for i, channel in enumerate(self._groups[number].channels):
+        group = self._block
+        for i, channel in enumerate(self._channels):
             end, last_bit = channel.bit_count, -1
             if self._version == 3:
                 end += channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0)
             else:
-                end += 8 * channel.byte_offset + channel.bit_offset if not self._is(number, i, _VIRTUAL) else -end
+                end += 8 * channel.byte_offset + channel.bit_offset if not self._is(i, _VIRTUAL) else -end
                 last_bit = channel.pos_invalidation_bit if channel.flags & _SOME_INVALID else -1
             if end > 8 * group.samples_byte_nr or last_bit >= 8 * getattr(group, "invalidation_bytes_nr", 0):
                 raise SpanDamageError(f"channel {channel.name} is outside of its record")
 
-    def _seconds(self, number: int) -> FloatArray:
+    def _seconds(self) -> FloatArray:
         """Return the times of a group from the start of the recording in s [N]; SpanDamageError without times."""
-        remote = getattr(self._groups[number].channel_group, "cg_master_index", None)
-        number = number if remote is None else remote
+        remote = getattr(self._block, "cg_master_index", None)
+        group = self if remote is None else self._groups[remote]
         masters = [
             (getattr(channel, "sync_type", 1), i)
-            for i, channel in enumerate(self._groups[number].channels)
+            for i, channel in enumerate(group._channels)
             if channel.channel_type in _MASTERS[self._version]
         ]
         kind, index = min(masters, default=(0, None))
         if index is None or kind in _NO_TIMES:
             raise SpanDamageError(f"its master is {_NO_TIMES[kind]}, no time" if masters else "it has no time channel")
-        return self._values(number, index)
+        return group._values(index)
 
-    def _stamps(self, number: int, name: str, losses: list[Loss]) -> tuple[IntArray, NDArray[Any]]:
+    def _stamps(self, name: str, start_ns: int, losses: list[Loss]) -> tuple[IntArray, NDArray[Any]]:
         """Return the ascending times of a group, and their rows; other rows are losses."""
-        seconds = self._seconds(number)
-        self._rows[number] = len(seconds)
-        if missing := self._groups[number].channel_group.cycles_nr - len(seconds):
+        seconds = self._seconds()
+        self._rows = len(seconds)
+        if missing := self._block.cycles_nr - len(seconds):
             losses.append(Loss("truncated", f"the file ends after {len(seconds)} rows", name, count=missing))
         finite = np.abs(seconds) < _MDF["longest_s"]
-        stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + self._start_ns
+        stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + start_ns
         stamps = placed(np.where(finite, stamps, NO_TIME))
         # Frames of several buses are buffered before they are written; rows of channels are in order.
-        order = np.argsort(stamps, kind="stable") if self._contains_frames(number) else np.arange(len(stamps))
+        order = np.argsort(stamps, kind="stable") if self._contains_frames else np.arange(len(stamps))
         rows, left_out = ascending_rows(stamps[order], name)
         losses += left_out
         return stamps[order[rows]], order[rows]
 
-    def _raw(self, number: int, index: int) -> tuple[NDArray[Any], BoolArray | None]:
+    def _raw(self, index: int) -> tuple[NDArray[Any], BoolArray | None]:
         """Return raw values [N] or [N, k] of a channel, and which rows are invalid [N]."""
-        channel, rows = self._groups[number].channels[index], np.arange(self._groups[number].channel_group.cycles_nr)
-        is_virtual = self._is(number, index, _VIRTUAL)
+        channel, rows = self._channels[index], np.arange(self._block.cycles_nr)
+        is_virtual = self._is(index, _VIRTUAL)
         if not channel.bit_count and self._version == 3:
             return rows * (channel.sampling_rate or 1.0), None
         if is_virtual and not channel.flags & _SOME_INVALID:
             return rows, None
         values, invalid = self._source.get(
-            group=number, index=index, raw=True, samples_only=True, ignore_invalidation_bits=True
+            group=self._number, index=index, raw=True, samples_only=True, ignore_invalidation_bits=True
         )
         return rows if is_virtual else np.asarray(values), invalid
 
-    def _values(self, number: int, index: int) -> FloatArray:
+    def _values(self, index: int) -> FloatArray:
         """Return physical values [N] of a channel, NaN for invalid samples."""
-        raw, invalid = self._raw(number, index)
+        raw, invalid = self._raw(index)
         if raw.ndim != 1 or raw.dtype.kind not in "biuf":
             raise SpanDamageError("it contains no numbers")
-        values = conversion_rule(self._conversions[number, index], self._version)(raw)
-        if getattr(self._groups[number].channels[index], "flags", 0) & _ALL_INVALID:
+        values = conversion_rule(self._conversions[index], self._version)(raw)
+        if getattr(self._channels[index], "flags", 0) & _ALL_INVALID:
             values[:] = np.nan
         elif invalid is not None:
             values[np.asarray(invalid, np.bool_)] = np.nan
         return values
 
-    def _load(self, number: int, indices: Mapping[str, int], order: Any, path: str, rows: slice) -> FloatArray:
-        if self._last[0] != (number, indices[path]):
-            values = self._values(number, indices[path])
-            if len(values) != self._rows[number]:
-                raise SpanDamageError(f"{len(values)} values for {self._rows[number]} times")
-            self._last = (number, indices[path]), values[order]
+    def _load(self, indices: Mapping[str, int], order: Any, path: str, rows: slice) -> FloatArray:
+        if self._last[0] != indices[path]:
+            values = self._values(indices[path])
+            if len(values) != self._rows:
+                raise SpanDamageError(f"{len(values)} values for {self._rows} times")
+            self._last = indices[path], values[order]
         return self._last[1][rows]
 
-    def _frames(self, number: int, stamps: IntArray, rows: Any) -> Frames:
+    def _frames(self, stamps: IntArray, rows: Any) -> Frames:
         """Return the CAN frames of a group, without the row numbers of a virtual channel."""
-        names = [channel.name.removeprefix(f"{_FRAMES}.") for channel in self._groups[number].channels]
+        names = [channel.name.removeprefix(f"{_FRAMES}.") for channel in self._channels]
         parts = {
-            name: np.nan_to_num(self._values(number, i), nan=-1.0)[rows].astype(np.int64)
+            name: np.nan_to_num(self._values(i), nan=-1.0)[rows].astype(np.int64)
             for i, name in enumerate(names)
             if name in ("ID", "IDE", "BusChannel", "DataLength", "DLC")
-            and (self._conversions[number, i] or not self._is(number, i, _VIRTUAL))
+            and (self._conversions[i] or not self._is(i, _VIRTUAL))
         }
-        data = self._bytes(number, names.index("DataBytes"))[rows]
+        data = self._bytes(names.index("DataBytes"))[rows]
         identifier = parts["ID"] & _CAN["id_bits"]
         length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
         if np.isin(length, _CAN["only_codes"]).any() or ("DLC" in parts and "DataLength" not in parts):
@@ -361,16 +365,15 @@ class Groups:
         frames = {"id": identifier, "length": length.clip(0, data.shape[1]), "is_extended": extended}
         return Frames(stamps, frames | ({"bus": parts["BusChannel"]} if "BusChannel" in parts else {}), data)
 
-    def _bytes(self, number: int, index: int) -> NDArray[np.uint8]:
+    def _bytes(self, index: int) -> NDArray[np.uint8]:
         """Return the data of frames [N, k], zero behind the length."""
-        group = self._groups[number]
-        is_variable = self._is(number, index, _VARIABLE[:1])
+        is_variable = self._is(index, _VARIABLE[:1])
         if is_variable:
-            group.channels[index].channel_type = 0  # its raw values are the places of the data
-        raw, _ = self._raw(number, index)
+            self._channels[index].channel_type = 0  # its raw values are the places of the data
+        raw, _ = self._raw(index)
         if not is_variable:
             return np.asarray(raw, np.uint8).reshape(len(raw), -1)
-        stored = np.frombuffer(self._source._mdf._load_signal_data(group, index), np.uint8)
+        stored = np.frombuffer(self._source._mdf._load_signal_data(self._group, index), np.uint8)
         begins = raw.astype(np.int64)
         if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - 4:
             raise SpanDamageError("data of a frame are missing")

@@ -177,39 +177,29 @@ def _in_two_columns(clock: Clock, sheet: Sheet, name: str, names: Mapping[str, s
 
 
 def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
-    """Return a clock with the power of ten that speed and positions show."""
-    rows = np.flatnonzero(clock.stamps_ns != NO_TIME)
-    columns = {snake(name): column for name, column in sheet.columns.items()}
-    decades = _decades_too_short(columns, rows, clock.stamps_ns[rows])
-    note = f"{name}: speed and positions show times that are 10^{decades} as long: corrected"
-    return table_clocks.rescaled(clock, decades, note) if decades else clock
-
-
-def _decades_too_short(columns: Mapping[str, Any], rows: IntArray, stamps: IntArray) -> int:
-    """Return the power of ten n for which times × 10**n make speed and path agree; 0 without evidence.
+    """Return a clock with the power of ten for which speed (in any usual unit) and path (in degrees) agree.
 
     Units of speed, from m/s to km/h, shorten the ratio of the path to the integral by up to 0.56 decades.
-
-    Parameters
-    ----------
-    columns : numbers [N] by name in lower case; positions in degrees, speed in any usual unit.
-    rows, stamps : rows with a time [K], and their times [K] in ns.
     """
+    columns = {snake(n): c for n, c in sheet.columns.items() if isinstance(c, np.ndarray)}
     latitude, longitude, speed = (
-        next((c for n, c in columns.items() if re.fullmatch(_MOTION[name], n) and isinstance(c, np.ndarray)), None)
-        for name in ("latitude", "longitude", "speed")
+        next((c for n, c in columns.items() if re.fullmatch(_MOTION[quantity], n)), None)
+        for quantity in ("latitude", "longitude", "speed")
     )
     if latitude is None or longitude is None or speed is None:
-        return 0
-    used = np.isfinite(latitude[rows]) & np.isfinite(longitude[rows]) & (latitude[rows] != 0.0)
-    rows, stamps = rows[used], stamps[used]
+        return clock
+    has_place = np.isfinite(latitude) & np.isfinite(longitude) & (latitude != 0.0)
+    rows = np.flatnonzero(has_place & (clock.stamps_ns != NO_TIME))
     # Long steps average the noise of the positions.
     corners = rows[:: max(1, len(rows) // _MOTION["steps"])]
     north, east = np.diff(latitude[corners]), np.diff(longitude[corners]) * np.cos(np.radians(latitude[corners[1:]]))
     path_m = DEGREE_M * float(np.hypot(north, east).sum())
-    length = float(np.nansum(np.abs(speed[rows[1:]]) * np.diff(stamps) * 1e-9))
-    is_moving = _MOTION["shortest_path_m"] < path_m < _MOTION["longest_path_m"] and length > 0.0
-    return math.ceil(math.log10(path_m / length) - _MOTION["noise_decades"]) if is_moving else 0
+    length = float(np.nansum(np.abs(speed[rows[1:]]) * np.diff(clock.stamps_ns[rows]) * 1e-9))
+    if not (_MOTION["shortest_path_m"] < path_m < _MOTION["longest_path_m"] and length > 0.0):
+        return clock
+    decades = math.ceil(math.log10(path_m / length) - _MOTION["noise_decades"])
+    note = f"{name}: speed and positions show times that are 10^{decades} as long: corrected"
+    return table_clocks.rescaled(clock, decades, note) if decades else clock
 
 
 def _best_clocks(clocks: Mapping[str, Clock], grades: Mapping[str, int]) -> list[str]:
@@ -240,9 +230,8 @@ def _grade(sheet: Sheet, name: str) -> int | None:
 
 def _grade_of_numbers(sheet: Sheet, name: str, given: NDArray[Any]) -> int | None:
     """Return :func:`_grade` of finite numbers or dates by their order, name, unit and steps."""
-    column, text = sheet.columns[name], snake(name)
-    is_date = given is not column and isinstance(column, np.ndarray) and column.dtype.kind == "M"
-    if (given[1:] >= given[:-1]).sum() < _ASCENDING_SHARE * (len(given) - 1) or len(column) == 1:
+    text, is_date = snake(name), sheet.columns[name].dtype.kind == "M"  # type: ignore[union-attr]
+    if (given[1:] >= given[:-1]).sum() < _ASCENDING_SHARE * (len(given) - 1) or len(sheet.columns[name]) == 1:
         return 2 if is_date else None
     is_unit_of_time = sheet.units.get(name, "").lower() in TIME_UNITS_NS or text.startswith("t_")
     if _TIME_LIKE.search(text) or is_date or is_unit_of_time:

@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -50,8 +50,6 @@ VBO_TYPE = "vbox/msg/Vbo"
 _ALONG_HEADING = 0.95
 
 _MOST_ELEMENTS, _LARGEST, _DEEPEST = (CONSTANTS["json"][name] for name in ("elements", "largest", "deepest"))
-#: Values of a column and their rows.
-_Cells: TypeAlias = "tuple[array[int], list[Any]]"
 
 
 def open_csv(file: TableFile) -> Tables:
@@ -577,26 +575,26 @@ def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str, name:
     """Return the tables of objects in the order of time; None counts as a damaged line."""
     losses: list[Loss] = []
     lines, wrong = array("q"), array("q")
-    cells: dict[str, _Cells] = {}
+    rows: list[dict[str, Any]] = []
+    paths: dict[str, None] = {}
     for number, record in enumerate(records, 1):
         if not isinstance(record, dict):
             wrong.append(number)
             continue
-        for path, value in _leaves(record, "", file.limits.schema_depth):
-            rows, values = cells.setdefault(path, (array("q"), []))
-            rows.append(len(lines))
-            values.append(value)
-        file.limits.check("array_width", len(cells), file.name)
+        rows.append(dict(_leaves(record, "", file.limits.schema_depth)))
+        paths |= dict.fromkeys(rows[-1])
+        file.limits.check("array_width", len(paths), file.name)
         lines.append(number)
-    if not cells:
+    if not paths:
         remedy = "each line, or each element of an array, is one object with a time"
         raise LogError(expected="a JSON object a line", got="none", where=file.name, remedy=remedy)
     if wrong:
         place = f"{file.name}, from line {wrong[0]} on"
         losses.append(Loss("bad-row", "line without an object", place, count=len(wrong)))
-    file.limits.check_table(8 * len(lines) * len(cells), file.size, file.name)
-    fields, units = read_head([*cells])
-    columns = {f: _json_column(f, cells[path], lines, file, losses) for f, path in zip(fields, cells, strict=True)}
+    file.limits.check_table(8 * len(rows) * len(paths), file.size, file.name)
+    fields, units = read_head([*paths])
+    cells = ([row.get(path) for row in rows] for path in paths)
+    columns = {f: _json_column(f, its, lines, file, losses) for f, its in zip(fields, cells, strict=True)}
     sheet = Sheet(field_name(name), columns, units)
     return Tables(kind, list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
 
@@ -620,21 +618,15 @@ def _name_of(value: Any) -> str:
     return next((v for k, v in named if isinstance(v, str) and PATTERNS["signal"].fullmatch(k.lower())), "")
 
 
-def _json_column(name: str, given: _Cells, lines: Sequence[int], file: TableFile, losses: list[Loss]) -> Any:
+def _json_column(name: str, values: Sequence[Any], lines: Sequence[int], file: TableFile, losses: list[Loss]) -> Any:
     """Return numbers [N] with NaN where a line has none, or texts [N]."""
     import polars as pl
 
-    rows, values = given
     if any(isinstance(value, str) for value in values):
-        texts: list[str | None] = [None] * len(lines)
-        for row, value in zip(rows, values, strict=True):
-            texts[row] = str(value)
-        series = pl.Series(texts, dtype=pl.String)
+        series = pl.Series([None if value is None else str(value) for value in values], dtype=pl.String)
         cells = read_cells(series, ".")
         losses += cells.losses(name, file.name, lines)
         return series if cells.is_text else cells.values
     # Integers stay exact: a double has 256 ns at a date.
-    exact = len(set(rows)) == len(lines) and all(isinstance(value, int) and abs(value) < 1 << 63 for value in values)
-    column = np.zeros(len(lines), np.int64) if exact else np.full(len(lines), np.nan)
-    column[rows] = values
-    return column
+    exact = all(isinstance(value, int) and abs(value) < 1 << 63 for value in values)
+    return np.array(values, np.int64 if exact else np.float64)

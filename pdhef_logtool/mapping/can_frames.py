@@ -16,20 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.can_decoding import (
-    CAN_TYPE,
-    ID_BITS,
-    MOST_BITS,
-    Selectors,
-    are_sent,
-    bytes_of,
-    fit_of,
-    has_j1939_identifier,
-    load_dbc,
-    selectors_of,
-    signal_groups,
-    signal_values,
-)
+from pdhef_logtool.logs import can_decoding as dbc
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.evidence import Pieces
@@ -72,7 +59,7 @@ def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
             remedy="see docs/formats.md",
         )
     views: dict[str, _CanView] = {}
-    databases = [(path, load_dbc(log.definition(path))) for path in mapping.can.dbc]
+    databases = [(path, dbc.load_dbc(log.definition(path))) for path in mapping.can.dbc]
     recorded = {t.name for t in log.topics}
     # check_mapping names the other topics, with the nearest one.
     topics = [topic for topic in dict.fromkeys(s.topic for s in sources) if topic in recorded]
@@ -102,7 +89,7 @@ def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> CanSignalLog |
 
     If several files define an identifier, the file named like the topic decides, else the one with most identifiers.
     """
-    databases = [(path, load_dbc(path)) for path in log.databases] if topics else []
+    databases = [(path, dbc.load_dbc(path)) for path in log.databases] if topics else []
     views: dict[str, _CanView] = {}
     settings = CanSettings(tuple(p if p in log.given_databases else Path(p.name) for p, _ in databases))
     for topic in topics if databases else ():
@@ -110,12 +97,12 @@ def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> CanSignalLog |
         if isinstance(paths, str):
             continue
         sent = _identifiers(log, topic.name, paths)
-        ranked = sorted(databases, key=lambda d: (not _is_named_like(d[0], topic.name), -fit_of(d[1], sent)))
+        ranked = sorted(databases, key=lambda d: (not _is_named_like(d[0], topic.name), -dbc.fit_of(d[1], sent)))
         described: set[tuple[int, bool]] = set()
         for _, database in ranked:
             for message in (m for m in database.messages if m.frame_id in sent):
                 key = (message.frame_id, message.is_extended_frame)
-                for ending, signals, selectors in signal_groups(message) if key not in described else ():
+                for ending, signals, selectors in dbc.signal_groups(message) if key not in described else ():
                     name = f"{topic.name}.{CAN_PREFIX}{message.name}{ending}"
                     by_name = {s.name: s for s in signals}
                     views[name] = _CanView(topic.name, paths, message, by_name, selectors, True)
@@ -126,12 +113,12 @@ def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> CanSignalLog |
 def _identifiers(log: DriveLog, topic: str, paths: _FramePaths) -> frozenset[int]:
     """Return the identifiers of a topic's frames in pieces of the log."""
     seen = Pieces(log).read([(topic, paths.parts["id"])]).values()
-    return frozenset(int(i) & ID_BITS for its in seen for i in np.unique(its.values[np.isfinite(its.values)]))
+    return frozenset(int(i) & dbc.ID_BITS for its in seen for i in np.unique(its.values[np.isfinite(its.values)]))
 
 
 def _buses(log: DriveLog, view: _CanView) -> list[int]:
     """Return the buses of a message in a log of frames alone; other logs usually have a topic for each bus."""
-    is_frames = any(t.name == view.topic and t.type_name == CAN_TYPE for t in log.topics)
+    is_frames = any(t.name == view.topic and t.type_name == dbc.CAN_TYPE for t in log.topics)
     if not is_frames or "bus" not in {f.path for f in log.fields(view.topic)}:
         return []
     frames = log.read({view.topic: [view.paths.parts["id"], "bus"]}, quiet=True)[view.topic].fields
@@ -162,7 +149,7 @@ class _CanView:
     paths: _FramePaths
     message: Message
     signals: Mapping[str, Signal]
-    selectors: Selectors
+    selectors: dbc.Selectors
     unflagged_may_be_extended: bool
 
 
@@ -252,19 +239,19 @@ class CanSignalLog(DriveLog):
         rows = np.flatnonzero(_is_message(frames, view, self._settings))
         data, available = _payload(frames, view.paths, rows)
         signals = {p: view.signals[p] for p in paths if p in view.signals}
-        needed = max(map(bytes_of, (*signals.values(), *(s for s, _ in view.selectors))), default=0)
+        needed = max(map(dbc.bytes_of, (*signals.values(), *(s for s, _ in view.selectors))), default=0)
         short_ns = frames.log_time_ns[rows[available < needed]]
         if short_ns.size:
             where = f"{view.topic}.{CAN_PREFIX}{view.message.name}"
             what, span = "frame that ends before its signal dropped", (int(short_ns.min()), int(short_ns.max()) + 1)
             loss = Loss("undecodable", what, where, *span, len(short_ns))
             short[where] = max(loss, short.get(where, loss), key=lambda x: x.count or 0)
-        use = (available >= needed) & are_sent(data, available, view.selectors)
+        use = (available >= needed) & dbc.are_sent(data, available, view.selectors)
         rows, data = rows[use], data[use]
         fields = {p: frames.fields[p][rows] for p in paths if p not in signals}
-        is_j1939 = has_j1939_identifier(view.message)
+        is_j1939 = dbc.has_j1939_identifier(view.message)
         for path, signal in signals.items():
-            fields[path] = signal_values(data, signal, is_j1939=is_j1939) if rows.size else np.empty(0)
+            fields[path] = dbc.signal_values(data, signal, is_j1939=is_j1939) if rows.size else np.empty(0)
         return Columns(topic, frames.log_time_ns[rows], frames.publish_time_ns[rows], fields)
 
 
@@ -276,7 +263,7 @@ def _is_message(frames: Columns, view: _CanView, settings: CanSettings) -> BoolA
     # Signed 32-bit fields contain an identifier with the extended flag as a negative number.
     ids = np.floor(np.where(is_valid, number, 0.0)).astype(np.int64) & (2**32 - 1)
     fits = is_valid & ((ids & NO_DATA_FLAGS) == 0)
-    bare = ids & ID_BITS
+    bare = ids & dbc.ID_BITS
     fits &= (bare & settings.id_mask) == (view.message.frame_id & settings.id_mask)
     flagged = (ids & EXTENDED_FLAG) != 0
     if "extended" in paths:
@@ -329,10 +316,10 @@ def _make_view(
     if signal_name not in by_name:
         return f"message {message_name} has no signal {signal_name}{near(signal_name, list(by_name))}"
     signal = by_name[signal_name]
-    if signal.length > MOST_BITS:
-        return f"{message_name}.{signal_name} has {signal.length} bits, at most {MOST_BITS} make a number"
+    if signal.length > dbc.MOST_BITS:
+        return f"{message_name}.{signal_name} has {signal.length} bits, at most {dbc.MOST_BITS} make a number"
     standard_ids = {m.frame_id for _, d in databases for m in d.messages if not m.is_extended_frame}
-    signals, selectors = dict.fromkeys(source.paths, signal), tuple(selectors_of(signal, by_name))
+    signals, selectors = dict.fromkeys(source.paths, signal), tuple(dbc.selectors_of(signal, by_name))
     return _CanView(source.topic, paths, message, signals, selectors, message.frame_id not in standard_ids)
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-from contextlib import closing
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,53 +18,39 @@ from scipy.io import savemat
 from scipy.sparse import eye_array
 
 from pdhef_logtool.logs.mat_log import open_mat
-from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.parquet_log import open_parquet
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import TableFile
 from pdhef_logtool.records.errors import LogError
+from tests.table_contents import Contents, opened, parsed
 
 N = 200
 TIME_S = np.arange(N) * 0.02
 AY = np.round(np.sin(TIME_S), 4)
 
 
-def _file(data: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> TableFile:
-    return TableFile(io.BytesIO(data), len(data), "a", limits)
-
-
-def _column(tables: Tables, path: str) -> Any:
-    return next(t.load(path, slice(None)) for t in tables.tables if path in {f.path for f in t.fields})
-
-
-def _names(tables: Tables) -> set[str]:
-    return {field.path for table in tables.tables for field in table.fields}
-
-
-def _losses(tables: Tables) -> list[tuple[str, str]]:
-    return [(loss.severity, loss.what) for loss in tables.losses]
+read_mat = partial(parsed, open_mat)
 
 
 def test_columns_of_a_matrix_have_the_titles_and_units_beside_it() -> None:
     out = io.BytesIO()
     cells = {"names": np.array(["t", "v"], object), "units": np.array(["s", "km/h"], object)}
     savemat(out, {"data": np.stack([TIME_S, AY], axis=1), **cells})
-    (table,) = open_mat(_file(out.getvalue())).tables
-    assert {f.path: f.unit for f in table.fields} == {"v": "km per h"}
+    assert read_mat(out.getvalue()).units == {"v": "km per h"}
 
 
 # ------------------------------------------------------------------------------------------------ Parquet
 
 
-def _parquet(columns: Any, limits: ResourceLimits = DEFAULT_LIMITS, **options: Any) -> Tables:
+def _parquet(columns: Any, limits: ResourceLimits = DEFAULT_LIMITS) -> Contents:
     out = io.BytesIO()
-    pq.write_table(columns if isinstance(columns, pa.Table) else pa.table(columns), out, **options)
-    return open_parquet(_file(out.getvalue(), limits))
+    pq.write_table(columns if isinstance(columns, pa.Table) else pa.table(columns), out)
+    return parsed(open_parquet, out.getvalue(), limits)
 
 
 def test_decimals_texts_and_integers_with_nulls_are_numbers_and_other_types_are_named() -> None:
     imu = pa.StructArray.from_arrays([pa.array(AY), pa.array([b"x"] * N)], ["ay", "raw"])
-    tables = _parquet({
+    read = _parquet({
         "t": TIME_S,
         "decimal": pa.array([Decimal(str(a)) for a in AY], pa.decimal128(12, 5)),
         "text": [f"{a}" if i else "ERR" for i, a in enumerate(AY)],
@@ -75,12 +61,12 @@ def test_decimals_texts_and_integers_with_nulls_are_numbers_and_other_types_are_
         "driver": pa.array(["me"] * N).dictionary_encode(),
         "date": pa.array([0] * N, pa.date32()),
     })  # fmt: skip
-    np.testing.assert_allclose(_column(tables, "decimal"), AY, rtol=1e-15)
-    np.testing.assert_array_equal(_column(tables, "text"), [np.nan, *AY[1:]])
-    np.testing.assert_array_equal(_column(tables, "count"), [np.nan, *range(N - 1)])
-    np.testing.assert_array_equal(_column(tables, "flag"), AY > 0.0)
-    np.testing.assert_array_equal(_column(tables, "imu_ay"), AY)
-    unusable, cells, texts = tables.losses
+    np.testing.assert_allclose(read.columns["decimal"], AY, rtol=1e-15)
+    np.testing.assert_array_equal(read.columns["text"], [np.nan, *AY[1:]])
+    np.testing.assert_array_equal(read.columns["count"], [np.nan, *range(N - 1)])
+    np.testing.assert_array_equal(read.columns["flag"], AY > 0.0)
+    np.testing.assert_array_equal(read.columns["imu_ay"], AY)
+    unusable, cells, texts = read.lost
     assert "imu.raw (binary)" in unusable.what
     assert "list (list<" in unusable.what
     assert (cells.kind, cells.count, cells.severity) == ("bad-cell", 1, "lost")
@@ -95,12 +81,12 @@ def test_dates_of_each_unit_and_those_outside_of_int64(unit: str, zone: str | No
     values[3] = 10**12 * per_s if unit != "ns" else values[3]
     of_g = pa.field("ay", pa.float64(), metadata={"unit": "g"})
     schema = pa.schema([pa.field("recorded", pa.timestamp(unit, zone)), of_g])
-    tables = _parquet(pa.table({"recorded": values, "ay": AY}, schema=schema))
+    read = _parquet(pa.table({"recorded": values, "ay": AY}, schema=schema))
     lost = 0 if unit == "ns" else 1
-    (table,) = tables.tables
-    assert [(field.path, field.unit) for field in table.fields] == [("ay", "g")]
-    np.testing.assert_array_equal(np.delete(np.arange(N), [3] * lost), table.stamps_ns // 10**9 - 1_714_521_600)
-    assert [loss.kind for loss in tables.losses] == ["bad-stamp"] * lost
+    assert read.units == {"ay": "g"}
+    (stamps,) = read.stamps_ns.values()
+    np.testing.assert_array_equal(np.delete(np.arange(N), [3] * lost), stamps // 10**9 - 1_714_521_600)
+    assert read.counts == [("bad-stamp", 1)] * lost
 
 
 def test_a_damaged_column_costs_its_rows_of_one_group() -> None:
@@ -109,12 +95,12 @@ def test_a_damaged_column_costs_its_rows_of_one_group() -> None:
     data = bytearray(out.getvalue())
     place = pq.ParquetFile(io.BytesIO(bytes(data))).metadata.row_group(1).column(3).data_page_offset
     data[place : place + 40] = b"\xff" * 40
-    tables = open_parquet(_file(bytes(data)))
-    (loss,) = tables.losses
+    read = parsed(open_parquet, bytes(data))
+    (loss,) = read.lost
     assert (loss.count, loss.what.partition(":")[0], loss.where) == (50, "c2", "a, row group 1")
     for i in range(5):
         is_lost = (np.arange(N) // 50 == 1) & (i == 2)
-        np.testing.assert_array_equal(_column(tables, f"c{i}"), np.where(is_lost, np.nan, AY + i))
+        np.testing.assert_array_equal(read.columns[f"c{i}"], np.where(is_lost, np.nan, AY + i))
 
 
 def test_rows_and_texts_above_the_limits_are_refused_before_they_are_read() -> None:
@@ -123,9 +109,9 @@ def test_rows_and_texts_above_the_limits_are_refused_before_they_are_read() -> N
         _parquet(constant, DEFAULT_LIMITS.times(0.01))
     indices = pa.array([0] * 5000, pa.int32())
     repeated = pa.DictionaryArray.from_arrays(indices, pa.array(["x" * 200_000]))
-    tables = _parquet({"t": np.arange(5000) * 0.02, "ay": np.zeros(5000), "repeated": repeated})
-    assert _names(tables) == {"ay"}
-    assert "table bytes" in tables.losses[0].what
+    read = _parquet({"t": np.arange(5000) * 0.02, "ay": np.zeros(5000), "repeated": repeated})
+    assert {*read.columns} == {"ay"}
+    assert "table bytes" in read.lost[0].what
 
 
 # ------------------------------------------------------------------------------------------------ MAT 5
@@ -146,19 +132,19 @@ def test_arrays_of_each_class_come_back(kind: str, rows: int, width: int, compre
     rows += width
     values = np.random.default_rng(seed).integers(0, 100, (rows, width)).astype(kind)
     inner = {"time": np.arange(rows) * 0.02, "x": values, "deep": {"x": values[:, 0]}}
-    tables = open_mat(_file(_mat({"d": inner, "note": "a drive", "gain": 3.0}, compressed=compressed)))
-    assert tables.losses == []
+    read = read_mat(_mat({"d": inner, "note": "a drive", "gain": 3.0}, compressed=compressed))
+    assert read.lost == ()
     for i in range(width):
-        np.testing.assert_array_equal(_column(tables, f"x_{i}" if width > 1 else "x"), values[:, i])
-    assert [t.name for t in tables.tables] == ["d", "d_deep"]
+        np.testing.assert_array_equal(read.columns[f"x_{i}" if width > 1 else "x"], values[:, i])
+    assert [*read.topics] == ["d", "d_deep"]
 
 
 @pytest.mark.parametrize("rows", [9, 200])
 def test_a_matrix_of_unsigned_numbers_that_fall_has_no_times(rows: int) -> None:
     values = np.column_stack([np.arange(rows)[::-1] % 250, np.arange(rows) % 7]).astype("u1")
-    tables = open_mat(_file(_mat({"d": {"time": np.arange(rows) * 0.02, "x": values}})))
-    assert tables.losses == []
-    np.testing.assert_array_equal(_column(tables, "x_0"), values[:, 0])
+    read = read_mat(_mat({"d": {"time": np.arange(rows) * 0.02, "x": values}}))
+    assert read.lost == ()
+    np.testing.assert_array_equal(read.columns["x_0"], values[:, 0])
 
 
 def test_what_is_no_array_of_numbers_is_named() -> None:
@@ -171,21 +157,20 @@ def test_what_is_no_array_of_numbers_is_named() -> None:
         "cube": np.zeros((3, 4, 5)),
         "wide": np.zeros((40, 30)),
     }
-    tables = open_mat(_file(_mat({"t": TIME_S, "ay": AY, "deep": deep, **others})))
-    assert _names(tables) == {"ay"}
-    assert {severity for severity, _ in _losses(tables)} == {"note"}
-    text = " ".join(what for _, what in _losses(tables))
+    read = read_mat(_mat({"t": TIME_S, "ay": AY, "deep": deep, **others}))
+    assert {*read.columns} == {"ay"}
+    assert not read.what()
     assert all(
-        part in text
+        part in read.what("note")
         for part in ("deep/d/d/d/d/d/d/d/d: too deep", "s: a sparse", "c: complex", "cube (3, 4, 5)", "wide (40, 30)")
     )
 
 
 def test_a_compressed_variable_above_the_limits_costs_itself() -> None:
     data = _mat({"t": TIME_S, "ay": AY}) + _mat({"zeros": np.zeros(4_000_000)}, compressed=True)[128:]
-    tables = open_mat(_file(data, DEFAULT_LIMITS.times(0.01)))
-    assert _names(tables) == {"ay"}
-    assert [loss.kind for loss in tables.losses] == ["bad-variable"]
+    read = read_mat(data, DEFAULT_LIMITS.times(0.01))
+    assert {*read.columns} == {"ay"}
+    assert [loss.kind for loss in read.lost] == ["bad-variable"]
 
 
 SEED = _mat(
@@ -202,24 +187,20 @@ def test_any_damage_of_a_mat_file_is_a_loss_or_one_line(changes: list[tuple[int,
     for place, value in changes:
         data[place] = value
     try:
-        tables = open_mat(_file(bytes(data)))
+        tables = open_mat(TableFile(io.BytesIO(data), len(data), "a", DEFAULT_LIMITS)).tables
     except LogError as error:
         assert "\n" not in str(error)
         return
-    assert all(
-        len(table.stamps_ns) == len(table.load(f.path, slice(None))) for table in tables.tables for f in table.fields
-    )
+    assert all(len(table.stamps_ns) == len(table.load(f.path, slice(None))) for table in tables for f in table.fields)
 
 
 def test_clocks_of_one_mat_file_share_a_unit_and_unlike_lengths_are_a_loss(tmp_path: Path) -> None:
     slow = {"time": np.arange(4) * 10.0, "x": AY[:4]}
-    one = open_mat(_file(_mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": slow})))
-    assert [int(np.ptp(t.stamps_ns)) // 10**9 for t in one.tables] == [35, 30]
+    one = read_mat(_mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": slow}))
+    assert [int(np.ptp(stamps)) // 10**9 for stamps in one.stamps_ns.values()] == [35, 30]
     fast = {"time_ms": np.arange(100) * 0.01, "x": AY[:100]}
-    path = tmp_path / "two.mat"
-    path.write_bytes(_mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": fast}))
-    with closing(open_log(path)) as two:
-        assert [loss.kind for loss in two.lost] == ["clock-lengths"]
+    two = _mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": fast})
+    assert [loss.kind for loss in opened(tmp_path / "two.mat", two).lost] == ["clock-lengths"]
 
 
 # ------------------------------------------------------------------------------------------------ MAT 7.3
@@ -227,14 +208,14 @@ def test_clocks_of_one_mat_file_share_a_unit_and_unlike_lengths_are_a_loss(tmp_p
 SECRET = b"root:x:0:0:secret" * 20
 
 
-def _mat73(path: Path, fill: Any) -> Tables:
+def _mat73(path: Path, fill: Any) -> Contents:
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w", userblock_size=512) as file:
         file["t"], file["ay"] = TIME_S[None], AY[None]
         fill(h5py, file)
     with path.open("r+b") as raw:
         raw.write(b"MATLAB 7.3 MAT-file")
-    return open_mat(_file(path.read_bytes()))
+    return read_mat(path)
 
 
 @pytest.mark.parametrize("kind", ["external", "virtual", "soft", "external link", "filter", "unwritten", "huge chunk"])
@@ -263,17 +244,16 @@ def test_a_dataset_that_is_not_in_the_file_is_a_loss_and_no_byte_of_others_is_re
             else:
                 file["leak"] = h5py.ExternalLink(other, "x")
 
-    tables = _mat73(tmp_path / "a.mat", fill)
-    assert _names(tables) == {"ay"}
-    ((severity, what),) = _losses(tables)
-    assert severity == "lost"
-    assert what.startswith("leak cannot be read")
+    read = _mat73(tmp_path / "a.mat", fill)
+    assert {*read.columns} == {"ay"}
+    (loss,) = read.lost
+    assert (loss.severity, loss.what.partition(":")[0]) == ("lost", "leak cannot be read")
 
 
 def test_an_array_without_bytes_costs_itself_and_not_the_others(tmp_path: Path) -> None:
-    tables = _mat73(tmp_path / "a.mat", lambda _, file: file.create_dataset("A", (2 * 10**9,), "f8", chunks=(10**6,)))
-    assert _names(tables) == {"ay"}
-    assert "table bytes" in _losses(tables)[0][1]
+    read = _mat73(tmp_path / "a.mat", lambda _, file: file.create_dataset("A", (2 * 10**9,), "f8", chunks=(10**6,)))
+    assert {*read.columns} == {"ay"}
+    assert "table bytes" in read.lost[0].what
 
 
 def test_structs_texts_units_and_cells_of_version_7_3(tmp_path: Path) -> None:
@@ -287,10 +267,8 @@ def test_structs_texts_units_and_cells_of_version_7_3(tmp_path: Path) -> None:
         file["loop"] = file["signal"]
         file.create_dataset("cell", (3,), h5py.ref_dtype)
 
-    tables = _mat73(tmp_path / "a.mat", fill)
-    assert {(t.name, f.path, f.unit) for t in tables.tables for f in t.fields} == {
-        ("mat", "ay", ""), ("loop", "data", "m/s^2"),
-    }  # fmt: skip
-    ((severity, what),) = _losses(tables)
-    assert severity == "note"
-    assert ": cell: " in what
+    read = _mat73(tmp_path / "a.mat", fill)
+    assert (read.topics, read.units) == ({"mat": N, "loop": N}, {"ay": "", "data": "m/s^2"})
+    (loss,) = read.lost
+    assert loss.severity == "note"
+    assert ": cell: " in loss.what

@@ -25,9 +25,9 @@ from pdhef_logtool.logs.mdf_conversions import conversion_rule, formula_rule
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
-from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from tests.command_line import called
+from tests.table_contents import opened, parsed
 
 asammdf = pytest.importorskip("asammdf")
 from asammdf.blocks import v2_v3_blocks, v4_blocks  # noqa: E402
@@ -40,29 +40,7 @@ START_NS = 1_714_564_800 * 10**9
 START = dt.datetime.fromtimestamp(START_NS // 10**9, tz=dt.UTC)
 
 
-@dataclass
-class Contents:
-    """A file as the reader returns it, with all columns loaded."""
-
-    read: Tables
-    columns: dict[str, NDArray[Any]]
-    stamps_ns: dict[str, NDArray[np.int64]]
-
-    def losses(self, severity: str = "lost") -> str:
-        return "; ".join(f"{loss.where}: {loss.what}" for loss in self.read.losses if loss.severity == severity)
-
-
-def contents(path: Path) -> Contents:
-    with path.open("rb") as stream:
-        read = open_mdf(TableFile(stream, path.stat().st_size, path.name, DEFAULT_LIMITS))
-        rows = {t.name: slice(0, len(t.stamps_ns)) for t in read.tables}
-        columns = {f"{t.name}.{f.path}": t.load(f.path, rows[t.name]) for t in read.tables for f in t.fields}
-    return Contents(read, columns, {t.name: t.stamps_ns for t in read.tables})
-
-
-def of_bytes(folder: Path, data: bytes) -> Contents:
-    (folder / "a.mf4").write_bytes(data)
-    return contents(folder / "a.mf4")
+read_mdf = partial(parsed, open_mdf)
 
 
 def written(path: Path, signals: Sequence[Any], version: str = "4.10", start: dt.datetime = START) -> Path:
@@ -179,40 +157,31 @@ def mdf(path: Path, version: str = "4.10") -> Path:
 
 @pytest.mark.parametrize("version", ["4.10", "4.11", "3.30"])
 def test_channel_groups_keep_their_clocks_and_units(version: str, tmp_path: Path) -> None:
-    with closing(open_log(mdf(tmp_path / "a.mf4", version))) as log:
-        assert log.kind == f"mdf-{version[0]}"
-        imu, other = sorted(log.topics, key=lambda t: -t.messages)
-        assert (imu.messages, other.messages) == (N, N // 10)
-        assert {f.path: f.unit for t in log.topics for f in log.fields(t.name)} == {
-            "IMU_AccY": "g", "IMU_AccX": "g", "Speed": "km/h",
-        }  # fmt: skip
-        read = log.read({imu.name: ["IMU_AccY"], other.name: ["Speed"]})
-        assert log.lost == ()
-    np.testing.assert_array_equal(read[imu.name].fields["IMU_AccY"], AY)
-    np.testing.assert_array_equal(read[other.name].fields["Speed"], SPEED[::10].astype(np.float32))
-    assert np.abs(np.diff(read[imu.name].log_time_ns) - 10_000_000).max() <= 1
-    assert read[imu.name].log_time_ns[0] == read[other.name].log_time_ns[0] == START_NS
+    read = opened(mdf(tmp_path / "a.mf4", version))
+    assert (read.kind, sorted(read.topics.values()), read.lost) == (f"mdf-{version[0]}", [N // 10, N], ())
+    assert read.units == {"IMU_AccY": "g", "IMU_AccX": "g", "Speed": "km/h"}
+    np.testing.assert_array_equal(read.columns["IMU_AccY"], AY)
+    np.testing.assert_array_equal(read.columns["Speed"], SPEED[::10].astype(np.float32))
+    other, imu = sorted(read.stamps_ns.values(), key=len)
+    assert np.abs(np.diff(imu) - 10_000_000).max() <= 1
+    assert imu[0] == other[0] == START_NS
 
 
 def test_a_file_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None:
-    (tmp_path / "a.mf4").write_bytes(imu())
-    (tmp_path / "b.mf4").write_bytes(imu()[: -16 * 100 - 5])
-    with closing(open_log(tmp_path / "a.mf4")) as log:
-        assert log.lost == ()
-        np.testing.assert_array_equal(log.read({"IMU": ["AccY"]})["IMU"].fields["AccY"], AY)
-    with closing(open_log(tmp_path / "b.mf4")) as log:
-        read = log.read({"IMU": ["AccY"]})["IMU"].fields["AccY"]
-        (loss,) = log.lost
-    assert (loss.kind, loss.severity, loss.count) == ("truncated", "lost", N - len(read))
-    np.testing.assert_array_equal(read, AY[: len(read)])
-    assert N - 102 <= len(read) <= N - 100
+    whole, cut = opened(tmp_path / "a.mf4", imu()), opened(tmp_path / "b.mf4", imu()[: -16 * 100 - 5])
+    assert whole.lost == ()
+    np.testing.assert_array_equal(whole.columns["AccY"], AY)
+    rows, (loss,) = len(cut.columns["AccY"]), cut.lost
+    assert (loss.kind, loss.severity, loss.count) == ("truncated", "lost", N - rows)
+    np.testing.assert_array_equal(cut.columns["AccY"], AY[:rows])
+    assert N - 102 <= rows <= N - 100
     assert called("inspect", tmp_path / "b.mf4").returncode == 3
 
 
 def test_links_beyond_the_end_are_a_loss(tmp_path: Path) -> None:
     data = imu()
-    read = of_bytes(tmp_path, patched(data, block(data, b"CN", 0) + 24, len(data) + 64))
-    assert "1 blocks are beyond the end of the file" in read.losses()
+    read = read_mdf(patched(data, block(data, b"CN", 0) + 24, len(data) + 64))
+    assert "1 blocks are beyond the end of the file" in read.what()
 
 
 # ---- conversions ----
@@ -294,10 +263,10 @@ def test_a_formula_of_a_file_runs_nothing(version: str, tmp_path: Path) -> None:
     hostile = {"formula": f"__import__('pathlib').Path('{canary}').touch() or X"}
     ours = [signal("bad", AY, conversion=hostile), signal("good", AY, conversion={"formula": "2*X+1"})]
     path = written(tmp_path / "a.mf4", ours, version)
-    read = contents(path)
-    np.testing.assert_allclose(read.columns["car.good"], 2.0 * AY + 1.0)
-    assert set(read.columns) == {"car.good"}
-    assert "bad cannot be read: its formula" in read.losses()
+    read = read_mdf(path)
+    np.testing.assert_allclose(read.columns["good"], 2.0 * AY + 1.0)
+    assert set(read.columns) == {"good"}
+    assert "bad cannot be read: its formula" in read.what()
     assert called("inspect", path).returncode == 3
     assert not canary.exists()
 
@@ -312,13 +281,13 @@ def test_conversions_of_a_file_are_applied(version: str, tmp_path: Path) -> None
         signal("tab", raw, conversion={"raw_0": 0, "phys_0": 0, "raw_1": 300, "phys_1": 3, "interpolation": True}),
         signal("text", np.asarray([b"a"] * N), encoding="utf-8"),
     ]  # fmt: skip
-    read = contents(written(tmp_path / "a.mf4", ours, version))
-    assert {name: unit for t in read.read.tables for name, unit in ((f.path, f.unit) for f in t.fields)}["lin"] == "g"
-    np.testing.assert_allclose(read.columns["car.lin"], raw * 0.5 + 1.0)
-    np.testing.assert_allclose(read.columns["car.gear"], raw % 3)
-    np.testing.assert_allclose(read.columns["car.tab"], raw / 100.0)
-    assert "no columns of numbers: text" in read.losses("note")
-    assert "car.text" not in read.columns
+    read = read_mdf(written(tmp_path / "a.mf4", ours, version))
+    assert read.units["lin"] == "g"
+    np.testing.assert_allclose(read.columns["lin"], raw * 0.5 + 1.0)
+    np.testing.assert_allclose(read.columns["gear"], raw % 3)
+    np.testing.assert_allclose(read.columns["tab"], raw / 100.0)
+    assert "no columns of numbers: text" in read.what("note")
+    assert "text" not in read.columns
 
 
 # ---- invalid samples ----
@@ -354,9 +323,9 @@ def test_a_local_start_does_not_depend_on_the_time_zone_of_the_machine(
     version: str, tmp_path: Path, time_zone: str
 ) -> None:
     start = START.replace(tzinfo=None) if version[0] == "4" else START
-    read = contents(written(tmp_path / "a.mf4", [signal("ay", AY)], version, start))
+    read = read_mdf(written(tmp_path / "a.mf4", [signal("ay", AY)], version, start))
     assert read.stamps_ns["car"][0] == START_NS
-    assert "local time without a time zone" in read.losses("note")
+    assert "local time without a time zone" in read.what("note")
 
 
 @pytest.mark.parametrize(("sync", "what"), [(2, "an angle"), (3, "a distance"), (4, "an index")])
@@ -364,9 +333,9 @@ def test_a_master_that_is_no_time_is_no_clock(sync: int, what: str, tmp_path: Pa
     samples = np.column_stack([TIME_S, AY]).tobytes()
     distance = Ch("s", kind=2, sync=sync)
     with pytest.raises(LogError, match=f"its master is {what}, no time"):
-        of_bytes(tmp_path, mdf4([distance, Ch("AccY", 8)], samples, N, 16))
-    read = of_bytes(tmp_path, mdf4([distance, Ch("AccY", 8), TIME], samples, N, 16))
-    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY)
+        read_mdf(mdf4([distance, Ch("AccY", 8)], samples, N, 16))
+    read = read_mdf(mdf4([distance, Ch("AccY", 8), TIME], samples, N, 16))
+    np.testing.assert_array_equal(read.columns["AccY"], AY)
 
 
 # ---- bus logging of newer loggers ----
@@ -427,11 +396,9 @@ LONG = [bytes(range(1, 13)), bytes(range(64))] * 2
 def test_frames_of_newer_loggers(
     length: list[Ch], numbers: dict[str, list[int]], frames: list[bytes], is_variable: bool, tmp_path: Path
 ) -> None:
-    (tmp_path / "a.mf4").write_bytes(can_file(length, numbers, frames, is_variable))
-    with closing(open_log(tmp_path / "a.mf4")) as log:
-        names = [f.path for f in log.fields("can")]
-        read = log.read({"can": names})["can"].fields
-        assert log.lost == ()
+    contents = opened(tmp_path / "a.mf4", can_file(length, numbers, frames, is_variable))
+    read = contents.columns
+    assert ([*contents.topics], contents.lost) == (["can"], ())
     assert read["id"].tolist() == [291] * 4
     assert read["is_extended"].tolist() == [0, 1, 0, 1]
     assert read["bus"].tolist() == [2] * 4
@@ -486,7 +453,7 @@ HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
 @pytest.mark.parametrize(("make", "match"), HARMFUL.values(), ids=HARMFUL)
 def test_a_file_that_is_made_to_harm_is_one_line(make: Callable[[], bytes], match: str, tmp_path: Path) -> None:
     with pytest.raises(LogError, match=match):
-        of_bytes(tmp_path, make())
+        read_mdf(make())
 
 
 def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(
@@ -500,9 +467,9 @@ def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(
     (tmp_path / "a.mf4").write_bytes(data)
     (tmp_path / "t").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "t"))
-    read = contents(tmp_path / "a.mf4")
-    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY)
-    assert "has not finished" in read.losses("note")
+    read = read_mdf(tmp_path / "a.mf4")
+    np.testing.assert_array_equal(read.columns["AccY"], AY)
+    assert "has not finished" in read.what("note")
     del read
     gc.collect()
     assert list((tmp_path / "t").iterdir()) == []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_clocks import (
     NO_TIME,
     RELATIVE_NS,
@@ -28,6 +26,7 @@ from pdhef_logtool.logs.table_clocks import (
 from pdhef_logtool.logs.table_columns import Sheet, find_clock, split_unit, tables_of
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
+from tests.table_contents import opened
 
 MAY_1_NS = 1_714_521_600 * 10**9  # 2024-05-01
 UNIX_TO_GPS_S = 315_964_800 - 18
@@ -292,10 +291,9 @@ CHANNELS = json.dumps({"channels": [{"name": "Speed", "unit": "km/h", "samplerat
     ],
 )
 def test_layouts(name: str, text: str, topic: str, field: str, values: np.ndarray, tmp_path: Path) -> None:
-    (tmp_path / name).write_text(text)
-    with closing(open_log(tmp_path / name)) as log:
-        columns = log.read({topic: [field]})[topic]
-        np.testing.assert_allclose(columns.fields[field], values, atol=1e-9)
+    read = opened(tmp_path / name, text)
+    assert topic in read.topics
+    np.testing.assert_allclose(read.columns[field], values, atol=1e-9)
 
 
 @pytest.mark.parametrize(
