@@ -62,13 +62,18 @@ class McapIndex:
     in_order: bool
 
 
-def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> McapIndex | None:
-    """Read the summary of an MCAP from its end; None if it is missing or inconsistent."""
+def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> tuple[McapIndex | None, bool]:
+    """Read the summary of an MCAP from its end.
+
+    Returns
+    -------
+    index : None if the summary is missing or inconsistent. is_damaged : whether its CRC does not match.
+    """
     try:
-        summary, start, sound = _summary(source)
-        return _index(summary, start, limits) if sound else None
+        summary, start, is_sound = _summary(source)
+        return (_index(summary, start, limits) if is_sound else None), not is_sound
     except _UNREADABLE:
-        return None
+        return None, False
 
 
 def chunk_places(source: ByteSource, limits: ResourceLimits) -> list[int]:
