@@ -439,7 +439,7 @@ class ColumnarLog(DriveLog):
                 continue
             if self.recording_span.left_out:
                 rows = rows[self.recording_span.used((c, span.index, id_), block.log_time_ns[rows])]
-            rows = rows if keep is None else rows[keep[rows]]
+            rows = rows[keep[rows]]
             columns = self._decode(plans[topic], self._channels[c, id_], span, block, rows) if rows.size else None
             if columns is not None:
                 yield columns
@@ -512,14 +512,10 @@ def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
     return Loss("over-budget", what, str(container.path), start, end, count)
 
 
-def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
-    """Return a mask of the log times in [start, end); None if all are."""
-    keep: BoolArray | None = None
-    if start_ns is not None:
-        keep = log_time_ns >= start_ns
-    if end_ns is not None:
-        keep = (log_time_ns < end_ns) if keep is None else keep & (log_time_ns < end_ns)
-    return None if keep is None or keep.all() else keep
+def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray:
+    """Return which of the log times are in [start, end)."""
+    keep: BoolArray = log_time_ns >= (log_time_ns.min(initial=0) if start_ns is None else start_ns)
+    return keep if end_ns is None else keep & (log_time_ns < end_ns)
 
 
 def _join(topic: str, plan: _Plan, parts: Sequence[Columns]) -> Columns:

@@ -13,6 +13,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
@@ -94,7 +95,6 @@ class McapContainer(FileContainer):
         self._raw_channels: dict[int, Channel] = {}
         self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
         self._unread: dict[int, int] = {}  # start and end of the parts of a remote file that are not wanted
-        self._indexed: list[int] | None = None  # places of the chunks that a damaged summary names
         self._closed = False
         self._data_end: int | None = None  # place of the record
         self._is_summary_damaged = False
@@ -107,7 +107,7 @@ class McapContainer(FileContainer):
         source, size = self.source, self.source.size
         indexed = self._indexed_places()
         self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
-        places, n = [*sorted(indexed), size], 0
+        places = [*sorted(indexed), size]
         self.position = self._read_header()
         for offset in self._places():
             if offset in indexed:
@@ -117,10 +117,9 @@ class McapContainer(FileContainer):
                 self._closed = True
                 return
             opcode, end = self._record_head(offset)
-            while places[n] <= offset:
-                n += 1
-            if end > places[n] or opcode == 0:
-                resume = places[n] if places[n] < size else self._next_chunk(offset)
+            following = places[bisect_right(places, offset)]
+            if end > following or opcode == 0:
+                resume = following if following < size else self._next_chunk(offset)
                 if resume is None:
                     self.lose_end(offset)
                     return
@@ -219,10 +218,12 @@ class McapContainer(FileContainer):
 
     def _next_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that a damaged summary names, or None."""
-        if self._indexed is None:
-            self._indexed = chunk_places(self.source, self.meter.limits)
-        position = bisect_right(self._indexed, after)
-        return self._indexed[position] if position < len(self._indexed) else None
+        position = bisect_right(self._named_chunks, after)
+        return self._named_chunks[position] if position < len(self._named_chunks) else None
+
+    @cached_property
+    def _named_chunks(self) -> list[int]:
+        return chunk_places(self.source, self.meter.limits)
 
     def _record(self, opcode: int, start: int, end: int) -> int:
         """Handle one complete record that is no message; return the start of the next one."""
