@@ -177,7 +177,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         group: list[Block] = []
         for raw in raws:
             group += [raw] if len(raw) else []
-            if sum(map(_record_bytes, group)) >= CHUNK_BYTES:
+            if sum(int((part.length + MESSAGE_HEAD.itemsize).sum()) for part in group) >= CHUNK_BYTES:
                 before = int(np.searchsorted(ours.log_time_ns, group[-1].log_time_ns[-1]))
                 self._emit_messages(self._records([*group, ours.take(slice(before))]))
                 group, ours = [], ours.take(slice(before, None))
@@ -323,7 +323,3 @@ def _bytes_of(*records: McapRecord) -> bytes:
         record.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data
-
-
-def _record_bytes(block: Block) -> int:
-    return int((block.length + MESSAGE_HEAD.itemsize).sum())
