@@ -224,17 +224,13 @@ class ColumnarLog(DriveLog):
 
     def unreadable(self, topic: str) -> str:
         """Return why a topic has no readable fields, for example a missing definition; empty if it has some."""
-        reasons = []
-        for channel in self._by_topic.get(topic, ()):
-            schema = self._schema(channel)
-            if isinstance(schema, MessageSchema):
-                return ""
-            if isinstance(schema, MissingDefinitionError):
-                missing = schema.type_name.replace("/msg/", "/")
-                reasons.append(f"the log contains no definition of {missing}; give its .msg file by --set msgs=DIR")
-            else:
-                reasons.append(str(schema))
-        return reasons[0] if reasons else ""
+        schemas = [self._schema(channel) for channel in self._by_topic.get(topic, ())]
+        if not schemas or any(isinstance(schema, MessageSchema) for schema in schemas):
+            return ""
+        if isinstance(schemas[0], MissingDefinitionError):
+            missing = schemas[0].type_name.replace("/msg/", "/")
+            return f"the log contains no definition of {missing}; give its .msg file by --set msgs=DIR"
+        return str(schemas[0])
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic, decoded; messages that do not decode are left out."""

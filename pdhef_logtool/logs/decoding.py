@@ -280,13 +280,12 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
             where="an array as columns",
             remedy="map single elements of it, such as data[0]",
         )
-    wide = []
+    joined, first = np.full((rows, width), np.nan), 0
     for part in filled:
         columns = part if part.ndim == 2 else part[:, None]
-        if columns.shape[1] < width:
-            columns = np.pad(columns, ((0, 0), (0, width - columns.shape[1])), constant_values=np.nan)
-        wide.append(columns)
-    return np.concatenate(wide)
+        joined[first : first + len(part), : columns.shape[1]] = columns
+        first += len(part)
+    return joined
 
 
 def missing_column(selection: Selection, n: int) -> NDArray[Any]:

@@ -205,10 +205,8 @@ class McapContainer(FileContainer):
         """Read the header record, which is the first one; return its end."""
         start = self.position
         opcode, end = self._record_head(start)
-        if opcode == 0 or end > self.source.size:
-            raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
-        if opcode != Opcode.HEADER:
-            raise self.no_log("a header record after the magic bytes", "none")
+        if opcode != Opcode.HEADER or end > self.source.size:
+            raise self.no_log("a complete header record after the magic bytes", "none")
         try:
             self.profile = _parsed(Header, self._payload(start, end)).profile
         except (struct.error, UnicodeDecodeError, McapError) as error:

@@ -232,18 +232,17 @@ def _read_metadata(path: Path, limits: ResourceLimits) -> Mapping[str, Any]:
         document = YAML(typ="safe").load(read_text(file))
         information = document["rosbag2_bagfile_information"]
         files = information["relative_file_paths"]
+        if not isinstance(files, list) or not isinstance(information, dict):
+            raise TypeError(f"{type(files).__name__} in place of a list")
     except OSError:
         raise
     except Exception as error:
         raise LogError(
-            expected="rosbag2_bagfile_information with relative_file_paths",
+            expected="rosbag2_bagfile_information with a list of relative_file_paths",
             got=f"a file without ({type(error).__name__})",
             where=str(file),
             remedy="re-index the folder with ros2 bag reindex, or give the storage file itself",
         ) from error
-    if not isinstance(files, list) or not isinstance(information, dict):
-        got = type(files).__name__
-        raise LogError(expected="a list of relative_file_paths", got=got, where=str(file), remedy=_REMEDY)
     return information
 
 

@@ -196,7 +196,7 @@ class LayoutReader:
 
     def values(self, records: NDArray[Any], steps: Steps) -> NDArray[Any] | None:
         """Return a leaf of N gathered messages, [N] or [N, k] in its own type; None if the layout lacks it."""
-        return records[self._names[steps]] if steps in self._names else None  # type: ignore[no-any-return]
+        return records[self._names[steps]] if steps in self._names else None
 
 
 def leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:
