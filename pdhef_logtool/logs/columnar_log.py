@@ -428,6 +428,7 @@ class ColumnarLog(DriveLog):
         if block is None:
             return
         keep = in_window(block.log_time_ns, *window_ns)
+        is_inside = bool(keep.all())
         # By the channels of the block: the counts of the span can be from a wrong index.
         for id_, rows in block.rows.items():
             topic = channels[id_].topic if id_ in channels else ""
@@ -435,7 +436,7 @@ class ColumnarLog(DriveLog):
                 continue
             if self.recording_span.left_out:
                 rows = rows[self.recording_span.used((c, span.index, id_), block.log_time_ns[rows])]
-            rows = rows[keep[rows]]
+            rows = rows if is_inside else rows[keep[rows]]
             columns = self._decode(plans[topic], self._channels[c, id_], span, block, rows) if rows.size else None
             if columns is not None:
                 yield columns

@@ -157,13 +157,16 @@ class ChannelDecoder:
     ) -> IntArray:
         """Read messages of this layout; return the other rows."""
         offset, length = block.offset[rows[left]], block.length[rows[left]]
-        # Up to three bytes of padding may follow a CDR message.
-        surplus = length - layout.size
-        sized = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
-        if not sized.any():
-            return left
-        fits, records = layout.gather(block.buffer, offset[sized])
-        read = left[sized] if fits is None else left[sized][fits]
+        candidates = left
+        if not (length == layout.size).all():
+            # Up to three bytes of padding may follow a CDR message.
+            surplus = length - layout.size
+            sized = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
+            candidates, offset = left[sized], offset[sized]
+            if not candidates.size:
+                return left
+        fits, records = layout.gather(block.buffer, offset)
+        read = candidates if fits is None else candidates[fits]
         if not read.size:
             return left
         leaves = {s.path: [layout.values(records, steps) for steps in s.components] for s in self.selections}
