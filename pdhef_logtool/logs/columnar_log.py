@@ -224,17 +224,13 @@ class ColumnarLog(DriveLog):
 
     def unreadable(self, topic: str) -> str:
         """Return why a topic has no readable fields, for example a missing definition; empty if it has some."""
-        reasons = []
-        for channel in self._by_topic.get(topic, ()):
-            schema = self._schema(channel)
-            if isinstance(schema, MessageSchema):
-                return ""
-            if isinstance(schema, MissingDefinitionError):
-                missing = schema.type_name.replace("/msg/", "/")
-                reasons.append(f"the log contains no definition of {missing}; give its .msg file by --set msgs=DIR")
-            else:
-                reasons.append(str(schema))
-        return reasons[0] if reasons else ""
+        schemas = [self._schema(channel) for channel in self._by_topic.get(topic, ())]
+        if not schemas or any(isinstance(schema, MessageSchema) for schema in schemas):
+            return ""
+        if isinstance(schemas[0], MissingDefinitionError):
+            missing = schemas[0].type_name.replace("/msg/", "/")
+            return f"the log contains no definition of {missing}; give its .msg file by --set msgs=DIR"
+        return str(schemas[0])
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic, decoded; messages that do not decode are left out."""
@@ -432,6 +428,7 @@ class ColumnarLog(DriveLog):
         if block is None:
             return
         keep = in_window(block.log_time_ns, *window_ns)
+        is_inside = bool(keep.all())
         # By the channels of the block: the counts of the span can be from a wrong index.
         for id_, rows in block.rows.items():
             topic = channels[id_].topic if id_ in channels else ""
@@ -439,7 +436,7 @@ class ColumnarLog(DriveLog):
                 continue
             if self.recording_span.left_out:
                 rows = rows[self.recording_span.used((c, span.index, id_), block.log_time_ns[rows])]
-            rows = rows if keep is None else rows[keep[rows]]
+            rows = rows if is_inside else rows[keep[rows]]
             columns = self._decode(plans[topic], self._channels[c, id_], span, block, rows) if rows.size else None
             if columns is not None:
                 yield columns
@@ -512,14 +509,10 @@ def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
     return Loss("over-budget", what, str(container.path), start, end, count)
 
 
-def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
-    """Return a mask of the log times in [start, end); None if all are."""
-    keep: BoolArray | None = None
-    if start_ns is not None:
-        keep = log_time_ns >= start_ns
-    if end_ns is not None:
-        keep = (log_time_ns < end_ns) if keep is None else keep & (log_time_ns < end_ns)
-    return None if keep is None or keep.all() else keep
+def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray:
+    """Return which of the log times are in [start, end)."""
+    keep: BoolArray = log_time_ns >= (log_time_ns.min(initial=0) if start_ns is None else start_ns)
+    return keep if end_ns is None else keep & (log_time_ns < end_ns)
 
 
 def _join(topic: str, plan: _Plan, parts: Sequence[Columns]) -> Columns:

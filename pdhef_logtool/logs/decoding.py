@@ -31,7 +31,6 @@ from pdhef_logtool.logs.message_schema import (
     Struct,
     bytes_of_text,
     json_schema,
-    json_schema_of_message,
     node_of_value,
     ros_schema,
     select,
@@ -89,7 +88,7 @@ def channel_schema(
         if channel.schema_encoding == "jsonschema" and channel.schema_data.strip():
             return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"), limits)
         if example is not None:
-            return json_schema_of_message(channel.type_name, example, limits)
+            return json_schema(channel.type_name, example, limits, is_message=True)
         raise NoSchemaError("JSON without a schema and without a message")
     if channel.encoding == "protobuf":
         if channel.schema_encoding != "protobuf":
@@ -284,13 +283,12 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
             where="an array as columns",
             remedy="map single elements of it, such as data[0]",
         )
-    wide = []
+    joined, first = np.full((rows, width), np.nan), 0
     for part in filled:
         columns = part if part.ndim == 2 else part[:, None]
-        if columns.shape[1] < width:
-            columns = np.pad(columns, ((0, 0), (0, width - columns.shape[1])), constant_values=np.nan)
-        wide.append(columns)
-    return np.concatenate(wide)
+        joined[first : first + len(part), : columns.shape[1]] = columns
+        first += len(part)
+    return joined
 
 
 def missing_column(selection: Selection, n: int) -> NDArray[Any]:

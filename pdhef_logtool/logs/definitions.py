@@ -31,15 +31,13 @@ _USUAL = (Path("/usr/local"), Path("/usr"))
 class Definitions:
     """Files of definitions by type name in ROS 2 form, and by bare name where a file lies in no package.
 
-    ``archive`` is the zip file or wheel with the files; None for plain files. ``prefixes``
-    and ``sources`` are folders of an installed ROS: ``share/PACKAGE/msg`` below the first, ``PACKAGE/msg`` below the
-    others.
+    ``archive`` is the zip file or wheel with the files; None for plain files. ``folders`` are those of packages of an
+    installed ROS.
     """
 
     files: Mapping[str, Path] = field(default_factory=dict)
     archive: Path | None = None
-    prefixes: tuple[Path, ...] = ()
-    sources: tuple[Path, ...] = ()
+    folders: tuple[Path, ...] = ()
 
     def text_of(self, type_name: str) -> str:
         """Return the text of a type without the types it contains, or an empty string.
@@ -65,13 +63,11 @@ class Definitions:
 
     def _places(self, package: str, name: str) -> Iterator[Path]:
         file = Path("msg", f"{name}.msg")
-        for prefix in self.prefixes:
-            yield prefix / "share" / package / file
-        for source in self.sources:
-            if source.name == package:
-                yield source / file
-            yield source / package / file
-            yield from sorted(source.glob(f"*/{package}/{file.as_posix()}"))
+        for folder in self.folders:
+            if folder.name == package:
+                yield folder / file
+            yield folder / package / file
+            yield from sorted(folder.glob(f"*/{package}/{file.as_posix()}"))
 
 
 #: Shipped definitions only, without the user's and the machine's.
@@ -81,12 +77,9 @@ SHIPPED = Definitions()
 @cache
 def _of_machine(prefixes: str, sources: str) -> Definitions:
     """Return shipped and installed definitions: sourced workspaces first, then the newest distribution."""
-    named = (Path(p) for p in prefixes.split(os.pathsep) if p)
-    distributions = sorted(Path("/opt/ros").glob("*"), reverse=True)
-    return Definitions(
-        prefixes=tuple(dict.fromkeys((*named, *distributions, *_USUAL))),
-        sources=tuple(Path(s) for s in sources.split(os.pathsep) if s),
-    )
+    named, given = ([Path(p) for p in paths.split(os.pathsep) if p] for paths in (prefixes, sources))
+    installed = [*named, *sorted(Path("/opt/ros").glob("*"), reverse=True), *_USUAL]
+    return Definitions(folders=tuple(dict.fromkeys([*(prefix / "share" for prefix in installed), *given])))
 
 
 def dbc_files(place: Path | str | None) -> tuple[Path, ...]:

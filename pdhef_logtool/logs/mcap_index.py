@@ -26,7 +26,6 @@ from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 
 #: One request brings the summary of a drive of several minutes; a longer one takes a second request.
 TAIL_BYTES = 256 << 10
-_MOST_SUMMARY_BYTES = 64 << 20
 RECORD = struct.Struct("<BQ")  # opcode, size of the content
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
 INDEX_RECORD = struct.Struct("<BQHI")  # opcode, size, channel, size of its pairs
@@ -62,25 +61,30 @@ class McapIndex:
     in_order: bool
 
 
-def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> McapIndex | None:
-    """Read the summary of an MCAP from its end; None if it is missing or inconsistent."""
+def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> tuple[McapIndex | None, bool]:
+    """Read the summary of an MCAP from its end.
+
+    Returns
+    -------
+    index : None if the summary is missing or inconsistent. is_damaged : whether its CRC does not match.
+    """
     try:
-        summary, start, sound = _summary(source)
-        return _index(summary, start, limits) if sound else None
+        summary, start, is_sound = _summary(source, limits)
+        return (_index(summary, start, limits) if is_sound else None), not is_sound
     except _UNREADABLE:
-        return None
+        return None, False
 
 
 def chunk_places(source: ByteSource, limits: ResourceLimits) -> list[int]:
     """Return the ascending offsets of chunks according to the summary, as far as it can be read."""
     places: list[int] = []
     with suppress(*_UNREADABLE):
-        indexes = (r for r in _records(_summary(source)[0], limits) if isinstance(r, ChunkIndex))
+        indexes = (r for r in _records(_summary(source, limits)[0], limits) if isinstance(r, ChunkIndex))
         places.extend(r.chunk_start_offset for r in indexes if source.read(r.chunk_start_offset, 1)[0] == Opcode.CHUNK)
     return sorted(places)
 
 
-def _summary(source: ByteSource) -> tuple[bytes, int, bool]:
+def _summary(source: ByteSource, limits: ResourceLimits) -> tuple[bytes, int, bool]:
     """Return the bytes from the summary section to the end of the file, their place, and whether their CRC matches.
 
     Raises
@@ -96,7 +100,7 @@ def _summary(source: ByteSource) -> tuple[bytes, int, bool]:
     opcode, length, start, _, crc = FOOTER.unpack_from(end)
     if opcode != Opcode.FOOTER or length != FOOTER.size - RECORD.size or end[FOOTER.size :] != MCAP_MAGIC:
         raise ValueError("a file without a footer")
-    if not 0 < start < foot or foot - start > _MOST_SUMMARY_BYTES:
+    if not 0 < start < foot or foot - start > limits.metadata_bytes:
         raise ValueError("a file without a summary")
     source.prefetch([(start, size)])
     summary = source.read(start, foot - start)

@@ -13,6 +13,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
@@ -45,7 +46,7 @@ from pdhef_logtool.logs.container import (
     items_at_bytes,
     rows_by_channel,
 )
-from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_PAIR, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
+from pdhef_logtool.logs.mcap_index import INDEX_PAIR, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -58,13 +59,13 @@ _CRC_BLOCK_BYTES = 4 << 20
 _CHUNK_HEAD_BYTES = RECORD.size + _CHUNK.size + _U64.size  # without the name of the compression
 _LONGEST_NAME = 4  # of a compression
 _ATTACHMENT_HEAD_BYTES = 64 << 10  # at most, in front of its data
-#: Plain numbers: comparing with the members of an enumeration takes longer than reading a record.
-_OP_MESSAGE, _OP_CHUNK, _OP_MESSAGE_INDEX = int(Opcode.MESSAGE), int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX)
-_OP_SCHEMA, _OP_CHANNEL, _OP_HEADER = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.HEADER)
-_DECLARATIONS = (_OP_SCHEMA, _OP_CHANNEL)
+#: A plain number: comparing with a member of an enumeration takes longer than reading a record.
+_OP_MESSAGE = int(Opcode.MESSAGE)
+_DECLARATIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _INDEXES = (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
-_SUMMARY_ONLY = frozenset(map(int, (*_INDEXES, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET, Opcode.FOOTER)))
+_SUMMARY_ONLY = frozenset((*_INDEXES, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET, Opcode.FOOTER))
 _FIRST_PRIVATE = 0x80  # other opcodes, neither defined nor private, are no records of the format
+_NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 #: Head of a message record, before its payload.
 MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
@@ -94,10 +95,9 @@ class McapContainer(FileContainer):
         self._raw_channels: dict[int, Channel] = {}
         self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
         self._unread: dict[int, int] = {}  # start and end of the parts of a remote file that are not wanted
-        self._indexed: list[int] | None = None  # places of the chunks that a damaged summary names
         self._closed = False
-        self._data_end: tuple[int, int] | None = None  # extent of the record
-        self._footer: int | None = None  # place of the record
+        self._data_end: int | None = None  # place of the record
+        self._is_summary_damaged = False
         self._statistics: Statistics | None = None
         self._has_end = False  # whether the file ends with its magic bytes
         self._opened_chunks = 0  # number of chunks that the summary does not describe
@@ -107,7 +107,7 @@ class McapContainer(FileContainer):
         source, size = self.source, self.source.size
         indexed = self._indexed_places()
         self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
-        places, n = [*sorted(indexed), size], 0
+        places = [*sorted(indexed), size]
         self.position = self._read_header()
         for offset in self._places():
             if offset in indexed:
@@ -117,10 +117,9 @@ class McapContainer(FileContainer):
                 self._closed = True
                 return
             opcode, end = self._record_head(offset)
-            while places[n] <= offset:
-                n += 1
-            if end > places[n] or opcode == 0:
-                resume = places[n] if places[n] < size else self._next_chunk(offset)
+            following = places[bisect_right(places, offset)]
+            if end > following or opcode == 0:
+                resume = following if following < size else self._next_chunk(offset)
                 if resume is None:
                     self.lose_end(offset)
                     return
@@ -152,7 +151,7 @@ class McapContainer(FileContainer):
         is_whole = not source.is_remote or self._wanted == EVERYTHING or source.size <= self._wanted.above_bytes
         if is_whole:
             source.prefetch([(0, source.size)])
-        index = read_index(source, self.meter.limits)
+        index, self._is_summary_damaged = read_index(source, self.meter.limits)
         if index is None or (source.is_remote and not index.in_order):
             source.prefetch([(0, source.size)])
             return {}
@@ -206,10 +205,8 @@ class McapContainer(FileContainer):
         """Read the header record, which is the first one; return its end."""
         start = self.position
         opcode, end = self._record_head(start)
-        if opcode == 0 or end > self.source.size:
-            raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
-        if opcode != _OP_HEADER:
-            raise self.no_log("a header record after the magic bytes", "none")
+        if opcode != Opcode.HEADER or end > self.source.size:
+            raise self.no_log("a complete header record after the magic bytes", "none")
         try:
             self.profile = _parsed(Header, self._payload(start, end)).profile
         except (struct.error, UnicodeDecodeError, McapError) as error:
@@ -219,34 +216,34 @@ class McapContainer(FileContainer):
 
     def _next_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that a damaged summary names, or None."""
-        if self._indexed is None:
-            self._indexed = chunk_places(self.source, self.meter.limits)
-        position = bisect_right(self._indexed, after)
-        return self._indexed[position] if position < len(self._indexed) else None
+        position = bisect_right(self._named_chunks, after)
+        return self._named_chunks[position] if position < len(self._named_chunks) else None
+
+    @cached_property
+    def _named_chunks(self) -> list[int]:
+        return chunk_places(self.source, self.meter.limits)
 
     def _record(self, opcode: int, start: int, end: int) -> int:
         """Handle one complete record that is no message; return the start of the next one."""
         if opcode in _DECLARATIONS:
             self._declare(opcode, self._payload(start, end))
             return end
-        if opcode == _OP_CHUNK:
+        if opcode == Opcode.CHUNK:
             return self._add_chunk(start, end)
         if opcode == Opcode.ATTACHMENT:
             self._check_attachment(start, end)
         elif opcode == Opcode.DATA_END:
-            self._data_end = (start, end)
+            self._data_end = start
         elif opcode == Opcode.METADATA:
             _parsed(Metadata, self._payload(start, end))
             self._records_at[Metadata].append((start, end))
         elif opcode == Opcode.STATISTICS and self._data_end:
             self._statistics = _parsed(Statistics, self._payload(start, end))
-        elif opcode == Opcode.FOOTER and self._data_end:
-            self._footer = start
-        elif opcode == _OP_MESSAGE_INDEX or (
+        elif opcode == Opcode.MESSAGE_INDEX or (
             opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self._data_end)
         ):
             raise SpanDamageError(f"no record of kind {opcode} is allowed here")
-        elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(start, end):
+        elif opcode - _FIRST_PRIVATE == Opcode.CHUNK and self._is_chunk(start, end):
             raise SpanDamageError("a chunk with one wrong bit in its opcode, which makes it a private record")
         return end
 
@@ -258,7 +255,7 @@ class McapContainer(FileContainer):
     def _declare(self, opcode: int, payload: bytes) -> None:
         """Add a schema or channel record."""
         self.meter.limits.check("metadata_bytes", len(payload), "a declaration")
-        if opcode == _OP_SCHEMA:
+        if opcode == Opcode.SCHEMA:
             schema = _parsed(Schema, payload)
             self._schemas.setdefault(schema.id, schema)
             return
@@ -306,7 +303,7 @@ class McapContainer(FileContainer):
         index_end, size = end, self.source.size
         while index_end + INDEX_RECORD.size <= size:
             opcode, following = self._record_head(index_end)
-            if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or following > size:
+            if opcode & ~_FIRST_PRIVATE != Opcode.MESSAGE_INDEX or following > size:
                 break  # one wrong bit makes an index a private record
             index_end = following
         extent = Extent(start, end, index_end)
@@ -346,7 +343,9 @@ class McapContainer(FileContainer):
         if self._statistics is not None and held < (total := self._statistics.message_count) and not self.lost:
             what = f"the file's statistics name {total} messages, {held} of them are there"
             self.lose("missing-messages", what, count=total - held)
-        self._check_summary()
+        if self._is_summary_damaged and not self.lost:
+            what = "the CRC of the summary does not match: its index is damaged, from which no message was read"
+            self.lost.append(Loss("bad-summary-crc", what, str(self.path), severity="note"))
         self.drop_undeclared("channels {}")
         self.is_remote = self.source.is_remote
         described = bool(self.chunks) and not self._opened_chunks and all(extent.is_chunk for extent in self.chunks)
@@ -355,14 +354,14 @@ class McapContainer(FileContainer):
     def _resolve_channels(self) -> None:
         """Join channels and schemas once all are known."""
         for id_, channel in self._raw_channels.items():
-            schema = self._schemas.get(channel.schema_id)
+            schema = self._schemas.get(channel.schema_id, _NO_SCHEMA)
             self.channels[id_] = ChannelRecord(
                 id=id_,
                 topic=channel.topic,
                 encoding=channel.message_encoding,
-                schema_name=schema.name if schema else "",
-                schema_encoding=schema.encoding if schema else "",
-                schema_data=schema.data if schema else b"",
+                schema_name=schema.name,
+                schema_encoding=schema.encoding,
+                schema_data=schema.data,
                 metadata=dict(channel.metadata),
             )
 
@@ -373,15 +372,14 @@ class McapContainer(FileContainer):
         """
         if self._data_end is None or self.lost:
             return
-        start, _ = self._data_end
-        (crc,) = _U32.unpack(self.source.read(start + RECORD.size, _U32.size))
+        (crc,) = _U32.unpack(self.source.read(self._data_end + RECORD.size, _U32.size))
         read = [extent for extent in self.chunks if extent.start not in self._unread]
         if not crc or (self._statistics is not None and all(map(self._has_crc, read))):
             return
         if self._unread:
             what = "the CRC of the data section was not verified, as not all of the log was read"
             self.lost.append(Loss(UNVERIFIED, what, str(self.path), severity="note"))
-        elif self._crc(0, start) != crc:
+        elif self._crc(0, self._data_end) != crc:
             what = (
                 "the CRC of the data section does not match: some messages are damaged or missing, and it is "
                 "unknown which; the messages that decode are used"
@@ -394,17 +392,6 @@ class McapContainer(FileContainer):
             return False
         _, _, size, crc, _ = _CHUNK.unpack(self.source.read(extent.start + RECORD.size, _CHUNK.size))
         return bool(crc or not size)
-
-    def _check_summary(self) -> None:
-        """Check the CRC of the summary. If it does not match, no message was read by its index: a note."""
-        if self._data_end is None or self._footer is None or self.lost:
-            return
-        _, _, start, _, crc = FOOTER.unpack(self.source.read(self._footer, FOOTER.size))
-        if not crc or not self._data_end[1] <= start <= self._footer:
-            return
-        if self._crc(start, self._footer + FOOTER.size - _U32.size) != crc:
-            what = "the CRC of the summary does not match: its index is damaged, from which no message was read"
-            self.lost.append(Loss("bad-summary-crc", what, str(self.path), severity="note"))
 
     def _crc(self, start: int, end: int) -> int:
         """Return the CRC-32 of bytes [start, end)."""
@@ -430,7 +417,10 @@ class McapContainer(FileContainer):
             return self._scan(self.source.read(extent.start, size))
         record = self.source.read(extent.start, extent.index_end - extent.start)
         content = self.chunk_content(record, size)
-        block = _indexed_messages(content, record, size)
+        indexes = _message_indexes(record, size)
+        # Each channel's offsets ascend already, which the stable sort makes use of.
+        offsets = None if indexes is None else np.sort(indexes[1][:, 1].astype(np.int64), kind="stable")
+        block = None if offsets is None else _gather_messages(content, offsets)
         block = self._scan(content) if block is None else block
         self.meter.limits.check_messages(len(block), size)
         for opcode, start, end in _other_records(block) if declare else ():
@@ -443,7 +433,15 @@ class McapContainer(FileContainer):
 
     def chunk_content(self, record: bytes, end: int) -> bytes:
         """Decompress the chunk record that is the first ``end`` bytes, and check its CRC."""
-        size, crc, compression, start, stored = _chunk_head(record, end)
+        head = ReadDataStream(BytesIO(record))
+        try:
+            head.read(RECORD.size + 2 * _U64.size)  # and times
+            size, crc, compression, stored = head.read8(), head.read4(), head.read_prefixed_string(), head.read8()
+        except (struct.error, UnicodeDecodeError, McapError) as error:
+            raise SpanDamageError(f"malformed chunk header: {error}") from error
+        start = head.count
+        if start + stored > end:
+            raise SpanDamageError("the chunk's records run past its end")
         content = decompress(compression, memoryview(record)[start : start + stored], size, self.meter.limits)
         if crc and crc32(content) != crc:
             raise SpanDamageError("its CRC does not match")
@@ -497,20 +495,6 @@ def _parsed(kind: Any, payload: bytes) -> Any:
     return kind.read(ReadDataStream(BytesIO(payload)))
 
 
-def _chunk_head(record: bytes, end: int) -> tuple[int, int, str, int, int]:
-    """Return size, CRC, compression, and place and length of the stored bytes of the chunk record up to ``end``."""
-    try:
-        _, _, size, crc, n = _CHUNK.unpack_from(record, RECORD.size)
-        name = RECORD.size + _CHUNK.size
-        compression = record[name : name + n].decode()
-        (stored,) = _U64.unpack_from(record, name + n)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise SpanDamageError(f"malformed chunk header: {error}") from error
-    if _CHUNK_HEAD_BYTES + n + stored > end:
-        raise SpanDamageError("the chunk's records run past its end")
-    return size, crc, compression, _CHUNK_HEAD_BYTES + n, stored
-
-
 def _message_indexes(record: bytes, offset: int) -> tuple[list[tuple[int, int]], UintArray] | None:
     """Return the message indexes from a byte on, None if one is malformed.
 
@@ -523,22 +507,13 @@ def _message_indexes(record: bytes, offset: int) -> tuple[list[tuple[int, int]],
             return None
         opcode, length, channel, size = INDEX_RECORD.unpack_from(record, offset)
         start, end = offset + INDEX_RECORD.size, offset + RECORD.size + length
-        if opcode != _OP_MESSAGE_INDEX or size % INDEX_PAIR.size or start + size > end:
+        if opcode != Opcode.MESSAGE_INDEX or size % INDEX_PAIR.size or start + size > end:
             return None
         if size:
             pairs.append(np.frombuffer(record, "<u8", 2 * size // INDEX_PAIR.size, start))
             parts.append((channel, size // INDEX_PAIR.size))
         offset = end
     return parts, np.concatenate(pairs).reshape(-1, 2)
-
-
-def _indexed_messages(content: bytes, record: bytes, index_start: int) -> Block | None:
-    """Return a chunk's messages through its message indexes; None if these do not name all of them."""
-    indexes = _message_indexes(record, index_start)
-    if indexes is None:
-        return None
-    # Each channel's offsets ascend already, which the stable sort makes use of.
-    return _gather_messages(content, np.sort(indexes[1][:, 1].astype(np.int64), kind="stable"))
 
 
 def _heads(content: bytes, offset: IntArray) -> NDArray[np.void]:

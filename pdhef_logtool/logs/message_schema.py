@@ -240,6 +240,8 @@ def ros_schema(
 
     what = f"the definition of {type_name}"
     borrowed: tuple[Path, ...] = ()
+    types: Any = {}
+    has_text = bool(text.strip())
 
     def text_of(name: str) -> str:
         text = definitions.text_of(name)
@@ -250,26 +252,24 @@ def ros_schema(
 
     with parsing(what):
         limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
-        base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
-        if text.strip():
+        if has_text:
             text = _SEPARATOR.sub("=" * 80, text)
             types = _idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
-            store = get_typestore(Stores.EMPTY)
+        if not has_text or referenced(types) - set(types):  # a distribution's types take long to load
+            base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
+            distributed = get_typestore(base).fielddefs
             try:
-                if referenced(types) - set(types):  # a distribution's types take long to load
-                    types = with_contained_types(types, get_typestore(base).fielddefs, text_of)
-            except MissingDefinitionError as error:  # the log's own text is not whole: its messages are lost
-                raise SchemaError(str(error)) from error
-            root = _ros_root(types, type_name, limits)
-            store.register(types)
-        else:
-            store = get_typestore(base)
-            if type_name not in store.fielddefs:
-                types = with_contained_types({}, store.fielddefs, text_of, type_name)
-                files = (definitions.installed(name) for name in sorted(set(types) - set(store.fielddefs)))
+                types = with_contained_types(types, distributed, text_of, "" if has_text else type_name)
+            except MissingDefinitionError as error:
+                if has_text:  # the log's own text is not whole: its messages are lost
+                    raise SchemaError(str(error)) from error
+                raise
+            if not has_text:
+                files = (definitions.installed(name) for name in sorted(set(types) - set(distributed)))
                 borrowed = tuple(file for file in files if file is not None)
-                store.register(types)
-            root = _ros_root(store.fielddefs, type_name, limits)
+        root = _ros_root(types, type_name, limits)
+        store = get_typestore(Stores.EMPTY)
+        store.register(types)
     units = stated_units(text) if encoding == "ros2msg" else {}
     return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed, units=units)
 
@@ -352,13 +352,16 @@ def _listed(length: int | None) -> int:
     return length if length is not None and length <= LISTED_ELEMENTS else 1
 
 
-def json_schema(type_name: str, text: str, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
-    """Parse a JSON Schema; raises :class:`SchemaError`."""
-    what = f"the JSON Schema of {type_name}"
+def json_schema(
+    type_name: str, text: str | bytes, limits: ResourceLimits = DEFAULT_LIMITS, *, is_message: bool = False
+) -> MessageSchema:
+    """Parse a JSON Schema, or derive the schema from a JSON message; raises :class:`SchemaError`."""
+    what = "the first message" if is_message else f"the JSON Schema of {type_name}"
     with parsing(what):
         limits.check("schema_bytes", len(text), what)
         document = json.loads(text)
-        root = _json_node(document, document, Unfolding(limits, what), 1, (), 0)
+        unfolding = Unfolding(limits, what)
+        root = node_of_value(document, limits) if is_message else _json_node(document, document, unfolding, 1, (), 0)
     return MessageSchema(type_name, "json", root, limits=limits)
 
 
@@ -408,15 +411,6 @@ def _json_type(declared: object) -> str | None:
     """Return the type that a JSON Schema declares, null aside; None where it declares none or several."""
     types = [t for t in declared if t != "null"] if isinstance(declared, list) else [declared]
     return str(types[0]) if len(types) == 1 and types[0] is not None else None
-
-
-def json_schema_of_message(type_name: str, message: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
-    """Derive the schema from a JSON message; raises :class:`SchemaError`."""
-    what = "the first message"
-    with parsing(what):
-        limits.check("schema_bytes", len(message), what)
-        root = node_of_value(json.loads(message), limits)
-    return MessageSchema(type_name, "json", root, limits=limits)
 
 
 def node_of_value(value: object, limits: ResourceLimits) -> Node:

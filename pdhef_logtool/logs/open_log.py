@@ -232,18 +232,17 @@ def _read_metadata(path: Path, limits: ResourceLimits) -> Mapping[str, Any]:
         document = YAML(typ="safe").load(read_text(file))
         information = document["rosbag2_bagfile_information"]
         files = information["relative_file_paths"]
+        if not isinstance(files, list) or not isinstance(information, dict):
+            raise TypeError(f"{type(files).__name__} in place of a list")
     except OSError:
         raise
     except Exception as error:
         raise LogError(
-            expected="rosbag2_bagfile_information with relative_file_paths",
+            expected="rosbag2_bagfile_information with a list of relative_file_paths",
             got=f"a file without ({type(error).__name__})",
             where=str(file),
             remedy="re-index the folder with ros2 bag reindex, or give the storage file itself",
         ) from error
-    if not isinstance(files, list) or not isinstance(information, dict):
-        got = type(files).__name__
-        raise LogError(expected="a list of relative_file_paths", got=got, where=str(file), remedy=_REMEDY)
     return information
 
 
@@ -254,7 +253,7 @@ def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
     encodings = _declared_encodings(information)
     containers: list[Container] = []
     lost: list[Loss] = []
-    try:
+    with ExitStack() as stack:
         for name in map(_text, information["relative_file_paths"]):
             file = _storage_file(path, name)
             if file is None:
@@ -264,21 +263,17 @@ def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
                 container = _open_file(replace(folder, path=file, place=file))
                 if not isinstance(container, Container):
                     container.close()
-                    raise LogError(
-                        expected="a file of messages", got=f"a log of kind {container.kind}", where=str(file)
-                    )
+                    raise LogError(expected="a file of messages", got=f"a {container.kind} log", where=str(file))
             except Exception as error:  # noqa: BLE001 (one file of several)
                 lost.append(Loss("bad-file", describe_damage(error)[1], str(file)))
                 continue
+            stack.callback(container.close)
             containers.append(container)
             container.zstd_messages = per_message
             # A topics table may name cdr by default where the recorder used another format: do not decode it as CDR.
             named = {id_: encodings.get(c.topic, c.encoding) for id_, c in container.channels.items()}
             container.channels |= {id_: replace(c, encoding=named[id_]) for id_, c in container.channels.items()}
-    except BaseException:
-        for opened in containers:
-            opened.close()
-        raise
+        stack.pop_all()
     if not containers:
         remedy = lost[0].what if lost else "metadata.yaml names no file"
         raise LogError(expected=what_is_a_log(), got="no readable storage file", where=str(path), remedy=remedy)

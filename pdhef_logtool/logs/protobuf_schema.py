@@ -7,6 +7,7 @@ set one are absent (NaN). Maps and types that contain themselves have no place a
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import lru_cache
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
@@ -85,23 +86,16 @@ def _well_known_file(name: str, importer: str) -> Any:
 
     if name.startswith(_WELL_KNOWN) and name.endswith(".proto"):
         module = name.removeprefix(_WELL_KNOWN).removesuffix(".proto")
-        try:
+        with suppress(ImportError):
             imported = importlib.import_module(f"google.protobuf.{module}_pb2")
-        except ImportError:
-            pass
-        else:
             return descriptor_pb2.FileDescriptorProto.FromString(imported.DESCRIPTOR.serialized_pb)
     raise SchemaError(f"{importer} imports {name}, which the descriptors lack")
 
 
 def _message_node(descriptor: Any, above: tuple[str, ...], unfolding: Unfolding) -> Struct:
     inside = (*above, descriptor.full_name)
-    members: dict[str, Node] = {}
-    for field in descriptor.fields:
-        node = _field_node(field, inside, unfolding)
-        if node is not None:
-            members[field.name] = node
-    return Struct(members)
+    nodes = {field.name: _field_node(field, inside, unfolding) for field in descriptor.fields}
+    return Struct({name: node for name, node in nodes.items() if node is not None})
 
 
 def _field_node(field: Any, inside: tuple[str, ...], unfolding: Unfolding) -> Node | None:

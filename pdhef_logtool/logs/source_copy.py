@@ -97,8 +97,7 @@ def _copied(block: Block, c: int, ids: Mapping[_Key, int], start_ns: int | None,
     channel = np.full(len(block), -1)
     for id_, rows in block.rows.items():
         channel[rows] = ids.get((c, id_), -1)
-    window = in_window(block.log_time_ns, max(start_ns or 0, 0), end_ns)
-    keep = np.flatnonzero((channel >= 0) & (True if window is None else window))
+    keep = np.flatnonzero((channel >= 0) & in_window(block.log_time_ns, max(start_ns or 0, 0), end_ns))
     return replace(block, channel=channel).take(keep[np.argsort(block.log_time_ns[keep], kind="stable")])
 
 

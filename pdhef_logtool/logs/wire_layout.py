@@ -24,7 +24,6 @@ from pdhef_logtool.logs.message_schema import (
     Node,
     Scalar,
     SchemaError,
-    Selection,
     Step,
     Struct,
     Unknown,
@@ -154,7 +153,6 @@ class LayoutReader:
     def __init__(self, layout: WireLayout, wire: str, wanted: Iterable[Steps]) -> None:
         self.size = layout.size
         self._names: dict[Steps, str] = {}
-        self._empty: dict[Steps, np.dtype[Any]] = {}
         self._expected: dict[str, int] = {}
         places: dict[str, tuple[int, np.dtype[Any]]] = {}
         if wire == "cdr":
@@ -164,9 +162,7 @@ class LayoutReader:
             places[name], self._expected[name] = (offset, _WORD), length
         for steps in wanted:
             leaf = leaf_at(layout, steps)
-            if leaf is not None and leaf.count == 0:
-                self._empty[steps] = leaf.dtype
-            elif leaf is not None:
+            if leaf is not None:
                 name = self._names[steps] = f"leaf{len(self._names)}"
                 places[name] = leaf.offset, leaf.dtype if leaf.count is None else np.dtype((leaf.dtype, (leaf.count,)))
         offsets, formats = zip(*places.values(), strict=True) if places else ((), ())
@@ -200,10 +196,7 @@ class LayoutReader:
 
     def values(self, records: NDArray[Any], steps: Steps) -> NDArray[Any] | None:
         """Return a leaf of N gathered messages, [N] or [N, k] in its own type; None if the layout lacks it."""
-        if steps in self._names:
-            values: NDArray[Any] = records[self._names[steps]]
-            return values
-        return np.empty((len(records), 0), dtype=self._empty[steps]) if steps in self._empty else None
+        return records[self._names[steps]] if steps in self._names else None
 
 
 def leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:
@@ -242,7 +235,6 @@ class CdrEncoder:
             raise MappingError(expected=f"a definition of {type_name}", got=str(error), where=topic) from error
         self._texts: dict[Steps, str] = {}
         self._numbers: dict[str, NDArray[np.float64]] = {}
-        self._selections: dict[str, Selection] = {}
         for path, value in constants.items():
             if isinstance(value, str):
                 self._texts[parse_path(path)] = value
@@ -272,16 +264,11 @@ class CdrEncoder:
             self._put(layout, rows, path, values)
         return rows
 
-    def _select(self, path: str) -> Selection:
-        if path not in self._selections:
-            self._selections[path] = resolve(self.schema, self.topic, path)
-        return self._selections[path]
-
     def _layout(self, widths: Mapping[str, int]) -> tuple[WireLayout, bytes]:
         """Return the layout for these array widths and a message with only the constants."""
         lengths: dict[Steps, int] = {}
         for path, width in widths.items():
-            selection = self._select(path)
+            selection = resolve(self.schema, self.topic, path)
             if selection.shape == "array" and selection.length is None:
                 lengths[selection.components[0]] = width
         key = tuple(sorted(lengths.items(), key=repr))
@@ -306,7 +293,7 @@ class CdrEncoder:
         return self._texts.get(steps, "") if isinstance(node, Scalar) and node.kind == "string" else 0
 
     def _put(self, layout: WireLayout, rows: NDArray[np.uint8], path: str, values: NDArray[Any]) -> None:
-        selection = self._select(path)
+        selection = resolve(self.schema, self.topic, path)
         parts: Sequence[NDArray[Any]] = (values,)
         if selection.shape == "time":
             parts = np.divmod(values, NS_PER_S)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -32,7 +32,6 @@ from mcap.records import (
     MetadataIndex,
     Schema,
     Statistics,
-    SummaryOffset,
 )
 from numpy.typing import NDArray
 
@@ -87,9 +86,8 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         import zstandard
 
         self._path, self._compressor = path, zstandard.ZstdCompressor(level=level)
-        self._schemas: dict[int, Schema] = {}
-        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
-        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[tuple[str, str, bytes], Schema] = {}
+        self._channels: list[Channel] = []
         self._encoders: dict[str, tuple[int, CdrEncoder]] = {}
         self._sequences: Counter[int] = Counter()
         self._counts: Counter[int] = Counter()
@@ -154,20 +152,18 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             metadata=dict(record.metadata),
             schema_id=schema,
         )
-        self._channels[channel.id] = channel
+        self._channels.append(channel)
         self._emit_record(channel)
         return channel.id
 
     def _add_schema(self, name: str, encoding: str, data: bytes) -> int:
         key = (name, encoding, data)
-        if key not in self._schema_ids:
-            schema = Schema(id=self._next_id(self._schemas), data=data, encoding=encoding, name=name)
-            self._schemas[schema.id] = schema
-            self._schema_ids[key] = schema.id
-            self._emit_record(schema)
-        return self._schema_ids[key]
+        if key not in self._schemas:
+            self._schemas[key] = Schema(id=self._next_id(self._schemas), data=data, encoding=encoding, name=name)
+            self._emit_record(self._schemas[key])
+        return self._schemas[key].id
 
-    def _next_id(self, taken: Mapping[int, object]) -> int:
+    def _next_id(self, taken: Sized) -> int:
         if len(taken) >= _LARGEST_ID:
             raise OutputError(expected="at most 65535 channels", got="more", where=self._path)
         return len(taken) + 1
@@ -181,7 +177,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         group: list[Block] = []
         for raw in raws:
             group += [raw] if len(raw) else []
-            if sum(map(_record_bytes, group)) >= CHUNK_BYTES:
+            if sum(int((part.length + MESSAGE_HEAD.itemsize).sum()) for part in group) >= CHUNK_BYTES:
                 before = int(np.searchsorted(ours.log_time_ns, group[-1].log_time_ns[-1]))
                 self._emit_messages(self._records([*group, ours.take(slice(before))]))
                 group, ours = [], ours.take(slice(before, None))
@@ -287,8 +283,6 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
 
     def _emit_summary(self) -> None:
         start = self._at
-        builder = RecordBuilder()
-        offsets: list[SummaryOffset] = []
         statistics = Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._channels),
@@ -300,29 +294,11 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self._schemas),
         )
-        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
-            (Opcode.SCHEMA, list(self._schemas.values())),
-            (Opcode.CHANNEL, list(self._channels.values())),
-            (Opcode.STATISTICS, [statistics]),
-            (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
-            (Opcode.METADATA_INDEX, self._metadata_indexes),
-        ]
-        for opcode, records in groups:
-            first = builder.count
-            for record in records:
-                record.write(builder)
-            if length := builder.count - first:
-                offsets.append(SummaryOffset(group_opcode=opcode, group_start=start + first, group_length=length))
-        offset_start = start + builder.count
-        for offset in offsets:
-            offset.write(builder)
-        summary: bytes = builder.end()  # type: ignore[no-untyped-call]
-        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
+        indexes = *self._chunk_indexes, *self._attachment_indexes, *self._metadata_indexes
+        summary = _bytes_of(*self._schemas.values(), *self._channels, statistics, *indexes)
+        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0)
         self._emit(summary)
-        self._emit_record(
-            Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc32(head, crc32(summary)))
-        )
+        self._emit_record(Footer(summary_start=start, summary_offset_start=0, summary_crc=crc32(head, crc32(summary))))
         self._emit(MCAP_MAGIC)
 
     def _emit(self, data: bytes) -> None:
@@ -336,13 +312,14 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._at += len(data)
 
     def _emit_record(self, record: McapRecord) -> tuple[int, int]:
-        builder = RecordBuilder()
-        record.write(builder)
-        data: bytes = builder.end()  # type: ignore[no-untyped-call]
-        start = self._at
+        data, start = _bytes_of(record), self._at
         self._emit(data)
         return start, len(data)
 
 
-def _record_bytes(block: Block) -> int:
-    return int((block.length + MESSAGE_HEAD.itemsize).sum())
+def _bytes_of(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from recorded import fields_of
+from rosbags.typesys import Stores, get_typestore
 
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.decoding import NO_TIME_NS
@@ -130,12 +131,6 @@ def _read_json(path: Path, messages: Sequence[object], schema: object, fields: S
     return fields_of(path, "/t", *fields)
 
 
-def _rosbags_store() -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_HUMBLE)
-
-
 def test_missing_json_fields_and_short_arrays_are_nan(tmp_path: Path) -> None:
     messages = [{"a": 1, "b": {"c": [1.5, 2.5]}, "d": True}, {"b": {"c": [3.5]}}, {"a": None, "b": {}, "d": False}]
     number = {"type": "number"}
@@ -173,7 +168,7 @@ def test_a_json_message_that_is_no_json_is_counted(tmp_path: Path) -> None:
 
 
 def test_a_cut_payload_costs_only_its_own_message(tmp_path: Path) -> None:
-    store = _rosbags_store()
+    store = get_typestore(Stores.ROS2_HUMBLE)
     name = "geometry_msgs/msg/Vector3"
     full = [bytes(store.serialize_cdr(store.types[name](x=float(i), y=0.0, z=0.0), name)) for i in range(5)]
     payloads = [*full[:2], full[2][:11], *full[3:]]
@@ -208,12 +203,9 @@ def test_a_wrong_path_names_the_nearest(tmp_path: Path, path: str, problem: str)
 def test_an_empty_window_has_columns_of_the_right_shape(tmp_path: Path) -> None:
     with McapLogWriter(tmp_path / "x.mcap") as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu")
+    shapes = {"header.stamp": (0,), "orientation": (0, 4), "orientation_covariance": (0, 9), "angular_velocity.z": (0,)}
     with closing(open_log(tmp_path / "x.mcap")) as log:
-        columns = log.read({"/imu": ["header.stamp", "orientation", "orientation_covariance", "angular_velocity.z"]})[
-            "/imu"
-        ]
+        columns = log.read({"/imu": [*shapes]})["/imu"]
         assert (log.start_ns, log.end_ns, len(columns)) == (0, 0, 0)
         assert columns.fields["header.stamp"].dtype == np.int64
-        assert columns.fields["orientation"].shape == (0, 4)
-        assert columns.fields["orientation_covariance"].shape == (0, 9)
-        assert columns.fields["angular_velocity.z"].shape == (0,)
+        assert {path: column.shape for path, column in columns.fields.items()} == shapes

@@ -21,7 +21,7 @@ from mcap.records import Message, Statistics
 from mcap.stream_reader import StreamReader
 from recorded import write_vectors
 
-from pdhef_logtool import Car, inspect_log, read_drive
+from pdhef_logtool import Car, inspect_log, load_mapping, read_drive
 from pdhef_logtool.logs import formats, mcap_log
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.mat_log import open_mat
@@ -225,35 +225,23 @@ TOPICS = {
     },
 }
 MAPPING = """
-[signals.ax_m_s2]
-topic = "imu"
-field = "longitudinal_acceleration"
-[signals.ay_m_s2]
-topic = "imu"
-field = "lateral_acceleration"
-scale = 9.80665
-[signals.yaw_rate_rad_s]
-topic = "imu"
-field = "yaw_rate"
-scale = 0.017453292519943295
+[signals]
+ax_m_s2 = {topic = "imu", field = "longitudinal_acceleration"}
+ay_m_s2 = {topic = "imu", field = "lateral_acceleration", scale = 9.80665}
+yaw_rate_rad_s = {topic = "imu", field = "yaw_rate", scale = 0.017453292519943295}
 """
 
 
-@pytest.fixture(scope="module")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of an installed package that adds the format: a module and an entry point."""
+@pytest.fixture
+def _installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Install a package that adds the format: a module and an entry point."""
     folder = tmp_path_factory.mktemp("package")
     shutil.copy(Path(__file__).with_name("npz_log.py"), folder)
     about = folder / "npz_log-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: npz-log\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[pdhef.log_formats]\nnpz = npz_log:FORMAT\n")
-    return folder
-
-
-@pytest.fixture
-def _installed(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.syspath_prepend(str(package))
+    monkeypatch.syspath_prepend(str(folder))
     importlib.invalidate_caches()
     formats.formats_of_other_packages.cache_clear()
     yield
@@ -293,8 +281,6 @@ def test_an_inspection_shows_tables_and_their_units(npz: Path) -> None:
 
 @pytest.mark.usefixtures("_installed")
 def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz: Path, tmp_path: Path) -> None:
-    import zstandard
-
     (tmp_path / "drive.npz.zst").write_bytes(zstandard.compress(npz.read_bytes()))
     expected = open_log(npz).read({"imu": ["yaw_rate"]})["imu"]
     for place in (tmp_path / "drive.npz.zst", tmp_path):
@@ -315,8 +301,6 @@ def test_a_table_has_ascending_times_and_tables_have_different_names(npz: Path) 
 def test_a_search_takes_files_of_the_format_and_a_mapping_file_names_their_columns(npz: Path, tmp_path: Path) -> None:
     assert [log.path for log in find_logs([str(npz.parent)])] == [npz]
     (tmp_path / "m.toml").write_text(MAPPING)
-    from pdhef_logtool import load_mapping
-
     with read_drive(npz, Car.load("saloon"), load_mapping(tmp_path / "m.toml")) as drive:
         assert drive.available >= {"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"}
 

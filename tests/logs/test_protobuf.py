@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from google.protobuf import descriptor_pb2, descriptor_pool, duration_pb2, message_factory, timestamp_pb2
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -38,7 +39,7 @@ def _add(message: Any, name: str, number: int, kind: int, **more: Any) -> Any:
     return field
 
 
-def _files(with_timestamp: bool = True) -> descriptor_pb2.FileDescriptorSet:
+def _files() -> descriptor_pb2.FileDescriptorSet:
     file = descriptor_pb2.FileDescriptorProto(name="car.proto", package="car", syntax="proto3")
     file.dependency.extend(["google/protobuf/timestamp.proto", "google/protobuf/duration.proto"])
     gear = file.enum_type.add(name="Gear")
@@ -72,15 +73,12 @@ def _files(with_timestamp: bool = True) -> descriptor_pb2.FileDescriptorSet:
     _add(state, "maybe", 33, Field.TYPE_DOUBLE, oneof_index=1, proto3_optional=True)
     # A file may precede its imports, and well-known files may be missing.
     files = descriptor_pb2.FileDescriptorSet(file=[file])
-    if with_timestamp:
-        timestamp_pb2.DESCRIPTOR.CopyToProto(files.file.add())
+    timestamp_pb2.DESCRIPTOR.CopyToProto(files.file.add())
     return files
 
 
 def _message_class() -> Any:
     pool = descriptor_pool.DescriptorPool()
-    from google.protobuf import duration_pb2
-
     for module in (timestamp_pb2, duration_pb2):
         pool.AddSerializedFile(module.DESCRIPTOR.serialized_pb)
     pool.Add(_files().file[0])
@@ -163,13 +161,8 @@ def test_fields_are_listed_without_maps_and_recursion(tmp_path: Path) -> None:
     _write(tmp_path / "a.mcap", [b""])
     with closing(open_log(tmp_path / "a.mcap")) as log:
         kinds = {f.path: f.kind for f in log.fields("/state")}
-    assert kinds["stamp"] == "time"
-    assert kinds["age"] == "time"
-    assert kinds["axes.x"] == "number"
-    assert kinds["a_bool"] == "bool"
-    assert kinds["packed[]"] == "number"
-    assert kinds["wheels[].z"] == "number"
-    assert kinds["name"] == "string"
+    expected = {"stamp": "time", "age": "time", "a_bool": "bool", "name": "string"}
+    assert kinds.items() >= (expected | dict.fromkeys(["axes.x", "packed[]", "wheels[].z"], "number")).items()
     assert not [p for p in kinds if p.startswith(("labels", "parent"))]
 
 
@@ -209,8 +202,6 @@ def test_a_schema_that_cannot_be_used_is_one_clear_line(
 
 @pytest.mark.parametrize("ending", ["|hex", "|base64"])
 def test_bytes_that_stand_as_text(tmp_path: Path, ending: str) -> None:
-    import base64
-
     raw = [b"", b"\x00\xff\x10", b"12345678"]
     texts = [x.hex(" ") if ending == "|hex" else base64.b64encode(x).decode() for x in raw]
     _write(tmp_path / "a.mcap", [STATE(name=t).SerializeToString() for t in (*texts, "no digits")])

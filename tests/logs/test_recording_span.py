@@ -21,7 +21,6 @@ from pdhef_logtool.logs.recording_span import (
     recorded_twice,
     shown_time,
 )
-from pdhef_logtool.records.signals import IntArray
 from tests.mcap_files import mcap_writer
 
 S = 1_000_000_000
@@ -29,14 +28,10 @@ T0 = 1_767_225_600 * S
 LATEST = 2**63 - 2
 
 
-def epochs(times_ns: IntArray) -> tuple[list[tuple[int, int]], np.ndarray, np.ndarray]:
-    return find_epochs(times_ns, times_ns + 1, np.ones(len(times_ns), dtype=np.int64))
-
-
 @pytest.mark.parametrize("stray", [0, 1, LATEST, T0 - 900 * S, T0 + 5000 * S])
 def test_one_message_far_from_all_others_is_stray(stray: int) -> None:
     times = np.append(T0 + np.arange(1000) * S // 100, stray)
-    intervals, kept, strays = epochs(times)
+    intervals, kept, strays = find_epochs(times, times + 1, np.ones(len(times), dtype=np.int64))
     assert intervals == [(T0, T0 + 999 * S // 100 + 1)]
     assert np.flatnonzero(strays).tolist() == [1000]
     assert kept.sum() == 1000

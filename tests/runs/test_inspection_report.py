@@ -273,7 +273,7 @@ def test_a_small_log_is_read_whole(sample_logs_dir):
 def _flip_in_chunk(number: int) -> Callable[[Path], None]:
     def spoil(file: Path) -> None:
         source = LocalFile(file)
-        index = read_index(source)
+        index, _ = read_index(source)
         source.close()
         data = bytearray(file.read_bytes())
         extent, _ = index.chunks[number]
