@@ -318,6 +318,13 @@ def _ecef_vectors(topic: str, fields: tuple[FieldInfo, ...]) -> Iterator[SignalS
             yield SignalSource(name, topic, tuple(f"{base}[{i}]" for i in range(3)), stamp_path_of(fields))
 
 
+def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
+    """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
+    relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
+    slope = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.slope
+    return math.copysign(float(SAME_STEPS[0] < abs(slope) < SAME_STEPS[1]), slope)
+
+
 def _is_place(item: Field, most: float) -> bool:
     """Return whether values can be degrees of latitude or longitude of a moving car."""
     if not item.seen.changes or not 0.01 < item.seen.largest * item.scale <= most:

@@ -43,7 +43,7 @@ from pdhef_logtool.mapping.fields import (
     posterior,
 )
 from pdhef_logtool.mapping.naming import words_of
-from pdhef_logtool.mapping.navigation import axes_of, has_heading
+from pdhef_logtool.mapping.navigation import axes_of, has_heading, turns
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
@@ -355,6 +355,7 @@ class Weighing:
         self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
         if not self.true:
             return
+        self._head()
         first = its[0]
         if first.role == "sensor" and self.true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
             self.true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
@@ -370,6 +371,23 @@ class Weighing:
         self.notes.append(f"ground truth comes from {first.topic.name}, by the names of its fields")
         for name, item in self.true.items():
             self._tell(f"truth.{name}", item)
+
+    def _head(self) -> None:
+        """Add the heading that turns as fast as the car.
+
+        Values of a full turn count clockwise from north, as a compass does; others have the sense of the yaw rate, and
+        count from east if it is to the left.
+        """
+        rate = self._chosen("yaw_rate_rad_s")
+        headings = [f for f in self.fields.candidates if f.meaning.quantity == "heading" and not f.fixed]
+        for item in sorted(headings, key=lambda f: f.topic.name != self.truth_from):
+            sense = 0.0 if rate is None else turns(self.fields.pieces, item.si, rate.si)
+            is_compass = bool(np.nanmin(item.seen.values) >= 0.0) and item.seen.largest * item.scale > math.pi
+            if sense and rate is not None and (is_compass or not _has_open_sign(rate)):
+                item.sign = -1.0 if is_compass and not rate.fixed else sense
+                item.offset = 0.0 if item.sign > 0.0 else math.pi / 2.0
+                self.true["yaw_rad"] = item
+                return
 
     # ------------------------------------------------------------------------------------------------- reporting
 
