@@ -29,8 +29,9 @@ EXCITED_CURVATURE_1_M, SLOW_M_S = 0.0001, 1.0
 _HALF = 5
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
-#: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
-SAME, BY_DRIVING = 0.03, 0.15
+#: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
+#: grade and slip, and of the usual tracks among cars; usual track.
+SAME, BY_DRIVING, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.2, 1.55
 #: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
@@ -207,6 +208,7 @@ def decide_units(fields: Fields) -> None:
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
+    _by_track(fields)
     _by_siblings(fields)
 
 
@@ -275,6 +277,17 @@ def _by_turning(fields: Fields) -> None:
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
         if relation is not None and abs(relation.correlation) > CLEAR:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
+
+
+def _by_track(fields: Fields) -> None:
+    """Determine the unit of the speed by the track with which wheel speeds of this unit differ in bends."""
+    speed, rate = fields.best("speed"), fields.best("rate")
+    wheels = [f.seen.cells for side in ("rl", "rr") for f in fields.open("wheel speed", side)[:1]]
+    if speed is None or rate is None or len(wheels) < 2 or not agree(wheels[1], speed.seen.cells):
+        return
+    relation = fit(fields.pieces.smooth(wheels[1] - wheels[0]), fields.pieces.smooth(rate.seen.cells))
+    if relation is not None and abs(relation.correlation) > CLEAR:
+        settle((speed, rate), [Gain((1, -1), relation.slope / USUAL_TRACK_M, USUAL_TRACKS)], "the track of its wheels")
 
 
 def _by_siblings(fields: Fields) -> None:

@@ -150,12 +150,16 @@ class Weighing:
             self._tell(name, item)
 
     def _usable(self) -> list[Field]:
-        """Return candidates for signals; estimates of a quantity that no sensor gives are included."""
+        """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation")]
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"acceleration", "rate", "speed", "steering"} - given
         usable += [f for f in self.fields.candidates if f.role == "estimate" and f.meaning.quantity in lacking]
-        return [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
+        usable = [f for f in usable if (f.seen.changes or f.fixed or f.is_steady) and f.section != "truth"]
+        elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
+        for item in usable:
+            item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
+        return usable
 
     def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
