@@ -58,6 +58,8 @@ _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: Correlation with speeding up below which an acceleration is along another axis.
 FOLLOWS = 0.5
+#: Speed over that over ground below which it is vertical.
+VERTICAL = 0.2
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -103,6 +105,7 @@ def weigh(
     decide_units(fields)
     weighing = Weighing(fields, anchor_of("vx_m_s", weighable))
     weighing.drop_vectors_over_ground()
+    weighing.drop_vertical_speeds()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     weighing.choose_signals(set(signals))
@@ -179,6 +182,13 @@ class Weighing:
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
+
+    def drop_vertical_speeds(self) -> None:
+        """Leave out speeds that are small against the velocity over ground of their message."""
+        for side in (*self.fields.open("over ground"), *self.taken.values()):
+            speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
+            for item in [f for f in speeds if f.seen.largest < VERTICAL * side.seen.largest]:
+                self.fields.candidates.remove(item)
 
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
         """Return whether another speed is the length of x and y, and not x."""
