@@ -102,18 +102,18 @@ def mean_of(columns: Sequence[FloatArray]) -> FloatArray:
 # ------------------------------------------------------------------------------------------------ path
 
 
-def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
-    """Return the steps north and east over a second, in m [M], of the first positions that change; None without any."""
+def path_velocity(pieces: Pieces, positions: Sequence[Field]) -> tuple[FloatArray, FloatArray] | None:
+    """Return the velocity north and east, m/s [M], along the first positions that change; None without any."""
     pairs = {"latitude": "longitude", "position": "position"}
-    for north in (f for f in fields.positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
+    for north in (f for f in positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
         wanted = (pairs[north.meaning.quantity], "x" if north.meaning.part else "")
-        others = [f for f in fields.positions if (f.meaning.quantity, f.meaning.part) == wanted]
+        others = [f for f in positions if (f.meaning.quantity, f.meaning.part) == wanted]
         same = [f for f in others if f.topic.name == north.topic.name]
         # Recorders with one number per topic store latitude and longitude in different topics.
         east = same[0] if same else others[0] if len(others) == 1 else None
         if east is None or not (north.seen.changes or east.seen.changes):
             continue
-        up, right = _step(fields, north.si), _step(fields, east.si)
+        up, right = _over_seconds(pieces, north.si), _over_seconds(pieces, east.si)
         if north.meaning.quantity == "latitude":
             up, right = up * DEGREE_M, right * DEGREE_M * math.cos(math.radians(float(np.nanmean(north.si))))
         if np.isfinite(up).any():
@@ -121,23 +121,12 @@ def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
     return None
 
 
-def path_velocity(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
-    """Return the velocity north and east along the path of positions, m/s [M]; None without positions."""
-    steps = _path(fields)
-    seconds = 2 * _HALF * CELL_NS * 1e-9
-    return None if steps is None else (steps[0] / seconds, steps[1] / seconds)
-
-
-def path_speed(fields: Fields) -> FloatArray | None:
-    """Return the speed along the path of positions, m/s [M]; None without positions."""
-    velocity = path_velocity(fields)
-    return None if velocity is None else np.hypot(*velocity)
-
-
-def _step(fields: Fields, cells: FloatArray) -> FloatArray:
-    rows = cells.reshape(len(fields.pieces.starts), -1)
+def _over_seconds(pieces: Pieces, cells: FloatArray) -> FloatArray:
+    """Return the time derivative [M] over a window that is long against the resolution of positions."""
+    rows = cells.reshape(len(pieces.starts), -1)
     out = np.full_like(rows, np.nan)
-    out[:, _HALF:-_HALF] = rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]
+    seconds = 2 * _HALF * CELL_NS * 1e-9
+    out[:, _HALF:-_HALF] = (rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]) / seconds
     return out.ravel()
 
 
@@ -249,10 +238,11 @@ def _speeds(fields: Fields) -> None:
     """Determine the units of speeds by a known speed and by positions."""
     settled = [f for f in fields.all("speed") if f.unit_known or f.fixed]
     reference = max(settled, key=lambda f: f.score, default=None)
-    path = path_speed(fields)
+    velocity = path_velocity(fields.pieces, fields.positions)
+    along_path = [] if velocity is None else [np.hypot(*velocity)]
     for item in fields.all("speed"):
-        others = [path, None if reference is None or reference is item else reference.si]
-        times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others if other is not None]
+        others = along_path + ([] if reference is None or reference is item else [reference.si])
+        times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others]
         settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x is not None and x > 0.0], "other speeds")
 
 

@@ -477,14 +477,10 @@ def _pose(topic: TopicInfo, part: str) -> str:
 
 
 def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen]:
-    """Read pieces of the fields that may contain constant fillers."""
-    fields = {t.name: log.fields(t.name) for t in topics if _probed_paths(t)}
-    return Pieces(log).read((t.name, p) for t in topics for p in _probed_paths(t) if has_path(fields[t.name], p))
-
-
-def _probed_paths(topic: TopicInfo) -> list[str]:
-    """Return the paths of a well-known type that may contain constant fillers."""
-    return _FIELDS["probed"].get(type_of(topic), "").split()
+    """Read pieces of the fields of well-known types that may contain constant fillers."""
+    probed = {t.name: _FIELDS["probed"].get(type_of(t), "").split() for t in topics}
+    fields = {name: log.fields(name) for name, paths in probed.items() if paths}
+    return Pieces(log).read((n, p) for n, paths in probed.items() for p in paths if has_path(fields[n], p))
 
 
 # ------------------------------------------------------------------------------------------------ sensors

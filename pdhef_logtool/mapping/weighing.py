@@ -166,7 +166,7 @@ class Weighing:
 
     def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
-        steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
+        steps, rates = path_velocity(self.fields.pieces, self.fields.positions), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
             is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
