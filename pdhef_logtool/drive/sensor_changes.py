@@ -382,9 +382,10 @@ def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tupl
             if name == "steer_rad":
                 expected = steering.table[k, 1:] @ steering.fit[k0]
                 change, limit, std = expected - expected[0], LEAST_STEER_CHANGE_RAD + MISSED * error[k0], error[k0]
-            else:  # the acceleration before is grade, or a bias
+            else:  # what a_x measured before beyond the change of the speed is grade, or a bias
                 before = max(k0 - round(GRADE_S / CELL_S), 0)
-                grade = (travelled[k0] - travelled[before]) / max(k0 - before, 1)
+                beyond = travelled[[before, k0]] - cells.speed[[before, k0]]
+                grade = np.nan_to_num(beyond[1] - beyond[0]) / max(k0 - before, 1)
                 expected = travelled[k] - travelled[k0] - grade * (k - k0)
                 change, limit, std, expected = expected, LEAST_SPEED_CHANGE_M_S, math.nan, np.full(len(k), np.nan)
             is_stuck = np.abs(change) > limit

@@ -36,6 +36,8 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
 #: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
+#: Words of a field in a table of several instruments that make it ground truth, or of a receiver.
+_TRUTH_WORDS, _RECEIVERS = frozenset(VOCABULARY["topics"]["truth"].split()), {"gps", "gnss", "ins", "rtk"}
 #: Words that leave the quantity of a field open: it may be any of them.
 _OPEN_WORDS = naming.COUNTING | {"angle", "yaw"}
 #: Affix that distinguishes the name of a sign from the name of its magnitude; YawToRight belongs to YawRate.
@@ -331,8 +333,8 @@ def _weighable(
             its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
         if seen is None or its is None or not np.isfinite(seen.values).any():
             continue
-        if role == "sensor" and {"gps", "gnss", "ins", "rtk"} & set(words_of(name)):
-            role = "navigation"
+        if role == "sensor" and (own := set(words_of(name))) & (_TRUTH_WORDS | _RECEIVERS):
+            role = "truth" if own & _TRUTH_WORDS else "navigation"
         entry = vendors.of(topic.type_name).fields[info.path] if documented else None
         yield _field_of(fields, topic, role, replace(info, path=name), its, seen, entry)
 

@@ -212,10 +212,12 @@ class Weighing:
     def _choose(self, judged: Sequence[tuple[float, str, Field]]) -> None:
         """Select the field with the highest score for its signal (score, signal, field), and record its rivals."""
 
-        # A speed before the x of a velocity, which is ahead in some axes only; what is constant last.
+        # The car's own sensor before that of a receiver, which may be the ground truth; a speed before the x of a
+        # velocity, which is ahead in some axes only.
         def rank(judgement: tuple[float, str, Field]) -> tuple[object, ...]:
             score, _, f = judgement
-            return -score, f.meaning.part, f.seen.is_off_centre, -f.topic.messages, f.topic.name, f.path
+            is_other = (f.role == "navigation", f.meaning.part, f.seen.is_off_centre)
+            return -score, *is_other, -f.topic.messages, f.topic.name, f.path
 
         good = sorted((j for j in judged if j[0] >= LEAST_SCORE), key=rank)
         if not good:
@@ -364,6 +366,10 @@ class Weighing:
         if not self.truth_from:
             return
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
+        # In a table of several instruments, those named as ground truth or as receivers alone, if they are sufficient.
+        for role in ("truth", "navigation"):
+            of_role = [f for f in its if f.role == role]
+            its = of_role if _truth_of(of_role) else its
         documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
         # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
         self.true = named if not documented or _SLIP & set(named) - set(documented) else documented

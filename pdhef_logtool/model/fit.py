@@ -62,8 +62,8 @@ SHARED_SHARE, SHARED_SHARES = 0.2, {priors.STEER_DELAY: 0.4}
 #: Minimum driving above the low-speed limit.
 LEAST_S = 5.0
 #: A fit is rejected if its error exceeds this share of the RMS of yaw rate or of a_y, and ``ERROR_STD``: sign or topic
-#: of a signal may be wrong, or the car spins.
-LARGEST_SHARE = 0.5
+#: of a signal may be wrong, or the car spins. A noisy sensor is accepted: its gain against the model is about 1.
+LARGEST_SHARE, LARGEST_GAIN = 0.5, 1.25
 #: A fit is rejected if the rear axle slides for this time and this share of the driving: beyond this slip angle the
 #: lateral force depends on longitudinal slip, which the model lacks.
 SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
@@ -204,7 +204,10 @@ class CarFit:
         ):
             measured = self._columns[column, self._driving.settled]
             share = rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
-            if share > LARGEST_SHARE and rms[row] > ERROR_STD[row]:
+            modelled = self._out[row, self._kept]
+            gain = float(modelled @ self._columns[column, self._kept]) / max(float(modelled @ modelled), 1e-9)
+            is_noise = 1.0 / LARGEST_GAIN < gain < LARGEST_GAIN
+            if share > LARGEST_SHARE and rms[row] > ERROR_STD[row] and not is_noise:
                 return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible", False
         turning = self._columns[equations.YAW_RATE, self._kept] / self._columns[equations.SPEED, self._kept]
         rear_slip = self.vehicle_file.cg_to_rear_axle_m * turning - self.sideslip(theta)

@@ -102,6 +102,17 @@ def test_a_sound_drive_stays_as_it_is(road: Signals) -> None:
     assert find_changes(road.rows(0, 1))[1] == ()
 
 
+def test_a_coarse_speed_after_acceleration_is_not_stuck(road: Signals) -> None:
+    """Speeds in km/h repeat for seconds while the car cruises; the acceleration before is no grade."""
+    cruises = np.clip(seconds(road) - 20.0, 0.0, 6.0)
+    speed, slope_m_s2 = (
+        np.round(3.6 * (14.0 + 2.0 * cruises)) / 3.6,
+        np.where((cruises > 0.0) & (cruises < 6.0), 2.0, 0.0),
+    )
+    quiet = replace(road, speed_m_s=speed, ax_m_s2=slope_m_s2 + 0.3)
+    assert [c for c in find_changes(quiet)[1] if c.kind == "stuck"] == []
+
+
 def test_stuck_readings_that_move_again_are_no_jump(sample_logs_dir: Path) -> None:
     with read_drive(sample_logs_dir / "faults.mcap", sample_logs_dir / "vehicle.toml") as drive:
         assert drive.recorded().changes == ()

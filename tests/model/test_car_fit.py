@@ -159,6 +159,15 @@ def test_a_right_file_decides_what_gentle_driving_cannot_and_a_wrong_one_does_no
     assert wrong_level < 0.7 * math.log(2.0)
 
 
+def test_a_noisy_accelerometer_is_accepted_and_one_of_another_sensor_refused() -> None:
+    """Vibration of 4 m/s² in samples of 20 Hz exceeds the lateral acceleration, but not its gain of 1."""
+    signals, noise = wide().signals, np.random.default_rng(2).normal(0.0, 4.0, len(wide().signals))
+    slow = np.repeat(noise[::5], 5)[: len(noise)]
+    noisy = found(replace(signals, ay_m_s2=signals.ay_m_s2 + slow), RIGHT)
+    assert not noisy.refused
+    assert "the lateral acceleration" in found(replace(signals, ay_m_s2=slow), RIGHT).refused
+
+
 def test_a_car_that_slides_all_the_time_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules, "SLIDING_RAD", 0.001)
     signals = wide().signals
