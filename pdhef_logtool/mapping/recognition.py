@@ -490,7 +490,9 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     imus = [t for t in topics if type_of(t) in IMU_TYPES and not _named(t, "truth")]
     in_g = in_deg = False
     why = "an IMU of the vehicle is preferred to one of a camera or lidar"
-    imu = draft.choose("imu", imus, lambda t: (_named(t, "device"),), why)
+    # Drivers with a message for each sensor leave the vectors of the other one at zero.
+    forces = [t for t in imus if any(_span(draft.values(t.name, path)) > 0.0 for path in _GRAVITY_PATHS)]
+    imu = draft.choose("imu", forces or imus, lambda t: (_named(t, "device"),), why)
     if imu is None:
         return
     gyros = [t for t in imus if _span(draft.values(t.name, "angular_velocity.z")) > 0.0]
