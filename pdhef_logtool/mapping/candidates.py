@@ -333,8 +333,8 @@ def _weighable(
             its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
         if seen is None or its is None or not np.isfinite(seen.values).any():
             continue
-        if role == "sensor" and (own := set(words_of(name))) & (_TRUTH_WORDS | _RECEIVERS):
-            role = "truth" if own & _TRUTH_WORDS else "navigation"
+        if role == "sensor" and (words := set(words_of(name))) & (_TRUTH_WORDS | _RECEIVERS):
+            role = "truth" if words & _TRUTH_WORDS else "navigation"
         entry = vendors.of(topic.type_name).fields[info.path] if documented else None
         yield _field_of(fields, topic, role, replace(info, path=name), its, seen, entry)
 
