@@ -29,8 +29,9 @@ EXCITED_CURVATURE_1_M, SLOW_M_S = 0.0001, 1.0
 _HALF = 5
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
-#: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
-SAME, BY_DRIVING = 0.03, 0.15
+#: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
+#: grade and slip, and of the usual tracks among cars; usual track.
+SAME, BY_DRIVING, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.2, 1.55
 #: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
 UPRIGHT, NEAR_1_G = 0.9, 0.25
 #: Probability at which a unit counts as known.
@@ -101,18 +102,18 @@ def mean_of(columns: Sequence[FloatArray]) -> FloatArray:
 # ------------------------------------------------------------------------------------------------ path
 
 
-def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
-    """Return the steps north and east over a second, in m [M], of the first positions that change; None without any."""
+def path_velocity(pieces: Pieces, positions: Sequence[Field]) -> tuple[FloatArray, FloatArray] | None:
+    """Return the velocity north and east, m/s [M], along the first positions that change; None without any."""
     pairs = {"latitude": "longitude", "position": "position"}
-    for north in (f for f in fields.positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
+    for north in (f for f in positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
         wanted = (pairs[north.meaning.quantity], "x" if north.meaning.part else "")
-        others = [f for f in fields.positions if (f.meaning.quantity, f.meaning.part) == wanted]
+        others = [f for f in positions if (f.meaning.quantity, f.meaning.part) == wanted]
         same = [f for f in others if f.topic.name == north.topic.name]
         # Recorders with one number per topic store latitude and longitude in different topics.
         east = same[0] if same else others[0] if len(others) == 1 else None
         if east is None or not (north.seen.changes or east.seen.changes):
             continue
-        up, right = _step(fields, north.si), _step(fields, east.si)
+        up, right = _over_seconds(pieces, north.si), _over_seconds(pieces, east.si)
         if north.meaning.quantity == "latitude":
             up, right = up * DEGREE_M, right * DEGREE_M * math.cos(math.radians(float(np.nanmean(north.si))))
         if np.isfinite(up).any():
@@ -120,23 +121,12 @@ def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
     return None
 
 
-def path_velocity(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
-    """Return the velocity north and east along the path of positions, m/s [M]; None without positions."""
-    steps = _path(fields)
-    seconds = 2 * _HALF * CELL_NS * 1e-9
-    return None if steps is None else (steps[0] / seconds, steps[1] / seconds)
-
-
-def path_speed(fields: Fields) -> FloatArray | None:
-    """Return the speed along the path of positions, m/s [M]; None without positions."""
-    velocity = path_velocity(fields)
-    return None if velocity is None else np.hypot(*velocity)
-
-
-def _step(fields: Fields, cells: FloatArray) -> FloatArray:
-    rows = cells.reshape(len(fields.pieces.starts), -1)
+def _over_seconds(pieces: Pieces, cells: FloatArray) -> FloatArray:
+    """Return the time derivative [M] over a window that is long against the resolution of positions."""
+    rows = cells.reshape(len(pieces.starts), -1)
     out = np.full_like(rows, np.nan)
-    out[:, _HALF:-_HALF] = rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]
+    seconds = 2 * _HALF * CELL_NS * 1e-9
+    out[:, _HALF:-_HALF] = (rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]) / seconds
     return out.ravel()
 
 
@@ -207,6 +197,7 @@ def decide_units(fields: Fields) -> None:
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
+    _by_track(fields)
     _by_siblings(fields)
 
 
@@ -247,10 +238,11 @@ def _speeds(fields: Fields) -> None:
     """Determine the units of speeds by a known speed and by positions."""
     settled = [f for f in fields.all("speed") if f.unit_known or f.fixed]
     reference = max(settled, key=lambda f: f.score, default=None)
-    path = path_speed(fields)
+    velocity = path_velocity(fields.pieces, fields.positions)
+    along_path = [] if velocity is None else [np.hypot(*velocity)]
     for item in fields.all("speed"):
-        others = [path, None if reference is None or reference is item else reference.si]
-        times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others if other is not None]
+        others = along_path + ([] if reference is None or reference is item else [reference.si])
+        times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others]
         settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x is not None and x > 0.0], "other speeds")
 
 
@@ -275,6 +267,17 @@ def _by_turning(fields: Fields) -> None:
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
         if relation is not None and abs(relation.correlation) > CLEAR:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
+
+
+def _by_track(fields: Fields) -> None:
+    """Determine the unit of the speed by the track with which wheel speeds of this unit differ in bends."""
+    speed, rate = fields.best("speed"), fields.best("rate")
+    wheels = [f.seen.cells for side in ("rl", "rr") for f in fields.open("wheel speed", side)[:1]]
+    if speed is None or rate is None or len(wheels) < 2 or not agree(wheels[1], speed.seen.cells):
+        return
+    relation = fit(fields.pieces.smooth(wheels[1] - wheels[0]), fields.pieces.smooth(rate.seen.cells))
+    if relation is not None and abs(relation.correlation) > CLEAR:
+        settle((speed, rate), [Gain((1, -1), relation.slope / USUAL_TRACK_M, USUAL_TRACKS)], "the track of its wheels")
 
 
 def _by_siblings(fields: Fields) -> None:

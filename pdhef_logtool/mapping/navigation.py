@@ -21,7 +21,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
 from pdhef_logtool.mapping.checking import stamp_path_of
-from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen, fit
+from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, fit
 from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_velocity
 from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
@@ -105,23 +105,15 @@ def axes_of(
 
 def twist_axes(log: DriveLog, velocity: SignalSource, references: Sequence[SignalSource]) -> Axes:
     """Return the axes of a velocity's first two fields by positions and a yaw rate among ``references``."""
-    pieces, read, anchors = _read(log, (velocity, *references))
+    pieces = Pieces(log)
+    read = pieces.read((source.topic, path) for source in (velocity, *references) for path in source.paths)
     x, y = (read.get((velocity.topic, path)) for path in velocity.paths[:2])
     if x is None or y is None:
         return ""
+    anchors = anchors_of(log, references, read)
     rate = next((f.si for f in anchors if f.meaning.quantity == "rate"), None)
-    return axes_of(pieces, x.cells, y.cells, path_velocity(_on_path(pieces, anchors)), rate)
-
-
-def _read(log: DriveLog, sources: Sequence[SignalSource]) -> tuple[Pieces, dict[tuple[str, str], Seen], list[Field]]:
-    """Read sources in a few pieces of a log; return them also as fields."""
-    pieces = Pieces(log)
-    read = pieces.read((source.topic, path) for source in sources for path in source.paths)
-    return pieces, read, anchors_of(log, sources, read)
-
-
-def _on_path(pieces: Pieces, anchors: Sequence[Field]) -> Fields:
-    return Fields(pieces, {}, [], [f for f in anchors if f.meaning.quantity in PLACES])
+    steps = path_velocity(pieces, [f for f in anchors if f.meaning.quantity in PLACES])
+    return axes_of(pieces, x.cells, y.cells, steps, rate)
 
 
 # ------------------------------------------------------------------------------------------------ receivers
@@ -214,7 +206,7 @@ class _Instrument:
     @cached_property
     def course(self) -> FloatArray | None:
         """Direction of the path, counter-clockwise from east, rad [M], NaN at low speed; None without positions."""
-        velocity = path_velocity(Fields(self.pieces, {}, [], self.places)) if self.has_place else None
+        velocity = path_velocity(self.pieces, self.places) if self.has_place else None
         return None if velocity is None else _direction(*velocity)
 
     @property
@@ -316,6 +308,13 @@ def _ecef_vectors(topic: str, fields: tuple[FieldInfo, ...]) -> Iterator[SignalS
         name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
         if f"{base}[2]" in paths and f"{base}[3]" not in paths and words & {"velocity", "vel", "position", "pos"}:
             yield SignalSource(name, topic, tuple(f"{base}[{i}]" for i in range(3)), stamp_path_of(fields))
+
+
+def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
+    """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
+    relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
+    slope = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.slope
+    return math.copysign(float(SAME_STEPS[0] < abs(slope) < SAME_STEPS[1]), slope)
 
 
 def _is_place(item: Field, most: float) -> bool:

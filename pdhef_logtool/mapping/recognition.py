@@ -477,14 +477,10 @@ def _pose(topic: TopicInfo, part: str) -> str:
 
 
 def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen]:
-    """Read pieces of the fields that may contain constant fillers."""
-    fields = {t.name: log.fields(t.name) for t in topics if _probed_paths(t)}
-    return Pieces(log).read((t.name, p) for t in topics for p in _probed_paths(t) if has_path(fields[t.name], p))
-
-
-def _probed_paths(topic: TopicInfo) -> list[str]:
-    """Return the paths of a well-known type that may contain constant fillers."""
-    return _FIELDS["probed"].get(type_of(topic), "").split()
+    """Read pieces of the fields of well-known types that may contain constant fillers."""
+    probed = {t.name: _FIELDS["probed"].get(type_of(t), "").split() for t in topics}
+    fields = {name: log.fields(name) for name, paths in probed.items() if paths}
+    return Pieces(log).read((n, p) for n, paths in probed.items() for p in paths if has_path(fields[n], p))
 
 
 # ------------------------------------------------------------------------------------------------ sensors
@@ -494,7 +490,9 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     imus = [t for t in topics if type_of(t) in IMU_TYPES and not _named(t, "truth")]
     in_g = in_deg = False
     why = "an IMU of the vehicle is preferred to one of a camera or lidar"
-    imu = draft.choose("imu", imus, lambda t: (_named(t, "device"),), why)
+    # Drivers with a message for each sensor leave the vectors of the other one at zero.
+    forces = [t for t in imus if any(_span(draft.values(t.name, path)) > 0.0 for path in _GRAVITY_PATHS)]
+    imu = draft.choose("imu", forces or imus, lambda t: (_named(t, "device"),), why)
     if imu is None:
         return
     gyros = [t for t in imus if _span(draft.values(t.name, "angular_velocity.z")) > 0.0]

@@ -43,7 +43,7 @@ from pdhef_logtool.mapping.fields import (
     posterior,
 )
 from pdhef_logtool.mapping.naming import tags_of, words_of
-from pdhef_logtool.mapping.navigation import axes_of, has_heading
+from pdhef_logtool.mapping.navigation import axes_of, has_heading, turns
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
@@ -58,6 +58,8 @@ _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 #: Correlation with speeding up below which an acceleration is along another axis.
 FOLLOWS = 0.5
+#: Speed over that over ground below which it is vertical.
+VERTICAL = 0.2
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -103,6 +105,7 @@ def weigh(
     decide_units(fields)
     weighing = Weighing(fields, anchor_of("vx_m_s", weighable))
     weighing.drop_vectors_over_ground()
+    weighing.drop_vertical_speeds()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     its = [f for f in may_be_true if f.topic.name == weighing.truth_from and _truth_name(f) in _SLIP and f.seen.changes]
@@ -154,7 +157,7 @@ class Weighing:
             self._tell(name, item)
 
     def _usable(self) -> list[Field]:
-        """Return candidates for signals; estimates of a quantity that no sensor gives are included."""
+        """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation")]
         given = {f.meaning.quantity.replace("wheel rate", "speed").replace("wheel speed", "speed") for f in usable}
         lacking = {"acceleration", "rate", "speed", "steering"} - given
@@ -168,15 +171,14 @@ class Weighing:
 
     def _kinship(self, item: Field) -> int:
         """Return how far the words of a field show the instrument that measures the lateral velocity."""
-        slip = self.slip
-        if slip is None or item.topic.name != slip.topic.name:
+        if item.topic.name != self.truth_from:
             return -9
-        tags, others = tags_of(item.path), tags_of(slip.path)
+        tags, others = tags_of(item.path), tags_of(self.slip.path if self.slip else item.path)
         return len(tags & others) - len(tags - others)
 
     def drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
-        steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
+        steps, rates = path_velocity(self.fields.pieces, self.fields.positions), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
             is_named = x.path.rpartition(".")[2] != "x" or bool(_OF_BODY & set(words_of(x.path)))
@@ -192,6 +194,13 @@ class Weighing:
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
+
+    def drop_vertical_speeds(self) -> None:
+        """Leave out speeds that are small against the velocity over ground of their message."""
+        for side in (*self.fields.open("over ground"), *self.taken.values()):
+            speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
+            for item in [f for f in speeds if f.seen.largest < VERTICAL * side.seen.largest]:
+                self.fields.candidates.remove(item)
 
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
         """Return whether another speed is the length of x and y, and not x."""
@@ -215,10 +224,12 @@ class Weighing:
     def _choose(self, judged: Sequence[tuple[float, str, Field]]) -> None:
         """Select the field with the highest score for its signal (score, signal, field), and record its rivals."""
 
-        # A speed before the x of a velocity, which is ahead in some axes only; what is constant last.
+        # The car's own sensor before that of a receiver, which may be the ground truth; a speed before the x of a
+        # velocity, which is ahead in some axes only.
         def rank(judgement: tuple[float, str, Field]) -> tuple[object, ...]:
             score, _, f = judgement
-            return -score, f.meaning.part, f.seen.is_off_centre, -f.topic.messages, f.topic.name, f.path
+            is_other = (f.role == "navigation", f.meaning.part, f.seen.is_off_centre)
+            return -score, *is_other, -f.topic.messages, f.topic.name, f.path
 
         good = sorted((j for j in judged if j[0] >= LEAST_SCORE), key=rank)
         if not good:
@@ -372,6 +383,7 @@ class Weighing:
         self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
         if not self.true:
             return
+        self._head()
         first = its[0]
         if first.role == "sensor" and self.true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
             self.true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
@@ -387,6 +399,23 @@ class Weighing:
         self.notes.append(f"ground truth comes from {first.topic.name}, by the names of its fields")
         for name, item in self.true.items():
             self._tell(f"truth.{name}", item)
+
+    def _head(self) -> None:
+        """Add the heading that turns as fast as the car.
+
+        Values of a full turn count clockwise from north, as a compass does; others have the sense of the yaw rate, and
+        count from east if it is to the left.
+        """
+        rate = self._chosen("yaw_rate_rad_s")
+        headings = [f for f in self.fields.candidates if f.meaning.quantity == "heading" and not f.fixed]
+        for item in sorted(headings, key=lambda f: f.topic.name != self.truth_from):
+            sense = 0.0 if rate is None else turns(self.fields.pieces, item.si, rate.si)
+            is_compass = bool(np.nanmin(item.seen.values) >= 0.0) and item.seen.largest * item.scale > math.pi
+            if sense and rate is not None and (is_compass or not _has_open_sign(rate)):
+                item.sign = -1.0 if is_compass and not rate.fixed else sense
+                item.offset = 0.0 if item.sign > 0.0 else math.pi / 2.0
+                self.true["yaw_rad"] = item
+                return
 
     # ------------------------------------------------------------------------------------------------- reporting
 
