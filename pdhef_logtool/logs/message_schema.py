@@ -103,8 +103,8 @@ class MessageSchema:
 
     ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
     ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
-    of an installed ROS that it was read from, if the log contains no definition. ``units`` of fields are those that its
-    text states.
+    of an installed ROS that it was read from, if the log contains no definition. ``units`` of fields by type are those
+    that comments of its text state.
     """
 
     type_name: str
@@ -114,12 +114,12 @@ class MessageSchema:
     message_class: Any = None
     limits: ResourceLimits = DEFAULT_LIMITS
     borrowed: tuple[Path, ...] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, Mapping[str, tuple[str, str]]] = field(default_factory=dict)
 
     @functools.cached_property
     def fields(self) -> tuple[FieldInfo, ...]:
         """The scalar leaves of the tree, times as one leaf."""
-        return tuple(replace(f, unit=self.units.get(f.path.partition("[")[0], "")) for f in leaves(self.root))
+        return tuple(replace(f, unit=_stated_unit(self.units, f.path)) for f in leaves(self.root))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +270,7 @@ def ros_schema(
                 borrowed = tuple(file for file in files if file is not None)
                 store.register(types)
             root = _ros_root(store.fielddefs, type_name, limits)
-    units = stated_units(text) if encoding == "ros2msg" else {}
+    units = stated_units(text) if encoding in ("ros2msg", "ros1msg") else {}
     return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed, units=units)
 
 
@@ -455,13 +455,54 @@ def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
         yield FieldInfo(path, node.kind, "" if node.kind == "string" else node.code)
 
 
-_STATED_UNIT = re.compile(r"^\s*[\w/\[\]<=]+\s+(\w+)\s*#\s*\[([^\[\]\s]{1,12})\]\s*$", re.MULTILINE)
+_SECTION = re.compile(r"^=+\s*\nMSG: *(\S+)", re.MULTILINE)
+_MEMBER = re.compile(r"\s*([A-Za-z][\w/]*)[\w\[\]<=]*\s+(\w+)[^=#]*(?:#(.*))?")
+#: A unit in a comment, with the size of a count; bare letters only in brackets, a Chinese degree not in other words.
+_UNIT = re.compile(
+    r"(?<![\w/.])(?:(0\.\d+|\de-\d+|1/\d+) *)?"
+    r"([ckm]?m(?:eter|etre)?s?(?:/| per )s(?:ec(?:ond)?)?(?:\^?2|²|/s)?|km/h|kph|kmh|kmph|mph|mps2?|knots?|dps|rpm"
+    r"|(?:rad|deg)(?:ian|ree)?s?(?:(?:/| per )s(?:ec(?:ond)?)?)?|°(?:/s)?|(?<=[\[(])m?g(?=[\])])"
+    r"|弧度(?:/秒)?|(?<=[\d位为：:])度(?:/秒)?|米/秒|(?:公里|千米)/小时)(?![\w/²^])",
+    re.ASCII | re.IGNORECASE,
+)
 
 
-def stated_units(definition: str) -> dict[str, str]:
-    """Return the units by field that comments of a ROS 2 message's own fields give: ``float64 speed  # [km/h]``."""
-    main_type = definition.partition("\n===")[0]
-    return {match[1]: match[2] for match in _STATED_UNIT.finditer(main_type)}
+def stated_units(definition: str) -> dict[str, dict[str, tuple[str, str]]]:
+    """Return type and unit of the fields by type, "" for the first, as comments beside or above the fields state."""
+    stated: dict[str, dict[str, tuple[str, str]]] = {}
+    first, *others = _SECTION.split(definition)
+    for name, text in (("", first), *zip(others[::2], others[1::2], strict=True)):
+        members, above, is_open = stated.setdefault(name.rpartition("/")[2], {}), "", False
+        for line in text.splitlines():
+            if line.lstrip().startswith("#"):
+                above, is_open = f"{above} {line}" if is_open else line, True
+            elif member := _MEMBER.fullmatch(line):
+                kind, field_name, beside = member.groups("")
+                unit = _unit_in(beside or above)
+                is_count = "int" in kind
+                members[field_name] = kind.rpartition("/")[2], unit if is_count else unit.rpartition(" ")[2]
+                is_open = False
+            else:
+                above = ""
+    return stated
+
+
+def _unit_in(comment: str) -> str:
+    """Return the only unit in a comment, or the only one in brackets; empty without one."""
+    for text in (comment, " ".join(re.findall(r"[\[(][^\])]*[\])]", comment))):
+        units = {" ".join(filter(None, found)).replace(" per ", "/") for found in _UNIT.findall(text)}
+        if len(units) == 1:
+            return units.pop()
+    return ""
+
+
+def _stated_unit(stated: Mapping[str, Mapping[str, tuple[str, str]]], path: str) -> str:
+    """Return the unit of a field, or else of the structs around it."""
+    kind = unit = ""
+    for name in re.sub(r"\[\d*\]", "", path).split("."):
+        kind, its = stated.get(kind, {}).get(name, ("-", ""))
+        unit = its or unit
+    return unit
 
 
 _PART = r"[^.\[\]]+(?:\[\d+\])*"

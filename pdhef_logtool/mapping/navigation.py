@@ -35,12 +35,8 @@ NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 _PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
 #: Largest plausible extent of a log, and least latitude in rad: simulators begin at 0.
 WIDEST_DEG, FROM_ORIGIN_RAD = 10.0, 0.1
-#: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
-_CONVENTIONS = tuple(
-    (f"{unit} {sense}", sign * factor, angle)
-    for sense, sign, angle in (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
-    for unit, factor in (("degrees", math.radians(1.0)), ("radians", 1.0))
-)
+#: Senses of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
+_SENSES = (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
 #: Tolerance of the ratio of a speed to that from positions; speed over ground over that along the path if the axes are
 #: the earth's; share of the time that a body moves ahead.
 NEAR_PATH, SAME_STEPS, AHEAD_SHARE = 0.08, (0.7, 1.4), 0.6
@@ -337,12 +333,17 @@ def _truth_of(its: _Instrument) -> NavigationTruth | None:
 
 
 def _enu_velocities(its: _Instrument) -> Iterator[SignalSource]:
-    """Yield the first velocity east, north, up (or down) by the field names of one struct."""
+    """Yield the first velocity east, north, up (or down) by the field names of one struct.
+
+    That of an INS, which has roll and pitch, may lack a vertical one, which is 0 then.
+    """
+    is_ins = any({"roll", "pitch"} & set(words_of(f.path)) for f in its.fields)
     for paths_of in its.velocities:
-        if vertical := next((s for s in "ud" if s in paths_of), ""):
-            paths = (paths_of["e"], paths_of["n"], paths_of[vertical])
+        vertical = next((s for s in "ud" if s in paths_of), "")
+        if vertical or is_ins:
+            paths = (paths_of["e"], paths_of["n"], paths_of[vertical or "n"])
             factor = its.meanings[paths[0]].scale or 1.0
-            scale = (factor, factor, factor if vertical == "u" else -factor)
+            scale = (factor, factor, factor * {"u": 1.0, "d": -1.0, "": 0.0}[vertical])
             yield SignalSource("enu_velocity_m_s", its.topic, paths, its.stamp, scale)
             return
 
@@ -394,11 +395,12 @@ def _convention(seen: Seen | None, course: FloatArray | None, unit: float | None
     if seen is None or course is None:
         return None
     unit = unit or (math.radians(1.0) if seen.largest > 2.1 * math.pi else 1.0)
-    conventions = [c for c in _CONVENTIONS if math.isclose(abs(c[1]), unit)]
-    off = [_off(seen, course, scale, angle) for _, scale, angle in conventions]
-    if len(off) < 2 or not (min(off) < NEAR_RAD and FAR_RAD < max(off) < math.inf):
+    off = [_off(seen, course, sign * unit, angle) for _, sign, angle in _SENSES]
+    if not (min(off) < NEAR_RAD and FAR_RAD < max(off) < math.inf):
         return None
-    return conventions[int(np.argmin(off))]
+    sense, sign, angle = _SENSES[int(np.argmin(off))]
+    words = "radians" if unit == 1.0 else f"{math.degrees(unit):.3g} degrees".removeprefix("1 ")
+    return f"{words} {sense}", sign * unit, angle
 
 
 def _median_off(angles: FloatArray) -> float:

@@ -186,7 +186,8 @@ class Weighing:
         """Leave out speeds that are small against the velocity over ground of their message."""
         for side in (*self.fields.open("over ground"), *self.taken.values()):
             speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
-            for item in [f for f in speeds if f.seen.largest < VERTICAL * side.seen.largest]:
+            largest = VERTICAL * side.seen.largest * abs(side.scale)
+            for item in [f for f in speeds if f.seen.largest * abs(f.scale) < largest]:
                 self.fields.candidates.remove(item)
 
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
