@@ -455,14 +455,17 @@ def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
         yield FieldInfo(path, node.kind, "" if node.kind == "string" else node.code)
 
 
-_SECTION = re.compile(r"^=+\s*\nMSG: *(\S+)", re.MULTILINE)
-_MEMBER = re.compile(r"\s*([A-Za-z][\w/]*)[\w\[\]<=]*\s+(\w+)[^=#]*(?:#(.*))?")
+_SECTION = re.compile(r"^=+\nMSG: *(\S*)", re.MULTILINE)
+# Possessive: the time is linear in any text.
+_BLOCK = re.compile(r"((?:^ *+#.*\n)*+)((?:^ *+[^#\s].*\n?)*+)", re.MULTILINE)
+_MEMBER = re.compile(r"^ *+([A-Za-z][\w/]*+)(?:[\[<]\S*+)? ++(\w++)[^=#\n]*+(?:#(.*))?$", re.MULTILINE)
 #: A unit in a comment, with the size of a count; bare letters only in brackets, a Chinese degree not in other words.
 _UNIT = re.compile(
     r"(?<![\w/.])(?:(0\.\d+|\de-\d+|1/\d+) *)?"
     r"([ckm]?m(?:eter|etre)?s?(?:/| per )s(?:ec(?:ond)?)?(?:\^?2|²|/s)?|km/h|kph|kmh|kmph|mph|mps2?|knots?|dps|rpm"
     r"|(?:rad|deg)(?:ian|ree)?s?(?:(?:/| per )s(?:ec(?:ond)?)?)?|°(?:/s)?|(?<=[\[(])m?g(?=[\])])"
-    r"|弧度(?:/秒)?|(?<=[\d位为：:])度(?:/秒)?|米/秒|(?:公里|千米)/小时)(?![\w/²^])",
+    r"|弧度(?:/秒)?|(?<=[\d位为：:])度(?:/秒)?|米/秒|(?:公里|千米)/小时)"
+    r"(?: ?[/*] ?(1e-?\d\d?(?!\d)|10{1,9}(?!\d)))?(?![\w/²^])",
     re.ASCII | re.IGNORECASE,
 )
 
@@ -470,30 +473,24 @@ _UNIT = re.compile(
 def stated_units(definition: str) -> dict[str, dict[str, tuple[str, str]]]:
     """Return type and unit of the fields by type, "" for the first, as comments beside or above the fields state."""
     stated: dict[str, dict[str, tuple[str, str]]] = {}
-    first, *others = _SECTION.split(definition)
-    for name, text in (("", first), *zip(others[::2], others[1::2], strict=True)):
-        members, above, is_open = stated.setdefault(name.rpartition("/")[2], {}), "", False
-        for line in text.splitlines():
-            if line.lstrip().startswith("#"):
-                above, is_open = f"{above} {line}" if is_open else line, True
-            elif member := _MEMBER.fullmatch(line):
-                kind, field_name, beside = member.groups("")
-                unit = _unit_in(beside or above)
-                is_count = "int" in kind
-                members[field_name] = kind.rpartition("/")[2], unit if is_count else unit.rpartition(" ")[2]
-                is_open = False
-            else:
-                above = ""
+    _, *parts = _SECTION.split(f"=\nMSG:\n{definition}")
+    for name, text in zip(parts[::2], parts[1::2], strict=True):
+        members = stated.setdefault(name.rpartition("/")[2], {})
+        for above, lines in _BLOCK.findall(text):
+            for kind, field_name, beside in _MEMBER.findall(lines):
+                size, unit = _unit_in(beside or above)
+                members[field_name] = kind.rpartition("/")[2], f"{size} {unit}".strip() if "int" in kind else unit
     return stated
 
 
-def _unit_in(comment: str) -> str:
-    """Return the only unit in a comment, or the only one in brackets; empty without one."""
-    for text in (comment, " ".join(re.findall(r"[\[(][^\])]*[\])]", comment))):
-        units = {" ".join(filter(None, found)).replace(" per ", "/") for found in _UNIT.findall(text)}
+def _unit_in(comment: str) -> tuple[str, str]:
+    """Return the only unit in a comment, or the only one in brackets, with the size of a count; empty without one."""
+    for text in (comment, " ".join(re.findall(r"[\[(][^\[\]()]*+[\])]", comment))):
+        units = {(size, unit.replace(" per ", "/"), steps) for size, unit, steps in _UNIT.findall(text)}
         if len(units) == 1:
-            return units.pop()
-    return ""
+            size, unit, steps = units.pop()
+            return size or (steps and f"1/{round(max(float(steps), 1.0 / float(steps)))}"), unit
+    return "", ""
 
 
 def _stated_unit(stated: Mapping[str, Mapping[str, tuple[str, str]]], path: str) -> str:
