@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions, referenced, with_contained_types
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.records.errors import MappingError, PdhefError
@@ -459,15 +460,7 @@ _SECTION = re.compile(r"^=+\nMSG: *(\S*)", re.MULTILINE)
 # Possessive: the time is linear in any text.
 _BLOCK = re.compile(r"((?:^ *+#.*\n)*+)((?:^ *+[^#\s].*\n?)*+)", re.MULTILINE)
 _MEMBER = re.compile(r"^ *+([A-Za-z][\w/]*+)(?:[\[<]\S*+)? ++(\w++)[^=#\n]*+(?:#(.*))?$", re.MULTILINE)
-#: A unit in a comment, with the size of a count; bare letters only in brackets, a Chinese degree not in other words.
-_UNIT = re.compile(
-    r"(?<![\w/.])(?:(0\.\d+|\de-\d+|1/\d+) *)?"
-    r"([ckm]?m(?:eter|etre)?s?(?:/| per )s(?:ec(?:ond)?)?(?:\^?2|²|/s)?|km/h|kph|kmh|kmph|mph|mps2?|knots?|dps|rpm"
-    r"|(?:rad|deg)(?:ian|ree)?s?(?:(?:/| per )s(?:ec(?:ond)?)?)?|°(?:/s)?|(?<=[\[(])m?g(?=[\])])"
-    r"|弧度(?:/秒)?|(?<=[\d位为：:])度(?:/秒)?|米/秒|(?:公里|千米)/小时)"
-    r"(?: ?[/*] ?(1e-?\d\d?(?!\d)|10{1,9}(?!\d)))?(?![\w/²^])",
-    re.ASCII | re.IGNORECASE,
-)
+_UNIT = re.compile(CONSTANTS["comments"]["unit"])
 
 
 def stated_units(definition: str) -> dict[str, dict[str, tuple[str, str]]]:
@@ -484,13 +477,10 @@ def stated_units(definition: str) -> dict[str, dict[str, tuple[str, str]]]:
 
 
 def _unit_in(comment: str) -> tuple[str, str]:
-    """Return the only unit in a comment, or the only one in brackets, with the size of a count; empty without one."""
-    for text in (comment, " ".join(re.findall(r"[\[(][^\[\]()]*+[\])]", comment))):
-        units = {(size, unit.replace(" per ", "/"), steps) for size, unit, steps in _UNIT.findall(text)}
-        if len(units) == 1:
-            size, unit, steps = units.pop()
-            return size or (steps and f"1/{round(max(float(steps), 1.0 / float(steps)))}"), unit
-    return "", ""
+    """Return the size of a count and the unit, if a comment contains only one; empty otherwise."""
+    units = {(size, unit.replace(" per ", "/"), steps) for size, unit, steps in _UNIT.findall(comment)}
+    size, unit, steps = units.pop() if len(units) == 1 else ("", "", "")
+    return size or (steps and f"1/{round(max(float(steps), 1.0 / float(steps)))}"), unit
 
 
 def _stated_unit(stated: Mapping[str, Mapping[str, tuple[str, str]]], path: str) -> str:

@@ -196,6 +196,10 @@ class _Instrument:
         self.named_velocities = [*_horizontal(self.meanings)]
         angles = ((m, p) for q in ("course", "heading") for p, m in self.meanings.items() if m.quantity == q)
         self.angles = {path: meaning for meaning, path in angles}
+        self.has_attitude = any({"roll", "pitch"} & set(words_of(f.path)) for f in self.fields)
+        # Beside a speed alone, the heading of a receiver is that of its motion.
+        is_receiver = not self.has_attitude and "speed" in first and "ins" not in words_of(topic.name)
+        self.courses = {p for p in self.angles if is_receiver and p.rpartition(".")[2].lower() == "heading"}
 
     def source(self, name: str, path: str, scale: float = 1.0, offset: float = 0.0) -> SignalSource:
         """Return a field of the topic as a source."""
@@ -321,7 +325,7 @@ def _truth_of(its: _Instrument) -> NavigationTruth | None:
         east, north = (its.seen.get(path) for path in velocity.paths[:2])
         course = None if east is None or north is None else _direction(north.cells, east.cells)
     note = f"ground truth comes from {its.topic}, by the names of its fields"
-    for path in (p for p, m in its.angles.items() if m.quantity == "heading"):
+    for path in (p for p, m in its.angles.items() if m.quantity == "heading" and p not in its.courses):
         convention = _convention(its.seen.get(path), course, its.angles[path].scale)
         if convention is not None:
             words, scale, offset = convention
@@ -337,10 +341,9 @@ def _enu_velocities(its: _Instrument) -> Iterator[SignalSource]:
 
     That of an INS, which has roll and pitch, may lack a vertical one, which is 0 then.
     """
-    is_ins = any({"roll", "pitch"} & set(words_of(f.path)) for f in its.fields)
     for paths_of in its.velocities:
         vertical = next((s for s in "ud" if s in paths_of), "")
-        if vertical or is_ins:
+        if vertical or its.has_attitude:
             paths = (paths_of["e"], paths_of["n"], paths_of[vertical or "n"])
             factor = its.meanings[paths[0]].scale or 1.0
             scale = (factor, factor, factor * {"u": 1.0, "d": -1.0, "": 0.0}[vertical])
@@ -358,13 +361,15 @@ def _horizontal(meanings: Mapping[str, Meaning]) -> Iterator[dict[str, str]]:
 
 
 def _ecef_vectors(its: _Instrument) -> Iterator[SignalSource]:
-    """Yield the arrays of three in ECEF that are a position or a velocity by name, in the order of the fields."""
+    """Yield the arrays of three, or vectors, in ECEF that are a position or a velocity by name."""
     paths = dict.fromkeys(f.path for f in its.fields)
-    for base in dict.fromkeys(p.removesuffix("[0]") for p in paths if p.endswith("[0]") and "ecef" in p.lower()):
-        words = set(words_of(base))
-        name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
-        if f"{base}[2]" in paths and f"{base}[3]" not in paths and words & {"velocity", "vel", "position", "pos"}:
-            yield SignalSource(name, its.topic, tuple(f"{base}[{i}]" for i in range(3)), its.stamp)
+    for ends in (("[0]", "[1]", "[2]"), (".x", ".y", ".z")):
+        for base in [p.removesuffix(ends[0]) for p in paths if p.endswith(ends[0]) and "ecef" in p.lower()]:
+            words, vector = set(words_of(base)), tuple(f"{base}{end}" for end in ends)
+            name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
+            is_vector = set(vector) <= paths.keys() and f"{base}[3]" not in paths
+            if is_vector and words & {"velocity", "vel", "position", "pos"}:
+                yield SignalSource(name, its.topic, vector, its.stamp)
 
 
 def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:

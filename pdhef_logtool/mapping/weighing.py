@@ -185,9 +185,9 @@ class Weighing:
     def drop_vertical_speeds(self) -> None:
         """Leave out speeds that are small against the velocity over ground of their message."""
         for side in (*self.fields.open("over ground"), *self.taken.values()):
+            least = VERTICAL * abs(side.seen.largest * side.scale)
             speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
-            largest = VERTICAL * side.seen.largest * abs(side.scale)
-            for item in [f for f in speeds if f.seen.largest * abs(f.scale) < largest]:
+            for item in [f for f in speeds if abs(f.seen.largest * f.scale) < least]:
                 self.fields.candidates.remove(item)
 
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:
@@ -210,7 +210,7 @@ class Weighing:
                 yield from ((x, y) for x in [f for f in beside if f.meaning.quantity == "speed" and f.seen.changes][:1])
 
     def _take(self, name: str, candidates: Sequence[Field]) -> None:
-        # A speed before the x of a velocity, which is ahead in some axes only; what is constant last.
+        # A speed before the x of a velocity, which is ahead in some axes only.
         ordered = sorted(candidates, key=lambda f: (-f.score, f.meaning.part, -f.topic.messages, f.topic.name, f.path))
         good = [f for f in ordered if f.score >= LEAST_SCORE]
         if not good:
