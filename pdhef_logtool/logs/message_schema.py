@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions, referenced, with_contained_types
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.records.errors import MappingError, PdhefError
@@ -103,8 +104,8 @@ class MessageSchema:
 
     ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
     ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
-    of an installed ROS that it was read from, if the log contains no definition. ``units`` of fields are those that its
-    text states.
+    of an installed ROS that it was read from, if the log contains no definition. ``units`` of fields by type are those
+    that comments of its text state.
     """
 
     type_name: str
@@ -114,12 +115,12 @@ class MessageSchema:
     message_class: Any = None
     limits: ResourceLimits = DEFAULT_LIMITS
     borrowed: tuple[Path, ...] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, Mapping[str, tuple[str, str]]] = field(default_factory=dict)
 
     @functools.cached_property
     def fields(self) -> tuple[FieldInfo, ...]:
         """The scalar leaves of the tree, times as one leaf."""
-        return tuple(replace(f, unit=self.units.get(f.path.partition("[")[0], "")) for f in leaves(self.root))
+        return tuple(replace(f, unit=_stated_unit(self.units, f.path)) for f in leaves(self.root))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +271,7 @@ def ros_schema(
         root = _ros_root(types, type_name, limits)
         store = get_typestore(Stores.EMPTY)
         store.register(types)
-    units = stated_units(text) if encoding == "ros2msg" else {}
+    units = stated_units(text) if encoding in ("ros2msg", "ros1msg") else {}
     return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed, units=units)
 
 
@@ -449,13 +450,40 @@ def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
         yield FieldInfo(path, node.kind, "" if node.kind == "string" else node.code)
 
 
-_STATED_UNIT = re.compile(r"^\s*[\w/\[\]<=]+\s+(\w+)\s*#\s*\[([^\[\]\s]{1,12})\]\s*$", re.MULTILINE)
+_SECTION = re.compile(r"^=+\nMSG: *(\S*)", re.MULTILINE)
+# Possessive: the time is linear in any text.
+_BLOCK = re.compile(r"((?:^ *+#.*\n)*+)((?:^ *+[^#\s].*\n?)*+)", re.MULTILINE)
+_MEMBER = re.compile(r"^ *+([A-Za-z][\w/]*+)(?:[\[<]\S*+)? ++(\w++)[^=#\n]*+(?:#(.*))?$", re.MULTILINE)
+_UNIT = re.compile(CONSTANTS["comments"]["unit"])
 
 
-def stated_units(definition: str) -> dict[str, str]:
-    """Return the units by field that comments of a ROS 2 message's own fields give: ``float64 speed  # [km/h]``."""
-    main_type = definition.partition("\n===")[0]
-    return {match[1]: match[2] for match in _STATED_UNIT.finditer(main_type)}
+def stated_units(definition: str) -> dict[str, dict[str, tuple[str, str]]]:
+    """Return type and unit of the fields by type, "" for the first, as comments beside or above the fields state."""
+    stated: dict[str, dict[str, tuple[str, str]]] = {}
+    _, *parts = _SECTION.split(f"=\nMSG:\n{definition}")
+    for name, text in zip(parts[::2], parts[1::2], strict=True):
+        members = stated.setdefault(name.rpartition("/")[2], {})
+        for above, lines in _BLOCK.findall(text):
+            for kind, field_name, beside in _MEMBER.findall(lines):
+                size, unit = _unit_in(beside or above)
+                members[field_name] = kind.rpartition("/")[2], f"{size} {unit}".strip() if "int" in kind else unit
+    return stated
+
+
+def _unit_in(comment: str) -> tuple[str, str]:
+    """Return the size of a count and the unit, if a comment contains only one; empty otherwise."""
+    units = {(size, unit.replace(" per ", "/"), steps) for size, unit, steps in _UNIT.findall(comment)}
+    size, unit, steps = units.pop() if len(units) == 1 else ("", "", "")
+    return size or (steps and f"1/{round(max(float(steps), 1.0 / float(steps)))}"), unit
+
+
+def _stated_unit(stated: Mapping[str, Mapping[str, tuple[str, str]]], path: str) -> str:
+    """Return the unit of a field, or else of the structs around it."""
+    kind = unit = ""
+    for name in re.sub(r"\[\d*\]", "", path).split("."):
+        kind, its = stated.get(kind, {}).get(name, ("-", ""))
+        unit = its or unit
+    return unit
 
 
 _PART = r"[^.\[\]]+(?:\[\d+\])*"

@@ -173,6 +173,7 @@ class Field:
         score += 0.15 if self.meaning.unit else 0.0
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
         score -= 0.1 if self.role == "navigation" and self.meaning.quantity == "speed" else 0.0
+        score -= 0.01 if not self.seen.changes else 0.0
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
     def use(self, unit: str) -> None:

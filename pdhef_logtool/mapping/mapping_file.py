@@ -212,8 +212,10 @@ def _shape_problem(source: SignalSource) -> str:
     name, columns, fields_, offset = source.name, source.columns, len(source.paths), source.offset
     scales = source.scale if isinstance(source.scale, tuple) else (source.scale,)
     problem = ""
-    if 0.0 in scales or not all(source.paths):
-        problem = "scale must not be 0" if 0.0 in scales else "field must not be empty"
+    # A column of a vector may be absent: 0 times another one.
+    is_zero = 0.0 in scales if columns == 1 else not any(scales)
+    if is_zero or not all(source.paths):
+        problem = "scale must not be 0" if is_zero else "field must not be empty"
     elif source.combine != "sum" and (columns > 1 or fields_ < 2):
         what = {"norm": "length", "root": "root of the sum", "signed": "magnitude and sign"}[source.combine]
         problem = f'combine = "{source.combine}" is the {what} of two or more fields, '

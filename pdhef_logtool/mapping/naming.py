@@ -6,10 +6,12 @@ spellings of recorders are accepted.
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Collection
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -131,8 +133,9 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     kind : kind of quantity, a key of ``UNITS``; units of other kinds are ignored (``g`` for a speed).
     """
     words = [w for w in re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", leaf).lower()) if w]
-    # Integers in thousandths (``acc_y_mps2_e3``).
+    # Integers in thousandths (``acc_y_mps2_e3``), or of a stated size (``steer_0.01 deg``).
     power = 10.0 ** -sum(int(w[1:]) for w in words[1:] if re.fullmatch(r"e\d", w))
+    power *= math.prod(float(Fraction(size)) for size in re.findall(r"_(0\.\d+|\de-\d+|1/[1-9]\d*) *[a-z]", leaf))
     text = re.sub(r"(?<=_)sec(?=2|_|$)", "s", "_".join(words).replace("_per_", "_"))
     for phrase, unit in _UNIT_PHRASES:
         if unit in UNITS[kind] and re.search(rf"(^|_){phrase}($|_)", text):

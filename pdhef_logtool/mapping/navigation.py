@@ -36,12 +36,8 @@ NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 _PLACES = ("latitude", "longitude")
 #: Largest plausible extent of a log.
 WIDEST_DEG = 10.0
-#: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
-_CONVENTIONS = tuple(
-    (f"{unit} {sense}", sign * factor, angle)
-    for sense, sign, angle in (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
-    for unit, factor in (("degrees", math.radians(1.0)), ("radians", 1.0))
-)
+#: Senses of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
+_SENSES = (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
 #: Speed over ground over that along the path if the axes are
 #: the earth's; share of the time that a body moves ahead.
 SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
@@ -270,15 +266,20 @@ def _speed_and_course(its: _Instrument, course: FloatArray) -> Iterator[SignalSo
 
 
 def _truth_of(log: DriveLog, topic: str, its: _Instrument) -> NavigationTruth | None:
-    truth = {s.name: s for s in (*_enu_velocities(its), *_ecef_vectors(topic, log.fields(topic, quiet=True)))}
-    course = its.course
+    fields, course = log.fields(topic, quiet=True), its.course
+    has_attitude = any({"roll", "pitch"} & set(words_of(f.path)) for f in fields)
+    velocities = _enu_velocities(its, has_attitude=has_attitude)
+    truth = {s.name: s for s in (*velocities, *_ecef_vectors(topic, fields))}
     if its.has_place:
         truth |= {name: _source(name, item) for name, item in zip(("lat_deg", "lon_deg"), its.places, strict=True)}
     if "enu_velocity_m_s" in truth:
         course = _direction(its.velocities[0]["n"].si, its.velocities[0]["e"].si)
     note = f"ground truth comes from {topic}, by the names of its fields"
+    # Beside a speed alone, the heading of a receiver is that of its motion.
+    is_receiver = not has_attitude and bool(its.of("speed")) and "ins" not in words_of(topic)
     for item in its.of("heading"):
-        convention = _convention(item, course)
+        is_course = is_receiver and item.path.rpartition(".")[2].lower() == "heading"
+        convention = None if is_course else _convention(item, course)
         if convention is not None:
             words, scale, offset = convention
             truth["yaw_rad"] = _source("yaw_rad", item, scale, offset)
@@ -288,26 +289,32 @@ def _truth_of(log: DriveLog, topic: str, its: _Instrument) -> NavigationTruth | 
     return (truth, note) if useful else None
 
 
-def _enu_velocities(its: _Instrument) -> Iterator[SignalSource]:
-    """Yield the first velocity east, north, up (or down) by the field names of one struct."""
+def _enu_velocities(its: _Instrument, *, has_attitude: bool) -> Iterator[SignalSource]:
+    """Yield the first velocity east, north, up (or down) by the field names of one struct.
+
+    That of an INS, which has roll and pitch, may lack a vertical one, which is 0 then.
+    """
     for sides in its.velocities:
-        if vertical := next((s for s in "ud" if s in sides), ""):
-            axes = [sides[side] for side in ("e", "n", vertical)]
-            scale = (1.0, 1.0, 1.0 if vertical == "u" else -1.0)
+        vertical = next((s for s in "ud" if s in sides), "")
+        if vertical or has_attitude:
+            axes = [sides[side] for side in ("e", "n", vertical or "n")]
+            signs = (1.0, 1.0, {"u": 1.0, "d": -1.0, "": 0.0}[vertical])
             paths = tuple(f.path for f in axes)
-            factors = tuple(f.scale * sign for f, sign in zip(axes, scale, strict=True))
+            factors = tuple(f.scale * sign for f, sign in zip(axes, signs, strict=True))
             yield SignalSource("enu_velocity_m_s", axes[0].topic.name, paths, axes[0].stamp, factors)
             return
 
 
 def _ecef_vectors(topic: str, fields: tuple[FieldInfo, ...]) -> Iterator[SignalSource]:
-    """Yield the arrays of three in ECEF that are a position or a velocity by name, in the order of the fields."""
+    """Yield the arrays of three, or vectors, in ECEF that are a position or a velocity by name."""
     paths = dict.fromkeys(f.path for f in fields)
-    for base in dict.fromkeys(p.removesuffix("[0]") for p in paths if p.endswith("[0]") and "ecef" in p.lower()):
-        words = set(words_of(base))
-        name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
-        if f"{base}[2]" in paths and f"{base}[3]" not in paths and words & {"velocity", "vel", "position", "pos"}:
-            yield SignalSource(name, topic, tuple(f"{base}[{i}]" for i in range(3)), stamp_path_of(fields))
+    for ends in (("[0]", "[1]", "[2]"), (".x", ".y", ".z")):
+        for base in [p.removesuffix(ends[0]) for p in paths if p.endswith(ends[0]) and "ecef" in p.lower()]:
+            words, vector = set(words_of(base)), tuple(f"{base}{end}" for end in ends)
+            name = "ecef_velocity_m_s" if words & {"velocity", "vel"} else "ecef_position_m"
+            is_vector = set(vector) <= paths.keys() and f"{base}[3]" not in paths
+            if is_vector and words & {"velocity", "vel", "position", "pos"}:
+                yield SignalSource(name, topic, vector, stamp_path_of(fields))
 
 
 def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
@@ -336,11 +343,12 @@ def _convention(item: Field, course: FloatArray | None) -> tuple[str, float, flo
     if course is None:
         return None
     unit = item.meaning.scale or (math.radians(1.0) if item.seen.largest > 2.1 * math.pi else 1.0)
-    conventions = [c for c in _CONVENTIONS if math.isclose(abs(c[1]), unit)]
-    off = [_median_off(scale * item.seen.cells + angle - course) for _, scale, angle in conventions]
-    if len(off) < 2 or not (min(off) < NEAR_RAD and FAR_RAD < max(off) < math.inf):
+    off = [_median_off(sign * unit * item.seen.cells + angle - course) for _, sign, angle in _SENSES]
+    if not (min(off) < NEAR_RAD and FAR_RAD < max(off) < math.inf):
         return None
-    return conventions[int(np.argmin(off))]
+    sense, sign, angle = _SENSES[int(np.argmin(off))]
+    words = "radians" if unit == 1.0 else f"{math.degrees(unit):.3g} degrees".removeprefix("1 ")
+    return f"{words} {sense}", sign * unit, angle
 
 
 def _median_off(angles: FloatArray) -> float:

@@ -198,8 +198,9 @@ class Weighing:
     def drop_vertical_speeds(self) -> None:
         """Leave out speeds that are small against the velocity over ground of their message."""
         for side in (*self.fields.open("over ground"), *self.taken.values()):
+            least = VERTICAL * abs(side.seen.largest * side.scale)
             speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
-            for item in [f for f in speeds if f.seen.largest < VERTICAL * side.seen.largest]:
+            for item in [f for f in speeds if abs(f.seen.largest * f.scale) < least]:
                 self.fields.candidates.remove(item)
 
     def _is_horizontal_speed(self, x: Field, y: Field) -> bool:

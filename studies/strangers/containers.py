@@ -25,24 +25,43 @@ def _store(ros1: bool) -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-    for name, text in shapes():
+    for name, text in shapes().items():
         store.register(get_types_from_msg(text, name))
     return store
 
 
-def shapes() -> Iterator[tuple[str, str]]:
-    """Yield name and definition of every type in ``shapes.txt``."""
+@lru_cache(maxsize=1)
+def shapes() -> dict[str, str]:
+    """Return the definition, with comments, of every type in ``shapes.txt``."""
     text = (Path(__file__).parent / "shapes.txt").read_text(encoding="utf-8")
-    for paragraph in re.split(r"\n\n+", re.sub(r"(?m)^#.*\n", "", text).strip()):
-        name, *lines = paragraph.splitlines()
-        typed = ((kind, field) for kind, *fields in map(str.split, lines) for field in fields)
-        yield name, "".join(f"{kind} {field}\n" for kind, field in typed)
+    paragraphs = map(str.splitlines, re.split(r"\n\n+", re.sub(r"(?m)^#.*\n", "", text).strip()))
+    return {name: "".join(_lines(*line.partition("#")) for line in lines) for name, *lines in paragraphs}
+
+
+def _lines(code: str, sign: str, comment: str) -> str:
+    """Return the lines of a definition for a line of ``shapes.txt``: one for each field, or a comment."""
+    kind, *names = code.split() or [""]
+    return "".join(f"{kind} {name} {sign}{comment}".strip() + "\n" for name in names or [""])
 
 
 def definition(type_name: str, *, ros1: bool = False) -> str:
-    """Return the full text of a type as ROS 1 or ROS 2 has it, with all types in it."""
+    """Return the full text of a type as ROS 1 or ROS 2 has it, with all types in it and their comments."""
     text: str = _store(ros1).generate_msgdef(type_name, ros_version=1 if ros1 else 2)[0]
-    return text
+    sign = f"{'=' * 80}\nMSG: "
+    first, *others = text.split(sign)
+    named = (other.partition("\n") for other in others)
+    parts = [f"{name}\n" + _commented(name.replace("/", "/msg/"), lines) for name, _, lines in named]
+    return sign.join([_commented(type_name, first), *parts])
+
+
+_FIELD = re.compile(r"((?:^#.*\n)*)^[^#\s]\S* (\S+)(.*)\n", re.MULTILINE)
+
+
+def _commented(type_name: str, lines: str) -> str:
+    """Return the fields of a type with the comments that its shape has above and beside them."""
+    for above, name, beside in _FIELD.findall(shapes().get(type_name, "")):
+        lines = re.sub(rf"(?m)^\S+ {name}$", rf"{above}\g<0>{beside}", lines)
+    return lines
 
 
 def write(topics: Sequence[Topic], path: Path, container: str) -> Path:
@@ -109,8 +128,13 @@ def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tu
 def _copied(topics: Sequence[Topic], path: Path, writer: Any, *, ros1: bool) -> Path:
     """Write the messages of topics with a writer of rosbags."""
     store = _store(ros1)
+
+    def described(name: str) -> dict[str, str]:
+        digest = {"md5sum": store.generate_msgdef(name)[1]} if ros1 else {"rihs01": store.hash_rihs01(name)}
+        return {"msgdef": definition(name, ros1=ros1), **digest}
+
     with writer:
-        connections = {t.name: writer.add_connection(t.name, t.type_name, typestore=store) for t in topics}
+        connections = {t.name: writer.add_connection(t.name, t.type_name, **described(t.type_name)) for t in topics}
         for topic, arrival, _, data in _messages(topics, path, ros1=ros1):
             writer.write(connections[topic.name], arrival, data)
     return path

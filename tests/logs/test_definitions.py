@@ -26,7 +26,7 @@ from studies.strangers.containers import Topic, shapes, write
 
 STEER, STATE, IMU = "teamx_msgs/msg/DriverInput", "vesc_msgs/msg/VescImuStamped", "vesc_msgs/msg/VescImu"
 #: Definitions by type, of which the package ships none.
-TEXTS = dict(shapes())
+TEXTS = shapes()
 START = 1_700_000_000_000_000_000
 
 

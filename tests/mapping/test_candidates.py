@@ -11,6 +11,7 @@ import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
 from pdhef_logtool.drive.survey import survey_log
+from pdhef_logtool.logs.message_schema import stated_units
 from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.mapping_file import mapping_from_dict
@@ -248,6 +249,26 @@ def test_the_path_shows_how_a_heading_counts(
         source = auto.mapping.truth["enu_velocity_m_s"]
         assert source.paths == (names[1], names[0], names[2])
         assert source.scale == (1.0, 1.0, -1.0 if names[2] == "vel_d" else 1.0)
+
+
+@pytest.mark.parametrize("attitude", [True, False])
+def test_a_receiver_has_a_course_and_an_ins_a_heading_also_without_a_vertical_velocity(attitude: bool) -> None:
+    north, east = V * np.sin(PATH_YAW), V * np.cos(PATH_YAW)
+    fields = {"north_vel_cmps": 100.0 * north, "east_vel_cmps": 100.0 * east} if attitude else {}
+    fields |= {"roll": 0.01 * np.sin(S)} if attitude else {}
+    compass = np.mod(90.0 - PATH_YAW / DEG, 360.0)
+    gnss = topic(heading=compass, speed_kmh=3.6 * V, **WHERE, **fields)
+    mapping = found(gps=gnss, imu__data=topic(**imu_fields())).mapping
+    assert mapping.signals["speed_m_s"].field == "speed_kmh"
+    assert ("gnss_course_rad" in mapping.signals, "yaw_rad" in mapping.truth) == (not attitude, attitude)
+    if attitude:
+        velocity = mapping.truth["enu_velocity_m_s"]
+        assert velocity.paths == ("east_vel_cmps", "north_vel_cmps", "north_vel_cmps")
+        assert velocity.scale == (0.01, 0.01, 0.0)
+        tables = {
+            "truth": {"enu_velocity_m_s": {"topic": "/gps", "field": [*velocity.paths], "scale": [0.01, 0.01, 0.0]}}
+        }
+        assert mapping_from_dict(tables, where="m").truth["enu_velocity_m_s"].scale == velocity.scale
 
 
 def test_a_magnitude_takes_its_sign_from_another_field() -> None:
@@ -536,6 +557,31 @@ def test_abbreviations_and_spelled_out_units(
     assert meaning is not None
     assert (meaning.quantity, meaning.part) == (quantity, part)
     assert meaning.scale == (None if scale is None else pytest.approx(scale))
+
+
+@pytest.mark.parametrize(
+    ("kind", "comment", "name", "scale"),
+    [
+        ("float32", "[degree]", "steering", DEG), ("float64", "km/h, without a sign", "speed", 1 / 3.6),
+        ("float32", "16|16@1+ (0.005,-163.84) [-163.84|163.835] deg/s", "Yaw_Rate", DEG),
+        ("int16", "0.01 deg", "steer", 0.01 * DEG), ("int16", "单位0.01度", "steer", 0.01 * DEG),
+        ("int32", "[deg / 1e-7]", "latitude", 1e-7), ("int32", "degrees * 1E7", "latitude", 1e-7),
+        ("int16", "in 1/512 m/s^2", "acceleration_lateral", 1 / 512), ("float32", "in 0.1 deg steps", "steer", DEG),
+        ("float32", "meters/sec^2", "longaccel", 1.0), ("float32", "(g)", "lat_acc", G),
+        ("float32", "m/s or km/h", "speed", None), ("float32", "angle of the wheels, e.g. a g", "lat_acc", None),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("text", ["{k} {n} # {c}\n", "# {c}\n{k} {n}\n{k} x\n", "S s\n===\nMSG: p/S\n{k} {n} #{c}\n"])
+def test_units_in_comments_of_a_definition(kind: str, comment: str, name: str, scale: float | None, text: str) -> None:
+    units = stated_units(text.format(k=kind, n=name, c=comment))
+    meaning = meaning_of("log", "", name, units["S" if "S" in units else ""][name][1])
+    assert meaning is not None
+    assert meaning.scale == (None if scale is None else pytest.approx(scale))
+
+
+def test_a_comment_above_describes_the_fields_up_to_a_blank_line_and_no_field_with_a_comment_of_its_own() -> None:
+    units = stated_units("# km/h\nfloat32 a\nfloat32 b # Nm\nfloat32 c\n\nfloat32 d\n#\nfloat32 e\n")[""]
+    assert {name: unit for name, (_, unit) in units.items()} == {"a": "km/h", "b": "", "c": "km/h", "d": "", "e": ""}
 
 
 @pytest.mark.parametrize(
