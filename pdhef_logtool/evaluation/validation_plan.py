@@ -35,17 +35,26 @@ _QUANTILE = re.compile(r"quantile (0\.\d+)")
 
 _Name = Annotated[str, Field(min_length=1, max_length=200)]
 _Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
+_Count = Annotated[int, Field(ge=0)]
 
 
 class ExposureNeed(Record):
-    """A table ``[[requirement.exposure]]``: the least driving in conditions, over the scored drives."""
+    """A table ``[[requirement.exposure]]``: the least driving in conditions, over the scored drives.
 
-    speed_m_s: Annotated[_Range, Field(description="Speed from, to: multiples of 5; [60, 65] is all above 60.")] = None
-    ay_m_s2: Annotated[_Range, Field(description="|a_y| from, to: integers; [12, 13] is all above 12.")] = None
-    friction: Annotated[_Range, Field(description="Median friction of the drive from, to.")] = None
-    car: Annotated[_Name | None, Field(description="Name of the car.")] = None
-    drives: Annotated[int, Field(ge=0, description="Least number of drives.")] = 0
-    minutes: Annotated[NonNegative, Field(description="Least minutes.")] = 0.0
+    Attributes
+    ----------
+    speed_m_s : from, to: multiples of 5; [60, 65] is all above 60.
+    ay_m_s2 : |a_y| from, to: integers; [12, 13] is all above 12.
+    friction : median of the drive from, to. car : its name.
+    drives, minutes : the least.
+    """
+
+    speed_m_s: _Range = None
+    ay_m_s2: _Range = None
+    friction: _Range = None
+    car: _Name | None = None
+    drives: _Count = 0
+    minutes: NonNegative = 0.0
 
     @model_validator(mode="after")
     def _agrees(self) -> ExposureNeed:
@@ -185,50 +194,47 @@ def shown(value: float, unit: str) -> str:
 
 
 class RequirementTable(Record):
-    """A table ``[[requirement]]`` of plan.toml."""
+    """A table ``[[requirement]]`` of plan.toml.
 
-    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="Unique identifier.")]
-    title: Annotated[_Name | None, Field(description="One line for reports. Default: the requirement in words.")] = None
-    signal: Annotated[_Name, Field(description="Signal of metrics.parquet, for example sideslip_rad.")]
-    metric: Annotated[_Name, Field(description="Metric of metrics.parquet.")] = "rmse"
-    estimator: Annotated[
-        _Name | None, Field(description="Default: the selected estimate; with pdhef metrics the recorded estimate.")
-    ] = None
-    segment: Annotated[_Name | None, Field(description="Segment of the drives. Default: all.")] = None
-    manoeuvre: Annotated[_Name | None, Field(description="Manoeuvre, in place of segment.")] = None
-    limit: Annotated[
-        float | None, Field(description="Limit in the SI unit of the metric; a minimum for coverage95.")
-    ] = None
-    limit_deg: Annotated[float | None, Field(description="Limit in degrees.")] = None
-    limit_deg_s: Annotated[float | None, Field(description="Limit in degrees per second.")] = None
-    baseline: Annotated[
-        _Name | None,
-        Field(
-            description="In place of a limit: an estimator of the same run (physics, zero), run (run A of compare), or "
-            "the output of another run: a path with a slash, relative to the plan, or a URL."
-        ),
-    ] = None
-    max_ratio: Annotated[Positive | None, Field(description="Largest ratio of the metric to the baseline's.")] = None
-    statistic: Annotated[
-        str,
-        Field(
-            pattern=r"^(pooled|worst drive|quantile 0\.\d+)$",
-            description="Over drives: pooled (all stamps together), worst drive, or for example quantile 0.9.",
-        ),
-    ] = POOLED
-    confidence: Annotated[
-        float, Field(ge=0.5, lt=1.0, description="Confidence level of the two-sided interval that decides.")
-    ] = 0.95
-    exposure_drives: Annotated[int, Field(ge=1, description="Least number of scored drives.")] = 1
-    exposure_minutes: Annotated[NonNegative, Field(description="Least scored driving in minutes.")] = 0.0
-    exposure_km: Annotated[NonNegative, Field(description="Least scored driving in kilometres.")] = 0.0
-    exposure: Annotated[list[ExposureNeed], Field(max_length=50, description="Least driving in conditions.")] = []  # noqa: RUF012
+    Attributes
+    ----------
+    title : one line for reports; default: the requirement in words.
+    signal, metric : of metrics.parquet, for example sideslip_rad and rmse.
+    estimator : default: the selected estimate; with pdhef metrics the recorded estimate.
+    segment : of the drives; default: all. manoeuvre : in place of segment.
+    limit : in the SI unit of the metric, a minimum for coverage95; limit_deg, limit_deg_s : in degrees (per second).
+    baseline : in place of a limit: an estimator of the same run (physics, zero), run (run A of compare), or the output
+        of another run: a path with a slash, relative to the plan, or a URL.
+    max_ratio : largest ratio of the metric to the baseline's.
+    statistic : over drives: pooled (all stamps together), worst drive, or for example quantile 0.9.
+    confidence : level of the two-sided interval that decides.
+    exposure_drives, exposure_minutes, exposure_km : least scored driving. exposure : least driving in conditions.
+    """
+
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    title: _Name | None = None
+    signal: _Name
+    metric: _Name = "rmse"
+    estimator: _Name | None = None
+    segment: _Name | None = None
+    manoeuvre: _Name | None = None
+    limit: float | None = None
+    limit_deg: float | None = None
+    limit_deg_s: float | None = None
+    baseline: _Name | None = None
+    max_ratio: Positive | None = None
+    statistic: Annotated[str, Field(pattern=r"^(pooled|worst drive|quantile 0\.\d+)$")] = POOLED
+    confidence: Annotated[float, Field(ge=0.5, lt=1.0)] = 0.95
+    exposure_drives: Annotated[int, Field(ge=1)] = 1
+    exposure_minutes: NonNegative = 0.0
+    exposure_km: NonNegative = 0.0
+    exposure: Annotated[list[ExposureNeed], Field(max_length=50)] = []  # noqa: RUF012
 
 
 class PlanTable(Record):
-    """The file plan.toml."""
+    """The file plan.toml; its title is for reports."""
 
-    title: Annotated[str, Field(max_length=200, description="Name of the plan, for reports.")] = ""
+    title: Annotated[str, Field(max_length=200)] = ""
     requirement: Annotated[list[RequirementTable], Field(min_length=1)]
 
 
