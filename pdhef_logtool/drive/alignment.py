@@ -233,7 +233,6 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan) -> tuple[Signals
         wheel_speed_m_s=wheels,
         available=plan.available,
         gnss_velocity_std_m_s=columns.get("gnss_velocity_accuracy_m_s", missing),
-        gnss_position_std_m=columns.get("gnss_position_accuracy_m", missing),
         **{name: columns.get(name, missing) for name in (*ALIGNED_SIGNALS, *_ALONE)},
         **gnss,
     )

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
 from pdhef_logtool.records.student import student_quantile
 

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from pdhef_logtool.drive.columns import student
-from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import FloatArray, IntArray
 

@@ -98,10 +98,6 @@ class Measured:
         return [*groups, *([tuple(wheels)] if len(wheels) > 1 else [])]
 
 
-def _known(vehicle: VehicleParameters | None) -> VehicleParameters | None:
-    return None if vehicle in (None, default_vehicle()) else vehicle
-
-
 def measure(
     signals: Mapping[str, Channel],
     truth: Mapping[str, Channel] | None = None,
@@ -118,7 +114,7 @@ def measure(
     columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
     sources = {} if mapping is None else mapping.by_subject
-    related = measured_relations(columns, speed_name, _known(vehicle))
+    related = measured_relations(columns, speed_name, None if vehicle == default_vehicle() else vehicle)
     # Two quantities of ground truth from the same field agree trivially.
     of_truth = {n: (s.topic, s.paths) for n, s in sources.items() if n.startswith("truth.")}
     read = [[of_truth[n] for n in r.powers if n in of_truth] for r in related]

@@ -107,7 +107,8 @@ def measured_relations(
     speed_name : the column used as the speed. vehicle : of a file; None without a file.
     """
     relations = list(_limits(columns))
-    of_path = {} if any(map(is_misscaled, position_factors(columns))) else columns
+    # The correction factor of a position in another unit is far from 1 (feet: 3.3).
+    of_path = {} if any(factor < 0.6 or factor > 1.7 for factor in position_factors(columns)) else columns
     for of in ("", "truth."):
         pace_name = f"{of}vx_m_s" if f"{of}vx_m_s" in columns else speed_name
         if pace_name is not None:
@@ -375,11 +376,6 @@ def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
         return math.nan, math.nan
     x, y = (math.sqrt(s) if s > SHOWN_STD * e else math.nan for s, e in zip(*result[:2], strict=True))
     return x, y
-
-
-def is_misscaled(factor: float) -> bool:
-    """Return whether the correction factor of a position is due to another unit (feet: 3.3)."""
-    return factor < 0.6 or factor > 1.7
 
 
 def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:

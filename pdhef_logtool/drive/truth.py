@@ -24,7 +24,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import median_known
 from pdhef_logtool.drive.correlation import GAP_PERIODS
-from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.geometry import (
     ecef_from_geodetic,
@@ -34,6 +33,7 @@ from pdhef_logtool.records.geometry import (
     shift_velocity_to_cg,
     wrap_angle,
 )
+from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.signals import TRUTH_UNITS, Channel, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
 

@@ -30,8 +30,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.records.dates import is_dated
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray, IntArray, is_dated
 from pdhef_logtool.records.student import student_quantile
 from pdhef_logtool.storage.templates import one_line, template
 

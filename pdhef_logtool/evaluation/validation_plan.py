@@ -35,7 +35,6 @@ _QUANTILE = re.compile(r"quantile (0\.\d+)")
 
 _Name = Annotated[str, Field(min_length=1, max_length=200)]
 _Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
-_Count = Annotated[int, Field(ge=0)]
 
 
 class ExposureNeed(Record):
@@ -53,7 +52,7 @@ class ExposureNeed(Record):
     ay_m_s2: _Range = None
     friction: _Range = None
     car: _Name | None = None
-    drives: _Count = 0
+    drives: Annotated[int, Field(ge=0)] = 0
     minutes: NonNegative = 0.0
 
     @model_validator(mode="after")

@@ -17,9 +17,8 @@ from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.table_columns import field_name, unique
 from pdhef_logtool.logs.table_file import LogFile, Tables, TableSettings
 from pdhef_logtool.logs.table_log import Table, TableLog
-from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import Loss, is_dated
 
 _FOLDER = CONSTANTS["folder"]
 

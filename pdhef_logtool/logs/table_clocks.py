@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
 from pdhef_logtool.logs.recording_span import NOTED_SHARE, survey_rows
-from pdhef_logtool.records.dates import is_dated
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss, is_dated
 
 if TYPE_CHECKING:
     from polars import Series

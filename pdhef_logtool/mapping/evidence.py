@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Number and length of the pieces of the log to read; a shorter log is read whole.
@@ -21,8 +22,8 @@ PIECE_NS = 10_000_000_000
 CELL_NS = 100_000_000
 #: Larger numbers are no measurements of a car.
 LARGEST = 1e12
-#: Longest gap that is interpolated, for sensors with a few samples per second.
-BRIDGED_CELLS = 5
+#: Longest gap that is interpolated, for sensors with one sample per second.
+BRIDGED_CELLS = 12
 #: Maximum number of columns to read of an array of unknown length.
 MOST_COLUMNS = 16
 #: Smallest number of cells that gives information.
@@ -191,16 +192,10 @@ def _usual(values: FloatArray) -> tuple[float, float]:
 
 
 def _filled(rows: FloatArray) -> FloatArray:
-    """Interpolate empty cells with neighbours at most ``BRIDGED_CELLS`` away [pieces, cells]."""
-    cell = np.arange(rows.shape[1])
+    """Interpolate empty cells in gaps of at most ``BRIDGED_CELLS`` [pieces, cells]."""
     for row in rows:
-        finite_cells = np.flatnonzero(np.isfinite(row))
-        if finite_cells.shape[0] < 2 or finite_cells.shape[0] == row.shape[0]:
-            continue
-        after = np.minimum(np.searchsorted(finite_cells, cell), finite_cells.shape[0] - 1)
-        away = np.minimum(np.abs(cell - finite_cells[after]), np.abs(cell - finite_cells[np.maximum(after - 1, 0)]))
-        inside = (cell >= finite_cells[0]) & (cell <= finite_cells[-1]) & (away <= BRIDGED_CELLS)
-        row[inside] = np.interp(cell[inside], finite_cells, row[finite_cells])
+        filled = np.flatnonzero(np.isfinite(row))
+        row[:] = Bracket(filled, np.arange(row.size), BRIDGED_CELLS).linear(row[filled])
     return rows
 
 

@@ -109,8 +109,7 @@ def weigh(
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     its = [f for f in may_be_true if f.topic.name == weighing.truth_from and _truth_name(f) in _SLIP and f.seen.changes]
-    ordered = sorted(its, key=lambda f: (f.role != "truth", f.role != "navigation", -f.score))
-    weighing.slip = next(iter(ordered), None)
+    weighing.slip = min(its, key=lambda f: (f.role != "truth", f.role != "navigation", -f.score), default=None)
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
     return weighing

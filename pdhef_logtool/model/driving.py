@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.sensor_changes import samples_and_sums
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.model.equations import AY, FRICTION, SPEED, STEER, YAW_RATE
+from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
 #: Step of the grid. The model is valid to 4 Hz; the integration is exact for tyre lags (12 ms at 40 m/s).

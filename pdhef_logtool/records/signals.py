@@ -141,7 +141,7 @@ class Signals:
     gnss_velocity_m_s : float64 [N, 2], east and north, of the antenna, finite only at the first stamp after a new
         sample. gnss_velocity_std_m_s : float64 [N], from the receiver. gnss_late_s : float64 [N], time from the stamp
         to the arrival of a velocity that ``ready_ns`` does not wait for.
-    gnss_position_deg : float64 [N, 2], latitude and longitude; gnss_position_std_m, gnss_heading_rad : float64 [N].
+    gnss_position_deg : float64 [N, 2], latitude and longitude; gnss_heading_rad : float64 [N].
     roll_rate_rad_s, pitch_rate_rad_s : float64 [N]. Missing columns are filled with NaN.
     extra_variance : float64 [N, 2], variance of a_y and yaw rate in excess of the usual one, m²/s⁴ and rad²/s².
     faults : float64 [N], bits of :mod:`pdhef_logtool.records.reasons`.
@@ -162,7 +162,6 @@ class Signals:
     gnss_velocity_std_m_s: FloatArray = field(default_factory=lambda: np.empty(0))
     gnss_late_s: FloatArray = field(default_factory=lambda: np.empty(0))
     gnss_position_deg: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
-    gnss_position_std_m: FloatArray = field(default_factory=lambda: np.empty(0))
     gnss_heading_rad: FloatArray = field(default_factory=lambda: np.empty(0))
     roll_rate_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
     pitch_rate_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
@@ -226,3 +225,8 @@ def has_gnss(names: Collection[str]) -> bool:
 def has_position(names: Collection[str]) -> bool:
     """Return whether signals contain a GNSS position."""
     return set(GNSS_POSITION) <= set(names)
+
+
+def is_dated(stamp_ns: float) -> bool:
+    """Return whether a stamp in ns is a date: before 1973 it counts from another start, of a log or a simulation."""
+    return stamp_ns >= 10**17

@@ -103,10 +103,10 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
     for d in (d for d in judged if d.median.value <= _DRAWN * first.median.value):
         low, middle, high = (DEGREES * x for x in (d.median.low, d.median.value, d.median.high))
         bars.append(Interval(d.estimator, low, middle, high, INK if d.estimator == ANSWER else colour(d.estimator)))
-    title = f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
+    title = f"Median RMSE of sideslip over {first.median.units} drives, 95 % interval"
     title += "" if len(bars) == len(judged) else f" (beyond {_DRAWN:g} times the selected estimate's: table)"
     charts.figures["medians"] = IntervalsFigure(title, "RMSE in °", bars)
-    if first.drives > 2:
+    if first.median.units > 2:
         values = first.values * DEGREES
         edges, counts = _histogram(values)
         beyond = " (last bar: and above)" if values[-1] > edges[-1] else ""
@@ -154,7 +154,7 @@ def _rows(distributions: Sequence[Distribution]) -> list[dict[str, Any]]:
     for d in distributions:
         unit, factor = read_unit(d.unit)
         quantiles = d.median.value, d.median.low, d.median.high, *np.quantile(d.values, [0.1, 0.9, 1.0]).tolist()
-        row = {"signal": LABELS[d.signal], "unit": unit, "estimator": d.estimator, "drives": d.drives}
+        row = {"signal": LABELS[d.signal], "unit": unit, "estimator": d.estimator, "drives": d.median.units}
         rows.append(row | {"figures": [x * factor for x in quantiles]})
     return sorted(rows, key=lambda r: [*LABELS.values()].index(r["signal"]))
 

@@ -24,9 +24,8 @@ from markupsafe import Markup
 from pdhef_logtool.evaluation.requirement_verdicts import joint_notes
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
-from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.printable import printable
-from pdhef_logtool.records.signals import NS_PER_S, FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, FloatArray, is_dated
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.results import selected_estimate

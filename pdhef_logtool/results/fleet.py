@@ -41,15 +41,6 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
-class Median:
-    """A median over drives with its 95 % interval; NaN where the drives are too few."""
-
-    value: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True, slots=True)
 class FleetDrive:
     """One drive with a report.
 
@@ -94,13 +85,8 @@ class Distribution:
     estimator: str
     signal: str
     unit: str
-    median: Median
+    median: statistics.Bounded
     values: FloatArray
-
-    @property
-    def drives(self) -> int:
-        """Drives with the figure."""
-        return len(self.values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +101,7 @@ class Rank:
     estimator: str
     drives: int
     better_than: tuple[str, ...]
-    against_answer: Median | None
+    against_answer: statistics.Bounded | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,8 +288,8 @@ def _of_all(drives: Sequence[FleetDrive], use: BoolArray | None = None) -> dict[
     return {f: [d.factors.get(f) for d in used] for f in statistics.FACTORS}
 
 
-def _median(change: statistics.PairedChange, scale: Callable[[float], float] = float) -> Median:
-    return Median(*map(scale, (change.median, change.low, change.high)))
+def _median(change: statistics.PairedChange, scale: Callable[[float], float] = float) -> statistics.Bounded:
+    return statistics.Bounded(scale(change.median), scale(change.low), scale(change.high), change.drives)
 
 
 def _distributions(drives: Sequence[FleetDrive], names: Sequence[str]) -> Iterable[Distribution]:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, one_log, read_drive
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
 from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
@@ -38,6 +37,7 @@ from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,

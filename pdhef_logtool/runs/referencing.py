@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -128,10 +128,7 @@ def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any
         "valid_share": valid / knots if knots else 0.0,
         "spans_refused": sum(bool(span.refused) for span in spans),
         "spans": len(spans),
-        "parameters": [
-            {"name": p.name, "unit": p.unit, "value": p.value, "std": p.std, "prior": p.prior, "limit": p.limit}
-            for p in (longest.parameters if longest else ())
-        ],
+        "parameters": [asdict(p) for p in (longest.parameters if longest else ())],
     }
 
 

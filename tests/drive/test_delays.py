@@ -10,12 +10,12 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.checks import delay_checks
 from pdhef_logtool.drive.correlation import CommonGrid, Shift, find_shift, on_common_grid, shift_error
 from pdhef_logtool.drive.delays import LatencyEstimate, late_sensors
-from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.plan import plan_drive
 from pdhef_logtool.drive.survey import mapping_proposals, survey_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks
+from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 from tests.drive.test_checks import survey
 

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean
 from pdhef_logtool.evaluation.segments import driven_speed
 from pdhef_logtool.evaluation.smoothing import median_step_ns
 from pdhef_logtool.evaluation.track_errors import scorable
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
+from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 SENSORS = "sensors"

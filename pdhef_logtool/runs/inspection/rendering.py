@@ -15,9 +15,8 @@ from rich.text import Text
 
 from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
-from pdhef_logtool.records.dates import is_dated
 from pdhef_logtool.records.printable import all_printable
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, is_dated
 from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport, number_text
 from pdhef_logtool.storage.templates import template
 
