@@ -162,11 +162,8 @@ def scratch_folder() -> tempfile.TemporaryDirectory[str]:
         with contextlib.suppress(OSError):
             for path in list(root.iterdir()):
                 match = _SCRATCH.fullmatch(path.name)
-                if match and is_alive(match[1]) is False and _is_ours(path):
+                # Where users have ids (not on Windows), they share a temporary folder.
+                is_ours = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
+                if match and is_alive(match[1]) is False and is_ours:
                     shutil.rmtree(path, ignore_errors=True)
     return tempfile.TemporaryDirectory(prefix=f"pdhef-{process_name()}-")
-
-
-def _is_ours(path: Path) -> bool:
-    """Return whether a file belongs to this user; always where the temporary folder belongs to one user (Windows)."""
-    return not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()

@@ -79,7 +79,7 @@ def test_drives_without_independent_truth_stand_apart_and_score_nothing(run):
         ("own", "its ground truth is not independent"),
     ]
     (answer, _) = found.distributions
-    assert (answer.estimator, answer.drives) == (ANSWER, 1)
+    assert (answer.estimator, answer.median.units) == (ANSWER, 1)
 
 
 def test_failures_are_told_by_reason(run):
