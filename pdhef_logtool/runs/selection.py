@@ -19,8 +19,8 @@ from pdhef_logtool.results.selected_estimate import NAIVE, MainFacts
 #: The preferred estimator, and those that run beside it where no driving has validated the car.
 PREFERRED = "pd-hef"
 SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
-#: The two tests: lateral consistency within this factor of the lowest one, yaw consistency within the other. On
-#: simulated drives with right and wrong files this selection has the lowest error (docs/method.md#selection).
+#: The two tests: lateral consistency within this factor of the lowest one of those whose yaw consistency is within the
+#: other (docs/method.md#selection).
 FACTOR, YAW_FACTOR = 1.2, 3.0
 #: Their lateral figures are meaningless, because they integrate the residual that ``d2`` measures.
 _NOT_JUDGED = ("kinematic", "slip-ukf", "washout")
@@ -30,23 +30,22 @@ _LAST = (NAIVE, "zero:no-lateral", REFERENCE)
 
 
 class Contradiction(NamedTuple):
-    """An estimate that fails a test: the ``best`` one that passes both, and the warning of the report."""
+    """An estimate that fails the test: the ``best`` one that passes both, and the warning of the report."""
 
     best: str
     text: str
 
 
 def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradiction | None:
-    """Return how the tests contradict an estimate; None if they do not, or no other one passes the yaw-rate test.
+    """Return what contradicts an estimate: a lower ``d2`` of one that passes the yaw test; None if nothing does.
 
-    A log without steering has no yaw-rate test, and then no estimate to compare with.
+    The yaw test alone contradicts nothing: at the limit of the tyres the right sideslip can fail it. A log without
+    steering has no yaw test, and then no estimate to compare with.
     """
     d2, yaw = _figures(rows)
     explain = [n for n, value in yaw.items() if n in d2 and value <= YAW_FACTOR * min(yaw.values())]
     best = min((n for n in explain if n not in (name, *_NOT_JUDGED)), key=lambda n: d2[n], default=None)
-    if name not in d2 or best is None:
-        return None
-    if d2[name] <= FACTOR * d2[best] and (name in explain or name not in yaw):
+    if name not in d2 or best is None or d2[name] <= FACTOR * d2[best]:
         return None
     return Contradiction(
         best,
