@@ -38,8 +38,7 @@ _PLACES = ("latitude", "longitude")
 WIDEST_DEG = 10.0
 #: Senses of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
 _SENSES = (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
-#: Speed over ground over that along the path if the axes are
-#: the earth's; share of the time that a body moves ahead.
+#: Speed over ground over that along the path if the axes are the earth's; share of the time that a body moves ahead.
 SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
 #: Least share of its y axis in a path: along the x axis, velocities over ground and of the body are equal.
 ACROSS_SHARE = 0.1
@@ -57,7 +56,7 @@ NavigationTruth: TypeAlias = tuple[dict[str, SignalSource], str]
 
 
 def length_of(velocity: SignalSource) -> SignalSource:
-    """Return the speed from a ground-truth velocity: the length of its horizontal part, of all three axes in ECEF."""
+    """Return the speed from a velocity: the length of its horizontal part, of all three axes in ECEF."""
     level = len(velocity.paths) if velocity.name == "ecef_velocity_m_s" else 2
     scale = velocity.scale[:level] if isinstance(velocity.scale, tuple) else (velocity.scale,) * level
     return replace(velocity, name="speed_m_s", field=velocity.paths[:level], scale=scale, offset=0.0, combine="norm")

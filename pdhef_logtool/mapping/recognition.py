@@ -438,7 +438,7 @@ def _map_speed_over_ground(draft: _Draft, topics: list[TopicInfo]) -> None:
         why = ", which is also the ground truth, as nothing else gives a speed: the estimator's input is the true speed"
     elif len(scales) == 2:
         paths = tuple(path for s in sides for path in s.paths)
-        source, why = replace(sides[0], name="speed_m_s", field=paths, scale=scales, combine="norm"), ""
+        source, why = navigation.length_of(replace(sides[0], field=paths, scale=scales)), ""
     else:
         return
     why += f"; it is {navigation.NEVER_NEGATIVE}" if source.combine == "norm" else ""
