@@ -11,13 +11,11 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from itertools import groupby
 from pathlib import Path
 from typing import TypeAlias
@@ -50,11 +48,6 @@ _OF_DRIVES = (
     "tables/parts/*",
 )
 _OF_RUN = ("run.json", "report.json", "report.html", "metrics.parquet", "tables/[!p]*.parquet")
-#: Tests of a fleet on Ray: file and part of the name.
-_RAY = {
-    "a Ray node is lost": ("tests/runs/test_fleet_runs.py", "one_of_which_goes"),
-    "a Ray cluster is lost": ("tests/workers/test_supervisor.py", "is_lost"),
-}
 
 
 def _run(logs: Path | str, output: Path, *more: str) -> Process:
@@ -237,16 +230,6 @@ def cut(path: Path) -> None:
     os.truncate(path, path.stat().st_size // 2)
 
 
-def lost_on_ray(file: str, name: str, _: Path) -> Verdict:
-    """Run a test of a fleet on Ray."""
-    if find_spec("ray") is None:
-        return Verdict("skipped: Ray is not installed")
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "fleet", file, "-k", name]
-    environment = os.environ | {"PDHEF_FLEET": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    return Verdict(f"pytest {done.returncode}", done.stdout[-800:] if done.returncode else "")
-
-
 def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Callable[[Path], Verdict]]:
     """Simulate the drives, run them undisturbed, and return the cases by their planted fault."""
     folders = {"fleet": (drives, DRIVE_S), "few": (FEW, DRIVE_S), "taught": (2, TAUGHT_S), "other": (1, DRIVE_S)}
@@ -277,7 +260,6 @@ def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Cal
             for what, patterns in kinds.items()
             for how, deed in harm.items()
         },
-        **{name: partial(lost_on_ray, *test) for name, test in _RAY.items()},
     }
 
 
