@@ -22,6 +22,7 @@ import numpy as np
 import polars as pl
 
 from pdhef_logtool import Car, PdhefError
+from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from studies.drawn_cars import KINDS, draw_car
 from studies.gates.tool import Tool, reports
 from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, update, write_toml, write_validated_car
@@ -39,7 +40,6 @@ CARS, SEED = 30, 99_005
 FRICTIONS, WRONG = (0.85, 1.0), (0.5, 2.0)
 #: Lowest and highest share of values that a ± with 95 % coverage may have.
 ACCEPTED = (0.90, 0.98)
-NORMAL_95 = 1.959964
 RIGHT, WRONG_FILE = "right", "wrong"
 ESTIMATORS = ("zero", "open-loop", "phy-ukf", "physics")
 _PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
