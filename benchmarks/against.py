@@ -6,11 +6,12 @@ machine.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from benchmarks.fleet_drive import DRIVES, drives
 from benchmarks.hour import run_words
-from benchmarks.measuring import CACHE, ROOT, ROUNDS, Row, command_cost
+from benchmarks.measuring import CACHE, ROOT, Row, best_seconds, command_cost
 from benchmarks.one_hour_log import SHARED_S, drive_log, image_log
 from benchmarks.starting import LIGHT
 
@@ -34,11 +35,9 @@ def rows(other: Path) -> list[Row]:
     """Measure this tree and another one."""
     measured = []
     for work, words in works().items():
-        seconds = {ROOT: float("inf"), other: float("inf")}
-        for tree in (ROOT, other):
-            command_cost(*words, tree=tree)  # code that is compiled on its first call
-        for _ in range(ROUNDS):
-            for tree, best in seconds.items():
-                seconds[tree] = min(best, command_cost(*words, tree=tree).seconds)
-        measured.append(Row(work, seconds[ROOT], "s", peers={"other tree": seconds[other] / seconds[ROOT]}))
+        ways = {name: partial(command_cost, *words, tree=tree) for name, tree in (("this", ROOT), ("other", other))}
+        for way in ways.values():
+            way()  # code that is compiled on its first call
+        seconds = best_seconds(ways)
+        measured.append(Row(work, seconds["this"], "s", peers={"other tree": seconds["other"] / seconds["this"]}))
     return measured

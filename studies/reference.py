@@ -31,7 +31,7 @@ from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from studies import pages
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
-from studies.gates.tool import Tool, estimates, reports, sideslip_rmse_deg
+from studies.gates.tool import Tool, estimates, metrics, reports, sideslip_rmse_deg
 from studies.mcap_logs import Message, messages, write_log
 from studies.pages import DRIVES, ROOT, number, table, write_toml
 from studies.peers.drives import PEER_DRIVES, mapping_table, peer_drive, vehicle_table
@@ -317,9 +317,9 @@ def scored_run(folder: Path, case: Case, vehicle: dict[str, Any]) -> Figures:
 
 def rankings(folder: Path, errors: dict[str, float]) -> tuple[int, int, int, int]:
     """Return ``pairs`` of :class:`Figures`; ``errors``: RMSE against ground truth by estimator."""
-    rows = pl.read_parquet(folder / "metrics.parquet").filter(metric="reference_further", segment="all")
     ranked = {f"{a}~{b}": errors[a] - errors[b] for a, b in combinations([n for n in RANKED if n in errors], 2)}
-    claims = {pair: value for pair, value in rows.select("estimator", "value").iter_rows() if pair in ranked}
+    rows = metrics(folder, metric="reference_further").select("estimator", "value").iter_rows()
+    claims = {pair: value for pair, value in rows if pair in ranked}
     agreed = sum(claim * ranked[pair] > 0.0 for pair, claim in claims.items())
     clear = [pair for pair, value in ranked.items() if abs(value) > CLEAR_DEG]
     return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)

@@ -49,7 +49,7 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from studies.defaults.fit_nominal_tyres import axle_curves
+from studies.defaults.fit_nominal_tyres import axle_curves, magic_formula
 from studies.pages import options
 from truthsim.suite import write_suite
 
@@ -114,7 +114,7 @@ class AxleCurve:
     def force_n(self, slip_rad: FloatArray) -> FloatArray:
         """Return D sin(C atan(B α)) with B = stiffness/(C D)."""
         b = self.stiffness_n_per_rad / (self.shape * self.peak_n)
-        return self.peak_n * np.sin(self.shape * np.arctan(b * slip_rad))
+        return magic_formula(slip_rad, b, self.shape, self.peak_n, 0.0)
 
 
 def usable_stamps(signals: Signals, truth: StateTrack, vehicle: VehicleParameters) -> BoolArray:

@@ -206,7 +206,7 @@ def strangers(only: Sequence[str], tool: Tool) -> Figures:
 def fuzz(name: str, count: int, tool: Tool) -> Figures:
     """Count how commands end on mutants of a format."""
     work = tool.work / f"fuzz-{name}-{count}"
-    given = ("--work", work, "--jobs", "1", "--format", name, "--count", str(count), "--out", work / "none.md")
+    given = ("--work", work, "--jobs", "1", "--format", name, "--count", str(count), "--out", work)
     judged = written(work / "formats.json", tool.python("studies.torture", "formats", *given))[name]
     figures = {f"{name}: problems": Figure(float(len(judged["problems"])), "count", 0.0)}
     for end in ("exit 0", "exit 1", "exit 3"):

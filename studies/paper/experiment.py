@@ -21,7 +21,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
-from studies.gates.tool import Tool, estimates
+from studies.gates.tool import Tool, estimates, metrics
 from studies.paper.schemes import ESP, SCHEMES
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
@@ -160,10 +160,10 @@ def run_experiment(
             folder = tool.run(f"{log.stem}-{sensors}", log, *given)
             wanted = pl.col("estimator").is_in(chosen if end else [*chosen, "truth"])
             tracks.append(estimates(folder).filter(wanted).with_columns(pl.col("estimator").cast(pl.String) + end))
-            metrics = pl.read_parquet(folder / "metrics.parquet").filter(wanted, segment="all")
+            scores = metrics(folder).filter(wanted, pl.col("value").is_finite())
             for name, (signal, metric, factor) in FIGURES.items():
-                found = metrics.filter(pl.col("value").is_finite(), signal=signal, metric=metric)
-                for scheme, value in found.select("estimator", "value").iter_rows():
+                found = scores.filter(signal=signal, metric=metric).select("estimator", "value")
+                for scheme, value in found.iter_rows():
                     rows.append(about | {"scheme": f"{scheme}{end}", "figure": name, "value": factor * value})
         if scenario.name not in done.logs:
             done.logs[scenario.name], done.tracks[scenario.name] = log, pl.concat(tracks)
