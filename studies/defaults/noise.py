@@ -1,7 +1,7 @@
 """Noise of the tuned filter of the shipped car (docs/method.md#noise).
 
-A trial is a point of the space. The first half of the trials is a scrambled Sobol sequence. The rest are Gaussian steps
-from the best point so far, in the logarithms of the factors, with a width that shrinks.
+Differential evolution of SciPy chooses the trials, points of the space of the logarithms of the factors; its first
+generation is a scrambled Sobol sequence.
 
 The objective is the mean over drives of ln √(RMSE² + floor²) of the sideslip, reported as its exponential, a geometric
 mean in degrees: every drive counts by its relative error. The floor limits the effect of drives that hardly turn.
@@ -10,10 +10,10 @@ mean in degrees: every drive counts by its relative error. The floor limits the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy.stats import qmc
+from scipy.optimize import differential_evolution
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise
@@ -37,10 +37,8 @@ TUNED = "phy-ukf:tuned"
 FLOOR_RAD = math.radians(0.05)
 #: If an estimate is missing at more of the scored stamps, its error is at least the error of sideslip 0.
 MIN_AVAILABILITY = 0.9
-#: Share of the trials that explore the whole space.
-EXPLORING_SHARE = 0.5
-#: 1-sigma of the local steps, from first to last, as a share of each factor's logarithmic range.
-STEP_FIRST, STEP_LAST = 0.15, 0.02
+#: Trials of a generation, a multiple of the number of factors.
+GENERATION = 16
 #: Ranges of the factors, log-uniform: q of v_y (m/s/√s), q of the yaw rate (rad/s/√s), r of a_y (m/s²), r of the yaw
 #: rate (rad/s). The other noises remain unchanged.
 LOW = np.array([0.002, 0.001, 0.02, 0.0002])
@@ -48,10 +46,6 @@ HIGH = np.array([2.0, 1.0, 5.0, 0.05])
 
 #: A point of the space, four significant digits each.
 Point = tuple[float, ...]
-
-
-#: Objective in degrees, number of the trial, and point; the least one is the best.
-Trial = tuple[float, int, Point]
 
 
 def tune(logs: Iterable[LogInput], config: RunConfig, trials: int) -> dict[str, FilterNoise]:
@@ -62,17 +56,26 @@ def tune(logs: Iterable[LogInput], config: RunConfig, trials: int) -> dict[str, 
         with read_drive(log, identified, mapping, options) as drive:
             drives.append(drive.whole())
 
-    def objective(values: Point) -> float:
-        car = identified.with_noise(TUNED, filter_noise(values))
+    def objective(shares: FloatArray) -> float:
+        car = identified.with_noise(TUNED, filter_noise(point(shares)))
         estimator = spec_of(TUNED).make(car, Options(options.use_speed))
         given = ((DriveSignals.of(d.signals, car).of_estimator(TUNED), d.truth) for d in drives)
         return objective_deg(
             [error_rad(run_estimator(estimator, s), truth, slow) for s, truth in given if truth is not None]
         )
 
-    error_deg, number, best = min(search(objective, trials, SEED))
-    print(f"{TUNED}: trial {number} of {trials}, {error_deg:.4f}°", flush=True)
-    return {TUNED: filter_noise(best)}
+    best = differential_evolution(
+        objective,
+        [(0.0, 1.0)] * len(LOW),
+        popsize=GENERATION // len(LOW),
+        maxiter=max(1, trials // GENERATION) - 1,
+        init="sobol",
+        tol=0.0,
+        polish=False,
+        seed=SEED,
+    )
+    print(f"{TUNED}: {best.nfev} trials, {best.fun:.4f}°", flush=True)
+    return {TUNED: filter_noise(point(best.x))}
 
 
 def filter_noise(values: Point) -> FilterNoise:
@@ -105,21 +108,3 @@ def objective_deg(errors_rad: Sequence[float]) -> float:
 def point(shares: FloatArray) -> Point:
     """Return the point at shares [4] in [0, 1] of the logarithmic ranges."""
     return tuple(float(f"{value:.4g}") for value in LOW * (HIGH / LOW) ** shares)
-
-
-def search(objective: Callable[[Point], float], trials: int, seed: int) -> list[Trial]:
-    """Return all trials; ``seed`` determines the Sobol scrambling and the local steps."""
-    exploring = max(1, round(EXPLORING_SHARE * trials))
-    sobol = qmc.Sobol(len(LOW), scramble=True, seed=seed).random_base2(max(0, (exploring - 1).bit_length()))
-    width = np.geomspace(STEP_FIRST, STEP_LAST, trials - exploring) if trials > exploring else np.empty(0)
-    steps = width[:, None] * np.random.default_rng([seed, len(LOW)]).standard_normal((trials - exploring, len(LOW)))
-    done: list[Trial] = []
-    for number in range(trials):
-        if number < exploring:
-            shares = sobol[number]
-        else:
-            centre = np.log(np.array(min(done)[2]) / LOW) / np.log(HIGH / LOW)
-            shares = np.clip(centre + steps[number - exploring], 0.0, 1.0)
-        values = point(shares)
-        done.append((objective(values), number, values))
-    return done
