@@ -27,10 +27,9 @@ from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, nominal_filter
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.residual_model.bundle import ModelBundle
 from studies.defaults.paper_drives import plan_drives
 from studies.pages import RESULTS, options, write
-from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, as_logged, on_the_road
+from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, as_logged, on_the_road, paper_network
 from truthsim.drive import Drive, simulate_drive
 
 FILE = RESULTS / "paper" / "constants.json"
@@ -68,20 +67,14 @@ class Case:
         whole = as_logged(self.drive, self.car)
         physics = nominal_filter(self.car.vehicle, use_speed=self.use_speed)
         features, dt_s, steps, _ = run_features(physics, whole.signals, None)
-        rate, _ = self._network.run(features, np.isnan(dt_s), None)
+        rate, _ = paper_network(self.car).run(features, np.isnan(dt_s), None)
         assert whole.truth is not None
         return whole.signals, whole.truth.sideslip_rad, steps, rate
-
-    @property
-    def _network(self) -> ModelBundle:
-        assert isinstance(self.car.network, ModelBundle)
-        assert self.car.network.paper_network is not None
-        return self.car.network.paper_network
 
     def rmse_deg(self, constants: Constants) -> float:
         """Return the RMSE of the sideslip after each update."""
         signals, truth, physics, rate = self._inputs
-        ukf = PaperHybridUkf(self.car.vehicle, self._network, use_speed=self.use_speed, constants=constants)
+        ukf = PaperHybridUkf(self.car.vehicle, paper_network(self.car), use_speed=self.use_speed, constants=constants)
         steps, *_ = ukf.filter_steps(signals, physics, rate)
         error = np.arctan2(steps.x[:, 1], steps.x[:, 0]) - truth
         return float(np.degrees(np.sqrt(np.mean(error[steps.valid & np.isfinite(error)] ** 2))))

@@ -21,6 +21,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from studies.gates.tool import Tool, estimates, metrics
 from studies.paper.schemes import ESP, SCHEMES
 from truthsim.drive import Drive, simulate_drive, write_drive
@@ -120,6 +121,12 @@ def on_the_road(car: Car, friction: float) -> Car:
         physics = physics.model_copy(update={"values": values})
     gain = car.residual_gain
     return replace(car, vehicle=vehicle, network_gain=gain, fitted_physics=physics)
+
+
+def paper_network(car: Car) -> ModelBundle:
+    """Return the network of the paper's filter of a shipped car."""
+    assert isinstance(car.network, ModelBundle) and car.network.paper_network is not None
+    return car.network.paper_network
 
 
 def read_log(log: Path, car: Car) -> WholeDrive:

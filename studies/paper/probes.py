@@ -16,9 +16,8 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.network.residuals import residual_rows
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.runs.estimating import estimate_drive
-from studies.paper.experiment import Experiment, time_s, valid
+from studies.paper.experiment import Experiment, paper_network, time_s, valid
 
 #: Rows of the residual, with their units.
 RESIDUAL_ROWS = (("v_y", "m/s²"), ("yaw rate", "rad/s²"))
@@ -51,9 +50,8 @@ class ResidualFit:
 
 def residual_fit(whole: WholeDrive, car: Car) -> ResidualFit:
     """Compare the residual of a drive with the output of the paper's network, features as in service."""
-    assert isinstance(car.network, ModelBundle)
-    assert car.network.paper_network is not None and whole.truth is not None
-    network, period_s = car.network.paper_network, whole.plan.alignment.grid_period_s
+    assert whole.truth is not None
+    network, period_s = paper_network(car), whole.plan.alignment.grid_period_s
     rows = residual_rows(whole.signals, whole.truth, filter_of(car, network.model), period_s=period_s)
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
     output, _ = network.run(rows.features, starts, None)

@@ -210,8 +210,7 @@ def _damage_mcap_chunk(record: Record, rng: random.Random) -> Record | None:
     if op != _CHUNK:
         return None
     try:
-        start, end, size, _ = struct.unpack_from("<QQQI", payload)
-        (n,) = struct.unpack_from("<I", payload, 28)
+        start, end, size, _, n = struct.unpack_from("<QQQII", payload)
         compression = payload[32 : 32 + n]
         inner = _split_mcap(_unpacked(compression, payload[40 + n :], size))
     except Exception:  # noqa: BLE001 (the decompressor raises any exception on an earlier fault)
