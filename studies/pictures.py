@@ -26,10 +26,10 @@ def subplots(
     return fig, axes
 
 
-def save(fig: Any, path: Path, dpi: int = 100) -> None:
+def save(fig: Any, path: Path) -> None:
     """Write a PNG without a time or a version in it, and let go of the figure."""
     import matplotlib.pyplot as plt
 
     with PendingFile(path) as pending:
-        fig.savefig(pending.path, format="png", dpi=dpi, metadata={"Software": None})
+        fig.savefig(pending.path, format="png", dpi=100, metadata={"Software": None})
     plt.close(fig)

@@ -43,9 +43,9 @@ class Stage:
     work: tuple[str, ...] = ()
 
 
-def load_stages(file: Path = TABLE) -> tuple[Stage, ...]:
-    """Return the stages of a table, with the sets of its inputs expanded."""
-    document = read_toml(file)
+def load_stages() -> tuple[Stage, ...]:
+    """Return the stages of the table, with the sets of its inputs expanded."""
+    document = read_toml(TABLE)
     sets = document.pop("sets", {})
 
     def expanded(patterns: Sequence[str]) -> Iterator[str]:

@@ -100,9 +100,9 @@ class Motion(NamedTuple):
     roll_rate_rad_s: FloatArray
 
 
-def made_gnss(motion: Motion, receiver: Receiver, fault: str = "", seed: int = 7) -> tuple[IntArray, FloatArray]:
+def made_gnss(motion: Motion, receiver: Receiver, fault: str) -> tuple[IntArray, FloatArray]:
     """Return the stamps [M] and the velocities [M, 2] to the east and north that a receiver would show."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(7)
     t = (motion.stamps_ns - motion.stamps_ns[0]) * 1e-9
     sampled = np.arange(0.0, t[-1], 1.0 / receiver.rate_hz)
     rate = np.gradient(np.unwrap(motion.heading_rad), t)

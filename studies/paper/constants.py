@@ -80,9 +80,9 @@ class Case:
         return float(np.degrees(np.sqrt(np.mean(error[steps.valid & np.isfinite(error)] ** 2))))
 
 
-def training_drives(count: int = COUNT) -> Iterator[Drive]:
+def training_drives() -> Iterator[Drive]:
     """Simulate the first training drives of the paper's network."""
-    for job in itertools.islice((j for j in plan_drives() if dict(j.facts)["split"] == "train"), count):
+    for job in itertools.islice((j for j in plan_drives() if dict(j.facts)["split"] == "train"), COUNT):
         for spec in job.candidates:
             try:
                 yield spec.simulate()

@@ -19,6 +19,8 @@ from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.runs.estimating import estimate_drive
 from studies.paper.experiment import Experiment, paper_network, time_s, valid
 
+#: Bins of the gain over the lateral acceleration, and rounds of the step times.
+BINS, ROUNDS = 12, 15
 #: Rows of the residual, with their units.
 RESIDUAL_ROWS = (("v_y", "m/s²"), ("yaw rate", "rad/s²"))
 
@@ -73,15 +75,15 @@ class TrustCurve:
     high: FloatArray
 
 
-def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> TrustCurve:
+def trust_curve(experiment: Experiment, scenario: str, scheme: str) -> TrustCurve:
     """Return β of a scheme over the true |a_y|."""
     ay = np.abs(experiment.truth(scenario)["ay_m_s2"].to_numpy()) / GRAVITY_M_S2
     trust = valid(experiment.track(scenario, scheme), "network_trust")
     use = np.isfinite(trust) & np.isfinite(ay)
     ay, trust = ay[use], trust[use]
-    edges = np.linspace(0.0, ay.max(), bins + 1)
-    place = np.clip(np.digitize(ay, edges) - 1, 0, bins - 1)
-    filled = [i for i in range(bins) if np.count_nonzero(place == i) >= 5]
+    edges = np.linspace(0.0, ay.max(), BINS + 1)
+    place = np.clip(np.digitize(ay, edges) - 1, 0, BINS - 1)
+    filled = [i for i in range(BINS) if np.count_nonzero(place == i) >= 5]
     points = np.array([np.percentile(trust[place == i], [10.0, 50.0, 90.0]) for i in filled])
     centre = 0.5 * (edges[1:] + edges[:-1])[filled]
     return TrustCurve(ay, trust, centre, points[:, 1], points[:, 0], points[:, 2])
@@ -97,18 +99,14 @@ def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float])
     return {"before": float(np.median(before)), "within": float(within.max())}
 
 
-#: Rounds of the step times.
-ROUNDS = 15
-
-
-def step_times(whole: WholeDrive, car: Car, names: Sequence[str], rounds: int = ROUNDS) -> dict[str, dict[str, float]]:
+def step_times(whole: WholeDrive, car: Car, names: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return median, fastest and slowest of several rounds in turns, in microseconds of processor time a step.
 
     The first round compiles and does not count.
     """
     schemes, corrected = [make_estimator(name, car) for name in names], DriveSignals.of(whole.signals, car)
     seconds: dict[str, list[float]] = {s.name: [] for s in schemes}
-    for number in range(rounds + 1):
+    for number in range(ROUNDS + 1):
         for scheme in schemes:
             start = time.process_time()
             estimate_drive(whole, corrected, [scheme])

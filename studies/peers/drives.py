@@ -60,7 +60,7 @@ def needed_files(drive: PeerDrive) -> tuple[Path, ...]:
     return tuple(DRIVES / f"{drive.log}{end}" for end in ("", *beside))
 
 
-def mapping_table(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = False) -> dict[str, Any]:
+def mapping_table(drive: PeerDrive, *, receiver: bool = False) -> dict[str, Any]:
     """Return the mapping file of a drive as a document; ``receiver``: the GNSS velocity of a V40 replaces its speed."""
     if drive.log.startswith("v40_"):
         document = read_toml(_HERE / "v40_gnss.toml")
@@ -70,7 +70,7 @@ def mapping_table(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = F
         return document
     if drive.files:
         return read_toml(REFERENCE / "mappings" / f"{drive.files}.toml")
-    return beside_mapping(read_toml(folder / f"{drive.log}.signals.toml"))
+    return beside_mapping(read_toml(DRIVES / f"{drive.log}.signals.toml"))
 
 
 def beside_mapping(document: Table[str, Any]) -> dict[str, Any]:
@@ -84,10 +84,10 @@ def beside_mapping(document: Table[str, Any]) -> dict[str, Any]:
     return sides
 
 
-def vehicle_table(drive: PeerDrive, folder: Path = DRIVES) -> dict[str, Any]:
+def vehicle_table(drive: PeerDrive) -> dict[str, Any]:
     """Return the published vehicle file of a drive as a document."""
     if not drive.files:
-        return beside_vehicle(read_toml(folder / f"{drive.log}.vehicle.toml"))
+        return beside_vehicle(read_toml(DRIVES / f"{drive.log}.vehicle.toml"))
     name = "comma2k19_rav4" if drive.files == "comma2k19" else drive.files
     vehicle = read_toml(REFERENCE / "vehicles" / f"{name}.toml")
     # The accelerometer position in the TT-S file was regressed on ground truth.
@@ -110,11 +110,11 @@ def beside_vehicle(document: Table[str, Any]) -> dict[str, Any]:
     return raw | {"tyres": stiffness}
 
 
-def mapping_of(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = False) -> Mapping:
+def mapping_of(drive: PeerDrive) -> Mapping:
     """Return the mapping of a drive, as :func:`mapping_table`."""
-    return mapping_from_dict(mapping_table(drive, folder, receiver=receiver), where=drive.log)
+    return mapping_from_dict(mapping_table(drive), where=drive.log)
 
 
-def vehicle_of(drive: PeerDrive, folder: Path = DRIVES) -> VehicleParameters:
+def vehicle_of(drive: PeerDrive) -> VehicleParameters:
     """Return the published vehicle of a drive."""
-    return vehicle_of_entries(vehicle_table(drive, folder), where=drive.log).vehicle
+    return vehicle_of_entries(vehicle_table(drive), where=drive.log).vehicle

@@ -163,8 +163,8 @@ def test_a_recorded_steering_that_freezes_is_named(shared_dir):
     """The steering repeats one value for the last 2 s, while the car comes out of a bend at 17 m/s."""
     (drive,) = (d for d in PEER_DRIVES if d.log == "stanford_wet_1.mcap")
     folder = shared_dir / "data" / "drives"
-    car = Car(vehicle_of(drive, folder))
-    with read_drive(folder / drive.log, car, mapping_of(drive, folder)) as opened:
+    car = Car(vehicle_of(drive))
+    with read_drive(folder / drive.log, car, mapping_of(drive)) as opened:
         (change,) = opened.whole().changes
     assert (change.sensor, change.kind) == ("steer_rad", "stuck")
     assert change.end_ns - change.start_ns == pytest.approx(1.98e9, abs=0.1e9)
