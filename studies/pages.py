@@ -7,7 +7,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,12 @@ def write(path: Path, text: str) -> None:
 def read_json(path: Path) -> Any:
     """Return the document of a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+def paragraphs(path: Path) -> Iterator[list[str]]:
+    """Yield the lines of each paragraph of a text file; lines that begin with # are comments."""
+    text = re.sub(r"(?m)^#.*\n", "", path.read_text(encoding="utf-8"))
+    yield from map(str.splitlines, re.split(r"\n\n+", text.strip()))
 
 
 def write_json(path: Path, document: object) -> None:

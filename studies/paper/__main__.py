@@ -7,14 +7,13 @@ The constants that the paper leaves open come from ``python -m studies.paper.con
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 from pathlib import Path
 
 from pdhef_logtool.car.car import Car
 from studies.gates.tool import Tool
-from studies.pages import ROOT, page_options, write
+from studies.pages import ROOT, page_options, read_json, write, write_json
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
 from studies.paper.page import PAGE_FIGURES, write_page
@@ -26,7 +25,7 @@ STORED = ("results.json", "constants.json")
 
 def render(results: Path, docs: Path) -> None:
     """Write the page from the stored results and figures of a folder."""
-    stored, constants = (json.loads((results / n).read_text(encoding="utf-8")) for n in STORED)
+    stored, constants = (read_json(results / name) for name in STORED)
     (docs / "paper").mkdir(parents=True, exist_ok=True)
     for name in PAGE_FIGURES:
         shutil.copyfile(results / name, docs / "paper" / name)
@@ -42,7 +41,7 @@ def main() -> int:
         seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + given.noise_seeds)
         results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)
         draw(results, given.results)
-        write(given.results / STORED[0], json.dumps(document(results), indent=1, allow_nan=False) + "\n")
+        write_json(given.results / STORED[0], document(results))
     render(given.results, given.out)
     return 0
 

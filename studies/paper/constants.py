@@ -11,7 +11,6 @@ the chosen point, on these drives and on scenarios A and B, which have no part i
 from __future__ import annotations
 
 import itertools
-import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, nominal_filter
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from studies.defaults.paper_drives import plan_drives
-from studies.pages import RESULTS, options, write
+from studies.pages import RESULTS, options, write_json
 from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, as_logged, on_the_road, paper_network
 from truthsim.drive import Drive, simulate_drive
 
@@ -151,7 +150,7 @@ def main() -> int:
                   "errors_deg": {title: goal(START) for title, goal in goals.items()}},
                  *sensitivity(chosen, goals)],
     }  # fmt: skip
-    write(arguments.output, json.dumps(document, indent=1) + "\n")
+    write_json(arguments.output, document)
     return 0
 
 

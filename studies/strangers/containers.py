@@ -15,6 +15,7 @@ from typing import Any
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from studies.mcap_logs import Message, messages, write_log
+from studies.pages import paragraphs
 from studies.strangers import buses, tables
 from studies.strangers.cars import Topic as Topic
 
@@ -33,9 +34,8 @@ def _store(ros1: bool) -> Any:
 @lru_cache(maxsize=1)
 def shapes() -> dict[str, str]:
     """Return the definition, with comments, of every type in ``shapes.txt``."""
-    text = (Path(__file__).parent / "shapes.txt").read_text(encoding="utf-8")
-    paragraphs = map(str.splitlines, re.split(r"\n\n+", re.sub(r"(?m)^#.*\n", "", text).strip()))
-    return {name: "".join(_lines(*line.partition("#")) for line in lines) for name, *lines in paragraphs}
+    types = paragraphs(Path(__file__).with_name("shapes.txt"))
+    return {name: "".join(_lines(*line.partition("#")) for line in lines) for name, *lines in types}
 
 
 def _lines(code: str, sign: str, comment: str) -> str:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
+from studies.pages import paragraphs
 from studies.strangers import recordings
 from studies.strangers.cars import Car, Series, drive
 from studies.strangers.containers import Topic
@@ -58,9 +59,7 @@ class Columns(dict[str, Any]):
 
 def layouts(*groups: str) -> Iterator[Recording]:
     """Yield the logs of some groups, by default all."""
-    text = Path(__file__).with_name("layouts.txt").read_text(encoding="utf-8")
-    for paragraph in re.split(r"\n\n+", re.sub(r"(?m)^#.*\n", "", text).strip()):
-        head, what, page, *lines = paragraph.splitlines()
+    for head, what, page, *lines in paragraphs(Path(__file__).with_name("layouts.txt")):
         name, group, container, kind = head.split()
         if groups and group not in groups:
             continue
