@@ -36,7 +36,7 @@ from pdhef_logtool.estimators.vehicle_model import VY
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car, physics_filter
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
-from pdhef_logtool.model.priors import prior_variations
+from pdhef_logtool.model.priors import coefficients, prior_variations
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.records.signals import SIGNAL_COLUMNS, FloatArray, IntArray, Signals
@@ -51,6 +51,8 @@ OWN_SHARE = 0.5
 #: Standard deviations of the parameters of an identified car over those of a vehicle file: 8 % of the stiffness of an
 #: axle, which changes of the load cause.
 IDENTIFIED_SHARE = 0.16
+#: 1-sigma of the crossfall of a road, which the filter cannot tell from a bias of a_y; roads fall by 2 to 2.5 %.
+CROSSFALL_STD_RAD = 0.02
 #: Smallest χ of parameters from earlier drives: later driving may fit less.
 EARLIER_ERROR_SCALE = 2.0
 #: Longest step of the filters whose differences count: parameters act slowly.
@@ -172,7 +174,8 @@ def _of_file(car: Car, share: float, *, use_speed: bool) -> Interval:
     vehicles = (physics.vehicle, *prior_variations(physics.vehicle, share=share))
     bare = physics.vehicle.physics.model_copy(update=dict.fromkeys(CURES, False))
     filters = tuple(replace(physics, vehicle=v.model_copy(update={"physics": bare})) for v in vehicles)
-    return Interval(filters, car.vehicle)
+    car_std_rad = CROSSFALL_STD_RAD / coefficients(physics.vehicle)[1]
+    return Interval(filters, car.vehicle, car_std_rad=car_std_rad / OWN_SHARE)
 
 
 def _in_blocks(signals: Signals) -> tuple[Signals, int, IntArray]:
