@@ -32,7 +32,7 @@ from pdhef_logtool.logs.table_file import LogFile, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
-from tests.mcap_files import copied, mcap_writer
+from studies import mcap_logs
 
 T0 = 1_700_000_000_000_000_000
 VALUES = np.arange(40) * 0.25
@@ -176,13 +176,14 @@ LARGE = b'{"size": %d, "pixels": "' + b"x" * 20_000 + b'"}'
 @pytest.fixture
 def mixed(sample_logs_dir: Path, tmp_path: Path) -> Path:
     """A drive with an image after every 50th message, in the same chunks."""
-    path = tmp_path / "mixed.mcap"
-    with mcap_writer(path, profile="ros2", chunk_size=400_000) as writer:
-        image = writer.register_channel("/camera", "json", 0)
-        for i, message in enumerate(copied(sample_logs_dir / "dlc.mcap", writer)):
+
+    def with_images() -> Iterator[mcap_logs.Message]:
+        for i, message in enumerate(mcap_logs.messages(sample_logs_dir / "dlc.mcap")):
+            yield message
             if i % 50 == 0:
-                writer.add_message(image, message.log_time, LARGE % i, message.publish_time)
-    return path
+                yield message._replace(topic="/camera", data=LARGE % i, encoding="json", schema=("", "", b""))
+
+    return mcap_logs.write_log(tmp_path / "mixed.mcap", with_images(), "ros2", chunk_size=400_000)
 
 
 def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: pytest.MonkeyPatch) -> None:

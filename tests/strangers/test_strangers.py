@@ -15,13 +15,13 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.can_frames import decoded_frames
 from pdhef_logtool.records.signals import Channel
+from studies.mcap_logs import messages, write_log
 from studies.strangers.__main__ import score_recording
 from studies.strangers.cars import Series, drive
 from studies.strangers.containers import Topic, write
 from studies.strangers.layouts import layout
 from studies.strangers.recordings import answers, imu, road_car, scalar
 from studies.strangers.scoring import ANSWERS, agrees, other_recording
-from tests.mcap_files import copied, mcap_writer
 
 _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
 _WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
@@ -127,10 +127,8 @@ def _topics(names: tuple[str, str]) -> list[Topic]:
 
 def _without_attachments(source: Path, target: Path, metadata: dict[str, bytes]) -> None:
     """Copy the messages of an MCAP, with DBC texts as a metadata record."""
-    with mcap_writer(target) as writer:
-        list(copied(source, writer))
-        if metadata:
-            writer.add_metadata("dbc", {name: text.decode() for name, text in metadata.items()})
+    texts = {name: text.decode() for name, text in metadata.items()}
+    write_log(target, messages(source), end=lambda writer: writer.add_metadata("dbc", texts) if texts else None)
 
 
 @pytest.mark.parametrize("place", ["attachments", "metadata", "given"])

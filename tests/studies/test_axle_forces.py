@@ -54,16 +54,16 @@ def test_axle_forces_follow_from_newton_and_euler() -> None:
     r = 0.1 * np.arange(n) * 0.01
     truth = make_track("t", stamps, vx_m_s=20 * full, vy_m_s=-0.4 * full, yaw_rate_rad_s=r, ay_m_s2=3.0 * full)
     signals = replace(fit_drive(3.99).signals, stamps_ns=stamps, steer_rad=0.2 * full)
-    samples = axle_samples([FitDrive("t", signals, truth)] * 2, CAR)
-    assert samples.front_force_n.size == 2 * n
+    (front_slip, front_force), (rear_slip, rear_force) = axle_samples([FitDrive("t", signals, truth)] * 2, CAR).values()
+    assert front_force.size == 2 * n
     at = slice(100, 300)  # away from the ends of the smoothing
     lf, lr, m, iz = 1.16, 1.71, 1440.0, 1523.0
     # Newton: F_f cos δ + F_r = m a_y. Euler: l_f F_f cos δ − l_r F_r = I_z ṙ.
-    forward, rear = samples.front_force_n[at] * math.cos(0.2), samples.rear_force_n[at]
+    forward, rear = front_force[at] * math.cos(0.2), rear_force[at]
     np.testing.assert_allclose(forward + rear, m * 3.0, rtol=1e-9)
     np.testing.assert_allclose(lf * forward - lr * rear, iz * 0.1, rtol=1e-4)
-    np.testing.assert_allclose(samples.front_slip_rad[at], 0.2 - np.arctan((-0.4 + lf * r[at]) / 20), atol=1e-9)
-    np.testing.assert_allclose(samples.rear_slip_rad[at], -np.arctan((-0.4 - lr * r[at]) / 20), atol=1e-9)
+    np.testing.assert_allclose(front_slip[at], 0.2 - np.arctan((-0.4 + lf * r[at]) / 20), atol=1e-9)
+    np.testing.assert_allclose(rear_slip[at], -np.arctan((-0.4 - lr * r[at]) / 20), atol=1e-9)
 
 
 def test_the_curve_is_the_magic_formula() -> None:
