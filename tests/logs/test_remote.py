@@ -6,6 +6,7 @@ import os
 import random
 import socket
 from contextlib import closing
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +15,20 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from pdhef_logtool import Car, ReadOptions, read_drive
 from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.byte_source import SourceError
-from pdhef_logtool.logs.container import Wanted
+from pdhef_logtool.logs.container import ChannelRecord, RawMessage, Wanted, block_of
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import log_metadata, open_log
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, RedirectGuard, is_public
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, LogError, UsageError
-from tests.camera_log import with_camera, write_apart
 from tests.command_line import called
 from tests.counting_server import CountingServer, Fault, cutting, serving, stalling, status
 
@@ -90,9 +92,33 @@ def test_any_split_gives_the_same_bytes_and_none_twice(reads, order):
 # -------------------------------------------------------------------------------------------------- the same log
 
 
+_CAMERA = ChannelRecord(-1, "/camera", "cdr", "sensor_msgs/msg/CompressedImage", "ros2msg", b"uint8[] data")
+_SLICE_NS, _IMAGE_NS, _IMAGE_BYTES = 2_000_000_000, 200_000_000, 20_000
+
+
+def with_camera(source: Path, target: Path) -> Path:
+    """Copy an MCAP in chunks of 2 s, and behind each write as long a chunk of images."""
+    noise, head = random.Random(1), b"\0\1\0\0" + _IMAGE_BYTES.to_bytes(4, "little")
+    with source.open("rb") as file, McapLogWriter(target) as writer:
+        camera, ids = writer.add_channel(_CAMERA), {}
+        for _, rows in groupby(make_reader(file).iter_messages(), lambda row: row[2].log_time // _SLICE_NS):
+            sensors = []
+            for schema, channel, message in rows:
+                if channel.id not in ids:
+                    record = (channel.topic, "cdr", schema.name, schema.encoding, schema.data)
+                    ids[channel.id] = writer.add_channel(ChannelRecord(-1, *record))
+                at = message.log_time
+                sensors.append(RawMessage(ids[channel.id], at, at, 0, message.data))
+            start_ns = sensors[0].log_time_ns
+            stamps = range(start_ns, start_ns + _SLICE_NS, _IMAGE_NS)
+            images = [RawMessage(camera, at, at, 0, head + noise.randbytes(_IMAGE_BYTES)) for at in stamps]
+            for chunk in (sensors, images):
+                writer.write([], [block_of(chunk)])
+    return target
+
+
 def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(tmp_path, sample_logs_dir, saloon):
-    file = tmp_path / "apart.mcap"
-    write_apart(file, with_camera(sample_logs_dir / "dlc.mcap", 2_000_000_000))
+    file = with_camera(sample_logs_dir / "dlc.mcap", tmp_path / "apart.mcap")
     with serving(**{file.name: file.read_bytes()}) as server:
         hashes = []
         for place in (_place(server, file.name), file):
@@ -237,8 +263,7 @@ def test_a_server_that_is_busy_or_cuts_for_a_while_costs_time_only(served, sampl
 
 @pytest.mark.parametrize("without_headers", [(), ("ETag",), ("ETag", "Last-Modified")])
 def test_a_changed_object_is_an_error(tmp_path, sample_logs_dir, without_headers):
-    write_apart(tmp_path / "apart.mcap", with_camera(sample_logs_dir / "dlc.mcap", 2_000_000_000))
-    data = (tmp_path / "apart.mcap").read_bytes()
+    data = with_camera(sample_logs_dir / "dlc.mcap", tmp_path / "apart.mcap").read_bytes()
     with serving(**{"apart.mcap": data}) as server:
         server.without = frozenset(without_headers)
         with closing(open_log(_place(server, "apart.mcap"), wanted=NOTHING_YET)) as log:
