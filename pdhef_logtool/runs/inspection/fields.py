@@ -8,8 +8,6 @@ from contextlib import closing
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.text import Text
 
 from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.logs.container import Wanted
@@ -19,8 +17,7 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.runs.inspection.rendering import table_of
-from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed, number_text
+from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed
 
 #: Arrays inside of arrays, or of structs.
 INNER_ARRAY = re.compile(r"\[\].")
@@ -92,18 +89,3 @@ def _report(path: str, kind: str, values: Sequence[FloatArray]) -> dict[str, Any
     with np.errstate(over="ignore"):
         figures = (float(f(every)) if every.size else np.nan for f in (np.min, np.mean, np.max))
         return {"path": path, "type": kind, **dict(zip(_STATISTICS, figures, strict=True))}
-
-
-def render_fields(report: Mapping[str, Any], console: Console) -> None:
-    """Print one table per topic, for a terminal of 80 columns or more."""
-    console.print(Text(report["path"], "bold"), soft_wrap=True)
-    part = "all" if report["whole"] else "pieces"
-    console.print(f"Values over {part} of the log, {report['seconds']:.0f} s, in recorded units.")
-    for topic in report["topics"]:
-        title, fields = f"{topic['name']} ({topic['type']})", topic["fields"]
-        if fields and not topic["reason"]:
-            rows = [(Text(f["path"]), f["type"], *(number_text(f[k]) for k in _STATISTICS)) for f in fields]
-            title = f"{title}, {number_text(topic['rate_hz'])} Hz"
-            console.print(table_of(title, ("field", "type", "min", "mean", "max"), rows, words=2))
-        else:
-            console.print(Text(f"{title}: {topic['reason']}"))
