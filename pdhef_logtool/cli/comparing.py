@@ -114,4 +114,4 @@ def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
         out.print(console.table(*heads, rows=texts))
         return
     for row in texts:  # too many columns: a line each
-        out.print(console.named_lines(dict(zip(rows.columns, row, strict=True))), "")
+        out.print(console.named_lines(zip(rows.columns, row, strict=True)), "")

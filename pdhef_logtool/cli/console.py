@@ -35,6 +35,8 @@ _verbose = False
 as_json = False
 #: Interval between lines of progress without a terminal, s.
 PROGRESS_S = 30.0
+#: Line break within a cell of a table; printable texts contain no such character.
+BREAK = "\v"
 #: A line on stderr is an error or a warning of several parts.
 _MOST_SIGNS = 5000
 
@@ -74,7 +76,7 @@ def table(*heads: str, rows: Iterable[Iterable[Any]] = (), title: str = "") -> T
         text = head.lstrip("<>!")
         signs = head.removesuffix(text)
         made.add_column(
-            Text.from_markup(text, emoji=False),
+            Text.from_markup(text.replace(BREAK, "\n"), emoji=False),
             justify="right" if ">" in signs else "left",
             overflow="fold" if "<" in signs else "ellipsis",
             no_wrap="!" in signs,
@@ -84,14 +86,14 @@ def table(*heads: str, rows: Iterable[Iterable[Any]] = (), title: str = "") -> T
     return made
 
 
-def named_lines(texts: Mapping[str, str | Text], *, style: str = "") -> Table:
+def named_lines(texts: Iterable[tuple[str | Text, str | Text]]) -> Table:
     """Return a line per text, after its name."""
     from rich.table import Table
 
     lines = Table.grid(padding=(0, 2, 0, 0))
-    lines.add_column(no_wrap=True, style=style)
+    lines.add_column(no_wrap=True)
     lines.add_column(overflow="fold")
-    for name, text in texts.items():
+    for name, text in texts:
         lines.add_row(name, text)
     return lines
 

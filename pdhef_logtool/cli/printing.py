@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from pdhef_logtool.cli.console import cell, named_lines, print_indented, table
+from pdhef_logtool.cli.console import BREAK, cell, named_lines, print_indented, table
 from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_steps
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import read_unit
@@ -23,16 +23,14 @@ from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.records.signals import is_dated
 from pdhef_logtool.results.run_report import lines_of
-from pdhef_logtool.results.selected_estimate import degrees, figures_of, is_worse, result_of
+from pdhef_logtool.results.selected_estimate import assumptions_of, degrees, figures_of, is_worse, result_of
 from pdhef_logtool.runs.inspection.report import number_text
 from pdhef_logtool.storage.templates import environment
 
-#: Line break within a cell of a table; fields contain no such character (:mod:`~pdhef_logtool.records.printable`).
-BREAK = "\v"
 #: Styles of the outcomes of requirements.
 _STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
 #: Functions and constants of all templates.
-_OF_RESULTS = degrees, figures_of, is_worse, lines_of, joint_notes, next_steps, result_of
+_OF_RESULTS = assumptions_of, degrees, figures_of, is_worse, lines_of, joint_notes, next_steps, result_of
 _FUNCTIONS = *_OF_RESULTS, cell, gathered, is_dated, listed, math.expm1, math.isfinite, read_unit, shown, shown_time
 _NAMED = {"BREAK": BREAK, "DEGREES": DEGREES, "STYLES": _STYLES, "number": number_text}
 
@@ -54,9 +52,9 @@ def print_template(name: str, console: Console, **fields: Any) -> None:
     """
     text, title = _environment().get_template(f"{name}.txt").render(fields), ""
     for kind, block in groupby(text.split("\n")[:-1], lambda line: ":" if line.startswith(":") else "\t" in line):
-        lines = [line.replace(BREAK, "\n").split("\t") for line in block]
+        lines = [line.split("\t") for line in block]
         if kind == ":":
-            console.print(named_lines({head[1:]: _text(words) for head, words in lines}, style="bold"))
+            console.print(named_lines([(_text(name[1:]), _text(words)) for name, words in lines]))
         elif kind:
             console.print(table(*lines[0], rows=(map(_text, row) for row in lines[1:]), title=title))
         else:
@@ -76,4 +74,4 @@ def _print_line(line: str, console: Console) -> str:
 
 
 def _text(markup: str) -> Text:
-    return Text.from_markup(markup, emoji=False)
+    return Text.from_markup(markup.replace(BREAK, "\n"), emoji=False)

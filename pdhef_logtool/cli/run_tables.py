@@ -7,17 +7,16 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from rich.console import Console
+from rich.markup import escape
 from rich.measure import Measurement
-from rich.table import Table
 from rich.text import Text
 
-from pdhef_logtool.cli.console import cell, named_lines, print_indented, table
+from pdhef_logtool.cli.console import BREAK, cell, table
 from pdhef_logtool.cli.printing import print_template
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.printable import all_printable
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
-from pdhef_logtool.results.run_report import lines_of
 from pdhef_logtool.results.selected_estimate import assumptions_of, figures_of
 from pdhef_logtool.runs.run_result import RunResult
 
@@ -34,14 +33,6 @@ _LEAVE_LAST = """
     ay_m_s2.all.rmse state.all.nis_ratio sideslip_rad.all.lag_s sideslip_rad.linear.rmse yaw_rate_rad_s.all.rmse
     sideslip_rad.nonlinear.rmse sideslip_rad.all.rmse sideslip_rad.all.coverage95
 """.split()  # noqa: SIM905 - a list with quotes is longer
-_TEXTS = {
-    "result": "Result",
-    "consistency": "Consistency",
-    "band": "95 % CI",
-    "hindsight": "In hindsight",
-    "assumed": "Assumed",
-    "next": "Then",
-}
 
 
 def render_run(result: RunResult, console: Console) -> None:
@@ -58,7 +49,8 @@ def render_run(result: RunResult, console: Console) -> None:
         if report is None:
             console.print(Text.assemble((log_result.outcome.log, "bold"), f"  {log_result.outcome.outcome}\n"))
         else:
-            _render_log(report, console, assumed if is_joint else None)
+            of_log = {"shown": _shown(report), "table": _table(report, console)}
+            print_template("log", console, r=report, common=assumed if is_joint else None, **of_log)
     counts = {
         "logs": len(result.results),
         "failed": len(failed),
@@ -82,50 +74,6 @@ def _page_of(output: Path | str | None, labels: Sequence[str] = ()) -> Path | No
     return next((page for folder in (*folders, Path(output)) if (page := folder / PAGE_FILE).is_file()), None)
 
 
-def _render_log(report: _Report, console: Console, common: Sequence[str] | None = None) -> None:
-    """Print the log of a run with one log.
-
-    ``common``: assumptions of several logs; a table has their figures, and only what needs attention is printed.
-    """
-    texts, is_named = _texts(report), report["answer"] is not None and report["answer"]["named"]
-    if common is None:
-        later = _clauses(texts, "next")[1:]  # the head contains the first one
-        shown = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
-        shown |= {"next": "; ".join(later)} if later else {}
-        lines = lines_of("checks", report, True)
-    else:
-        is_scored = figures_of(report).get((report["selected_estimate"], "sideslip_rad", "all", "rmse")) is not None
-        rest = [clause for clause in assumptions_of(report) if clause not in common]
-        shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
-        shown |= {"assumed": "; ".join(rest)} if rest else {}
-        lines = [*lines_of("checks", report, False), *lines_of("losses", report, False)]
-        if not (shown or lines or is_named):
-            return
-    log, has_table = report["log"], common is None or is_named
-    about = f"  {log['kind']}, {log['duration_s']:.1f} s" if has_table else ""
-    console.print(Text.assemble((log["name"], "bold"), about))
-    for line in lines:
-        print_indented(line, console)
-    if shown:
-        console.print(named_lines({f"  {_TEXTS[key]}": text for key, text in shown.items()}))
-    if has_table:
-        console.print(_table(report, console))
-    for line in lines_of("below", report, _shown(report)) if common is None else ():
-        print_indented(line, console)
-    console.print()
-
-
-def _texts(report: _Report) -> dict[str, str]:
-    """Return the texts of the selected estimate in order; empty without an estimate."""
-    texts = (report["answer"] or {"texts": {}})["texts"]
-    return {key: texts[key] for key in _TEXTS if texts.get(key)}
-
-
-def _clauses(texts: Mapping[str, str], key: str) -> list[str]:
-    """Return the independent clauses of a text."""
-    return texts[key].split("; ") if texts.get(key) else []
-
-
 def _shown(report: _Report) -> list[Mapping[str, Any]]:
     """Return the displayed estimators: the selected estimate first, estimators that are not causal last."""
     answer = report["answer"]
@@ -135,8 +83,8 @@ def _shown(report: _Report) -> list[Mapping[str, Any]]:
     return sorted(ran.values(), key=lambda e: not e["causal"])
 
 
-def _table(report: _Report, console: Console) -> Table:
-    """Return the table of the displayed estimators, with as many columns as fit the terminal."""
+def _table(report: _Report, console: Console) -> list[list[str]]:
+    """Return heads and rows of the table of the displayed estimators, with as many columns as fit the terminal."""
     values, truth = figures_of(report), report["truth"]
     shown = [e for e in _shown(report) if any(name == e["name"] for name, *_ in values)]  # --keep metrics has less
     asked = _columns(truth=truth["available"], main=report["selected_estimate"] or "").items()
@@ -144,16 +92,15 @@ def _table(report: _Report, console: Console) -> Table:
     others = [".".join(k) for k, _ in columns if ".".join(k) not in _LEAVE_LAST] if truth["available"] else []
     for leave in (None, *others, *_LEAVE_LAST[:-2]):
         columns = [(k, c) for k, c in columns if ".".join(k) != leave]
-        heads = (f">{head}" + (" †" if k[0] in truth["not_independent"] else "") for k, (head, *_) in columns)
-        made = table("\nestimator", *heads)
-        for column in made.columns:
-            column.no_wrap = True
+        heads = [f"!>{head}" + (" †" if k[0] in truth["not_independent"] else "") for k, (head, *_) in columns]
+        rows = [[f"!{BREAK}estimator", *heads]]
         for e in shown:
             figures = (cell(values.get((e["name"], *k)), factor, digits) for k, (_, factor, digits) in columns)
-            made.add_row(e["name"] + ("" if e["causal"] else " *"), *figures)
+            rows.append([e["name"] + ("" if e["causal"] else " *"), *figures])
+        made = table(*map(escape, rows[0]), rows=rows[1:])
         if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= console.width:
             break
-    return made
+    return rows
 
 
 def _columns(*, truth: bool, main: str) -> dict[_Key, _Column]:
@@ -165,13 +112,13 @@ def _columns(*, truth: bool, main: str) -> dict[_Key, _Column]:
         label = metrics[name].head(signal)
         if not top and not unit:  # in two lines, as the others
             top, _, label = label.rpartition(" ")
-        columns[signal, segment, key or name] = head or f"{top}\n{label}", factor, metrics[name].digits
+        columns[signal, segment, key or name] = head or f"{top}{BREAK}{label}", factor, metrics[name].digits
 
     if not truth:
-        add("reference_rms", "sideslip_rad", head="sideslip: RMS\nfrom reference °")
-        add("disagreement_rms", "sideslip_rad", head=f"sideslip: RMS\nfrom {main} °", key="from_main")
+        add("reference_rms", "sideslip_rad", head=f"sideslip: RMS{BREAK}from reference °")
+        add("disagreement_rms", "sideslip_rad", head=f"sideslip: RMS{BREAK}from {main} °", key="from_main")
         add("d2", "vy_m_s", top="lateral kin.")
-        columns[_NIS_RATIO] = "innovations\nNIS/dof", 1.0, 2
+        columns[_NIS_RATIO] = f"innovations{BREAK}NIS/dof", 1.0, 2
     asked = [(signal, metric) for metric in metrics.values() for signal in metric.terminal]
     signals = [*dict.fromkeys(signal for signal, _ in asked)]
     topped = {"state"}
@@ -181,5 +128,5 @@ def _columns(*, truth: bool, main: str) -> dict[_Key, _Column]:
     if truth:
         for segment in ("linear", "nonlinear"):
             add("rmse", "sideslip_rad", segment, top=segment)
-        columns[_NIS_RATIO] = "\nNIS/dof", 1.0, 2
+        columns[_NIS_RATIO] = f"{BREAK}NIS/dof", 1.0, 2
     return columns
