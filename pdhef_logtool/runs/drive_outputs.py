@@ -18,6 +18,7 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, all_specs
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.records.signals import NS_PER_S
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.results import opened_run
 from pdhef_logtool.results.no_position import topics_with_position, without_pose
@@ -125,7 +126,7 @@ class DriveOutputs:
         """Return the first stamp from which the rows of each causal estimator depend on past samples only."""
         drive = self._run.drive
         after_s = drive.plan.decided_s if drive.causal_from_s is None else drive.causal_from_s
-        first_ns = drive.plan.start_ns + round(after_s * 1e9)
+        first_ns = drive.plan.start_ns + round(after_s * NS_PER_S)
         return {e.name: first_ns for e in self._run.estimators if e.causal and not drive.not_causal}
 
     def _write_layouts(self, colours: dict[str, int]) -> None:

@@ -42,6 +42,7 @@ from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     ESTIMATE_UNITS,
+    NS_PER_S,
     TRUTH_UNITS,
     WHEELS,
     BoolArray,
@@ -360,7 +361,7 @@ def read_estimate(
             continue
         topic = columns[s.read_topic]
         stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
-        stamps = stamps - np.int64(round(s.latency_s * 1e9))
+        stamps = stamps - np.int64(round(s.latency_s * NS_PER_S))
         kept = _in_order(stamps, topic.log_time_ns, usable)
         values, low, high = si_values(topic, s)[kept], s.valid_min, s.valid_max
         use = np.isfinite(values) & (low is None or values >= low) & (high is None or values <= high)

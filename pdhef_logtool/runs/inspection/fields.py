@@ -16,7 +16,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray
 from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed
 
 #: Arrays inside of arrays, or of structs.
@@ -47,8 +47,8 @@ def fields_of_log(
             names = ", ".join(t.name for t in log.topics) or "none"
             raise UsageError(expected="a topic of the log", got=repr(topic), where=str(path), remedy=f"topics: {names}")
         pieces = Pieces(log)
-        seconds = min(log.end_ns - log.start_ns, len(pieces.starts) * PIECE_NS) * 1e-9
-        whole = log.end_ns - log.start_ns <= seconds * 1e9 + 1
+        seconds = min(log.end_ns - log.start_ns, len(pieces.starts) * PIECE_NS) * S_PER_NS
+        whole = log.end_ns - log.start_ns <= seconds * NS_PER_S + 1
         reports = [_topic_fields(log, pieces, t) for t in topics]
         return {"path": str(path), "seconds": seconds, "whole": whole, "topics": reports}
 

@@ -33,7 +33,7 @@ from pdhef_logtool.mapping.mapping_file import mapping_of, mapping_to_toml, miss
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError
 from pdhef_logtool.records.printable import all_printable
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import S_PER_NS, SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, IntArray, Loss
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
@@ -61,7 +61,7 @@ class Steps:
     @classmethod
     def of(cls, parts: Sequence[IntArray]) -> Steps:
         """Return the steps within each part, int64 [K] ascending; a step from one part to the next is left out."""
-        steps = [np.diff(part) * 1e-9 for part in parts]
+        steps = [np.diff(part) * S_PER_NS for part in parts]
         starts = [part[:-1] for part in parts]
         return cls(sum(map(len, parts)), np.concatenate([np.empty(0), *steps]), np.concatenate([_NONE, *starts]))
 
@@ -95,7 +95,7 @@ class Steps:
         i = int(np.argmax(self.steps_s)) if self.steps_s.shape[0] else 0
         gap = math.nan, math.nan
         if (self.steps_s[i : i + 1] > above_s).any():
-            gap = float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * 1e-9
+            gap = float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * S_PER_NS
         return dict(zip(("largest_gap_s", "largest_gap_at_s"), gap, strict=True))
 
     @property
@@ -252,7 +252,7 @@ class Inspection:
     @property
     def duration_s(self) -> float:
         """Length of the log."""
-        return (self.end_ns - self.start_ns) * 1e-9
+        return (self.end_ns - self.start_ns) * S_PER_NS
 
     @property
     def exit_code(self) -> int:
@@ -390,9 +390,9 @@ def _topic_reports(
 
 
 def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log: DriveLog) -> TopicReport:
-    log_s = (log.end_ns - log.start_ns) * 1e-9
+    log_s = (log.end_ns - log.start_ns) * S_PER_NS
     numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
-    delays = np.concatenate([np.empty(0), *((c.log_time_ns - c.publish_time_ns) * 1e-9 for c in stamps)])
+    delays = np.concatenate([np.empty(0), *((c.log_time_ns - c.publish_time_ns) * S_PER_NS for c in stamps)])
     median, late = np.quantile(delays, [0.5, 0.95]).tolist() if delays.size else (math.nan, math.nan)
     return TopicReport(
         name=topic.name,
