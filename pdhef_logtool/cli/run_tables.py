@@ -9,7 +9,6 @@ from typing import Any, TypeAlias
 from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
-from rich.text import Text
 
 from pdhef_logtool.cli.console import BREAK, cell, table
 from pdhef_logtool.cli.printing import print_template
@@ -37,27 +36,15 @@ _LEAVE_LAST = """
 
 def render_run(result: RunResult, console: Console) -> None:
     """Print the selected estimate of each log, or one table for several logs, and the location of the outputs."""
-    reports_by_log = [(r, all_printable(r.report)) for r in result.results]
-    reports = [report for _, report in reports_by_log if report is not None]
-    failed = [r.outcome.log for r, report in reports_by_log if report is None]
-    is_joint = len(reports) > 1 and all(report["answer"] for report in reports)
+    logs = [(r.outcome, all_printable(r.report)) for r in result.results]
+    reports = [report for _, report in logs if report is not None]
     first, *others = [assumptions_of(report) for report in reports] or [[]]
     assumed = [clause for clause in first if all(clause in clauses for clauses in others)]
     plan = None if result.requirements is None else result.requirements.to_dict()
-    print_template("run", console, reports=reports, failed=failed, assumed=assumed, plan=plan, joint=is_joint)
-    for log_result, report in reports_by_log:
-        if report is None:
-            console.print(Text.assemble((log_result.outcome.log, "bold"), f"  {log_result.outcome.outcome}\n"))
-        else:
-            of_log = {"shown": _shown(report), "table": _table(report, console)}
-            print_template("log", console, r=report, common=assumed if is_joint else None, **of_log)
-    counts = {
-        "logs": len(result.results),
-        "failed": len(failed),
-        "lost": sum(bool(r.outcome.lost) for r in result.results),
-    }
-    page = _page_of(result.place, [r.outcome.log for r in result.results])
-    print_template("run_end", console, plan=plan, **counts, output=result.place, page=page)
+    tables = [None if report is None else (_shown(report), _table(report, console)) for _, report in logs]
+    page = _page_of(result.place, [outcome.log for outcome, _ in logs])
+    of_run = {"assumed": assumed, "plan": plan, "output": result.place, "page": page}
+    print_template("run", console, logs=logs, reports=reports, tables=tables, **of_run)
 
 
 def render_fleet(summary: Mapping[str, Any], console: Console) -> None:

@@ -342,11 +342,6 @@ def _times(requirement: Requirement, bounded: statistics.Bounded) -> float:
     return times if times > _MOST_TIMES else math.ceil(10.0 * times) / 10.0
 
 
-def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
-    """Return whether a verdict is a FAIL, or with ``strict`` an INCONCLUSIVE."""
-    return any(v.outcome == "FAIL" or (strict and v.outcome == "INCONCLUSIVE") for v in verdicts)
-
-
 def joint_notes(plan: Mapping[str, Any]) -> list[str]:
     """Return each note of a document's requirements once, with the ids of its requirements unless it applies to all."""
     of_all = plan["requirements"]

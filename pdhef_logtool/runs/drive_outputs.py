@@ -227,11 +227,10 @@ def check_places(
     cars: Sequence[Path | None] = (),
 ) -> None:
     """Refuse to write over an input; raises UsageError."""
+    files, folders = [*filter(None, [junit])], list[Path]()
+    if output is not None:
+        folders = [output / log_place(i.stem) for i in inputs]
+        files += [output / name for name in (opened_run.METRICS_FILE, RUN_FILE, opened_run.PAGE_FILE)]
+        files += [folder / name for folder in folders for name in LOG_FILES]
     can = () if mapping is None else mapping.dbc
-    files = (
-        [] if output is None else [output / name for name in (opened_run.METRICS_FILE, RUN_FILE, opened_run.PAGE_FILE)]
-    )
-    folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
-    files += [folder / name for folder in folders for name in LOG_FILES]
-    read = [*(i.local for i in inputs), *config.files, *cars, *can]
-    check_no_input(read, files if junit is None else [*files, junit], folders)
+    check_no_input([*(i.local for i in inputs), *config.files, *cars, *can], files, folders)
