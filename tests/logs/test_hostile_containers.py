@@ -20,7 +20,7 @@ from pdhef_logtool.logs.container import SpanDamageError
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
-from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.errors import EXIT_PARTIAL, LogError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log
 from tests.mcap_files import mcap_writer
@@ -76,7 +76,7 @@ def test_a_flipped_bit_in_a_chunk_without_indexes_is_a_loss_that_names_it(tmp_pa
     assert 0 < read == claimed < 2 * N
     assert (loss.kind, loss.start_ns, loss.end_ns, loss.count) == ("bad-chunk", first, last + 1, None)
     assert f"at byte {at}:" in loss.what
-    assert inspect_log(path).is_partial
+    assert inspect_log(path).exit_code == EXIT_PARTIAL
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,12 @@ from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdhef_logtool.cli.inspecting import render_inspection
 from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, clock_key, fit_clocks, read_signals
 from pdhef_logtool.mapping.clocks import apply_clock, fit_clock_line, why_unusable
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray
-from pdhef_logtool.runs.inspection import inspect_drive_log, render_inspection
+from pdhef_logtool.runs.inspection import inspect_drive_log
 from pdhef_logtool.runs.inspection.report import Steps
 from tests.command_line import rendered
 
