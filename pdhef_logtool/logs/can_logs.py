@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.can_decoding import ID_BITS, Frames
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.table_clocks import ascending_rows, placed
+from pdhef_logtool.logs.table_clocks import ascending_rows, placed, to_ns
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import NS_PER_S, IntArray, Loss
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
 _ROW = struct.Struct(f"{len(_PARTS)}i")
@@ -43,7 +43,7 @@ def _tables(
         remedy = "candump -l and candump -t a record times" * (kind == "candump")
         raise LogError(expected="CAN frames with times", got=got, where=file.name, remedy=remedy)
     widest = max(1, int(numbers[:, 1].max()))
-    file.limits.check_table(len(stamps) * (_ROW_BYTES + widest), file.size, f"{len(stamps)} frames")
+    file.check(len(stamps) * (_ROW_BYTES + widest), f"{len(stamps)} frames")
     rows = np.zeros((len(stamps), widest), np.uint8)
     rows[np.arange(widest) < numbers[:, 1:2]] = data
     order = np.argsort(stamps, kind="stable")
@@ -57,7 +57,7 @@ def _start_ns(year: int, month: int, day: int, hour: int, minute: int, second: i
         seconds = dt.datetime(year, month, day, hour, minute, second, micro, dt.UTC).timestamp()
     except ValueError:
         return 0
-    return round(seconds * 1e6) * 1000 if 0.0 < seconds < 4e9 else 0
+    return int(to_ns(seconds)) if 0.0 < seconds < CONSTANTS["can"]["last_date_s"] else 0
 
 
 # BLF: objects "LOBJ", most of them in compressed containers. An object may continue in the next container.
@@ -134,7 +134,7 @@ class _Blf:
         stored = self._data[start + _CONTAINER_HEAD : end]
         try:
             self._file.limits.check_unpacked(size, len(stored), place)
-            self._file.limits.check_table(self._unpacked + size, self._file.size, f"{place} and those before it")
+            self._file.check(self._unpacked + size, f"{place} and those before it")
             block = _unpacked(stored, size, is_cut=end == self._file.size) if method else stored
         except (ValueError, LogError, zlib.error) as error:
             kind, text = describe_damage(error)
@@ -244,7 +244,7 @@ _FD_FRAME = re.compile(
 )
 _FRAME_SHAPE = re.compile(rb"\d+\s+(?:\S+\s+[rt]x\s|errorframe)|canfd\s", re.I)
 #: A step back in time by more begins a measurement.
-_STEP_NS = 10**9
+_STEP_NS = NS_PER_S
 
 
 #: A frame: time in ns, data, and the numbers of ``_PARTS``.
@@ -327,7 +327,7 @@ class _Asc:
         if event is None:
             self._read_head(line.decode("ascii", "ignore"))
             return None
-        time_ns, text = round(float(event[1]) * 1e9), event[2].rstrip()
+        time_ns, text = round(float(event[1]) * NS_PER_S), event[2].rstrip()
         if self._begins_ns is None and not self._is_relative and time_ns < self._now_ns - _STEP_NS:
             self._begins_ns = 0
         if self._begins_ns is not None:
@@ -391,7 +391,7 @@ def _candump_frame(line: bytes, interfaces: dict[bytes, int]) -> _Frame | None:
         return None
     time, interface, identifier, remote, data, count, remote_too, listed = match.groups()
     whole, _, fraction = time.partition(b".")
-    stamp_ns = int(whole) * 10**9 if whole.isdigit() else int(np.datetime64(whole.decode(), "ns").astype(np.int64))
+    stamp_ns = int(whole) * NS_PER_S if whole.isdigit() else int(np.datetime64(whole.decode(), "ns").astype(np.int64))
     is_remote = bool(remote or remote_too)
     content = b"" if is_remote else bytes.fromhex((listed if data is None else data.replace(b".", b"")).decode())
     number, bus = int(identifier, 16), interfaces.setdefault(interface, len(interfaces))

@@ -27,11 +27,11 @@ from pdhef_logtool.logs.mdf_conversions import conversion_rule
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, ascending_rows, placed
 from pdhef_logtool.logs.table_columns import field_name, unique
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Loss
 
 _FRAMES = "CAN_DataFrame"
 _MDF, _CAN = CONSTANTS["mdf"], CONSTANTS["can"]
@@ -50,6 +50,8 @@ _NO_TIMES = numbered(_MDF["no_times"])
 
 # Blocks that are surveyed before asammdf opens a file.
 _FIRST = 64
+#: Heads of blocks: kind, and in version 4 the number of links. Link, or length of a block, of version 4.
+_HEAD_3, _HEAD, _LINK = struct.Struct("<2s2x"), struct.Struct("<2x2s12xQ"), struct.Struct("<Q")
 #: Places of the links that are followed, by kind of block; empty: all links of a list of data.
 _FOLLOWED, _FOLLOWED_3 = (
     {kind.encode(): places for kind, places in _MDF[name].items()} for name in ("followed", "followed_3")
@@ -122,31 +124,30 @@ def survey_blocks(file: TableFile) -> int:
     stream, limits, unfinished = file.stream, file.limits, is_unfinished(file)
     stream.seek(_FIRST)
     is_old = stream.read(2) == b"HD"
-    base, link, followed = (4, struct.Struct("<I"), _FOLLOWED_3) if is_old else (24, struct.Struct("<Q"), _FOLLOWED)
+    base, link, followed = (_HEAD_3, struct.Struct("<I"), _FOLLOWED_3) if is_old else (_HEAD, _LINK, _FOLLOWED)
     kinds: Counter[bytes] = Counter()
     seen: set[int] = set()
     unpacked = missing = 0
     pending: list[tuple[int, bytes, int]] = [(_FIRST, b"", 0)]
     while pending:
         address, parent, place = pending.pop()
-        if address > file.size - base:
+        if address > file.size - base.size:
             missing += 1
             continue
         stream.seek(address)
-        head = stream.read(base)
-        kind = head[:2] if is_old else head[2:4]
+        kind, *links_stated = base.unpack(stream.read(base.size))
         if _CHAINS.get((parent, place), kind) != kind:
             raise _damage(f"a block {_CHAINS[parent, place].decode()} at byte {address}", "another one", file)
         if kind == b"DZ":
-            unpacked += int.from_bytes(stream.read(16)[8:], "little")
+            unpacked += int.from_bytes(stream.read(2 * _LINK.size)[_LINK.size :], "little")
         if kind not in followed or ((parent, place) == (b"CN", 5) and kind not in _LISTS):
             continue
         if address in seen:
             raise _damage("links that lead to other blocks", f"a circle at byte {address}", file)
         seen.add(address)
         kinds[kind] += 1
-        count = int.from_bytes(head[16:24], "little") if kind in _LISTS else 1 + max(followed[kind])
-        limits.check("metadata_bytes", 8 * count, file.name)
+        count = sum(links_stated) if kind in _LISTS else 1 + max(followed[kind])
+        limits.check("metadata_bytes", _LINK.size * count, file.name)
         data = stream.read(count * link.size)
         links = [target for (target,) in link.iter_unpack(data[: len(data) // link.size * link.size])]
         missing += len(links) < count
@@ -155,7 +156,7 @@ def survey_blocks(file: TableFile) -> int:
         pending += [(links[i], kind, i) for i in followed[kind] or range(len(links)) if i < len(links) and links[i]]
     limits.check("channels", kinds[b"CG"], file.name)
     limits.check("schema_leaves", kinds[b"CN"] / max(1, kinds[b"CG"]), f"{file.name}, channels of a group")
-    limits.check_table(unpacked, file.size, file.name)
+    file.check(unpacked)
     return missing
 
 
@@ -169,11 +170,12 @@ def _repaired(file: TableFile) -> BytesIO | None:
     """Return a copy of a version 4 file with the length of its cut last data block corrected; None without a cut."""
     file.stream.seek(0)
     data = bytearray(file.stream.read())
-    starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= len(data)]
-    cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > len(data)]
+    heads = [m.end() for m in _DATA_BLOCK.finditer(data) if m.end() + _LINK.size <= len(data)]
+    starts = {at: at - len(b"##DT1234") for at in heads}
+    cut = [at for at, start in starts.items() if start + _LINK.unpack_from(data, at)[0] > len(data)]
     if not cut:
         return None
-    data[cut[-1] + 8 : cut[-1] + 16] = (len(data) - cut[-1]).to_bytes(8, "little")
+    _LINK.pack_into(data, cut[-1], len(data) - starts[cut[-1]])
     return BytesIO(data)
 
 
@@ -194,7 +196,7 @@ def _start(header: Any) -> tuple[int, bool]:
         text = b" ".join((header.date, header.time)).decode("latin-1").strip(" \0")
         with suppress(ValueError):
             date = dt.datetime.strptime(f"{text} +0000", "%d:%m:%Y %H:%M:%S %z")
-            start, flags = round(date.timestamp()) * TIME_UNITS_NS["seconds"], _LOCAL
+            start, flags = round(date.timestamp()) * NS_PER_S, _LOCAL
     return (start, flags == _LOCAL) if 0 < start < _MDF["last_date_ns"] else (0, False)
 
 
@@ -239,8 +241,8 @@ class _Group:
         group, file = self._block, self._file
         if not self._channels or not group.cycles_nr:
             return
-        row_bytes = group.samples_byte_nr + getattr(group, "invalidation_bytes_nr", 0) + 8
-        file.limits.check_table(group.cycles_nr * row_bytes, file.size, f"{file.name}, {name}")
+        row_bytes = group.samples_byte_nr + getattr(group, "invalidation_bytes_nr", 0) + NUMBER_BYTES
+        file.check(group.cycles_nr * row_bytes, f"{file.name}, {name}")
         self._check_layout()
         stamps, rows = self._stamps(name, start_ns, losses)
         if self._contains_frames:
@@ -306,7 +308,7 @@ class _Group:
         if missing := self._block.cycles_nr - len(seconds):
             losses.append(Loss("truncated", f"the file ends after {len(seconds)} rows", name, count=missing))
         finite = np.abs(seconds) < _MDF["longest_s"]
-        stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + start_ns
+        stamps = np.round(np.where(finite, seconds, 0.0) * NS_PER_S).astype(np.int64) + start_ns
         stamps = placed(np.where(finite, stamps, NO_TIME))
         # Frames of several buses are buffered before they are written; rows of channels are in order.
         order = np.argsort(stamps, kind="stable") if self._contains_frames else np.arange(len(stamps))

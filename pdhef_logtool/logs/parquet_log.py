@@ -11,9 +11,9 @@ from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_cells import read_cells
 from pdhef_logtool.logs.table_clocks import unwrapped
 from pdhef_logtool.logs.table_columns import Sheet, read_head, tables_of
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import NS_PER_S, Loss
 
 
 def open_parquet(file: TableFile) -> Tables:
@@ -93,8 +93,8 @@ def _groups(source: Any, paths: Sequence[str], file: TableFile, losses: list[Los
         part: dict[str, Any] = {}
         errors: dict[str, str] = {}
         try:
-            claimed += max(8 * rows * max(1, len(paths)), group.total_byte_size)
-            file.limits.check_table(claimed, file.size, where)
+            claimed += max(NUMBER_BYTES * rows * max(1, len(paths)), group.total_byte_size)
+            file.check(claimed, where)
         except LogError as error:
             losses.append(Loss("bad-rows", str(error), where, count=rows))
             continue
@@ -141,7 +141,7 @@ def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Los
     if kind == "duration":
         is_of_day = series.dtype == pl.Time
         nanoseconds = series if is_of_day else series.cast(pl.Duration("ns"))
-        values = nanoseconds.cast(pl.Int64).cast(pl.Float64).to_numpy() / 1e9
+        values = nanoseconds.cast(pl.Int64).cast(pl.Float64).to_numpy() / NS_PER_S
         return unwrapped(values) if is_of_day else values
     if series.dtype.is_float() or (series.dtype.is_integer() and not series.null_count()):
         return series.to_numpy()
@@ -157,7 +157,7 @@ def _texts(column: Any, name: str, file: TableFile, losses: list[Loss]) -> NDArr
     column.validate(full=True)  # texts that are not UTF-8 would end the process
     dictionaries = [chunk for chunk in column.chunks if pa.types.is_dictionary(chunk.type)]
     sizes = (pc.sum(pc.take(pc.binary_length(c.dictionary), c.indices)).as_py() or 0 for c in dictionaries)
-    file.limits.check_table(sum(sizes), file.size, f"{file.name}, {name}")
+    file.check(sum(sizes), f"{file.name}, {name}")
     texts = pl.Series(pl.from_arrow(column.cast(pa.large_string())))
     cells = read_cells(texts)
     if cells.is_text:

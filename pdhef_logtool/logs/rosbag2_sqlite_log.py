@@ -25,11 +25,11 @@ from pdhef_logtool.logs.container import (
     rows_by_channel,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import LimitError, Meter
+from pdhef_logtool.logs.resource_limits import MIB, LimitError, Meter
 from pdhef_logtool.storage.files import scratch_folder
 
 _PAGE_ROWS = 8192
-_PAGE_BYTES = 4 << 20
+_PAGE_BYTES = 4 * MIB
 _STEPS_A_CHECK = 100_000  # instructions of SQLite between checks of the time
 
 

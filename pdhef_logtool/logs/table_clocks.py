@@ -119,13 +119,19 @@ def number_clock(
     finite = np.isfinite(values)
     if (of_day := seconds_of_day(values[finite])) is not None:
         stamps = np.full(len(values), NO_TIME, np.int64)
-        stamps[finite] = np.round(of_day * 1e6).astype(np.int64) * 1000
+        stamps[finite] = to_ns(of_day)
         return Clock(placed(stamps))
     stated = TIME_UNITS_NS.get(re.sub(r"[\s\[\](){}.]", "", unit).lower(), 0)
     factor, epoch, note = _reading(values[finite], stated, others, rate_hz)
     stamps = placed(_scaled(values, factor, epoch, finite))
     clock = Clock(stamps, (f"{name}: {note}",) if note else (), bool(stated or epoch or rate_hz) or _is_dated(stamps))
     return clock if epoch else _of_gps(clock, name, others)
+
+
+def to_ns(seconds: Any) -> Any:
+    """Return seconds, a number or [N], as whole microseconds in ns: a double of a date has no more digits."""
+    us = TIME_UNITS_NS["microseconds"]
+    return np.round(np.asarray(seconds) * (_SECONDS // us)).astype(np.int64) * us
 
 
 def seconds_of_day(values: FloatArray) -> FloatArray | None:

@@ -27,9 +27,9 @@ import numpy as np
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.mat_log import tables_of_variables
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
-from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, of_digits, placed, whole_days
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, of_digits, placed, to_ns, whole_days
 from pdhef_logtool.logs.table_columns import Sheet, by_times, field_name, is_unit, read_head, tables_of
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
@@ -412,7 +412,7 @@ def _fitting(
             losses.append(Loss(kind, what, place, count=len(numbers), severity=severity))
     if not lines:
         raise LogError(expected=f"rows of {width} cells", got="none", where=file.name)
-    file.limits.check_table(8 * width * len(lines), file.size, file.name)
+    file.check(NUMBER_BYTES * width * len(lines))
     return lines, data.getvalue()
 
 
@@ -460,7 +460,7 @@ def _vbo_stamps(columns: Mapping[str, Any], created: Iterable[tuple[str, str, st
     clock: FloatArray = columns["time"]
     finite = np.isfinite(clock) & (clock >= 0.0) & (clock < 240_000.0)
     stamps = np.full(len(clock), NO_TIME, np.int64)
-    stamps[finite] = np.round(of_digits(clock[finite])[0] * 1e6).astype(np.int64) * 1000
+    stamps[finite] = to_ns(of_digits(clock[finite])[0])
     with suppress(ValueError):
         for day, month, year in created:
             return np.where(finite, stamps + whole_days(dt.date(int(year), int(month), int(day))), NO_TIME)
@@ -591,7 +591,7 @@ def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str, name:
     if wrong:
         place = f"{file.name}, from line {wrong[0]} on"
         losses.append(Loss("bad-row", "line without an object", place, count=len(wrong)))
-    file.limits.check_table(8 * len(rows) * len(paths), file.size, file.name)
+    file.check(NUMBER_BYTES * len(rows) * len(paths))
     fields, units = read_head([*paths])
     cells = ([row.get(path) for row in rows] for path in paths)
     columns = {f: _json_column(f, its, lines, file, losses) for f, its in zip(fields, cells, strict=True)}

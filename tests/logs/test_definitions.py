@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -96,23 +95,6 @@ def test_definitions_of_a_zip_file_or_a_wheel(tmp_path: Path, name: str) -> None
     assert "steering_angle" in {f.path for f in log.fields("/steer")}
     log.read({"/steer": ["steering_angle"]})
     assert log.lost == ()
-
-
-@pytest.mark.parametrize("variable", ["AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH"])
-def test_an_installed_ros_is_looked_in_and_named(
-    tmp_path: Path, variable: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = steering_bag(tmp_path)
-    folder = tmp_path / "ros" / ("share" if variable == "AMENT_PREFIX_PATH" else "stack") / "teamx_msgs" / "msg"
-    folder.mkdir(parents=True)
-    (folder / "DriverInput.msg").write_text(TEXTS[STEER])
-    monkeypatch.setenv(variable, f"{tmp_path / 'nowhere'}{os.pathsep}{tmp_path / 'ros'}")
-    log = open_log(path)
-    assert "steering_angle" in {f.path for f in log.fields("/steer")}
-    log.read({"/steer": ["steering_angle"]})
-    (note,) = log.lost
-    assert (note.severity, note.where) == ("note", "/steer")
-    assert f"read by {folder / 'DriverInput.msg'} of this machine, as the log does not define its type" in note.what
 
 
 T0 = 1_700_000_000_000_000_000

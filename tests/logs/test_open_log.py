@@ -24,13 +24,14 @@ from recorded import write_vectors
 from pdhef_logtool import Car, inspect_log, load_mapping, read_drive
 from pdhef_logtool.logs import formats, mcap_log
 from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.mat_log import open_mat
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import is_log_folder, open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter
 from pdhef_logtool.logs.table_file import LogFile, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table, TableLog
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
 from tests.mcap_files import copied, mcap_writer
 
@@ -42,7 +43,7 @@ def _mcap(path: Path, values: np.ndarray = VALUES, start_ns: int = T0) -> Path:
     stamps = start_ns + np.arange(len(values)) * 10_000_000
     with McapLogWriter(path) as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
-        writer.write([TopicBatch("/imu", stamps, stamps, {"angular_velocity.z": values})])
+        writer.write([Columns("/imu", stamps, stamps, {"angular_velocity.z": values})])
     return path
 
 
@@ -205,7 +206,7 @@ def test_sums_times_and_numbers_of_messages_are_those_of_the_file(tmp_path: Path
     with McapLogWriter(tmp_path / "a.mcap") as writer:
         writer.add_topic("/v", "std_msgs/msg/Float64")
         for times in np.arange(12).reshape(3, 4):
-            writer.write([TopicBatch("/v", times, times, {"data": np.zeros(4)})])
+            writer.write([Columns("/v", times, times, {"data": np.zeros(4)})])
     with (tmp_path / "a.mcap").open("rb") as file:
         records = [*StreamReader(file, validate_crcs=True).records]
     assert [r.sequence for r in records if isinstance(r, Message)] == [*range(12)]
