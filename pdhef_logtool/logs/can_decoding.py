@@ -33,8 +33,8 @@ _MAX_DBC_BYTES = 32 * MIB
 #: Bits of a signal that become a number.
 MOST_BITS = 64
 _CAN = CONSTANTS["can"]
-ID_BITS = _CAN["id_bits"]
-_BYTE, _BYTE_BITS = 0xFF, 8
+ID_BITS, EXTENDED_FLAG = _CAN["id_bits"], _CAN["extended_flag"]
+_BYTE, BYTE_BITS = 0xFF, 8
 #: Identifiers in the number of a source.
 _IDS = 1 << 32
 #: Identifiers that a note names.
@@ -227,13 +227,13 @@ def has_j1939_identifier(message: Message) -> bool:
 
 def parameter_group(identifier: int) -> int:
     """Return the PGN of a 29-bit identifier, without the destination address where it contains one."""
-    group: int = identifier >> _BYTE_BITS & _CAN["pgn_bits"]
+    group: int = identifier >> BYTE_BITS & _CAN["pgn_bits"]
     return group if _is_broadcast(identifier) else group & ~_BYTE
 
 
 def _is_broadcast(identifier: int) -> bool:
     """Return whether the PDU format of a 29-bit identifier has no destination address."""
-    return identifier >> 2 * _BYTE_BITS & _BYTE >= int(_CAN["broadcast"])
+    return identifier >> 2 * BYTE_BITS & _BYTE >= int(_CAN["broadcast"])
 
 
 def described_sources(database: Database, sources: Iterable[Source]) -> dict[Source, Message]:
@@ -260,12 +260,12 @@ def _bytes_of(signal: Signal) -> tuple[int, int, int]:
     Its start is the least significant bit of a little-endian signal, the most significant one of a big-endian signal.
     """
     if signal.byte_order == "little_endian":
-        first, skipped = divmod(signal.start, _BYTE_BITS)
-        return first, (signal.start + signal.length - 1) // _BYTE_BITS, skipped
-    first, place = divmod(signal.start, _BYTE_BITS)
-    end = _BYTE_BITS * (first + 1) - 1 - place + signal.length
-    last = (end - 1) // _BYTE_BITS
-    return first, last, _BYTE_BITS * (last + 1) - end
+        first, skipped = divmod(signal.start, BYTE_BITS)
+        return first, (signal.start + signal.length - 1) // BYTE_BITS, skipped
+    first, place = divmod(signal.start, BYTE_BITS)
+    end = BYTE_BITS * (first + 1) - 1 - place + signal.length
+    last = (end - 1) // BYTE_BITS
+    return first, last, BYTE_BITS * (last + 1) - end
 
 
 def bytes_of(signal: Signal) -> int:
@@ -280,7 +280,7 @@ def raw_bits(data: NDArray[np.uint8], signal: Signal) -> NDArray[np.uint64]:
     columns = range(first, last + 1) if signal.byte_order == "little_endian" else range(last, first - 1, -1)
     for i, column in enumerate(columns):
         byte = data[:, column].astype(np.uint64)
-        shift = _BYTE_BITS * i - skipped
+        shift = BYTE_BITS * i - skipped
         value |= byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
     return value & np.uint64((1 << signal.length) - 1)
 
@@ -304,19 +304,19 @@ def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = F
     raw = raw_bits(data, signal)
     number: NDArray[Any] = raw
     if signal.is_float:
-        width = signal.length // _BYTE_BITS
+        width = signal.length // BYTE_BITS
         with np.errstate(invalid="ignore"):  # numpy warns about a signalling NaN
             number = raw.astype(f"<u{width}").view(f"<f{width}").astype(np.float64)
     elif signal.is_signed:
         sign = np.uint64(1 << (signal.length - 1))
         number = ((raw ^ sign) - sign).view(np.int64)
     values = np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
-    for code, text in (signal.choices or {}).items() if signal.length >= _BYTE_BITS else ():
+    for code, text in (signal.choices or {}).items() if signal.length >= BYTE_BITS else ():
         if _NO_VALUE.search(str(text)):
             values[number == code] = np.nan
     if is_j1939 and not signal.is_float and not signal.is_signed and signal.length > 1:
-        top_bits = min(signal.length, _BYTE_BITS)
-        least = _CAN["no_value"] if top_bits == _BYTE_BITS else (1 << top_bits) - 1
+        top_bits = min(signal.length, BYTE_BITS)
+        least = _CAN["no_value"] if top_bits == BYTE_BITS else (1 << top_bits) - 1
         values[raw >> np.uint64(signal.length - top_bits) >= least] = np.nan
     return values
 

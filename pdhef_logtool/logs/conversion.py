@@ -76,8 +76,8 @@ def _write_tables(writer: McapLogWriter, log: DriveLog) -> None:
         writer.add_topic(topic.name, _type_of(topic), definition="\n".join(lines))
     for start_ns, end_ns in windows(log.start_ns, log.end_ns, _WINDOW_NS, log.recording_span):
         read = log.read({topic: tuple(paths) for topic, paths in columns.items()}, start_ns, end_ns)
-        fields = {t: {name: _stored(read[t].fields[path]) for path, name in its.items()} for t, its in columns.items()}
-        writer.write([replace(rows, fields=fields[topic]) for topic, rows in read.items()])
+        renamed = {t: {name: _stored(read[t].fields[path]) for path, name in its.items()} for t, its in columns.items()}
+        writer.write([replace(rows, fields=renamed[topic]) for topic, rows in read.items()])
 
 
 def _stored(values: NDArray[Any]) -> NDArray[Any]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.can_decoding import Frames
+from pdhef_logtool.logs.can_decoding import BYTE_BITS, EXTENDED_FLAG, Frames
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.mdf_conversions import conversion_rule
@@ -39,6 +39,7 @@ _MDF, _CAN = CONSTANTS["mdf"], CONSTANTS["can"]
 _LENGTHS = np.array(_CAN["bytes_of_code"])
 _DATA_BLOCK = re.compile(rb"##(?:DT|SD|DV)\0{4}")
 _LONGEST_NAME = 40
+_SIZE = np.dtype("<u4")  # in front of data of variable length
 _VARIABLE, _VIRTUAL = _MDF["variable"], _MDF["virtual"]
 #: Types of masters by version.
 _MASTERS = numbered(_MDF["masters"])
@@ -49,7 +50,8 @@ _LOCAL, _WITH_OFFSETS = 1, 2
 _NO_TIMES = numbered(_MDF["no_times"])
 
 # Blocks that are surveyed before asammdf opens a file.
-_FIRST = 64
+#: The start: kind, first digit of the version, and flags of what is unfinished.
+_FIRST, _START = 64, struct.Struct("7sxc51x2s")
 #: Heads of blocks: kind, and in version 4 the number of links. Link, or length of a block, of version 4.
 _HEAD_3, _HEAD, _LINK = struct.Struct("<2s2x"), struct.Struct("<2x2s12xQ"), struct.Struct("<Q")
 #: Places of the links that are followed, by kind of block; empty: all links of a list of data.
@@ -107,9 +109,9 @@ def open_mdf(file: TableFile) -> Tables:
 def is_unfinished(file: TableFile) -> bool:
     """Return whether the recorder did not complete lengths and links, and leave the stream at its start."""
     file.stream.seek(0)
-    head = file.stream.read(_FIRST).ljust(_FIRST)
+    kind, version, flags = _START.unpack(file.stream.read(_START.size).ljust(_START.size))
     file.stream.seek(0)
-    return head[8:9] == b"4" and (head[:7] == b"UnFinMF" or any(head[60:62]))
+    return version == b"4" and (kind == b"UnFinMF" or any(flags))
 
 
 def survey_blocks(file: TableFile) -> int:
@@ -170,12 +172,12 @@ def _repaired(file: TableFile) -> BytesIO | None:
     """Return a copy of a version 4 file with the length of its cut last data block corrected; None without a cut."""
     file.stream.seek(0)
     data = bytearray(file.stream.read())
-    heads = [m.end() for m in _DATA_BLOCK.finditer(data) if m.end() + _LINK.size <= len(data)]
-    starts = {at: at - len(b"##DT1234") for at in heads}
-    cut = [at for at, start in starts.items() if start + _LINK.unpack_from(data, at)[0] > len(data)]
+    blocks = [m.span() for m in _DATA_BLOCK.finditer(data) if m.end() + _LINK.size <= len(data)]
+    cut = [(start, place) for start, place in blocks if start + _LINK.unpack_from(data, place)[0] > len(data)]
     if not cut:
         return None
-    _LINK.pack_into(data, cut[-1], len(data) - starts[cut[-1]])
+    start, place = cut[-1]
+    _LINK.pack_into(data, place, len(data) - start)
     return BytesIO(data)
 
 
@@ -277,14 +279,15 @@ class _Group:
     def _check_layout(self) -> None:
         """Raise SpanDamageError for a channel outside of its record: asammdf would read and write memory of others."""
         group = self._block
+        invalidation_bits = BYTE_BITS * getattr(group, "invalidation_bytes_nr", 0)
         for i, channel in enumerate(self._channels):
             end, last_bit = channel.bit_count, -1
             if self._version == 3:
-                end += channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0)
+                end += channel.start_offset + BYTE_BITS * getattr(channel, "additional_byte_offset", 0)
             else:
-                end += 8 * channel.byte_offset + channel.bit_offset if not self._is(i, _VIRTUAL) else -end
+                end += BYTE_BITS * channel.byte_offset + channel.bit_offset if not self._is(i, _VIRTUAL) else -end
                 last_bit = channel.pos_invalidation_bit if channel.flags & _SOME_INVALID else -1
-            if end > 8 * group.samples_byte_nr or last_bit >= 8 * getattr(group, "invalidation_bytes_nr", 0):
+            if end > BYTE_BITS * group.samples_byte_nr or last_bit >= invalidation_bits:
                 raise SpanDamageError(f"channel {channel.name} is outside of its record")
 
     def _seconds(self) -> FloatArray:
@@ -363,7 +366,8 @@ class _Group:
         length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
         if np.isin(length, _CAN["only_codes"]).any() or ("DLC" in parts and "DataLength" not in parts):
             length = _LENGTHS[length.clip(0, len(_LENGTHS) - 1)]
-        extended = (parts["ID"] >> 31 & 1) | (identifier > _CAN["base_id_bits"]) | (parts.get("IDE", np.zeros(1)) > 0)
+        is_flagged = ((parts["ID"] & EXTENDED_FLAG) > 0) | (parts.get("IDE", np.zeros(1)) > 0)
+        extended = is_flagged | (identifier > _CAN["base_id_bits"])
         frames = {"id": identifier, "length": length.clip(0, data.shape[1]), "is_extended": extended}
         return Frames(stamps, frames | ({"bus": parts["BusChannel"]} if "BusChannel" in parts else {}), data)
 
@@ -377,9 +381,10 @@ class _Group:
             return np.asarray(raw, np.uint8).reshape(len(raw), -1)
         stored = np.frombuffer(self._source._mdf._load_signal_data(self._group, index), np.uint8)
         begins = raw.astype(np.int64)
-        if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - 4:
+        if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - _SIZE.itemsize:
             raise SpanDamageError("data of a frame are missing")
-        frames = np.lib.stride_tricks.sliding_window_view(np.pad(stored, (0, _LENGTHS[-1])), 4 + _LENGTHS[-1])[begins]
-        lengths = frames[:, :4].copy().view("<u4")
-        data = frames[:, 4 : 4 + min(lengths.max(initial=0), _LENGTHS[-1])]
+        most, head = _LENGTHS[-1], _SIZE.itemsize
+        frames = np.lib.stride_tricks.sliding_window_view(np.pad(stored, (0, most)), head + most)[begins]
+        lengths = frames[:, :head].copy().view(_SIZE)
+        data = frames[:, head : head + min(lengths.max(initial=0), most)]
         return np.where(np.arange(data.shape[1]) < lengths, data, np.uint8(0))

@@ -24,7 +24,7 @@ from http import HTTPStatus
 from io import DEFAULT_BUFFER_SIZE
 from pathlib import Path
 from threading import Lock
-from typing import Any, BinaryIO
+from typing import Any
 
 from isal.isal_zlib import crc32
 
@@ -33,7 +33,7 @@ from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, guarded_clie
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.resource_limits import KIB, MIB
 from pdhef_logtool.records.extras import required
-from pdhef_logtool.storage.files import scratch_folder
+from pdhef_logtool.storage.files import scratch_folder, take_lock
 from pdhef_logtool.storage.object_store import s3_system, words_of
 
 BLOCK_BYTES, MOST_RANGE_BYTES = 64 * KIB, 8 * MIB
@@ -53,7 +53,8 @@ class RemoteCopy:
 
     Parameters
     ----------
-    name : of the object. identity : of its version; empty, or without a writable cache folder: the copy is temporary.
+    name : of the object.
+    identity : of its version; empty, or without a writable cache folder with locks: the copy is temporary.
 
     Attributes
     ----------
@@ -74,7 +75,7 @@ class RemoteCopy:
         self.path, index = folder / "object" / (name.replace("/", "_")[-80:] or "log"), folder / "index"
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._index = stack.enter_context(index.open("a+b", buffering=0))
-        if not (_lock(self._index, exclusive=False) and index.exists()):
+        if cached is not None and not (take_lock(self._index.fileno(), exclusive=False) and index.exists()):
             raise FileNotFoundError  # another process is removing the copy
         os.utime(index)
         self.path.touch()
@@ -113,18 +114,6 @@ def _cache_folder() -> Path:
     return Path(os.environ.get("PDHEF_CACHE_DIR") or Path(caches, "pdhef")) / "remote"
 
 
-def _lock(file: BinaryIO, *, exclusive: bool) -> bool:
-    """Lock a file until it is closed; False if another process has locked it."""
-    try:
-        import fcntl
-    except ImportError:
-        return True  # such systems do not remove files that are open
-    with suppress(BlockingIOError):
-        fcntl.flock(file, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-        return True
-    return False
-
-
 def _evict() -> None:
     """Remove the least recently used copies that are not in use, until the others fit in CACHE_BYTES."""
     total = 0
@@ -133,7 +122,7 @@ def _evict() -> None:
             files = [path.stat() for path in (index.parent / "object").iterdir()]
             total += sum(getattr(file, "st_blocks", file.st_size >> 9) << 9 for file in files)
             with index.open("rb") as file:
-                if total > CACHE_BYTES and _lock(file, exclusive=True):
+                if total > CACHE_BYTES and take_lock(file.fileno()):
                     shutil.rmtree(index.parent, ignore_errors=True)
 
 
