@@ -17,8 +17,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pdhef_logtool.logs.container import RawMessage, block_of
 from pdhef_logtool.logs.definitions import message_definition
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 
 pytestmark = pytest.mark.slow
 
@@ -216,7 +217,7 @@ _texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size
 
 
 @st.composite
-def _batches(draw: st.DrawFn) -> list[TopicBatch]:
+def _batches(draw: st.DrawFn) -> list[Columns]:
     """Return a batch of each type; its topic has the name of the type."""
     batches = []
     for name, widths in FIELDS.items():
@@ -228,7 +229,7 @@ def _batches(draw: st.DrawFn) -> list[TopicBatch]:
             width = len(shape) if isinstance(shape, str) else shape
             elements = _ELEMENTS.get(path, st.floats(allow_nan=True, allow_infinity=True, width=64))
             fields[path] = draw(hnp.arrays(np.float64, (n, width) if width else n, elements=elements))
-        batches.append(TopicBatch(name, log_time, log_time - 5, fields))
+        batches.append(Columns(name, log_time, log_time - 5, fields))
     return batches
 
 

@@ -14,9 +14,10 @@ from mcap.writer import CompressionType, IndexType
 from recorded import counts_of, numeric_paths, summary_of, write_vectors
 
 from pdhef_logtool.logs.container import Wanted
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, PdhefError
 from tests.command_line import called
 from tests.mcap_files import mcap_writer
@@ -32,9 +33,7 @@ def _mcap(folder: Path) -> bytes:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
         for at in range(0, N, 100):  # a chunk a call
             cut = slice(at, at + 100)
-            writer.write(
-                [TopicBatch("/imu", stamps[cut], stamps[cut], {"angular_velocity.z": np.arange(N)[cut] * 0.5})]
-            )
+            writer.write([Columns("/imu", stamps[cut], stamps[cut], {"angular_velocity.z": np.arange(N)[cut] * 0.5})])
     return path.read_bytes()
 
 
@@ -176,7 +175,7 @@ def test_a_chunk_whose_index_is_cut_gives_all_its_topics(tmp_path):
     with McapLogWriter(path) as writer:
         for topic in ("/a", "/b"):
             writer.add_topic(topic, "sensor_msgs/msg/Imu")
-        writer.write([TopicBatch(topic, stamps, stamps, {}) for topic in ("/a", "/b")])
+        writer.write([Columns(topic, stamps, stamps, {}) for topic in ("/a", "/b")])
     (chunk,) = summary_of(path).chunk_indexes
     second_index = sorted(chunk.message_index_offsets.values())[1]
     path.write_bytes(path.read_bytes()[: second_index + 20])

@@ -21,13 +21,14 @@ from recorded import write_vectors
 from pdhef_logtool import Car, inspect_log, load_mapping, read_drive
 from pdhef_logtool.logs import formats, mcap_log
 from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.mat_log import open_mat
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import is_log_folder, open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter
 from pdhef_logtool.logs.table_file import LogFile, TableFile
 from pdhef_logtool.logs.table_log import Table, TableLog
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
 from studies import mcap_logs
 
@@ -39,7 +40,7 @@ def _mcap(path: Path, values: np.ndarray = VALUES, start_ns: int = T0) -> Path:
     stamps = start_ns + np.arange(len(values)) * 10_000_000
     with McapLogWriter(path) as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
-        writer.write([TopicBatch("/imu", stamps, stamps, {"angular_velocity.z": values})])
+        writer.write([Columns("/imu", stamps, stamps, {"angular_velocity.z": values})])
     return path
 
 
@@ -174,7 +175,7 @@ LARGE = b'{"size": %d, "pixels": "' + b"x" * 20_000 + b'"}'
 def mixed(sample_logs_dir, tmp_path):
     """A drive with an image after every 50th message, in the same chunks."""
 
-    def with_images() -> Iterator[mcap_logs.Message]:
+    def with_images():
         for i, message in enumerate(mcap_logs.messages(sample_logs_dir / "dlc.mcap")):
             yield message
             if i % 50 == 0:
@@ -203,7 +204,7 @@ def test_sums_times_and_numbers_of_messages_are_those_of_the_file(tmp_path):
     with McapLogWriter(tmp_path / "a.mcap") as writer:
         writer.add_topic("/v", "std_msgs/msg/Float64")
         for times in np.arange(12).reshape(3, 4):
-            writer.write([TopicBatch("/v", times, times, {"data": np.zeros(4)})])
+            writer.write([Columns("/v", times, times, {"data": np.zeros(4)})])
     with (tmp_path / "a.mcap").open("rb") as file:
         records = [*StreamReader(file, validate_crcs=True).records]
     assert [r.sequence for r in records if isinstance(r, Message)] == [*range(12)]

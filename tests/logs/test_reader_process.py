@@ -65,7 +65,7 @@ def test_a_reader_reaches_no_other_file_program_or_process(tmp_path, deed):
 
 
 def test_time_and_memory_of_a_reader_are_limited_by_the_budget(tmp_path):
-    with pytest.raises(LimitError, match=r"537 MB of memory.*--set budget=FACTOR"):
+    with pytest.raises(LimitError, match=r"512 MiB of memory.*--set budget=FACTOR"):
         open_log(_file(tmp_path, "memory"))
     with pytest.raises(LimitError, match=r"0.05 s of processor time.*--set budget=FACTOR"):
         open_log(_file(tmp_path, "hang"), DEFAULT_LIMITS.times(0.01))

@@ -13,11 +13,11 @@ from recorded import attribute, counts_of, decoded_by_rosbags, messages_of, nume
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import RawMessage, block_of
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import LogError, MappingError
 from tests.mcap_files import mcap_writer
 
@@ -174,7 +174,7 @@ def _annotate(source: Path | ColumnarLog, target: Path, leave_out=lambda _: Fals
             channels = register_channels(writer, log, leave_out=leave_out)
             writer.add_topic("/ours", "std_msgs/msg/Float64")
             stamps = T0 - 50_000_000 + np.arange(7000) * 100_000
-            ours = [TopicBatch("/ours", stamps, stamps, {"data": np.arange(7000.0)})]
+            ours = [Columns("/ours", stamps, stamps, {"data": np.arange(7000.0)})]
             writer.write(ours, iterate_copy(log, channels, *window))
         return log.lost
 
