@@ -39,7 +39,7 @@ from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
 from pdhef_logtool.model.priors import coefficients, prior_variations
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
-from pdhef_logtool.records.signals import SIGNAL_COLUMNS, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import S_PER_NS, SIGNAL_COLUMNS, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, release
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
@@ -180,7 +180,7 @@ def _of_file(car: Car, share: float, *, use_speed: bool) -> Interval:
 
 def _in_blocks(signals: Signals) -> tuple[Signals, int, IntArray]:
     """Return means over blocks of samples, their number of samples, and by stamp [N] the last complete block, or -1."""
-    period_s = float(np.median(np.diff(signals.stamps_ns))) * 1e-9 if len(signals) > 1 else SLOW_STEP_S
+    period_s = float(np.median(np.diff(signals.stamps_ns))) * S_PER_NS if len(signals) > 1 else SLOW_STEP_S
     number = max(1, int(SLOW_STEP_S / period_s))
     count = len(signals) // number
 
