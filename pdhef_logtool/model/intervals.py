@@ -49,10 +49,9 @@ DRIVE_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
 #: cars, each identified on one drive and evaluated on drives of other manoeuvres.
 OWN_SHARE = 0.5
 #: Standard deviations of the parameters of an identified car over those of a vehicle file: 8 % of the stiffness of an
-#: axle, which changes of the load cause.
-IDENTIFIED_SHARE = 0.16
-#: 1-sigma of the crossfall of a road, which the filter cannot tell from a bias of a_y; roads fall by 2 to 2.5 %.
-CROSSFALL_STD_RAD = 0.02
+#: axle, which changes of the load cause. 1-sigma of the crossfall of a road (usually 2 to 2.5 %), whose effect on a_y
+#: equals that of a bias.
+IDENTIFIED_SHARE, CROSSFALL_STD_RAD = 0.16, 0.02
 #: Smallest χ of parameters from earlier drives: later driving may fit less.
 EARLIER_ERROR_SCALE = 2.0
 #: Longest step of the filters whose differences count: parameters act slowly.
