@@ -10,9 +10,9 @@ posterior, or of the prior without a fit to the log. s_l is the uncertainty of t
 centre of gravity if no file contains it: the lateral velocity is determined at the rear axle. On a vehicle of the
 drive's posterior, s_car is the model error of a single track, which is nearly constant within a drive, and χ ≥ 1 is the
 RMS error of the fit over the assumed one (Birge 1932); otherwise χ s_car is the rear slip angle on a crossfall. c is
-the lateral kinematic consistency, as far as it correlates with the driving: of the whole drive if the vehicle was fitted
-to it, otherwise as available online (:func:`running_consistency`). The variance of v_y is the same sum as a velocity.
-Estimates are unchanged.
+the lateral kinematic consistency, as far as it correlates with the driving: of the whole drive if the vehicle was
+fitted to it, otherwise as available online (:func:`running_consistency`). The variance of v_y is the same sum as a
+velocity. Estimates are unchanged.
 """
 
 from __future__ import annotations
