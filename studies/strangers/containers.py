@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.drive_log import Columns
+from pdhef_logtool.logs.writer import McapLogWriter
 from studies.mcap_logs import Message, messages, write_log
 from studies.pages import paragraphs
 from studies.strangers import buses, tables
@@ -92,7 +93,7 @@ def _mcap(topics: Sequence[Topic], path: Path) -> Path:
                 text = definition(topic.type_name)
                 writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
         raws = [message for topic in joints for message in _joints(writer, topic)]
-        batches = [TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints]
+        batches = [Columns(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints]
         writer.write(batches, [block_of(raws)])
     return path
 
