@@ -23,8 +23,10 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import MIB, Meter
 from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
+#: A plain number: comparing with a member of an enumeration takes longer.
+_OP_MESSAGE = int(RecordType.MSGDATA)
 _U32 = struct.Struct("<I")
-_LENGTHS_BYTES = 2 * _U32.size  # of the header and the data of a record
+_LENGTH_BYTES, _LENGTHS_BYTES = _U32.size, 2 * _U32.size  # of the header, and of header and data, of a record
 #: Bytes of a message record without data: five lengths, an opcode, a connection and a time with their names.
 _LEAST_MESSAGE_BYTES = struct.calcsize("<5IBIQ") + len(b"op=conn=time=")
 
@@ -165,7 +167,7 @@ class Rosbag1Container(FileContainer):
             fields, begin, offset = record
             try:
                 op = fields.get_uint8("op")
-                if op == RecordType.MSGDATA:
+                if op == _OP_MESSAGE:
                     self.meter.check_scan(len(stamps))
                     channels.append(fields.get_uint32("conn"))
                     stamps.append(fields.get_time("time"))
@@ -197,12 +199,12 @@ def _record_at(read: Callable[[int, int], bytes], offset: int, size: int, most: 
     """
     if offset + _LENGTHS_BYTES > size:
         return None
-    (header,) = _U32.unpack(read(offset, _U32.size))
+    header = int.from_bytes(read(offset, _LENGTH_BYTES), "little")
     start = offset + _LENGTHS_BYTES + header
     if header == 0 or start > size or header > most:
         return None
     text = read(offset, start - offset)
-    end = start + int.from_bytes(text[-_U32.size :], "little")
+    end = start + int.from_bytes(text[-_LENGTH_BYTES:], "little")
     if end > size:
         return None
     try:
