@@ -238,6 +238,13 @@ def _matches(pattern: str) -> list[Path]:
     return sorted(paths, key=str)
 
 
+def names_of_logs(folder: Path) -> set[str]:
+    """Return the names of the logs in a folder, by their suffixes, without those in folders below it."""
+    files = (e.name for e in folder.iterdir() if not (e.name.startswith(".") or e.is_dir()))
+    names = {name for name in files if _bare_name(name) != name}
+    return without_general(names - {"history.jsonl", "journal.jsonl"})  # of cars and runs
+
+
 def _search(folder: Path, visited: set[str], settings: TableSettings) -> Iterator[Path]:
     """Yield the logs below a folder; each folder is visited once, because links may form a loop."""
     from pdhef_logtool.logs.recording_folder import is_recording
@@ -252,8 +259,7 @@ def _search(folder: Path, visited: set[str], settings: TableSettings) -> Iterato
     if (folder / RUN_FILE).is_file():
         return
     entries = [e for e in sorted(folder.iterdir()) if not e.name.startswith(".")]
-    named = {e.name for e in entries if not e.is_dir() and _bare_name(e.name) != e.name}
-    logs = without_general(named - {"history.jsonl", "journal.jsonl"})  # of cars and runs
+    logs = names_of_logs(folder)
     if is_recording(folder, logs, settings):
         yield folder
         logs = set()

@@ -11,16 +11,14 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 from rosbags.rosbag1.reader import Header, ReaderError, RecordType
 
-from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import Block, ChannelRecord, FileContainer, Span, SpanDamageError, block_from_lists
-from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import MIB, Meter
+from pdhef_logtool.logs.resource_limits import MIB
+from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
 #: A plain number: comparing with a member of an enumeration takes longer.
@@ -53,12 +51,12 @@ class Rosbag1Container(FileContainer):
     remedy = "is it a ROS 1 bag?"
     chunks: list[_Chunk]
 
-    def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
+    def __init__(self, file: LogFile) -> None:
         self._found: list[_Chunk] = []
         self._is_truncated = False
         self._header: tuple[int, int] | None = None  # where the index section begins, and how many chunks there are
         self._infos: dict[int, Counter[int]] = {}  # counts by connection of the chunk at a byte, by the index section
-        super().__init__(path, shown_path, meter)
+        super().__init__(file)
 
     def _walk(self) -> None:
         size = self.source.size
