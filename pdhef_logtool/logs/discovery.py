@@ -14,11 +14,11 @@ from itertools import chain, takewhile
 from pathlib import Path
 from typing import TypeAlias
 
-from pdhef_logtool.logs.byte_source import ChangedError, require_regular
+from pdhef_logtool.logs.byte_source import ChangedError, require_regular, unreadable
 from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes, without_general
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
-from pdhef_logtool.records.errors import LogError, UsageError
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.storage.documents import file_sha256
 
 #: Stems are folder names on any system.
@@ -145,12 +145,7 @@ def identity_of(log: LogInput) -> str:
         try:
             return hash_log(log.path)
         except OSError as error:
-            got = error.strerror or str(error)
-            remedy = "check the path and its permissions"
-            missing = isinstance(error, FileNotFoundError)
-            raise LogError(
-                expected="a readable log", got=got, where=str(log.path), remedy=remedy, missing=missing
-            ) from error
+            raise unreadable(error, log.path) from error
     from pdhef_logtool.logs.remote_source import identity_of_object
 
     return identity_of_object(log.path)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.logs.byte_source import raise_source_error, require_regular
+from pdhef_logtool.logs.byte_source import raise_source_error, require_regular, unreadable
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.compression import decompress_file
 from pdhef_logtool.logs.container import EVERYTHING, MCAP_MAGIC, Container, Wanted, describe_damage
@@ -94,12 +94,7 @@ def _opened(file: LogFile, wanted: Wanted) -> DriveLog:
             opened = _open_file(file)
     except OSError as error:
         raise_source_error(error, str(path))
-        raise LogError(
-            expected="a readable file",
-            got=error.strerror or str(error),
-            where=str(path),
-            remedy="check its permissions",
-        ) from error
+        raise unreadable(error, path) from error
     except PdhefError:
         raise
     except Exception as error:
