@@ -485,6 +485,10 @@ class _Channel:
             yield Loss("undecodable", what, topic, count=undecodable)
         if isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
             yield Loss("bad-schema", f"its messages cannot be decoded: {schema}", topic)
+        if isinstance(schema, MessageSchema) and schema.borrowed:
+            files = ", ".join(map(str, schema.borrowed))
+            what = f"read by {files} of this machine, as the log does not define its type: correct only if they match"
+            yield Loss("borrowed-definition", f"{what} the recorded version", topic, severity="note")
 
 
 @dataclass(frozen=True, slots=True)

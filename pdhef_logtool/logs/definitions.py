@@ -1,11 +1,12 @@
-"""Message definitions of logs without any: the user's files, and a few that are shipped (``schemas``)."""
+"""Message definitions: of logs without any the user's, an installed ROS's, and a few that are shipped (``schemas``)."""
 
 from __future__ import annotations
 
+import os
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -20,35 +21,67 @@ from pdhef_logtool.storage.documents import read_text
 MOST_FILES = 50_000
 MOST_BYTES = MIB
 #: A type name may come from a log, and becomes a path.
-_TYPE_NAME = re.compile(r"[A-Za-z]\w*/(?:msg|srv|action)/[A-Za-z]\w*", re.ASCII)
+_TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:msg|srv|action)/([A-Za-z]\w*)", re.ASCII)
 #: Line between two definitions.
 MESSAGE_SEPARATOR = "=" * 80
+#: Environment variables with the packages of ROS 2 and ROS 1, and the default folders.
+_PREFIXES, _SOURCES = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"), "ROS_PACKAGE_PATH"
+_USUAL = (Path("/usr/local"), Path("/usr"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Definitions:
     """Files of definitions by type name in ROS 2 form, and by bare name where a file lies in no package.
 
-    ``archive`` is the zip file or wheel with the files; None for plain files.
+    ``archive`` is the zip file or wheel with the files; None for plain files. ``folders`` are those of packages of an
+    installed ROS.
     """
 
     files: Mapping[str, Path] = field(default_factory=dict)
     archive: Path | None = None
+    folders: tuple[Path, ...] = ()
 
     def text_of(self, type_name: str) -> str:
-        """Return the text of a type without the types it contains, the user's first; empty without one."""
+        """Return the text of a type without the types it contains, or an empty string.
+
+        The order is the user's files, shipped files, installed files.
+        """
         package, _, name = type_name.partition("/msg/")
         path = self.files.get(type_name) or self.files.get(name if package else "")
         if path is None:
-            return shipped_definition(type_name)
+            installed = self.installed(type_name)
+            return shipped_definition(type_name) if installed is None else read_text(installed)[:MOST_BYTES]
         if self.archive is None:
             return read_text(path)[:MOST_BYTES]
         with zipfile.ZipFile(self.archive) as archive, archive.open(path.as_posix()) as file:
             return file.read(MOST_BYTES).decode("utf-8", errors="replace")
 
+    def installed(self, type_name: str) -> Path | None:
+        """Return the file of a type that only an installed ROS or a sourced workspace defines."""
+        match = _TYPE_NAME.fullmatch(type_name)
+        if match is None or type_name in self.files or match[2] in self.files or shipped_definition(type_name):
+            return None
+        return next((path for path in self._places(match[1], match[2]) if path.is_file()), None)
 
-#: Shipped definitions only, without the user's.
+    def _places(self, package: str, name: str) -> Iterator[Path]:
+        file = Path("msg", f"{name}.msg")
+        for folder in self.folders:
+            if folder.name == package:
+                yield folder / file
+            yield folder / package / file
+            yield from sorted(folder.glob(f"*/{package}/{file.as_posix()}"))
+
+
+#: Shipped definitions only, without the user's and the machine's.
 SHIPPED = Definitions()
+
+
+@cache
+def _of_machine(prefixes: str, sources: str) -> Definitions:
+    """Return shipped and installed definitions: sourced workspaces first, then the newest distribution."""
+    named, given = ([Path(p) for p in paths.split(os.pathsep) if p] for paths in (prefixes, sources))
+    installed = [*named, *sorted(Path("/opt/ros").glob("*"), reverse=True), *_USUAL]
+    return Definitions(folders=tuple(dict.fromkeys([*(prefix / "share" for prefix in installed), *given])))
 
 
 def dbc_files(place: Path | str | None) -> tuple[Path, ...]:
@@ -63,14 +96,16 @@ def read_definitions(place: Path | str | None) -> Definitions:
     """Find the definitions in a folder of ``.msg`` files, of packages, in a workspace, a zip file or a wheel.
 
     ``PACKAGE/msg/Name.msg`` and ``PACKAGE/Name.msg`` are ``PACKAGE/msg/Name``; a file that lies in the folder itself
-    defines its name in any package. None: only shipped definitions.
+    defines its name in any package. None: only shipped and installed definitions.
 
     Raises
     ------
     UsageError : It is neither folder nor archive, or contains no definition.
     """
+    prefixes = os.pathsep.join(os.environ.get(name, "") for name in _PREFIXES)
+    machine = _of_machine(prefixes, os.environ.get(_SOURCES, ""))
     if place is None:
-        return SHIPPED
+        return machine
     place = Path(place)
     archive = place if place.is_file() and zipfile.is_zipfile(place) else None
     if archive is None:
@@ -87,7 +122,7 @@ def read_definitions(place: Path | str | None) -> Definitions:
             where=str(place),
             remedy="give the package's source, or /opt/ros/DISTRO/share of the machine that recorded",
         )
-    return Definitions(files, archive)
+    return replace(machine, files=files, archive=archive)
 
 
 def _named(paths: Iterable[Path], root: Path, *, in_archive: bool = False) -> dict[str, Path]:

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.logs.constants import CONSTANTS
@@ -102,8 +103,9 @@ class MessageSchema:
     """A message type: its tree and its decoder.
 
     ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
-    ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too. ``units`` of fields by
-    type are those that comments of its text state.
+    ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
+    of an installed ROS that it was read from, if the log contains no definition. ``units`` of fields by type are those
+    that comments of its text state.
     """
 
     type_name: str
@@ -112,6 +114,7 @@ class MessageSchema:
     store: Typestore | None = None
     message_class: Any = None
     limits: ResourceLimits = DEFAULT_LIMITS
+    borrowed: tuple[Path, ...] = ()
     units: Mapping[str, Mapping[str, tuple[str, str]]] = field(default_factory=dict)
 
     @functools.cached_property
@@ -237,6 +240,7 @@ def ros_schema(
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     what = f"the definition of {type_name}"
+    borrowed: tuple[Path, ...] = ()
     types: Any = {}
     has_text = bool(text.strip())
 
@@ -261,11 +265,14 @@ def ros_schema(
                 if has_text:  # the log's own text is not whole: its messages are lost
                     raise SchemaError(str(error)) from error
                 raise
+            if not has_text:
+                files = (definitions.installed(name) for name in sorted(set(types) - set(distributed)))
+                borrowed = tuple(file for file in files if file is not None)
         root = _ros_root(types, type_name, limits)
         store = get_typestore(Stores.EMPTY)
         store.register(types)
     units = stated_units(text) if encoding in ("ros2msg", "ros1msg") else {}
-    return MessageSchema(type_name, wire, root, store, limits=limits, units=units)
+    return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed, units=units)
 
 
 def _idl_types(text: str) -> Any:

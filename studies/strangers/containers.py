@@ -126,8 +126,8 @@ def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tu
         scratch.unlink()
 
 
-def _copied(topics: Sequence[Topic], path: Path, writer: Any, *, ros1: bool) -> Path:
-    """Write the messages of topics with a writer of rosbags."""
+def copied(topics: Sequence[Topic], path: Path, writer: Any, *, ros1: bool) -> Path:
+    """Write the messages of topics with a writer of rosbags; return the path."""
     store = _store(ros1)
 
     def described(name: str) -> dict[str, str]:
@@ -145,7 +145,7 @@ def _rosbag1(topics: Sequence[Topic], path: Path) -> Path:
     from rosbags.rosbag1 import Writer
 
     path = path.with_suffix(".bag")
-    return _copied(topics, path, Writer(path), ros1=True)
+    return copied(topics, path, Writer(path), ros1=True)
 
 
 def _mcap_ros1(topics: Sequence[Topic], path: Path) -> Path:
@@ -161,7 +161,7 @@ def _rosbag2(topics: Sequence[Topic], path: Path, plugin: str = "SQLITE3") -> Pa
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     shutil.rmtree(path, ignore_errors=True)
-    return _copied(topics, path, Writer(path, version=9, storage_plugin=StoragePlugin[plugin]), ros1=False)
+    return copied(topics, path, Writer(path, version=9, storage_plugin=StoragePlugin[plugin]), ros1=False)
 
 
 def _rosbag2_bare(topics: Sequence[Topic], path: Path) -> Path:
