@@ -50,6 +50,17 @@ def raise_source_error(error: BaseException, where: str = "the log") -> None:
         raise SourceError(expected="a readable file", got=got, where=where, remedy=remedy) from error
 
 
+def unreadable(error: OSError, place: LogPlace) -> LogError:
+    """Return the error for a file or folder that the system refuses to read."""
+    return LogError(
+        expected="a readable log",
+        got=error.strerror or str(error),
+        where=str(place),
+        remedy="check the path and its permissions",
+        missing=isinstance(error, FileNotFoundError),
+    )
+
+
 class ByteSource(ABC):
     """Bytes that can be read at any offset.
 

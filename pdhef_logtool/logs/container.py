@@ -9,21 +9,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.records import Attachment, Metadata
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
-from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import LimitError, Meter
+from pdhef_logtool.logs.resource_limits import LimitError
+from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
-
-if TYPE_CHECKING:
-    from pdhef_logtool.logs.table_file import LogFile
 
 #: First and last bytes of an MCAP.
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -292,22 +288,17 @@ class Container(ABC):
     remedy = ""
     zstd_messages = False
 
-    def __init__(self, path: LogPlace, size: int, meter: Meter | None = None) -> None:
-        self.path = path
+    def __init__(self, file: LogFile, size: int) -> None:
+        self.path = file.place
         self.channels: dict[int, ChannelRecord] = {}
         self.spans: list[Span] = []
         self.lost: list[Loss] = []
         self.undeclared: dict[int, int] = {}
-        self.meter = meter or Meter()
+        self.meter = file.meter
         self.size = size
         self.cut = False
         self._closing = ExitStack()
         self._losses: Counter[str] = Counter()  # how many of a kind
-
-    @classmethod
-    def open(cls, file: LogFile) -> Self:
-        """Open a file of this format; for formats with the parameters of :class:`FileContainer`."""
-        return cls(file.path, file.place, file.meter)  # type: ignore[arg-type]
 
     @abstractmethod
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
@@ -370,10 +361,8 @@ class FileContainer(Container):
 
     Parameters
     ----------
-    path : file to read, or its bytes wherever they lie.
-    shown_path : name of the file in messages (a decompressed copy has another name than its source).
-    undeclared : messages by span that are not in its counts, as no record declares their channels.
-    meter : resource limits; None: the default.
+    file : file to read.
+    source : its bytes; None: of the local file.
 
     Raises
     ------
@@ -383,10 +372,9 @@ class FileContainer(Container):
     magic = b""
     magic_text = ""
 
-    def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
-        self.source = path if isinstance(path, ByteSource) else LocalFile(path, shown_path)
-        shown = shown_path or (Path() if isinstance(path, ByteSource) else path)
-        super().__init__(shown, self.source.size, meter)
+    def __init__(self, file: LogFile, source: ByteSource | None = None) -> None:
+        self.source = LocalFile(file.path, file.place) if source is None else source
+        super().__init__(file, self.source.size)
         self.on_close(self.source.close)
         self.position = len(self.magic)  # of the walk
         self.chunks: list[Any] = []  # by index of the span

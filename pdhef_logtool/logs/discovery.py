@@ -14,11 +14,11 @@ from itertools import chain, takewhile
 from pathlib import Path
 from typing import TypeAlias
 
-from pdhef_logtool.logs.byte_source import ChangedError, require_regular
+from pdhef_logtool.logs.byte_source import ChangedError, require_regular, unreadable
 from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes, without_general
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
-from pdhef_logtool.records.errors import LogError, UsageError
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.storage.documents import file_sha256
 
 #: Stems are folder names on any system.
@@ -145,12 +145,7 @@ def identity_of(log: LogInput) -> str:
         try:
             return hash_log(log.path)
         except OSError as error:
-            got = error.strerror or str(error)
-            remedy = "check the path and its permissions"
-            missing = isinstance(error, FileNotFoundError)
-            raise LogError(
-                expected="a readable log", got=got, where=str(log.path), remedy=remedy, missing=missing
-            ) from error
+            raise unreadable(error, log.path) from error
     from pdhef_logtool.logs.remote_source import identity_of_object
 
     return identity_of_object(log.path)
@@ -238,6 +233,13 @@ def _matches(pattern: str) -> list[Path]:
     return sorted(paths, key=str)
 
 
+def names_of_logs(folder: Path) -> set[str]:
+    """Return the names of the logs in a folder, by their suffixes, without those in folders below it."""
+    files = (e.name for e in folder.iterdir() if not (e.name.startswith(".") or e.is_dir()))
+    names = {name for name in files if _bare_name(name) != name}
+    return without_general(names - {"history.jsonl", "journal.jsonl"})  # of cars and runs
+
+
 def _search(folder: Path, visited: set[str], settings: TableSettings) -> Iterator[Path]:
     """Yield the logs below a folder; each folder is visited once, because links may form a loop."""
     from pdhef_logtool.logs.recording_folder import is_recording
@@ -252,8 +254,7 @@ def _search(folder: Path, visited: set[str], settings: TableSettings) -> Iterato
     if (folder / RUN_FILE).is_file():
         return
     entries = [e for e in sorted(folder.iterdir()) if not e.name.startswith(".")]
-    named = {e.name for e in entries if not e.is_dir() and _bare_name(e.name) != e.name}
-    logs = without_general(named - {"history.jsonl", "journal.jsonl"})  # of cars and runs
+    logs = names_of_logs(folder)
     if is_recording(folder, logs, settings):
         yield folder
         logs = set()

@@ -165,7 +165,7 @@ class DriveLog(ABC):
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic, decoded with texts; messages that do not decode are left out.
 
-        ``value_at`` of ``message_schema`` reads places in them.
+        ``values_at`` of ``message_schema`` reads places in them.
         """
         del topic, most
         return []

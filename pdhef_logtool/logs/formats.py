@@ -44,8 +44,8 @@ class LogFormat:
     Attributes
     ----------
     title : for messages: ``an MCAP file``.
-    opener : ``package.module:function``, which opens a :class:`LogFile` as a log, or as a container of messages, and
-        raises LogError for a file of another format.
+    opener : ``package.module:name`` of a function or class, which opens a :class:`LogFile` as a log, or as a container
+        of messages, and raises LogError for a file of another format.
     libraries : None; or the opener is a reader of tables, which runs in a separate process
         (:mod:`~pdhef_logtool.logs.reader_process`), with the modules that it imports.
     suffixes : by which a search through folders takes files for logs. named : also, if it is named outright.

@@ -22,7 +22,7 @@ from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
 from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
-from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables, left_out
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
@@ -95,9 +95,7 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
             unusable.append(f"{path} {value.shape}")
         arrays.setdefault(struct_, {}).update(vectors)
         units.setdefault(struct_, {}).update(dict.fromkeys(vectors, unit))
-    if unusable:
-        what = f"variables that are no vectors of numbers are left out: {', '.join(unusable)}"
-        losses.append(Loss("no-numbers", what, file.name, count=len(unusable), severity="note"))
+    losses += left_out("variables that are no vectors of numbers", unusable, file.name)
     tables = list(_mat_tables(arrays, units, file, losses, rate_hz))
     if not tables:
         expected = "a vector of times (t, time, ...) as long as the signals beside it"

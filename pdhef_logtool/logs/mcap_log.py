@@ -16,7 +16,6 @@ from dataclasses import replace
 from functools import cached_property
 from io import BytesIO
 from itertools import accumulate
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -47,8 +46,8 @@ from pdhef_logtool.logs.container import (
     rows_by_channel,
 )
 from pdhef_logtool.logs.mcap_index import INDEX_PAIR, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
-from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import KIB, MIB, LimitError, Meter
+from pdhef_logtool.logs.resource_limits import KIB, MIB, LimitError
+from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.records.signals import IntArray, Loss
 
 UintArray: TypeAlias = NDArray[np.uint64]
@@ -82,13 +81,7 @@ class McapContainer(FileContainer):
     remedy = "is it an MCAP 1.0 recording?"
     chunks: list[Extent]
 
-    def __init__(
-        self,
-        path: Path | ByteSource,
-        shown_path: LogPlace | None = None,
-        meter: Meter | None = None,
-        wanted: Wanted = EVERYTHING,
-    ) -> None:
+    def __init__(self, file: LogFile, source: ByteSource | None = None, wanted: Wanted = EVERYTHING) -> None:
         self.profile = ""
         self._wanted = wanted
         self._schemas: dict[int, Schema] = {}
@@ -101,7 +94,7 @@ class McapContainer(FileContainer):
         self._statistics: Statistics | None = None
         self._has_end = False  # whether the file ends with its magic bytes
         self._opened_chunks = 0  # number of chunks that the summary does not describe
-        super().__init__(path, shown_path, meter)
+        super().__init__(file, source)
 
     def _walk(self) -> None:
         source, size = self.source, self.source.size

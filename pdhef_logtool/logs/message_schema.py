@@ -600,31 +600,28 @@ def bytes_of_text(value: object, encoding: str) -> list[int] | None:
         return None
 
 
-def value_at(message: object, steps: Sequence[Step]) -> object:
-    """Follow steps through attributes, mappings and sequences; None where the message lacks one."""
-    value: Any = message
-    for step in steps:
-        if isinstance(step, int):
-            try:
-                value = value[step]
-            except (IndexError, KeyError, TypeError):
-                return None
-        else:
-            value = value.get(step) if isinstance(value, dict) else getattr(value, step, None)
-    return value
+def _value_at(value: Any, step: Step) -> Any:
+    """Return an element, an entry or an attribute of a value; None if it lacks it."""
+    if isinstance(step, str):
+        return value.get(step) if isinstance(value, dict) else getattr(value, step, None)
+    try:
+        return value[step]
+    except (IndexError, KeyError, TypeError):
+        return None
 
 
 def values_at(values: Sequence[Any], steps: Sequence[Step]) -> Sequence[Any]:
-    """Follow steps through messages or values of one type, as :func:`value_at` does through one of them.
+    """Follow steps through messages or values of one type; None where one of them lacks a step.
 
     Absent fields of protobuf messages are None. A default that the type declares (proto2) replaces an absent value.
     """
     for step in steps:
         kind: Any = type(next((value for value in values if value is not None), None))
-        if isinstance(step, int) or not hasattr(kind, "DESCRIPTOR"):
-            values = [value_at(value, (step,)) for value in values]
+        named = kind.DESCRIPTOR.fields_by_name if hasattr(kind, "DESCRIPTOR") else {}
+        if isinstance(step, int) or step not in named:
+            values = [_value_at(value, step) for value in values]
             continue
-        field = kind.DESCRIPTOR.fields_by_name[step]
+        field = named[step]
         if field.has_presence and not field.has_default_value:
             values = [getattr(v, step) if v is not None and v.HasField(step) else None for v in values]
         else:

@@ -8,21 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.logs.byte_source import raise_source_error, require_regular
+from pdhef_logtool.logs.byte_source import raise_source_error, require_regular, unreadable
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.compression import decompress_file
 from pdhef_logtool.logs.container import EVERYTHING, MCAP_MAGIC, Container, Wanted, describe_damage
 from pdhef_logtool.logs.definitions import dbc_files, read_definitions
+from pdhef_logtool.logs.discovery import names_of_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.formats import (
-    COMPRESSED_SUFFIXES,
     HEAD_BYTES,
     ROSBAG2_METADATA,
     ZSTD_MAGIC,
-    log_suffixes,
     recognised_format,
     what_is_a_log,
-    without_general,
 )
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
@@ -96,12 +94,7 @@ def _opened(file: LogFile, wanted: Wanted) -> DriveLog:
             opened = _open_file(file)
     except OSError as error:
         raise_source_error(error, str(path))
-        raise LogError(
-            expected="a readable file",
-            got=error.strerror or str(error),
-            where=str(path),
-            remedy="check its permissions",
-        ) from error
+        raise unreadable(error, path) from error
     except PdhefError:
         raise
     except Exception as error:
@@ -124,22 +117,6 @@ def log_metadata(path: LogPlace, limits: ResourceLimits = DEFAULT_LIMITS) -> dic
         return log.metadata()
 
 
-def is_log_folder(path: Path) -> bool:
-    """Return whether a folder is one log (a rosbag2 folder) rather than a folder of logs."""
-    return path.is_dir() and (path / ROSBAG2_METADATA).is_file()
-
-
-def looks_like_log(path: Path) -> bool:
-    """Return, by the first bytes and the name, whether a file can be a log, without opening it further."""
-    if not path.is_file():
-        return is_log_folder(path)
-    with path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-    if head.startswith(ZSTD_MAGIC):
-        return path.suffix in COMPRESSED_SUFFIXES and path.stem.endswith(log_suffixes())
-    return recognised_format(head, path.name) is not None
-
-
 def _open_file(file: LogFile) -> Container | DriveLog:
     """Open one file."""
     is_compressed = _head_of(file.path).startswith(ZSTD_MAGIC)
@@ -156,7 +133,7 @@ def _open_remote(file: LogFile, place: RemotePlace, wanted: Wanted) -> Container
         if head.startswith(MCAP_MAGIC):
             from pdhef_logtool.logs.mcap_log import McapContainer
 
-            return McapContainer(source, place, file.meter, wanted)
+            return McapContainer(file, source, wanted)
         file = replace(file, path=source.path, release=source.close)
         if head.startswith(ZSTD_MAGIC) or recognised_format(head, source.path.name) is not None:
             source.fetch_whole()
@@ -207,10 +184,9 @@ def _open_folder(file: LogFile) -> DriveLog:
     from pdhef_logtool.logs.recording_folder import open_recording
 
     path = file.path
-    if is_log_folder(path):
+    if (path / ROSBAG2_METADATA).is_file():
         return _open_rosbag2_folder(file)
-    logs = [p for p in sorted(path.iterdir()) if p.is_file() and looks_like_log(p)]
-    logs = [p for p in logs if p.name in without_general({log.name for log in logs})]
+    logs = [path / name for name in sorted(names_of_logs(path))]
     if (recording := open_recording(file, logs)) is not None:
         return recording
     if len(logs) != 1:

@@ -16,7 +16,7 @@ from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_cells import read_cells
 from pdhef_logtool.logs.table_clocks import unwrapped
 from pdhef_logtool.logs.table_columns import Sheet, read_head, tables_of
-from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables, left_out
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import NS_PER_S, Loss
 
@@ -29,9 +29,8 @@ def open_parquet(file: TableFile) -> Tables:
     file.limits.check("channels", len(leaves), file.name)
     kinds = {path: _kind(field.type) for path, field in leaves.items()}
     paths = [path for path, kind in kinds.items() if kind]
-    if unusable := [f"{path} ({leaves[path].type})" for path, kind in kinds.items() if not kind]:
-        what = f"columns of types without numbers are left out: {', '.join(unusable)}"
-        losses.append(Loss("no-numbers", what, file.name, count=len(unusable), severity="note"))
+    unusable = [f"{path} ({leaves[path].type})" for path, kind in kinds.items() if not kind]
+    losses += left_out("columns of types without numbers", unusable, file.name)
     file.stream.seek(0)
     with pq.ParquetFile(file.stream, read_dictionary=[p for p in paths if kinds[p] == "text"]) as source:
         parts = _groups(source, paths, file, losses)

@@ -33,7 +33,7 @@ from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, guarded_clie
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.resource_limits import KIB, MIB
 from pdhef_logtool.records.extras import required
-from pdhef_logtool.storage.files import scratch_folder, take_lock
+from pdhef_logtool.storage.files import WINDOWS, scratch_folder, take_lock
 from pdhef_logtool.storage.object_store import s3_system, words_of
 
 BLOCK_BYTES, MOST_RANGE_BYTES = 64 * KIB, 8 * MIB
@@ -75,7 +75,8 @@ class RemoteCopy:
         self.path, index = folder / "object" / (name.replace("/", "_")[-80:] or "log"), folder / "index"
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._index = stack.enter_context(index.open("a+b", buffering=0))
-        if cached is not None and not (take_lock(self._index.fileno(), exclusive=False) and index.exists()):
+        is_held = cached is None or WINDOWS or take_lock(self._index.fileno(), exclusive=False)
+        if not (is_held and index.exists()):
             raise FileNotFoundError  # another process is removing the copy
         os.utime(index)
         self.path.touch()
@@ -122,7 +123,8 @@ def _evict() -> None:
             files = [path.stat() for path in (index.parent / "object").iterdir()]
             total += sum(getattr(file, "st_blocks", file.st_size >> 9) << 9 for file in files)
             with index.open("rb") as file:
-                if total > CACHE_BYTES and take_lock(file.fileno()):
+                # Windows does not remove open files.
+                if total > CACHE_BYTES and (WINDOWS or take_lock(file.fileno())):
                     shutil.rmtree(index.parent, ignore_errors=True)
 
 

@@ -11,20 +11,20 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 from rosbags.rosbag1.reader import Header, ReaderError, RecordType
 
-from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import Block, ChannelRecord, FileContainer, Span, SpanDamageError, block_from_lists
-from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import MIB, Meter
+from pdhef_logtool.logs.resource_limits import MIB
+from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
+#: A plain number: comparing with a member of an enumeration takes longer.
+_OP_MESSAGE = int(RecordType.MSGDATA)
 _U32 = struct.Struct("<I")
-_LENGTHS_BYTES = 2 * _U32.size  # of the header and the data of a record
+_LENGTH_BYTES, _LENGTHS_BYTES = _U32.size, 2 * _U32.size  # of the header, and of header and data, of a record
 #: Bytes of a message record without data: five lengths, an opcode, a connection and a time with their names.
 _LEAST_MESSAGE_BYTES = struct.calcsize("<5IBIQ") + len(b"op=conn=time=")
 
@@ -51,12 +51,12 @@ class Rosbag1Container(FileContainer):
     remedy = "is it a ROS 1 bag?"
     chunks: list[_Chunk]
 
-    def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
+    def __init__(self, file: LogFile) -> None:
         self._found: list[_Chunk] = []
         self._is_truncated = False
         self._header: tuple[int, int] | None = None  # where the index section begins, and how many chunks there are
         self._infos: dict[int, Counter[int]] = {}  # counts by connection of the chunk at a byte, by the index section
-        super().__init__(path, shown_path, meter)
+        super().__init__(file)
 
     def _walk(self) -> None:
         size = self.source.size
@@ -165,7 +165,7 @@ class Rosbag1Container(FileContainer):
             fields, begin, offset = record
             try:
                 op = fields.get_uint8("op")
-                if op == RecordType.MSGDATA:
+                if op == _OP_MESSAGE:
                     self.meter.check_scan(len(stamps))
                     channels.append(fields.get_uint32("conn"))
                     stamps.append(fields.get_time("time"))
@@ -197,12 +197,12 @@ def _record_at(read: Callable[[int, int], bytes], offset: int, size: int, most: 
     """
     if offset + _LENGTHS_BYTES > size:
         return None
-    (header,) = _U32.unpack(read(offset, _U32.size))
+    header = int.from_bytes(read(offset, _LENGTH_BYTES), "little")
     start = offset + _LENGTHS_BYTES + header
     if header == 0 or start > size or header > most:
         return None
     text = read(offset, start - offset)
-    end = start + int.from_bytes(text[-_U32.size :], "little")
+    end = start + int.from_bytes(text[-_LENGTH_BYTES:], "little")
     if end > size:
         return None
     try:

@@ -24,8 +24,8 @@ from pdhef_logtool.logs.container import (
     describe_damage,
     rows_by_channel,
 )
-from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import MIB, LimitError, Meter
+from pdhef_logtool.logs.resource_limits import MIB, LimitError
+from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.storage.files import scratch_folder
 
 _PAGE_ROWS = 8192
@@ -47,13 +47,13 @@ class SqliteContainer(Container):
     selective = True  # rows of other topics are not read
     remedy = "is it a rosbag2 recording?"
 
-    def __init__(self, path: Path, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
-        require_regular(path, shown_path)
-        super().__init__(shown_path or path, path.stat().st_size, meter)
+    def __init__(self, file: LogFile) -> None:
+        require_regular(file.path, file.place)
+        super().__init__(file, file.path.stat().st_size)
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._ends: list[int] = []  # bytes of the rows up to the end of each page
         self._late: LimitError | None = None
-        self._db = self._connect(path)
+        self._db = self._connect(file.path)
         self.on_close(self._db.close)
         try:
             self._db.text_factory = lambda stored: stored.decode("utf-8", errors="replace")  # also of a damaged one

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs import table_clocks
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, Clock
+from pdhef_logtool.logs.table_file import left_out
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.geometry import DEGREE_M
@@ -302,9 +303,7 @@ def tables_of(
         values = column[rows]
         there = _own_rows(np.isfinite(values), times)
         groups.setdefault(np.packbits(there).tobytes(), (there, {}))[1][name] = values[there]
-    if unusable:
-        what = f"columns without numbers are left out: {', '.join(unusable)}"
-        losses.append(Loss("no-numbers", what, f"{where}, {sheet.name}", count=len(unusable), severity="note"))
+    losses.extend(left_out("columns without numbers", unusable, f"{where}, {sheet.name}"))
     ordered = sorted(groups.values(), key=lambda group: -np.count_nonzero(group[0]))
     for number, (there, columns) in enumerate(ordered, 1):
         name = sheet.name if number == 1 else f"{sheet.name}_{number}"

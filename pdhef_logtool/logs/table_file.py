@@ -83,6 +83,12 @@ class TableFile:
         self.limits.check_table(size, self.size, where or self.name)
 
 
+def left_out(what: str, names: Sequence[str], where: str) -> list[Loss]:
+    """Return the note on parts of a file without numbers; none without names."""
+    text = f"{what} are left out: {', '.join(names)}"
+    return [Loss("no-numbers", text, where, count=len(names), severity="note")] if names else []
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Tables:
     """Contents of a file: its kind for reports (``csv``, ``mdf-4``, ...), its tables, and its losses."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.logs.message_schema import value_at
+from pdhef_logtool.logs.message_schema import values_at
 from pdhef_logtool.mapping.naming import Meaning, corner_of, words_of
 
 #: Number of messages to read the names from: several nodes may send different joints to one topic.
@@ -21,7 +21,7 @@ def is_joints(topic: TopicInfo) -> bool:
 
 def joint_names(log: DriveLog, topic: TopicInfo) -> tuple[str, ...]:
     """Return the joints of a topic in their order; empty if the order varies between messages."""
-    listed = (value_at(m, ("name",)) for m in log.first_messages(topic.name, MESSAGES))
+    listed = values_at(log.first_messages(topic.name, MESSAGES), ("name",))
     orders = {tuple(map(str, names)) for names in listed if isinstance(names, list | tuple) and names}
     return next(iter(orders)) if len(orders) == 1 else ()
 

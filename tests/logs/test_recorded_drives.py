@@ -16,7 +16,9 @@ from pdhef_logtool.logs.container import RawMessage, block_of
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
+from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import LogError, MappingError
 from tests.mcap_files import mcap_writer
@@ -224,7 +226,7 @@ def _split(tmp_path: Path, swap: bool) -> ColumnarLog:
             times = T0 + 10**9 * k + np.arange(100)
             messages = (RawMessage(ids["/b" if i % 2 else "/a"], int(t), 0, i, b"x") for i, t in enumerate(times))
             writer.write([], [block_of(messages)])
-        containers.append(McapContainer(path))
+        containers.append(McapContainer(LogFile(path, path, Meter())))
     return ColumnarLog(tmp_path, "rosbag2-mcap", containers)
 
 
