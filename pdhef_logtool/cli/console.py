@@ -144,15 +144,6 @@ def print_json(document: Any) -> None:
     print(text if text.replace("\n", "").isprintable() else "".join(signs))  # noqa: T201
 
 
-def print_facts(facts: dict[str, Any]) -> None:
-    """Print one fact per line, or a JSON document."""
-    if as_json:
-        print_json(facts)
-        return
-    for key, value in facts.items():
-        print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {printable(value)}")  # noqa: T201
-
-
 def show(result: _Shown, output: Callable[[_Shown, Console], None] | str, **fields: Any) -> None:
     """Print a result as a JSON document, or by a function or a template; it is the template's field ``r``."""
     if as_json:
