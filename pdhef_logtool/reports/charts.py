@@ -26,13 +26,13 @@ def colour(name: str) -> str:
     """Return the colour ``#rrggbb`` of an estimator or of the ground truth, which is the same on every page."""
     if name == TRUTH:
         return INK
-    rgb = colour_rgb(name, {s.name: s.colour for s in all_specs()})
+    rgb: Sequence[int] = colour_rgb(name, {s.name: s.colour for s in all_specs()})
     while contrast(rgb) < _LEAST_CONTRAST:
-        rgb = (rgb[0] * 15 // 16, rgb[1] * 15 // 16, rgb[2] * 15 // 16)
+        rgb = [part * 15 // 16 for part in rgb]
     return "#{:02x}{:02x}{:02x}".format(*rgb)
 
 
-def contrast(rgb: tuple[int, int, int]) -> float:
+def contrast(rgb: Sequence[int]) -> float:
     """Return the contrast to white by WCAG 2.1, 1 to 21."""
     red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb))
     return 1.05 / (0.2126 * red + 0.7152 * green + 0.0722 * blue + 0.05)
