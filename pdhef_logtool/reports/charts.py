@@ -209,42 +209,27 @@ class Charts:
         return {"start": start_s, "cell": cell_s, "cells": grid.cells}
 
     def document(self) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return the document for the page's script, and the text blocks that it refers to, by name."""
-        packed = _Blocks()
-        figures = {
-            key: {"kind": figure.kind, **packed.entries(figure, getattr(figure, "resolution", 0.0))}
-            for key, figure in self.figures.items()
-        }
-        return {"time": self.time(), "figures": figures}, packed.texts
+        """Return the document for the page's script, and the text blocks of series that it refers to, by name."""
+        blocks: dict[str, str] = {}
 
+        def plain(value: Any, resolution: float) -> Any:
+            if isinstance(value, np.ndarray):
+                name = f"b{len(blocks)}"
+                blocks[name], scale = encode(value, resolution)
+                return {"block": name, **scale}
+            if isinstance(value, str):
+                half = _LABEL_SIGNS // 2
+                return printable(value if len(value) <= _LABEL_SIGNS else f"{value[: half - 1]}…{value[-half:]}")
+            if isinstance(value, float):
+                return float(f"{value:.9g}") if np.isfinite(value) else None
+            if isinstance(value, list | tuple):
+                return [plain(entry, resolution) for entry in value]
+            if is_dataclass(value):
+                return {f.name: plain(getattr(value, f.name), resolution) for f in fields(value)}
+            return value
 
-class _Blocks:
-    """The encoded series of a page."""
-
-    def __init__(self) -> None:
-        self.texts: dict[str, str] = {}
-
-    def add(self, values: FloatArray, resolution: float = 0.0) -> dict[str, Any]:
-        """Add a series and return its reference for the script."""
-        name = f"b{len(self.texts)}"
-        self.texts[name], scale = encode(values, resolution)
-        return {"block": name, **scale}
-
-    def entries(self, record: Any, resolution: float) -> dict[str, Any]:
-        """Return a record by its fields for the page's script."""
-        return {f.name: self._plain(getattr(record, f.name), resolution) for f in fields(record)}
-
-    def _plain(self, value: Any, resolution: float) -> Any:
-        if isinstance(value, np.ndarray):
-            return self.add(value, resolution)
-        if isinstance(value, str):
-            half = _LABEL_SIGNS // 2
-            return printable(value if len(value) <= _LABEL_SIGNS else f"{value[: half - 1]}…{value[-half:]}")
-        if isinstance(value, float):
-            return float(f"{value:.9g}") if np.isfinite(value) else None
-        if isinstance(value, list | tuple):
-            return [self._plain(entry, resolution) for entry in value]
-        return self.entries(value, resolution) if is_dataclass(value) else value
+        figures = {k: {"kind": f.kind, **plain(f, getattr(f, "resolution", 0.0))} for k, f in self.figures.items()}
+        return {"time": self.time(), "figures": figures}, blocks
 
 
 def joined(spans: Sequence[Span]) -> list[Span]:
