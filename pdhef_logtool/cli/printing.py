@@ -42,7 +42,7 @@ def _environment() -> Environment:
 
 
 def print_template(name: str, console: Console, **fields: Any) -> None:
-    """Print ``templates/NAME.txt`` with its fields, whose brackets are no markup.
+    """Print ``templates/NAME.txt`` with its fields, in which no sign has a meaning.
 
     Lines with tabs in succession are a table: its heads (:func:`~.console.table`), then its rows. A line that begins
     with ``==`` is the title of the table below it. Lines that begin with a colon are a name and, after a tab, its text.
