@@ -45,7 +45,7 @@ def responses(drive: EvaluatedDrive) -> Iterator[Columns]:
     if drive.calibrated is None:
         return
     signals, vehicle, _ = drive.calibrated
-    since_s = np.asarray((signals.stamps_ns - signals.stamps_ns[:1]) * S_PER_NS, dtype=np.float64)
+    since_s: FloatArray = np.multiply(signals.stamps_ns - signals.stamps_ns[:1], S_PER_NS)
     kinds = [(_first(drive, since_s, names.split()), needed.split(), figures) for names, needed, figures in _KINDS]
     signals_of, steered = {m.name: m.brief for m in METRICS}, np.isfinite(signals.steer_rad)
     for track in (*drive.tracks.values(), *(() if drive.truth is None else (drive.truth,))):
