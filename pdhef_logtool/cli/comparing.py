@@ -96,8 +96,6 @@ def _seconds(text: str, option: str) -> float:
 @options.command()
 def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
     """Ask about the drives of one or more runs, in SQL."""
-    from rich.markup import escape
-
     from pdhef_logtool.results import querying
 
     rows = querying.query(runs, sql)
@@ -108,7 +106,7 @@ def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
     def text(value: object) -> str:
         return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else printable(str(value))
 
-    heads = [f"<{'>' * kind.is_numeric()}{escape(name)}" for name, kind in rows.schema.items()]
+    heads = [f"<{'>' * kind.is_numeric()}{console.protected(name)}" for name, kind in rows.schema.items()]
     texts, out = (map(text, row) for row in rows.iter_rows()), console.stdout()
     if sum(len(name) + 2 for name in rows.columns) <= out.width:
         out.print(console.table(*heads, rows=texts))

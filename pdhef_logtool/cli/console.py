@@ -37,6 +37,9 @@ as_json = False
 PROGRESS_S = 30.0
 #: Line break within a cell of a table; printable texts contain no such character.
 BREAK = "\v"
+#: Signs with a meaning in templates, as which fields contain private characters until they are printed.
+_PROTECTED = str.maketrans({sign: chr(0xE000 + ord(sign)) for sign in "[\\:|="})
+_SHOWN = {ord(private): chr(sign) for sign, private in _PROTECTED.items()}
 #: A line on stderr is an error or a warning of several parts.
 _MOST_SIGNS = 5000
 
@@ -58,6 +61,20 @@ def stdout() -> Console:
     )
 
 
+def protected(value: object) -> str:
+    """Return a text with none of the signs that have a meaning in templates; :func:`marked_up` restores them."""
+    return str(value).translate(_PROTECTED)
+
+
+def marked_up(markup: str) -> Text:
+    """Return a text in the markup of Rich."""
+    from rich.text import Text
+
+    text = Text.from_markup(markup.replace(BREAK, "\n"), emoji=False)
+    text.plain = text.plain.translate(_SHOWN)
+    return text
+
+
 def table(*heads: str, rows: Iterable[Iterable[Any]] = (), title: str = "") -> Table:
     """Return a table of rows, with rules below its title if it has one.
 
@@ -66,17 +83,16 @@ def table(*heads: str, rows: Iterable[Iterable[Any]] = (), title: str = "") -> T
     """
     from rich import box
     from rich.table import Table
-    from rich.text import Text
 
     made = Table(box=None, header_style="bold")
     if title:
         style: dict[str, Any] = {"box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
-        made = Table(title=Text.from_markup(title, emoji=False), title_justify="left", title_style="bold", **style)
+        made = Table(title=marked_up(title), title_justify="left", title_style="bold", **style)
     for head in heads:
         text = head.lstrip("<>!")
         signs = head.removesuffix(text)
         made.add_column(
-            Text.from_markup(text.replace(BREAK, "\n"), emoji=False),
+            marked_up(text),
             justify="right" if ">" in signs else "left",
             overflow="fold" if "<" in signs else "ellipsis",
             no_wrap="!" in signs,
@@ -142,15 +158,6 @@ def print_json(document: Any) -> None:
     text = json.dumps(jsonable(document), indent=2, sort_keys=False, ensure_ascii=False, allow_nan=False)
     signs = (c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
     print(text if text.replace("\n", "").isprintable() else "".join(signs))  # noqa: T201
-
-
-def print_facts(facts: dict[str, Any]) -> None:
-    """Print one fact per line, or a JSON document."""
-    if as_json:
-        print_json(facts)
-        return
-    for key, value in facts.items():
-        print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {printable(value)}")  # noqa: T201
 
 
 def show(result: _Shown, output: Callable[[_Shown, Console], None] | str, **fields: Any) -> None:

@@ -10,10 +10,8 @@ from typing import Any
 
 from jinja2 import Environment
 from rich.console import Console
-from rich.markup import escape
-from rich.text import Text
 
-from pdhef_logtool.cli.console import BREAK, cell, named_lines, print_indented, table
+from pdhef_logtool.cli.console import BREAK, cell, marked_up, named_lines, print_indented, protected, table
 from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_steps
 from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.evaluation.units import read_unit
@@ -38,13 +36,13 @@ _NAMED = {"BREAK": BREAK, "DEGREES": DEGREES, "STYLES": _STYLES, "number": numbe
 @cache
 def _environment() -> Environment:
     made = environment(Path(__file__).parent / "templates")
-    made.finalize = lambda value: escape(str(value))
+    made.finalize = protected
     made.globals |= {function.__name__: function for function in _FUNCTIONS} | _NAMED
     return made
 
 
 def print_template(name: str, console: Console, **fields: Any) -> None:
-    """Print ``templates/NAME.txt`` with its fields, whose brackets are no markup.
+    """Print ``templates/NAME.txt`` with its fields, in which no sign has a meaning.
 
     Lines with tabs in succession are a table: its heads (:func:`~.console.table`), then its rows. A line that begins
     with ``==`` is the title of the table below it. Lines that begin with a colon are a name and, after a tab, its text.
@@ -54,9 +52,9 @@ def print_template(name: str, console: Console, **fields: Any) -> None:
     for kind, block in groupby(text.split("\n")[:-1], lambda line: ":" if line.startswith(":") else "\t" in line):
         lines = [line.split("\t") for line in block]
         if kind == ":":
-            console.print(named_lines([(_text(name[1:]), _text(words)) for name, words in lines]))
+            console.print(named_lines([(marked_up(name[1:]), marked_up(words)) for name, words in lines]))
         elif kind:
-            console.print(table(*lines[0], rows=(map(_text, row) for row in lines[1:]), title=title))
+            console.print(table(*lines[0], rows=(map(marked_up, row) for row in lines[1:]), title=title))
         else:
             for (line,) in lines:
                 title = _print_line(line, console)
@@ -67,11 +65,7 @@ def _print_line(line: str, console: Console) -> str:
     if line.startswith("=="):
         return line.removeprefix("==").strip()
     if line.startswith("  "):
-        print_indented(_text(line[2:]), console)
+        print_indented(marked_up(line[2:]), console)
     else:
-        console.print(_text(line.removeprefix("|")), soft_wrap=line.startswith("|"))
+        console.print(marked_up(line.removeprefix("|")), soft_wrap=line.startswith("|"))
     return ""
-
-
-def _text(markup: str) -> Text:
-    return Text.from_markup(markup.replace(BREAK, "\n"), emoji=False)

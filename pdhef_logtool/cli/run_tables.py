@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from rich.console import Console
-from rich.markup import escape
 from rich.measure import Measurement
 
-from pdhef_logtool.cli.console import BREAK, cell, table
+from pdhef_logtool.cli.console import BREAK, cell, protected, table
 from pdhef_logtool.cli.printing import print_template
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
@@ -84,7 +83,7 @@ def _table(report: _Report, console: Console) -> list[list[str]]:
         for e in shown:
             figures = (cell(values.get((e["name"], *k)), factor, digits) for k, (_, factor, digits) in columns)
             rows.append([e["name"] + ("" if e["causal"] else " *"), *figures])
-        made = table(*map(escape, rows[0]), rows=rows[1:])
+        made = table(*map(protected, rows[0]), rows=rows[1:])
         if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= console.width:
             break
     return rows

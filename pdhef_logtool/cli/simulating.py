@@ -62,7 +62,7 @@ def simulate(
         keep_spins=keep_spins,
     )
     write_drive(drive, output, without=without or ())
-    console.print_facts({"output": str(output), **drive.facts()})
+    console.show({"output": str(output), **drive.facts()}, "facts")
 
 
 @options.command("simulate suite")
@@ -83,7 +83,7 @@ def suite(
             progress=report.progress,
         )
     facts = {key: manifest[key] for key in ("command", "splits", "written", "dropped_draws")}
-    console.print_facts({"output": str(output), **facts})
+    console.show({"output": str(output), **facts}, "facts")
     for entry in manifest["drives"]:
         if "sha256" not in entry:
             console.warn(f"{entry['file']}: no drive: {entry['dropped'][-1]['reason']}")
@@ -104,12 +104,8 @@ def _list_manoeuvres() -> None:
     from truthsim.manoeuvres import MANOEUVRES
 
     fields = ("description", "speed_km_h", "friction", "duration_s")
-    if console.as_json:
-        rows = [{"name": name, **{f: getattr(m, f) for f in fields}} for name, m in MANOEUVRES.items()]
-        console.print_json({"manoeuvres": rows})
-        return
-    figures = ((n, *(f"{getattr(m, f):g}" for f in fields[1:]), m.description) for n, m in MANOEUVRES.items())
-    console.stdout().print(console.table("name", "km/h", "mu", "s", "what it is", rows=figures))
+    rows = [{"name": name, **{f: getattr(m, f) for f in fields}} for name, m in MANOEUVRES.items()]
+    console.show({"manoeuvres": rows}, "manoeuvres")
 
 
 @options.command()

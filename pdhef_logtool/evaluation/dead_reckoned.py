@@ -17,7 +17,7 @@ from pdhef_logtool.records.tracks import StateTrack
 ANCHOR_S = 1.0
 #: Number of points of a drift, and the share of the way by which paths are aligned.
 _MOST_POINTS, _ALIGNED_SHARE = 500, 0.1
-#: Longest step between stamps within a second of dead reckoning.
+#: Longest step between stamps: within a second of dead reckoning, and that counts as driving.
 MAX_STEP_S = 0.2
 
 

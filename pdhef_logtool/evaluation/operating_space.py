@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.evaluation.dead_reckoned import MAX_STEP_S
 from pdhef_logtool.evaluation.segments import MANOEUVRE_SMOOTHING_HZ, driven_speed, taken
 from pdhef_logtool.evaluation.smoothing import median_step_ns, smooth
 from pdhef_logtool.evaluation.track_errors import signal_error
@@ -21,9 +22,6 @@ from pdhef_logtool.records.tracks import StateTrack
 #: Lower edges of the cells; the last cell has no upper edge. 60 m/s are 216 km/h.
 SPEED_EDGES_M_S = tuple(float(5 * i) for i in range(13))
 AY_EDGES_M_S2 = tuple(float(i) for i in range(13))
-#: Upper limit of the duration of a step between stamps.
-MAX_STEP_S = 0.2
-
 
 #: Entries of a cell with data.
 _CELL = ("speed", "ay", "seconds", "scored", "sideslip_mse_rad2")

@@ -42,6 +42,8 @@ Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
 #: Values of each drive by factor (day, car, route); None if the log does not contain it.
 Factors: TypeAlias = Mapping[str, Sequence[object] | NDArray[np.object_]]
 
+#: Confidence level of intervals, and of one-sided bounds.
+LEVEL = 0.95
 #: Metadata keys of a route; the first one in the log counts.
 ROUTE_KEYS = ("route", "track", "course")
 #: Factors unless the user names a cluster.
@@ -223,7 +225,7 @@ def pooled(
     *,
     squares: bool,
     positive: bool,
-    level: float,
+    level: float = LEVEL,
     factors: Factors | None = None,
 ) -> Bounded:
     """Return the mean of values [N] weighted by stamps [N], or its ratio to the mean of ``others`` [N].
@@ -319,7 +321,7 @@ def _deviations(top: FloatArray, below: FloatArray, power: float, centre: float,
     return usable if usable.size else np.zeros(1)
 
 
-def quantile(values: FloatArray, share: float, level: float, factors: Factors | None = None) -> Bounded:
+def quantile(values: FloatArray, share: float, level: float = LEVEL, factors: Factors | None = None) -> Bounded:
     """Return a quantile of drives [N] with its bounds by order statistics; infinite if N is too small.
 
     The bounds are exact for independent drives; otherwise a normal approximation with the design effect is used.
@@ -397,7 +399,7 @@ def log_ratios(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def paired_change(
-    ratios: FloatArray, clusters: Sequence[object] | None = None, factors: Factors | None = None, level: float = 0.95
+    ratios: FloatArray, clusters: Sequence[object] | None = None, factors: Factors | None = None, level: float = LEVEL
 ) -> PairedChange:
     """Return the median log ratio of drives with its bounds.
 
@@ -419,7 +421,7 @@ def paired_change(
     above = (ratios > median).astype(np.float64) - (ratios < median)
     effect = dependence(above, {"cluster": clusters} if clusters is not None else factors or {})
     votes = sign_p(ratios, effect)
-    bounds = (_bounds(ascending, share, effect) for share in (0.5 + 0.5 * level, 0.95))
+    bounds = (_bounds(ascending, share, effect) for share in (0.5 + 0.5 * level, LEVEL))
     (low, high), (least, most) = bounds if groups >= LEAST_CLUSTERS else ((nan, nan), (nan, nan))
     return PairedChange(n, groups, median, low, high, least, most, (most - least) / (2 * _BOUND_95), votes, effect)
 

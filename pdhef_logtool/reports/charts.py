@@ -26,13 +26,13 @@ def colour(name: str) -> str:
     """Return the colour ``#rrggbb`` of an estimator or of the ground truth, which is the same on every page."""
     if name == TRUTH:
         return INK
-    rgb = colour_rgb(name, {s.name: s.colour for s in all_specs()})
+    rgb: Sequence[int] = colour_rgb(name, {s.name: s.colour for s in all_specs()})
     while contrast(rgb) < _LEAST_CONTRAST:
-        rgb = (rgb[0] * 15 // 16, rgb[1] * 15 // 16, rgb[2] * 15 // 16)
+        rgb = [part * 15 // 16 for part in rgb]
     return "#{:02x}{:02x}{:02x}".format(*rgb)
 
 
-def contrast(rgb: tuple[int, int, int]) -> float:
+def contrast(rgb: Sequence[int]) -> float:
     """Return the contrast to white by WCAG 2.1, 1 to 21."""
     red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb))
     return 1.05 / (0.2126 * red + 0.7152 * green + 0.0722 * blue + 0.05)
@@ -209,42 +209,27 @@ class Charts:
         return {"start": start_s, "cell": cell_s, "cells": grid.cells}
 
     def document(self) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return the document for the page's script, and the text blocks that it refers to, by name."""
-        packed = _Blocks()
-        figures = {
-            key: {"kind": figure.kind, **packed.entries(figure, getattr(figure, "resolution", 0.0))}
-            for key, figure in self.figures.items()
-        }
-        return {"time": self.time(), "figures": figures}, packed.texts
+        """Return the document for the page's script, and the text blocks of series that it refers to, by name."""
+        blocks: dict[str, str] = {}
 
+        def plain(value: Any, resolution: float) -> Any:
+            if isinstance(value, np.ndarray):
+                name = f"b{len(blocks)}"
+                blocks[name], scale = encode(value, resolution)
+                return {"block": name, **scale}
+            if isinstance(value, str):
+                half = _LABEL_SIGNS // 2
+                return printable(value if len(value) <= _LABEL_SIGNS else f"{value[: half - 1]}…{value[-half:]}")
+            if isinstance(value, float):
+                return float(f"{value:.9g}") if np.isfinite(value) else None
+            if isinstance(value, list | tuple):
+                return [plain(entry, resolution) for entry in value]
+            if is_dataclass(value):
+                return {f.name: plain(getattr(value, f.name), resolution) for f in fields(value)}
+            return value
 
-class _Blocks:
-    """The encoded series of a page."""
-
-    def __init__(self) -> None:
-        self.texts: dict[str, str] = {}
-
-    def add(self, values: FloatArray, resolution: float = 0.0) -> dict[str, Any]:
-        """Add a series and return its reference for the script."""
-        name = f"b{len(self.texts)}"
-        self.texts[name], scale = encode(values, resolution)
-        return {"block": name, **scale}
-
-    def entries(self, record: Any, resolution: float) -> dict[str, Any]:
-        """Return a record by its fields for the page's script."""
-        return {f.name: self._plain(getattr(record, f.name), resolution) for f in fields(record)}
-
-    def _plain(self, value: Any, resolution: float) -> Any:
-        if isinstance(value, np.ndarray):
-            return self.add(value, resolution)
-        if isinstance(value, str):
-            half = _LABEL_SIGNS // 2
-            return printable(value if len(value) <= _LABEL_SIGNS else f"{value[: half - 1]}…{value[-half:]}")
-        if isinstance(value, float):
-            return float(f"{value:.9g}") if np.isfinite(value) else None
-        if isinstance(value, list | tuple):
-            return [self._plain(entry, resolution) for entry in value]
-        return self.entries(value, resolution) if is_dataclass(value) else value
+        figures = {k: {"kind": f.kind, **plain(f, getattr(f, "resolution", 0.0))} for k, f in self.figures.items()}
+        return {"time": self.time(), "figures": figures}, blocks
 
 
 def joined(spans: Sequence[Span]) -> list[Span]:

@@ -48,14 +48,14 @@ def write_clips(
     """
     logs = {log.label: log for log in run.logs}
     names: list[str] = []
-    failed, pad_ns = found_events.failed, round(pad_s * NS_PER_S)
+    incomplete, pad_ns = 0, round(pad_s * NS_PER_S)
     with OutputFolder(run.folder), FolderTransaction(run.folder / CLIPS, keep=False) as change:
         for label, events in groupby(found_events.events, key=lambda event: event.drive):
             log = logs[label]
             try:
                 opened = open_log(_source_of(log, source))
             except PdhefError as error:
-                failed = True
+                incomplete += 1
                 tell(f"{label}: no clip: {error}")
                 continue
             with closing(opened):
@@ -74,8 +74,8 @@ def write_clips(
                         clip.write(cut)
                         clip.finish(report, cut)
                     names.append(str(run.folder / CLIPS / name))
-                failed |= any(loss.severity == "lost" for loss in opened.lost)
-    return replace(found_events, clips=tuple(names), failed=failed)
+                incomplete += any(loss.severity == "lost" for loss in opened.lost)
+    return replace(found_events, clips=tuple(names), unreadable=found_events.unreadable + incomplete)
 
 
 def _source_of(log: OpenedLog, folder: Path | None) -> Path:

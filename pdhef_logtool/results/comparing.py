@@ -491,9 +491,9 @@ def _of_all(run: OpenedRun, asked: Requirement) -> tuple[statistics.Bounded, str
     n, values = (of_run[key].to_numpy().astype(np.float64) for key in ("n", "value"))
     unit = of_run["unit"][0] if len(of_run) else ""
     if asked.metric not in SQUARES | MEANS:
-        return statistics.quantile(values, 0.5, 0.95, factors), unit
+        return statistics.quantile(values, 0.5, factors=factors), unit
     squares = asked.metric in SQUARES
-    return statistics.pooled(n, values, None, squares=squares, positive=True, level=0.95, factors=factors), unit
+    return statistics.pooled(n, values, None, squares=squares, positive=True, factors=factors), unit
 
 
 @cache

@@ -57,8 +57,8 @@ class FoundEvents:
     ----------
     where : the condition. of : estimator of its columns. searched : drives that were looked at. events : in the order
         of the run's drives.
-    left_out : drives that could not be looked at, with the reason; ``unreadable``: number of damaged and failed ones.
-        failed : whether something of the run could not be read.
+    left_out : drives that could not be looked at, with the reason; ``unreadable``: number of damaged and failed ones,
+        and of logs that clips could not be cut from completely.
     clips : files that were written.
     """
 
@@ -67,7 +67,6 @@ class FoundEvents:
     events: tuple[FoundEvent, ...]
     left_out: Mapping[str, str]
     of: str = "the selected estimates"
-    failed: bool = False
     unreadable: int = 0
     clips: tuple[str, ...] = ()
 
@@ -76,7 +75,7 @@ class FoundEvents:
         """3 if a file could not be read, 1 if no drive could be read, otherwise 0."""
         if self.unreadable and not self.searched and self.unreadable == len(self.left_out):
             return EXIT_FAILURE
-        return EXIT_PARTIAL if self.failed else EXIT_OK
+        return EXIT_PARTIAL if self.unreadable else EXIT_OK
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON-able values."""
@@ -140,7 +139,7 @@ def find_events(
         _check_tracks(estimators, condition, estimator, selected=any(log.main() for log in run.logs))
     where = condition.text + (f" for {least_s:g} s" if least_s else "")
     of = estimator or "the selected estimates"
-    return FoundEvents(where, searched, tuple(events), left_out, of, unreadable > 0, unreadable)
+    return FoundEvents(where, searched, tuple(events), left_out, of, unreadable)
 
 
 @dataclass(frozen=True, slots=True)

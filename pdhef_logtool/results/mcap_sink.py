@@ -26,7 +26,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.plotted import LogLine, log_lines, log_message, plotted_fields
+from pdhef_logtool.results.plotted import log_lines, log_message, plotted_fields
 from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots, rounded
 from pdhef_logtool.storage.documents import jsonable
 
@@ -187,7 +187,10 @@ class AnnotatedMcap(AbstractContextManager["AnnotatedMcap"]):
     def finish(self, report: Mapping[str, Any], tracks: Sequence[StateTrack], events: Sequence[Event] = ()) -> None:
         """Write the maps of the tracks, the log, the metrics record and report.json, and give the file its name."""
         self._write_paths(tracks)
-        self._write_log(log_lines(report, events, tracks))
+        if lines := log_lines(report, events, tracks):
+            channel = self._raw_channel(LOG_TOPIC, LOG_TYPE)
+            raws = [RawMessage(channel, x.stamp_ns, x.stamp_ns, i, log_message(x)) for i, x in enumerate(lines)]
+            self._writer.write([], [block_of(raws)])
         if self._source is not None and self.left_out is None:
             for attachment in self._source.attachments():
                 if not _is_our_report(attachment):
@@ -224,13 +227,6 @@ class AnnotatedMcap(AbstractContextManager["AnnotatedMcap"]):
                 data = _path_message(start_ns, poses[:: 1 + len(poses) // _MOST_POSES])
                 raws.append(RawMessage(channel, start_ns, start_ns, 0, data))
         self._writer.write([], [block_of(raws)] if raws else [])
-
-    def _write_log(self, lines: Sequence[LogLine]) -> None:
-        """Write the lines of the log."""
-        if lines:
-            channel = self._raw_channel(LOG_TOPIC, LOG_TYPE)
-            raws = [RawMessage(channel, x.stamp_ns, x.stamp_ns, i, log_message(x)) for i, x in enumerate(lines)]
-            self._writer.write([], [block_of(raws)])
 
     def _raw_channel(self, topic: str, type_name: str) -> int:
         definition = message_definition(type_name).encode()

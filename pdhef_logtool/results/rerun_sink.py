@@ -71,12 +71,8 @@ def write_recording(
     events: Sequence[Event] = (),
     *,
     application_id: str,
-    log_name: str,
     input_hash: str,
-    start_ns: int,
-    end_ns: int | None = None,
     shown: Sequence[str],
-    min_speed_m_s: float = 1.0,
     colours: Mapping[str, int] | None = None,
 ) -> None:
     """Write recording.rrd.
@@ -90,12 +86,11 @@ def write_recording(
     Parameters
     ----------
     path : the finished recording; an unfinished one is left to the caller.
+    report : the document of report.json; its log names the recording, and begins the timeline ``elapsed``.
     application_id : the same for all logs of a run; the viewer shows them as one dataset with one blueprint.
-    log_name : the recording's name.
     input_hash : hexadecimal hash of the log, which distinguishes the recordings of a run.
-    start_ns : zero of the timeline ``elapsed``. end_ns : of the drive, which decides whether it is long; None: not.
     shown : estimators of ``/main`` and ``/baseline``, on which the recording opens.
-    min_speed_m_s : sideslip is not drawn below it. colours : 0xRRGGBB by estimator.
+    colours : 0xRRGGBB by estimator.
 
     Raises
     ------
@@ -109,15 +104,16 @@ def write_recording(
             where=str(path),
             remedy="unset RERUN",
         )
-    is_long = end_ns is not None and end_ns - start_ns > LONGEST_WHOLE_NS
+    log, min_speed_m_s = report["log"], report["vehicle"]["low_speed_blend_m_s"]
+    is_long = log["end_ns"] - log["start_ns"] > LONGEST_WHOLE_NS
     places = _places([t.name for t in tracks], shown)
     truth = next((t for t in tracks if t.name == TRUTH), None)
     # In memory, because Rerun's writer thread ends on an error of the disk, and other threads then wait for it forever.
     memory = recording.memory_recording()
     recording.send_blueprint(_blueprint(), make_active=False, make_default=True)
-    recording.send_recording_name(log_name)
-    recording.send_recording_start_time_nanos(start_ns)
-    drawing = _Drawing(recording, start_ns, is_long, min_speed_m_s)
+    recording.send_recording_name(log["name"])
+    recording.send_recording_start_time_nanos(log["start_ns"])
+    drawing = _Drawing(recording, log["start_ns"], is_long, min_speed_m_s)
     if signals is not None:
         inputs = {p.name: np.asarray(getattr(signals, p.column))[:, None] * p.factor for p in _INPUTS}
         drawing.send_sparse("/inputs", _SIGNALS, signals.stamps_ns, inputs)

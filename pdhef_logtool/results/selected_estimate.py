@@ -102,7 +102,7 @@ def _interval(report: Report) -> list[float] | None:
     if of is None:
         return None
     counts, values = np.array(of.n, dtype=np.float64), np.array(of.value)
-    bounded = pooled(counts, values, None, squares=True, positive=True, level=0.95)
+    bounded = pooled(counts, values, None, squares=True, positive=True)
     return [bounded.low, bounded.high]
 
 

@@ -73,7 +73,6 @@ class DriveOutputs:
         # Recordings show the selected estimate beside physics alone, otherwise beside the naive estimate.
         order = dict.fromkeys([main.name, PHYSICS, *filter(None, [main.naive]), *main.shown])
         self._shown = [name for name in order if name in names][:2]
-        self._min_speed_m_s = run.car.vehicle.low_speed_blend_m_s
 
     def annotated(self) -> AbstractContextManager[AnnotatedMcap | None]:
         """Return the annotated log as a context, None if it is not requested; add remarks of the drive."""
@@ -95,7 +94,7 @@ class DriveOutputs:
             drive.log if self._is_copy else None,
             shown={self._main.name, TRUTH},
             others_step_ns=None if is_named else step_ns,
-            min_speed_m_s=self._min_speed_m_s,
+            min_speed_m_s=self._run.car.vehicle.low_speed_blend_m_s,
             left_out=left_out,
         )
 
@@ -159,12 +158,8 @@ class DriveOutputs:
             report,
             events,
             application_id=run,
-            log_name=drive.name,
             input_hash=sha256(f"{run} {drive.sha256} {drive.name}".encode()).hexdigest(),
-            start_ns=drive.plan.start_ns,
-            end_ns=drive.plan.end_ns,
             shown=self._shown,
-            min_speed_m_s=self._min_speed_m_s,
             colours=colours,
         )
 

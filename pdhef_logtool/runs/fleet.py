@@ -29,9 +29,9 @@ from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, PAGE_FILE, TABL
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.drive_outputs import check_places, log_place, write_run, write_run_tables
-from pdhef_logtool.runs.journal import Entry, Journal
+from pdhef_logtool.runs.journal import Journal
 from pdhef_logtool.runs.judging import judge, read_validation_plan, write_verdicts
-from pdhef_logtool.runs.planning import Plan, PlannedLog, plan_logs, settings_of, sweep_parts
+from pdhef_logtool.runs.planning import Plan, plan_logs, settings_of, sweep_parts
 from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult, RunResult
 from pdhef_logtool.runs.stored_output import StoredOutput, stored_drive
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
@@ -241,7 +241,6 @@ class _Fleet:
     _lost_workers: int = 0
     _warned: set[str] = field(default_factory=set)
     _name: str = field(default_factory=lambda: f"{process_name()}-{next(_RUNS)}")
-    _quiet: bool = False
 
     def run(self) -> tuple[list[LogResult], PlanVerdicts | None]:
         """Process all pending logs and write the files of the run, also if the run is interrupted."""
@@ -292,10 +291,8 @@ class _Fleet:
         todo = self.plan.pending(names, keep, bool(self.schedule.repeat), self.reporter)
         if not todo:
             return
-        self._quiet = len(self.plan.logs) > FEW_LOGS
         progress = FleetProgress(self.reporter.progress, len(todo))
-        tasks = (self._task(p, keep) for p in todo)
-        for ended in self._supervised(tasks, progress.update):
+        for ended in self._supervised((self._task(p.log, keep) for p in todo), progress.update):
             planned = todo[ended.number]
             end = self._end(ended)
             if end.outcome.failed is not None and len(self.plan.logs) > 1:
@@ -303,7 +300,9 @@ class _Fleet:
                 self._warn(f"{planned.log.path.name} failed, the others go on")  # the results give the reason
             for line in end.warned:
                 self._warn(line)
-            self._record(planned, end, keep, quarantined=ended.failure is not None and ended.failure.tries > 1)
+            self.plan.record(planned, end, keep, quarantined=ended.failure is not None and ended.failure.tries > 1)
+            if self.stored is not None:
+                self.stored.note_end()
             progress.end(ended.number)
 
     def _supervised(
@@ -331,17 +330,10 @@ class _Fleet:
                 result = ended.result if self.stored is None else self.stored.take(ended.result)
                 yield Ended(ended.number, ended.item, result, ended.failure)
 
-    def _task(self, planned: PlannedLog, keep: Keep) -> DriveTask:
-        label = planned.log.stem
-        return DriveTask(
-            planned.log,
-            self.plan.output,
-            replace(self.job.config, keep=keep),
-            self.job.validation,
-            self.job.report and keep == "full",
-            self._name,
-            label == self.plan.logs[0].log.stem,
-        )
+    def _task(self, log: LogInput, keep: Keep) -> DriveTask:
+        config, page = replace(self.job.config, keep=keep), self.job.report and keep == "full"
+        is_first = log.stem == self.plan.logs[0].log.stem
+        return DriveTask(log, self.plan.output, config, self.job.validation, page, self._name, is_first)
 
     def _end(self, ended: Ended[DriveTask, DriveEnd]) -> DriveEnd:
         if ended.result is not None:
@@ -353,20 +345,9 @@ class _Fleet:
         tries = f", {failure.tries} tries" if failure.tries > 1 else ""
         return DriveEnd(failed_outcome(log, f"{failure.reason}{tries}{last}", self.job.config), None, again=True)
 
-    def _record(self, log: PlannedLog, end: DriveEnd, keep: str, *, quarantined: bool) -> None:
-        car = None if end.car is None else self.plan.add_car(end.car)
-        failed = end.outcome.failed is not None and end.part is None
-        entry = Entry(
-            log.log.stem, log.place, end.identity or log.identity, self.plan.setting, car, keep, end.part,
-            end.error_rad, failed, end.again, quarantined,
-        )  # fmt: skip
-        self.plan.add(entry, end)
-        if self.stored is not None:
-            self.stored.note_end()
-
     def _warn(self, line: str) -> None:
         """Print a warning once; with many drives, only their reports contain it."""
-        if not self._quiet and line not in self._warned:
+        if len(self.plan.logs) <= FEW_LOGS and line not in self._warned:
             self._warned.add(line)
             self.reporter.warn(line)
 

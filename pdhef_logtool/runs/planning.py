@@ -174,13 +174,6 @@ class Plan:
         entries = [e for p in self.logs if (e := self.entry(p)) is not None and e.error_rad is not None]
         return [e.label for e in sorted(entries, key=lambda e: (-(e.error_rad or 0.0), e.label))[:count]]
 
-    def add_car(self, record: dict[str, Any]) -> str:
-        """Write a car's record into the journal; return its digest."""
-        digest = digest_of(record["parts"])
-        self.journal.describe("car", digest, record)
-        self.cars_of_run()[digest] = record
-        return digest
-
     def cars_of_run(self) -> dict[str, dict[str, Any]]:
         """Return the records of the run's present cars by digest, without cars that cannot be read."""
         if self._current_cars is None:
@@ -240,8 +233,17 @@ class Plan:
         entries = (entry for p in self.logs if (entry := self.entry(p)) is not None)
         return {e.label for e in entries if self._changed_outputs(e, pages=True)}
 
-    def add(self, entry: Entry, end: DriveEnd) -> None:
-        """Write how a drive ended into the journal, then remove its former figures."""
+    def record(self, log: PlannedLog, end: DriveEnd, keep: str, *, quarantined: bool) -> None:
+        """Write how a drive ended, and its car, into the journal, then remove its former figures."""
+        car = None if end.car is None else digest_of(end.car["parts"])
+        if car is not None and end.car is not None:
+            self.journal.describe("car", car, end.car)
+            self.cars_of_run()[car] = end.car
+        failed = end.outcome.failed is not None and end.part is None
+        entry = Entry(
+            log.log.stem, log.place, end.identity or log.identity, self.setting, car, keep, end.part, end.error_rad,
+            failed, end.again, quarantined,
+        )  # fmt: skip
         before = self.journal.entries.get(entry.label)
         self._damages[self.journal.add(entry, end.outcome, end.outputs).offset] = None
         if before is not None and before.part not in (None, entry.part):

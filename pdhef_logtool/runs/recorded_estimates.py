@@ -191,13 +191,11 @@ def _score_drive(
     drive.plan.dependent.update(equal | drive.plan.dependent)
     selected = tracks[0].name if len(tracks) == 1 else None
     stamps_ns = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
-    whole, together = scored[0], at(stamps_ns, tracks)
-    if selected is None:  # each has been scored at its own stamps; the drive is cut into segments at those of all
-        parts = estimating.evaluate(drive, at(stamps_ns, []), model)
-        rows = {(m.estimator, m.signal, m.segment, m.metric): m for s in scored for m in s.rows}
-        whole = replace(
-            parts, rows=[*rows.values()], events=estimating.in_order([*parts.events, *estimating.divergences(tracks)])
-        )
+    # Each has been scored at its own stamps; the drive is cut into segments at those of all.
+    parts, together = estimating.evaluate(drive, at(stamps_ns, []), model), at(stamps_ns, tracks)
+    rows = {(m.estimator, m.signal, m.segment, m.metric): m for s in scored for m in s.rows}
+    events = estimating.in_order([*parts.events, *estimating.divergences(tracks)])
+    whole = replace(parts, rows=[*rows.values()], events=events)
     blocks = []
     for track, s in zip(tracks, scored, strict=True):
         asked = [q for q in plan.requirements if q.estimator == track.name or (selected and q.estimator is None)]

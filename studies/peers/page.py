@@ -78,7 +78,7 @@ def estimator_table(rows: pl.DataFrame) -> str:
     for (name,), own in rows.join(zero, on="log").group_by("estimator", maintain_order=True):
         weights, values, others = (own[c].to_numpy() for c in ("scored_s", "rmse_deg", "of_zero"))
         factors = {factor: own[factor].to_list() for factor in ("car", "drive")}
-        error = pooled(weights, values, None, squares=True, positive=True, level=0.95, factors=factors)
+        error = pooled(weights, values, None, squares=True, positive=True, factors=factors)
         ratio = float(np.sqrt(np.average(values**2, weights=weights) / np.average(others**2, weights=weights)))
         share, covers, winkler, cost = (
             float(np.average(own[c].to_numpy(), weights=weights))

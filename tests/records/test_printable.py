@@ -17,6 +17,7 @@ from pdhef_logtool.records.printable import all_printable, listed, printable, ut
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log
 from pdhef_logtool.storage.documents import jsonable
+from tests.command_line import printed
 
 _ANY = st.text(st.characters(exclude_categories=()), max_size=60)  # surrogates, too
 _HOSTILE = "\x1b[31m\nwarning: forged\r\x9b2J\u202e\u2066\u200f\x00\x7f\u2028\udcff [red][/]"
@@ -66,7 +67,7 @@ def test_records_are_shown_whole():
 def test_the_console_obeys_nothing_and_forges_no_line(capsys):
     console.warn(f"topic {_HOSTILE}")
     console.print_json({"topic": _HOSTILE})
-    console.print_facts({"topic": _HOSTILE})
+    console.show({"topic": _HOSTILE}, "facts")
     out, err = capsys.readouterr()
     assert err.count("\n") == 1
     assert (out + err).replace("\n", "").isprintable()
@@ -96,3 +97,13 @@ def test_an_inspection_of_hostile_names_is_plain(tmp_path, capsys, monkeypatch, 
         assert json.loads(out)["topics"][0]["name"] == topic
     else:
         assert "[red][/]" in out.replace("\n", "").replace(" ", "")
+
+
+@pytest.mark.parametrize("name", ["a[red]b", "[/]", "[bold", "x\\", "\\[x]", ":smile:", "==x", "|x", "]"])
+def test_a_name_is_no_markup_of_the_terminals_templates(name):
+    assert printed("facts", {name: name}) == f"{name}: {name}\n"
+    field = {"path": name, "type": name, "minimum": 1.0, "mean": 1.0, "maximum": 1.0}
+    topics = [{"name": name, "type": name, "fields": of, "reason": "", "rate_hz": 1.0} for of in ([], [field])]
+    lines = printed("fields", {"path": name, "whole": True, "seconds": 1.0, "topics": topics}).splitlines()
+    assert [lines[0], lines[2]] == [name, f"{name} ({name}): "]
+    assert lines[3].rstrip() == f"{name} ({name}), 1 Hz" and lines[-2].split() == [name, name, "1", "1", "1"]

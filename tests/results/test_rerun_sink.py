@@ -49,9 +49,11 @@ STATIC = {
 }
 
 
-def record(path: Path, tracks, signals=None, report=REPORT, events=(), shown=SHOWN, **facts) -> None:
+def record(path: Path, tracks, signals=None, report=REPORT, events=(), shown=SHOWN, end_ns=START_NS, **facts) -> None:
     """Write a recording of tracks."""
-    facts = {"application_id": "pdhef-x", "log_name": "drive", "input_hash": HASH, "start_ns": START_NS, **facts}
+    log = report["log"] | {"name": "drive", "start_ns": START_NS, "end_ns": end_ns}
+    report = report | {"log": log, "vehicle": report["vehicle"] | {"low_speed_blend_m_s": 1.0}}
+    facts = {"application_id": "pdhef-x", "input_hash": HASH, **facts}
     write_recording(path, signals, tracks, report, events, shown=shown, **facts)
 
 
@@ -231,8 +233,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.rerun_sink import write_recording
 try:
     write_recording(
-        Path(sys.argv[1]), None, [], {}, application_id="x", shown=["zero"], log_name="d", input_hash="ab" * 32,
-        start_ns=0,
+        Path(sys.argv[1]), None, [], {}, application_id="x", shown=["zero"], input_hash="ab" * 32
     )
 except OutputError as error:
     print(error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 from pdhef_logtool.mapping import Mapping, SignalSource
@@ -70,15 +71,9 @@ def _answered(
         return None if words[0] == "-" else others[number - 1].source if 1 <= number <= len(others) else HELP
     if len(words) <= 3 and words[0] not in topics:
         return f"no topic {words[0]}; pdhef inspect lists them"
-    if len(words) <= 3 and _is_number(words[2:]):
-        scale = float(words[2]) if len(words) == 3 else 1.0
-        name = names[0] if len(names) == 1 or taken is None else taken.name
-        return SignalSource(name, words[0], words[1], scale=scale)
+    with suppress(ValueError):
+        scale = float(words[2]) if len(words) > 2 else 1.0
+        if len(words) <= 3 and scale != 0.0:
+            name = names[0] if len(names) == 1 or taken is None else taken.name
+            return SignalSource(name, words[0], words[1], scale=scale)
     return HELP
-
-
-def _is_number(words: Sequence[str]) -> bool:
-    try:
-        return all(float(w) != 0.0 for w in words)
-    except ValueError:
-        return False

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
+from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
@@ -76,11 +77,8 @@ def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> dict[str, 
 
 def _values_by_path(samples: Mapping[tuple[str, str], Seen], paths: set[str]) -> dict[str, list[FloatArray]]:
     """Return values by path; elements of an array also by the array's path."""
-    values: dict[str, list[FloatArray]] = {}
-    for (_, path), sample in samples.items():
-        for name in {path} if path in paths else {path, INDEX.sub("", path)}:
-            values.setdefault(name, []).append(sample.values)
-    return values
+    names = {path: {path} if path in paths else {path, INDEX.sub("", path)} for _, path in samples}
+    return gathered((name, sample.values) for (_, path), sample in samples.items() for name in names[path])
 
 
 def _report(path: str, kind: str, values: Sequence[FloatArray]) -> dict[str, Any]:
