@@ -26,7 +26,7 @@ from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
+from pdhef_logtool.mapping.vendors import Vendors, VendorType, meaning_of_source, names_of
 from pdhef_logtool.records.signals import FloatArray
 
 #: Kind of data in a field, according to the names around it.
@@ -181,6 +181,13 @@ class Field:
         self.factors = tuple(sorted(self.factors, key=lambda f: f[0] != unit))
         self.unit_known = True
 
+    def fix(self, source: SignalSource) -> None:
+        """Use the unit, sign and offset of a documented or mapped source of one field."""
+        scale, offset = source.scale, source.offset
+        if isinstance(scale, float) and isinstance(offset, float):
+            self.factors, self.sign, self.offset = ((self.meaning.unit, abs(scale)),), math.copysign(1.0, scale), offset
+        self.fixed = self.unit_known = True
+
     def candidate(self, name: str, section: Literal["signals", "truth"], *, taken: bool) -> Candidate:
         """Return the field as a candidate source of a signal."""
         source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
@@ -213,7 +220,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             if not _is_column(info) or is_command(info.path):
                 continue
             if its := documented.entries(info.path):
-                results += [(topic, role, replace(info, path=p), entry.meaning, True) for p, entry in its.items()]
+                results += [(topic, role, replace(info, path=p), meaning_of_source(s), True) for p, s in its.items()]
             elif not documented.fields or info.path.count(".") or documented.has:
                 meaning = naming.meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
@@ -336,8 +343,8 @@ def _weighable(
             continue
         if role == "sensor" and (words := set(words_of(name))) & (_TRUTH_WORDS | _RECEIVERS):
             role = "truth" if words & _TRUTH_WORDS else "navigation"
-        entry = vendors.of(topic.type_name).fields[info.path] if documented else None
-        yield _field_of(fields, topic, role, replace(info, path=name), its, seen, entry)
+        kind = vendors.of(topic.type_name) if documented else None
+        yield _field_of(fields, topic, role, replace(info, path=name), its, seen, kind)
 
 
 def _field_of(
@@ -347,20 +354,19 @@ def _field_of(
     info: FieldInfo,
     meaning: Meaning,
     seen: Seen,
-    entry: VendorField | None = None,
+    documented: VendorType | None = None,
 ) -> Field:
-    """Return a field with its possible units and what its name or documentation (``entry``) leaves open."""
+    """Return a field with its possible units and what its name, or its documented type, leaves open."""
     factors = _factors(meaning, seen)
     if meaning.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
         meaning = replace(meaning, quantity="wheel rate")
         factors = _factors(meaning, seen)
     item = Field(topic, info.path, meaning, role, stamp_of(fields, info.path), seen, factors)
-    if entry is not None:
-        item.fixed = item.unit_known = True
-        item.section = entry.section
-        item.factors = ((entry.unit, abs(entry.scale)),)
-        item.sign, item.offset = math.copysign(1.0, entry.scale), entry.offset
-        item.reasons.append(f"documented: {entry.page}")
+    if documented is not None:
+        entry = documented.fields[info.path]
+        item.section = "truth" if entry in documented.truth else "signals"
+        item.fix(entry)
+        item.reasons.append(f"documented: {documented.page}")
     elif meaning.scale is not None:
         item.unit_known = True
         item.reasons.append(f"unit {naming.UNIT_TEXTS.get(meaning.unit, meaning.unit)}")
@@ -369,7 +375,7 @@ def _field_of(
     if _may_be_share(item, info):
         item.is_weak = _is_control(item, info, fields)
         item.doubts.append("it may be a share of the largest angle, which needs a scale")
-    if item.is_downward and entry is None:
+    if item.is_downward and not item.fixed:
         item.sign = -1.0
         item.reasons.append("positive downward by its name")
     return item
@@ -395,20 +401,19 @@ def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tup
     results = []
     for source in sources:
         seen = read.get((source.topic, source.paths[0]))
-        if seen is None or isinstance(source.scale, tuple) or not isinstance(source.offset, float):
+        if seen is None or isinstance(source.scale, tuple):
             continue
-        meaning = meaning_of_signal(source.name)
-        item = Field(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))
-        item.factors, item.sign = (("", abs(source.scale)),), math.copysign(1.0, source.scale)
-        item.offset, item.fixed, item.unit_known, item.anchor = source.offset, True, True, True
+        item = Field(topics[source.topic], source.paths[0], meaning_of_source(source), "sensor", source.stamp, seen, ())
+        item.fix(source)
+        item.anchor = True
         results.append(item)
     return results
 
 
 def anchor_of(name: str, results: Sequence[Field]) -> Field | None:
     """Return the anchor of a mapped signal or ground truth."""
-    meaning = meaning_of_signal(name)
-    return next((f for f in results if f.anchor and f.meaning == meaning), None)
+    its = (f for f in results if f.anchor)
+    return next((f for f in its if name in names_of(f.meaning.quantity, f.meaning.part, (name,))), None)
 
 
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:

@@ -19,10 +19,10 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
+from pdhef_logtool.mapping.candidates import MOST, Field
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, fit
-from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_velocity
+from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields, path_velocity
 from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
@@ -98,19 +98,6 @@ def axes_of(
     return "" if relation is None else "body"
 
 
-def twist_axes(log: DriveLog, velocity: SignalSource, references: Sequence[SignalSource]) -> Axes:
-    """Return the axes of a velocity's first two fields by positions and a yaw rate among ``references``."""
-    pieces = Pieces(log)
-    read = pieces.read((source.topic, path) for source in (velocity, *references) for path in source.paths)
-    x, y = (read.get((velocity.topic, path)) for path in velocity.paths[:2])
-    if x is None or y is None:
-        return ""
-    anchors = anchors_of(log, references, read)
-    rate = next((f.si for f in anchors if f.meaning.quantity == "rate"), None)
-    steps = path_velocity(pieces, [f for f in anchors if f.meaning.quantity in PLACES])
-    return axes_of(pieces, x.cells, y.cells, steps, rate)
-
-
 # ------------------------------------------------------------------------------------------------ receivers
 
 
@@ -156,11 +143,8 @@ def receiver_signals(
                 continue
             if any(f"{base}{name}" in there for name in receiver.without):
                 return {}
-            sources = {
-                f.name: SignalSource(f.name, topic, there[f"{base}{path}"], stamp, f.scale, f.offset)
-                for path, f in receiver.fields.items()
-                if f"{base}{path}" in there
-            }
+            its = ((s, there.get(f"{base}{path}")) for path, s in receiver.fields.items())
+            sources = {s.name: replace(s, topic=topic, field=path, stamp=stamp) for s, path in its if path}
             struct = there.get(f"{base}latitude", "").removesuffix("latitude")
             if any(p.startswith(f"{struct}position_covariance[") for p in paths):  # 1 sigma: mean of east and north
                 squared = tuple(f"{struct}position_covariance[{i}]" for i in (0, 4))

@@ -11,10 +11,10 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping import navigation
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
-from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
+from pdhef_logtool.mapping.candidates import MOST, Candidate, Role, anchors_of
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.evidence import Pieces, Seen
-from pdhef_logtool.mapping.fields import Fields
+from pdhef_logtool.mapping.fields import PLACES, Fields, path_velocity
 from pdhef_logtool.mapping.joints import is_joints, joint_names
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command, words_of
@@ -99,7 +99,6 @@ class _Draft:
     quality: QualityGate | None = None
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    axes: dict[tuple[str, ...], navigation.Axes] = field(default_factory=dict)
 
     def values(self, topic: str, path: str) -> FloatArray:
         seen = self.samples.get((topic, path))
@@ -282,18 +281,12 @@ def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendo
     """Take ground truth from an INS of a documented type if recognised types provide at most a position."""
     if {"vx_m_s", "enu_velocity_m_s", "quat_wxyz", "yaw_rad", "x_m"} & set(draft.truth):
         return
-    whole: dict[str, dict[str, SignalSource]] = {}
+    whole: dict[str, _Sources] = {}
     for topic in topics:
         fields = draft.log.fields(topic.name, quiet=True)
-        sources = [
-            SignalSource(f.name, topic.name, path, stamp_path_of(fields), f.scale, f.offset)
-            for path, f in vendors.of(topic.type_name).fields.items()
-            if f.section == "truth" and has_path(fields, path)
-        ]
-        vectors = [v for v in vendors.of(topic.type_name).vectors if all(has_path(fields, p) for p in v.paths)]
-        sources += [replace(v, topic=topic.name, stamp=stamp_path_of(fields)) for v in vectors]
-        if vectors:
-            whole[topic.name] = {s.name: s for s in sources}
+        its = [s for s in vendors.of(topic.type_name).truth if all(has_path(fields, p) for p in s.paths)]
+        if any(s.columns > 1 for s in its):
+            whole[topic.name] = {s.name: replace(s, topic=topic.name, stamp=stamp_path_of(fields)) for s in its}
     candidates = [t for t in topics if t.name in whole]
     chosen = draft.choose("truth", candidates, lambda t: (-len(whole[t.name]),), "the one with most quantities")
     if chosen is None:
@@ -363,23 +356,23 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> navigation.Axes:
     """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate."""
-    x, y = (_twist(twist, "linear", axis) for axis in "xy")
-    if not (draft.is_given(twist.name, x) and draft.is_given(twist.name, y)):
-        return ""
-    references: _Sources = {}
+    references = {n: s for n, s in draft.signals.items() if n == "yaw_rate_rad_s"}
     if _has_pose(draft, twist):
         for axis in "xy":
             draft.take(references, f"{axis}_m", twist.name, _pose(twist, f"position.{axis}"))
     elif fix := next((t for t in topics if _has_fix(draft, t)), None):
         for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude")):
             draft.take(references, name, fix.name, path)
-    if "yaw_rate_rad_s" in draft.signals:
-        references["yaw_rate_rad_s"] = draft.signals["yaw_rate_rad_s"]
-    key = (twist.name, *(source.label for source in references.values()))
-    if key not in draft.axes:  # asked for speed, ground truth and GNSS
-        velocity = SignalSource("speed_m_s", twist.name, (x, y))
-        draft.axes[key] = navigation.twist_axes(draft.log, velocity, [*references.values()])
-    return draft.axes[key]
+    pieces, sources = Pieces(draft.log), [*references.values()]
+    fields = [(source.topic, source.paths[0]) for source in sources]
+    draft.samples |= pieces.read(f for f in fields if f not in draft.samples)
+    x, y = (draft.samples.get((twist.name, _twist(twist, "linear", axis))) for axis in "xy")
+    if x is None or y is None:
+        return ""
+    anchors = anchors_of(draft.log, sources, draft.samples)
+    rate = next((f.si for f in anchors if f.meaning.quantity == "rate"), None)
+    steps = path_velocity(pieces, [f for f in anchors if f.meaning.quantity in PLACES])
+    return navigation.axes_of(pieces, x.cells, y.cells, steps, rate)
 
 
 def _device(topic: str) -> str:
