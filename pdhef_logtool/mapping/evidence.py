@@ -26,16 +26,23 @@ LARGEST = 1e12
 BRIDGED_CELLS = 12
 #: Maximum number of columns to read of an array of unknown length.
 MOST_COLUMNS = 16
+#: Smallest correlation that counts as a relation.
+CLEAR = 0.75
 #: Smallest number of cells that gives information.
 FEWEST_CELLS = 40
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """``y = slope * x + a`` over cells of 0.1 s, and the correlation of the two."""
+    """``y = slope * x + a`` over cells of 0.1 s, and the correlation of the two; both are 0 without a relation."""
 
-    slope: float
-    correlation: float
+    slope: float = 0.0
+    correlation: float = 0.0
+
+    @property
+    def is_clear(self) -> bool:
+        """Return whether the correlation, of any sign, counts as a relation."""
+        return abs(self.correlation) > CLEAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,22 +206,16 @@ def _filled(rows: FloatArray) -> FloatArray:
     return rows
 
 
-def fit(y: FloatArray, x: FloatArray) -> Fit | None:
-    """Fit a line through the finite cells [M]; None if there are too few or one of the two is constant."""
+def fit(y: FloatArray, x: FloatArray) -> Fit:
+    """Fit a line through the finite cells [M]; no relation if there are too few or one of the two is constant."""
     use = np.isfinite(y) & np.isfinite(x)
     if np.count_nonzero(use) < FEWEST_CELLS:
-        return None
+        return Fit()
     # Exclude a few outliers, such as a sensor's "invalid".
     a, b = (np.clip(values, *np.quantile(values, [0.005, 0.995])) for values in (y[use], x[use]))
     da, db = a - a.mean(), b - b.mean()
     sa, sb = float(np.sqrt(np.mean(da * da))), float(np.sqrt(np.mean(db * db)))
     if not (sa > 1e-12 and sb > 1e-12):
-        return None
+        return Fit()
     both = float(np.mean(da * db))
     return Fit(both / (sb * sb), both / (sa * sb))
-
-
-def correlation(y: FloatArray, x: FloatArray) -> float:
-    """Return the correlation of the finite cells [M]; 0 where :func:`fit` has no line."""
-    relation = fit(y, x)
-    return 0.0 if relation is None else relation.correlation

@@ -19,8 +19,6 @@ from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
 
-#: Smallest correlation that counts as a relation.
-CLEAR = 0.75
 #: Smallest standard deviation of an acceleration that excites a relation.
 EXCITED_A_M_S2 = 0.25
 #: Standard deviation of the curvature below which a path counts as straight; speed at standstill.
@@ -65,12 +63,11 @@ class Fields:
         """Return the surest field of a quantity that is not constant."""
         return next(iter(self.open(quantity)), None)
 
-    def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit | None:
-        """Fit a_y to v r; None if the car does not turn."""
+    def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit:
+        """Fit a_y to v r; no relation if the car does not turn."""
         expected = rate * speed
-        if not spread(expected) > EXCITED_A_M_S2:
-            return None
-        return fit(self.pieces.smooth(ay), self.pieces.smooth(expected))
+        turns = spread(expected) > EXCITED_A_M_S2
+        return fit(self.pieces.smooth(ay), self.pieces.smooth(expected)) if turns else Fit()
 
     def curvature(
         self, speed: FloatArray | None, rate: FloatArray | None, ay: FloatArray | None = None
@@ -88,7 +85,7 @@ class Fields:
 def agree(a: FloatArray, b: FloatArray) -> bool:
     """Return whether two fields on the grid [M] have the same values."""
     relation = fit(a, b)
-    return relation is not None and relation.correlation > 0.97 and 0.9 < relation.slope < 1.1
+    return relation.correlation > 0.97 and 0.9 < relation.slope < 1.1
 
 
 def mean_of(columns: Sequence[FloatArray]) -> FloatArray:
@@ -251,7 +248,7 @@ def _by_speeding_up(fields: Fields) -> None:
     along = fields.open("acceleration", "x") + fields.open("acceleration", "ahead")
     for speed, ax in itertools.product(fields.open("speed"), along):
         relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
-        if relation is not None and relation.correlation >= CLEAR:
+        if relation.is_clear and relation.slope > 0.0:
             settle((ax, speed), [Gain((1, -1), relation.slope, BY_DRIVING)], "a_x ≈ v̇", bonus=0.3)
             if ax.meaning.part == "ahead":
                 ax.meaning, ax.bonus = replace(ax.meaning, part="x"), ax.bonus - 0.1
@@ -265,7 +262,7 @@ def _by_turning(fields: Fields) -> None:
         return
     for rate, ay in itertools.product(fields.open("rate", "z")[:4], fields.open("acceleration", "y")[:4]):
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
-        if relation is not None and abs(relation.correlation) > CLEAR:
+        if relation.is_clear:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
 
 
@@ -276,7 +273,7 @@ def _by_track(fields: Fields) -> None:
     if speed is None or rate is None or len(wheels) < 2 or not agree(wheels[1], speed.seen.cells):
         return
     relation = fit(fields.pieces.smooth(wheels[1] - wheels[0]), fields.pieces.smooth(rate.seen.cells))
-    if relation is not None and abs(relation.correlation) > CLEAR:
+    if relation.is_clear:
         settle((speed, rate), [Gain((1, -1), relation.slope / USUAL_TRACK_M, USUAL_TRACKS)], "the track of its wheels")
 
 

@@ -21,8 +21,8 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.candidates import MOST, Field
 from pdhef_logtool.mapping.checking import stamp_path_of
-from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, fit
-from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields, path_velocity
+from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, fit
+from pdhef_logtool.mapping.fields import SLOW_M_S, Fields, path_velocity
 from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
@@ -79,23 +79,21 @@ def axes_of(
     for order, *along in orders:
         fits = [fit(a, b) for a, b in zip(along, (x, y), strict=True)]
         is_across = np.nanmean(along[1] ** 2) > ACROSS_SHARE**2 * np.nanmean(along[0] ** 2 + along[1] ** 2)
-        if is_across and all(
-            f is not None and f.correlation > CLEAR and SAME_STEPS[0] < f.slope < SAME_STEPS[1] for f in fits
-        ):
+        if is_across and all(f.is_clear and SAME_STEPS[0] < f.slope < SAME_STEPS[1] for f in fits):
             return order
     length = np.hypot(x, y)
     moving = length > SLOW_M_S
     turning = pieces.turning(np.where(moving, x + 1j * y, np.nan))
-    relation = None if rate is None else fit(pieces.smooth(rate), turning)
+    relation = Fit() if rate is None else fit(pieces.smooth(rate), turning)
     # The direction over ground turns as fast as the car, in rad/s or deg/s; a sideslip that follows it turns less.
-    slope = relation.slope if relation is not None and relation.correlation > CLEAR else 0.0
-    if any(SAME_STEPS[0] < slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0))):
+    as_fast = any(SAME_STEPS[0] < relation.slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0)))
+    if relation.is_clear and as_fast:
         return "east, north"
     enough = np.count_nonzero(moving) >= FEWEST_CELLS
     is_ahead = not enough or bool(np.mean((x > np.abs(y))[moving]) >= AHEAD_SHARE)
     if not is_ahead:
         return "not ahead"
-    return "" if relation is None else "body"
+    return "body" if relation.correlation else ""
 
 
 # ------------------------------------------------------------------------------------------------ receivers
@@ -303,8 +301,8 @@ def _ecef_vectors(topic: str, fields: tuple[FieldInfo, ...]) -> Iterator[SignalS
 def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
     """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
     relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
-    slope = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.slope
-    return math.copysign(float(SAME_STEPS[0] < abs(slope) < SAME_STEPS[1]), slope)
+    is_same = relation.is_clear and SAME_STEPS[0] < abs(relation.slope) < SAME_STEPS[1]
+    return math.copysign(float(is_same), relation.slope)
 
 
 def _is_place(item: Field, most: float) -> bool:

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.mapping.evidence import Fit, Pieces, Seen, correlation, fit
+from pdhef_logtool.mapping.evidence import Fit, Pieces, Seen, fit
 from pdhef_logtool.records.signals import FloatArray
 
 #: Quantities and parts that a proposal consists of, and the range of the largest value of each in a drive, SI.
@@ -69,9 +69,9 @@ def _steering(
         rate = cells[turning] * factor[turning] / (speed if r is None else 1.0)
         curvature, lateral = np.where(speed > 1.0, rate / speed, np.nan), rate * speed
     free = {i for i, c in enumerate(columns) if c.role is None and "steering" in c.units and not c.seen.is_off_centre}
-    surest, steering = max(((abs(correlation(cells[i], curvature)), i) for i in free - {*places}), default=(0.0, 0))
+    surest, steering = max(((abs(fit(cells[i], curvature).correlation), i) for i in free - {*places}), default=(0.0, 0))
     # A roll angle follows the lateral acceleration better than the curvature.
-    return steering if surest > max(LEAST, abs(correlation(cells[steering], lateral))) else None
+    return steering if surest > max(LEAST, abs(fit(cells[steering], lateral).correlation)) else None
 
 
 def _options(columns: Sequence[Column], role: tuple[str, str], wanted: Sequence[tuple[str, str]]) -> list[int | None]:
@@ -106,8 +106,8 @@ def _relations(
     ahead = {x: fit(cells[x], change) for x in of_x}
     left = {(y, r): fit(cells[y], cells[r] * cells[v]) for y, r in product(of_y, of_r) if y != r}
     return (
-        {x: f for x, f in ahead.items() if f is not None and f.correlation > LEAST},
-        {pair: f for pair, f in left.items() if f is not None and abs(f.correlation) > LEAST},
+        {x: f for x, f in ahead.items() if f.correlation > LEAST},
+        {pair: f for pair, f in left.items() if abs(f.correlation) > LEAST},
     )
 
 

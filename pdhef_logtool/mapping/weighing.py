@@ -27,10 +27,9 @@ from pdhef_logtool.mapping.candidates import (
     proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
+from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, ratio
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
-    CLEAR,
     SLOW_M_S,
     USUAL_LENGTH_M,
     Fields,
@@ -252,10 +251,10 @@ class Weighing:
         if ax is None or speed is None or ax.fixed or not ax.is_axis or len(across) != 1:
             return
         ay, change = across[0], pieces.rate_of(speed.si)
-        along, ahead = (correlation(pieces.smooth(f.si), change) for f in (ax, ay))
-        if abs(ahead) <= CLEAR or abs(along) >= FOLLOWS:
+        along, ahead = (fit(pieces.smooth(f.si), change) for f in (ax, ay))
+        if not ahead.is_clear or abs(along.correlation) >= FOLLOWS:
             return
-        for name, item, factor in (("ax_m_s2", ay, ahead), ("ay_m_s2", ax, -ahead)):
+        for name, item, factor in (("ax_m_s2", ay, ahead.slope), ("ay_m_s2", ax, -ahead.slope)):
             item.sign, item.is_turned = item.sign * math.copysign(1.0, factor), True
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
             self.taken[name] = item
@@ -296,8 +295,8 @@ class Weighing:
     def _per_turning(self, speed: FloatArray) -> float | None:
         """Return how much of a speed [M] in another unit is 1 m/s by a_y ≈ v r; None if the drive does not show it."""
         rate, ay = self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2")
-        relation = None if rate is None or ay is None else self.fields.turning(ay.si, rate.si, speed)
-        return None if relation is None or abs(relation.correlation) < CLEAR else 1.0 / abs(relation.slope)
+        relation = Fit() if rate is None or ay is None else self.fields.turning(ay.si, rate.si, speed)
+        return 1.0 / abs(relation.slope) if relation.is_clear else None
 
     # --------------------------------------------------------------------------------------------- steering
 
@@ -313,7 +312,7 @@ class Weighing:
             if item.is_weak:
                 self.notes.append(f"{item.topic.name}.{item.path} is not used: {item.doubts[-1]}")
                 continue
-            relation = None if curvature is None else fit(self.fields.pieces.smooth(item.seen.cells), curvature)
+            relation = Fit() if curvature is None else fit(self.fields.pieces.smooth(item.seen.cells), curvature)
             name, follows = self._steering_kind(item, relation)
             judged.append((item.score + 0.3 * follows, name, item))
         self._choose(judged)
@@ -328,10 +327,10 @@ class Weighing:
             item.bonus -= 0.3
         self._steering([f for f in commands if f.seen.changes or f.fixed])
 
-    def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool]:
+    def _steering_kind(self, item: Field, relation: Fit) -> tuple[str, bool]:
         """Return the signal for a steering angle, and whether it follows the car's turning as a usual one."""
         kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
-        if relation is None or abs(relation.correlation) < CLEAR:
+        if not relation.is_clear:
             return _steering_by_range(item, kinds, relation), False
         metres = abs(relation.slope)
         ways = [Unit(u, f / USUAL_LENGTH_M[k], k, 0.7) for k in kinds for u, f in item.units]
@@ -505,12 +504,12 @@ def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
     return max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
 
 
-def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit | None) -> str:
+def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit) -> str:
     """Return the signal for a steering angle by the range of values, if the curvature is not conclusive."""
     name = kinds[-1] if item.seen.largest * item.factors[0][1] > 0.9 else kinds[0]
     if len(kinds) == 2 and not item.fixed:
         item.doubts.append(f"its name gives neither steering wheel nor road wheels; taken as {name}")
-    if relation is not None and not item.fixed:
+    if relation.correlation and not item.fixed:
         item.doubts.append(f"its correlation with the path's curvature is only {relation.correlation:.2f}")
     return name
 
