@@ -18,13 +18,11 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping import naming
-from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, VOCABULARY, Meaning, is_command, words_of
-from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
+from pdhef_logtool.mapping.naming import VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, VendorType, meaning_of_source, names_of
 from pdhef_logtool.records.signals import FloatArray
@@ -38,8 +36,6 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
 #: Words of a field in a table of several instruments that make it ground truth, or of a receiver.
 _TRUTH_WORDS, _RECEIVERS = frozenset(VOCABULARY["topics"]["truth"].split()), {"gps", "gnss", "ins", "rtk"}
-#: Words that leave the quantity of a field open: it may be any of them.
-_OPEN_WORDS = naming.COUNTING | {"angle", "yaw"}
 #: Affix that distinguishes the name of a sign from the name of its magnitude; YawToRight belongs to YawRate.
 _SIGN = re.compile("|".join(VOCABULARY["patterns"]["sign"]), re.IGNORECASE)
 #: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
@@ -217,7 +213,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         there = {f.path for f in fields}
         no_values = _no_values(topic, fields)
         for info in (f for f in fields if f.path not in no_values):
-            if not _is_column(info) or is_command(info.path):
+            if not is_column(info) or is_command(info.path):
                 continue
             if its := documented.entries(info.path):
                 results += [(topic, role, replace(info, path=p), meaning_of_source(s), True) for p, s in its.items()]
@@ -227,66 +223,9 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     return results
 
 
-def _is_column(info: FieldInfo) -> bool:
+def is_column(info: FieldInfo) -> bool:
     """Return whether a field has one number, or one array of numbers, a message."""
     return info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
-
-
-def proposed_fields(
-    log: DriveLog, pieces: Pieces, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], fields: list[Field]
-) -> Iterator[Field]:
-    """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives.
-
-    ``fields`` have a quantity, mapped or by name.
-    """
-    measured = [f for f in fields if f.role != "command"]
-    there = {(f.meaning.quantity, part) for f in measured for part in (f.meaning.part, "any")}
-    wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
-    wanted += [] if ("steering", "any") in there else [("steering", "")]
-    open_fields = _open_fields(log, topics, named) if wanted else {}
-    sides = [column for role in ROLES for column in _named_column(measured, role)]
-    read = pieces.read([*open_fields][: MOST_PROPOSED - len(sides)])
-    others = []
-    for (name, path), seen in read.items():
-        topic, info, units = open_fields.get((name, path)) or open_fields[name, path.partition("[")[0]]
-        others += [(topic, replace(info, path=path), Column(seen, units))] if seen.changes else []
-    columns = [*sides, *(column for _, _, column in others)]
-    why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
-    for place, (quantity, part, unit) in propose(pieces, columns, wanted).items() if others else ():
-        topic, info, column = others[place - len(sides)]
-        scale = dict(column.units[quantity]).get(unit)
-        meaning = Meaning(quantity, part, PROPOSED, unit if scale else "", scale, why)
-        yield _field_of(log.fields(topic.name, quiet=True), topic, "sensor", info, meaning, column.seen)
-
-
-def _open_fields(
-    log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]
-) -> dict[tuple[str, str], tuple[TopicInfo, FieldInfo, Units]]:
-    """Return the sensors' fields without a meaning, with their possible units, by topic and path."""
-    by_name = {(topic.name, info.path) for topic, _, info, _, _ in named}
-    open_fields = {}
-    for topic in (t for t, role in topics if role == "sensor"):
-        fields = log.fields(topic.name, quiet=True)
-        for info in () if holds_frames(topic.name, fields) else filter(_is_column, fields):
-            if (units := _units_without_name(info)) and (topic.name, info.path) not in by_name:
-                open_fields[topic.name, info.path.removesuffix("[]")] = topic, info, units
-    return open_fields
-
-
-def _named_column(fields: Sequence[Field], role: tuple[str, str]) -> Iterator[Column]:
-    """Yield the surest field of one of :data:`ROLES`; a wheel speed replaces a missing speed."""
-    its = [f for f in fields if f.meaning.quantity == role[0] and f.meaning.part in (role[1], "")]
-    its = its or [f for f in fields if role[0] == "speed" and f.meaning.quantity == "wheel speed"]
-    for item in sorted(its, key=lambda f: -f.meaning.strength)[:1]:
-        yield Column(item.seen, {role[0]: item.units}, role)
-
-
-def _units_without_name(info: FieldInfo) -> Units:
-    """Return the possible units of a field without a unit by quantity, if no word of its name has a meaning."""
-    words = set(words_of(info.path)) - STATES
-    unknown = all(len(w) == 1 or w.isdigit() or w in _OPEN_WORDS or w not in naming.KNOWN for w in words)
-    quantities = ("speed", "acceleration", "rate", "steering")
-    return {q: HYPOTHESES[q][:2] for q in quantities} if unknown and not info.unit and not words & NOT_VALUES else {}
 
 
 def _signs_of(paths: Collection[str]) -> dict[str, str]:
@@ -344,10 +283,10 @@ def _weighable(
         if role == "sensor" and (words := set(words_of(name))) & (_TRUTH_WORDS | _RECEIVERS):
             role = "truth" if words & _TRUTH_WORDS else "navigation"
         kind = vendors.of(topic.type_name) if documented else None
-        yield _field_of(fields, topic, role, replace(info, path=name), its, seen, kind)
+        yield field_of(fields, topic, role, replace(info, path=name), its, seen, kind)
 
 
-def _field_of(
+def field_of(
     fields: tuple[FieldInfo, ...],
     topic: TopicInfo,
     role: Role,

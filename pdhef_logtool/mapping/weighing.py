@@ -24,12 +24,12 @@ from pdhef_logtool.mapping.candidates import (
     look,
     named_fields,
     place_of,
-    proposed_fields,
     triad_of,
 )
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, ratio
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
+    PLACES,
     SLOW_M_S,
     USUAL_LENGTH_M,
     Fields,
@@ -43,6 +43,7 @@ from pdhef_logtool.mapping.fields import (
 )
 from pdhef_logtool.mapping.naming import tags_of, words_of
 from pdhef_logtool.mapping.navigation import axes_of, has_heading, turns
+from pdhef_logtool.mapping.proposals import proposed_fields
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
@@ -97,10 +98,9 @@ def weigh(
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
     pieces, weighable = look(log, named, vendors, [*signals.values(), *true])
     anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
-    meant = [*anchors.values(), *(f for f in weighable if not f.anchor)]
-    weighable += proposed_fields(log, pieces, topics, named, meant)
-    places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
+    places = [f for f in weighable if f.meaning.quantity in PLACES]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
+    fields.candidates += proposed_fields(log, topics, named, fields)
     decide_units(fields)
     weighing = Weighing(fields, anchor_of("vx_m_s", weighable))
     weighing.drop_vectors_over_ground()
