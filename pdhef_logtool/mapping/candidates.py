@@ -20,7 +20,7 @@ from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping import naming
 from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
-from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
+from pdhef_logtool.mapping.evidence import EVIDENCE, LOG_ODDS, MOST_COLUMNS, Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.records import SignalSource
@@ -38,13 +38,7 @@ _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
 _TRUTH_WORDS, _RECEIVERS = frozenset(VOCABULARY["topics"]["truth"].split()), {"gps", "gnss", "ins", "rtk"}
 #: Affix that distinguishes the name of a sign from the name of its magnitude; YawToRight belongs to YawRate.
 _SIGN = re.compile("|".join(VOCABULARY["patterns"]["sign"]), re.IGNORECASE)
-#: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
-MOST_FIELDS = 3000
-#: Maximum number of fields to read; the best names have priority.
-MOST_READ = 160
-#: Candidates with a lower score are listed as comments only.
-LEAST_SCORE = 0.45
-
+_NAMES = EVIDENCE["names"]
 #: Possible units of a field without one, with their factors, by quantity; the conventional one is first.
 HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
     quantity: tuple(units.items()) for quantity, units in VOCABULARY["possible_units"].items()
@@ -52,8 +46,7 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
 #: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
 MOST: dict[str, float] = VOCABULARY["largest"]
 CONSTANT = "constant in the parts of the log that were read"
-#: Strength of the meaning of a field that only the drive gives, and least strength of a name.
-PROPOSED, LEAST_NAMED = 0.55, 0.6
+PROPOSED: float = _NAMES["proposed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +56,8 @@ class Candidate:
     Attributes
     ----------
     section : ``signals`` or ``truth``. source : the field, with its likeliest scale and offset.
-    score : 0 to 1. reason : evidence for the quantity. doubt : uncertain properties; empty if there are none.
-    taken : the mapping contains it.
+    score : probability of the reading. reason : evidence for the quantity.
+    doubt : uncertain properties; empty if there are none. taken : the mapping contains it.
     """
 
     section: Literal["signals", "truth"]
@@ -89,6 +82,7 @@ class Field:
     ----------
     factors : possible units, the likeliest first. fixed : unit and sign are documented.
     section : ``signals`` or ``truth`` by its documentation.
+    evidence : names of evidence for or against the quantity, in log odds (``evidence.toml``).
     unit_known : its unit is certain. anchor : the mapping already contains it. sign : sign of the scale.
     sign_path : path of the field that contains its sign.
     is_weak : its values cannot identify the quantity, so that it is never taken.
@@ -108,9 +102,9 @@ class Field:
     unit_known: bool = False
     anchor: bool = False
     sign: float = 1.0
-    bonus: float = 0.0
     reasons: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
+    evidence: list[str] = field(default_factory=list)
     offset: float = 0.0
     is_weak: bool = False
     is_turned: bool = False
@@ -131,6 +125,11 @@ class Field:
     def units(self) -> tuple[tuple[str, float], ...]:
         """Units that are still possible."""
         return self.factors[:1] if self.unit_known or self.fixed else self.factors
+
+    @property
+    def is_named(self) -> bool:
+        """Return whether its name gives the quantity."""
+        return self.meaning.strength >= float(_NAMES["least"])
 
     @property
     def unit_doubt(self) -> list[str]:
@@ -161,16 +160,19 @@ class Field:
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
 
     @property
-    def score(self) -> float:
-        """Confidence in the quantity given by the name, 0 to 1."""
-        if self.fixed:
-            return 0.95
-        score = 0.45 * self.meaning.strength + 0.1 + self.bonus
-        score += 0.15 if self.meaning.unit else 0.0
-        score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
-        score -= 0.1 if self.role == "navigation" and self.meaning.quantity == "speed" else 0.0
-        score -= 0.01 if not self.seen.changes else 0.0
-        return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
+    def log_odds(self) -> float:
+        """Log odds of the quantity, by the evidence of ``evidence.toml``."""
+        if self.fixed or self.is_weak:
+            return LOG_ODDS["documented" if self.fixed else "weak"]
+        applies = {
+            "unit": bool(self.meaning.unit),
+            "often": self.seen.rate_hz >= _NAMES["often_hz"],
+            "seldom": self.seen.rate_hz < _NAMES["seldom_hz"],
+            "receiver": self.role == "navigation" and self.meaning.quantity == "speed",
+            "constant": not self.seen.changes,
+        }
+        evidence = (*self.evidence, *(name for name, is_so in applies.items() if is_so))
+        return LOG_ODDS["prior"] + LOG_ODDS["name"] * self.meaning.strength + sum(LOG_ODDS[name] for name in evidence)
 
     def use(self, unit: str) -> None:
         """Select a unit."""
@@ -195,7 +197,8 @@ class Field:
             source = replace(source, valid_min=-most, valid_max=most)
         reason = "; ".join([self.meaning.why, *self.reasons])
         doubts = dict.fromkeys([*self.doubts, *([] if self.seen.changes else [CONSTANT])])
-        return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
+        probability = round(1.0 / (1.0 + math.exp(-self.log_odds)), 2)
+        return Candidate(section, source, probability, reason, "; ".join(doubts), taken)
 
 
 def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendors: Vendors) -> list[Named]:
@@ -203,7 +206,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     results = []
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
-        if len(fields) > MOST_FIELDS or vendors.of(topic.type_name).left_out:
+        if len(fields) > _NAMES["most_fields"] or vendors.of(topic.type_name).left_out:
             continue
         if is_joints(topic):
             joints = () if role == "command" else joint_meanings(log, topic)
@@ -247,7 +250,7 @@ def look(
 
     Fields without a number are excluded, as are fields that exceed a car's range in every unit.
     """
-    named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[:MOST_READ]
+    named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[: _NAMES["most_read"]]
     fields = [(topic.name, info.path.removesuffix("[]")) for topic, _, info, _, _ in named]
     of_topics = {t: _signs_of({f.path for f in log.fields(t, quiet=True)}) for t in dict.fromkeys(t for t, _ in fields)}
     signs = {(t, p): of_topics[t][p] for t, p in fields if p in of_topics[t]}
@@ -309,7 +312,7 @@ def field_of(
     elif meaning.scale is not None:
         item.unit_known = True
         item.reasons.append(f"unit {naming.UNIT_TEXTS.get(meaning.unit, meaning.unit)}")
-    if meaning.strength < LEAST_NAMED:
+    if not item.is_named:
         item.doubts.append("its values alone identify it")
     if _may_be_share(item, info):
         item.is_weak = _is_control(item, info, fields)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,8 +28,10 @@ LARGEST = 1e12
 BRIDGED_CELLS = 12
 #: Maximum number of columns to read of an array of unknown length.
 MOST_COLUMNS = 16
-#: Smallest correlation that counts as a relation.
-CLEAR = 0.75
+#: Evidence and limits by subject, and the evidence for a reading in log odds (evidence.toml).
+EVIDENCE: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+LOG_ODDS: dict[str, float] = EVIDENCE["log_odds"]
+CLEAR: float = EVIDENCE["relations"]["clear"]
 #: Smallest number of cells that gives information.
 FEWEST_CELLS = 40
 

@@ -18,7 +18,7 @@ from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping import naming
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import HYPOTHESES, PROPOSED, Field, Named, Role, field_of, is_column
-from pdhef_logtool.mapping.evidence import Fit, Seen, fit
+from pdhef_logtool.mapping.evidence import EVIDENCE, Fit, Seen, fit
 from pdhef_logtool.mapping.fields import BY_DRIVING, Fields, Gain, Unit, posterior
 from pdhef_logtool.mapping.naming import Meaning, words_of
 
@@ -28,9 +28,9 @@ _SPEED, _AX, _AY, _RATE = ("speed", "x"), ("acceleration", "x"), ("acceleration"
 #: Exponents of the quantities in the gains of a_x ≈ v̇ and a_y ≈ v r.
 _FORWARD, _TURN = {_AX: 1, _SPEED: -1}, {_AY: 1, _RATE: -1, _SPEED: -1}
 #: Range of the largest value of each quantity in a drive, SI.
-_LARGEST = {_SPEED: (4.0, 90.0), _AX: (0.7, 16.0), _AY: (0.7, 16.0), _RATE: (0.04, 2.5)}
-#: Most columns that are compared; least correlation of a relation; how much surer the best proposal must be.
-MOST_PROPOSED, LEAST, MARGIN = 24, 0.8, 1.0
+_LIMITS = EVIDENCE["proposals"]
+_LARGEST: dict[_Quantity, tuple[float, float]] = {q: _LIMITS["largest"][" ".join(q)] for q in (_SPEED, _AX, _AY, _RATE)}
+_LEAST: float = _LIMITS["correlation"]
 #: Words that leave the quantity of a field open: it may be any of them.
 _OPEN_WORDS = naming.COUNTING | {"angle", "yaw"}
 
@@ -63,9 +63,10 @@ def proposed_fields(
     items = {quantity: item for quantity in _LARGEST if (item := _surest(measured, quantity)) is not None}
     steers = any(f.meaning.quantity == "steering" for f in measured)
     columns = [] if len(items) == len(_LARGEST) and steers else [*_open_columns(log, fields, topics, named)]
-    best, *others = sorted(_ways(fields, items, columns), key=lambda way: -way.score) if columns else [None]
-    if best is None or any(way.score > best.score - MARGIN and way.items != best.items for way in others):
+    ways = sorted(_ways(fields, items, columns), key=lambda way: -way.score)
+    if not ways or any(way.score > ways[0].score - _LIMITS["margin"] and way.items != ways[0].items for way in ways):
         return
+    best = ways[0]
     for quantity, column in best.items.items():
         if isinstance(column, _Column):
             items[quantity] = _field(log, column, quantity, best.units[quantity])
@@ -78,7 +79,7 @@ def proposed_fields(
     follows = [abs(fit(fields.pieces.smooth(c.seen.cells), curvature).correlation) for c in free]
     surest, steering = max(zip(follows, free, strict=True), key=lambda f: f[0], default=(0.0, None))
     # A roll angle follows the lateral acceleration better than the curvature.
-    if steering is not None and surest > max(LEAST, abs(fit(steering.seen.cells, curvature * v**2).correlation)):
+    if steering is not None and surest > max(_LEAST, abs(fit(steering.seen.cells, curvature * v**2).correlation)):
         yield _field(log, steering, ("steering", ""), "")
 
 
@@ -102,7 +103,7 @@ def _open_columns(
             unknown = all(len(w) == 1 or w.isdigit() or w in _OPEN_WORDS or w not in naming.KNOWN for w in words)
             if unknown and not (info.unit or words & naming.NOT_VALUES or (topic.name, info.path) in by_name):
                 infos[topic.name, info.path.removesuffix("[]")] = topic, info
-    for (name, path), seen in fields.pieces.read([*infos][:MOST_PROPOSED]).items():
+    for (name, path), seen in fields.pieces.read([*infos][: _LIMITS["most"]]).items():
         topic, info = infos.get((name, path)) or infos[name, path.partition("[")[0]]
         if seen.changes:
             yield _Column(topic, replace(info, path=path), seen)
@@ -119,15 +120,17 @@ def _field(log: DriveLog, column: _Column, quantity: _Quantity, unit: str) -> Fi
 def _ways(fields: Fields, named: Mapping[_Quantity, Field], columns: Sequence[_Column]) -> Iterator[_Way]:
     """Yield the assignments that the drive's motion supports."""
     pieces = fields.pieces
+    every: list[Field | _Column] = [*named.values(), *columns]
+    cells = {id(item): pieces.smooth(item.seen.cells) for item in every}
+    of: dict[_Quantity, Sequence[Field | _Column]]
     of = {quantity: [named[quantity]] if quantity in named else columns for quantity in _LARGEST}
-    cells = {id(item): pieces.smooth(item.seen.cells) for item in (*named.values(), *columns)}
-    for v in (v for v in of[_SPEED] if np.fmin.reduce(cells[id(v)]) > -0.05 * v.seen.largest):
+    for v in (v for v in of[_SPEED] if np.fmin.reduce(cells[id(v)]) > -_LIMITS["reverse"] * v.seen.largest):
         change = pieces.rate_of(v.seen.cells)
         ahead = [({_AX: x}, fit(cells[id(x)], change)) for x in of[_AX] if x is not v]
         pairs = [(y, r) for y, r in product(of[_AY], of[_RATE]) if y is not r and v not in (y, r)]
         left = [({_AY: y, _RATE: r}, fit(cells[id(y)], cells[id(r)] * cells[id(v)])) for y, r in pairs]
-        forward = [(its, f) for its, f in ahead if f.correlation > LEAST]
-        turn = [(its, f) for its, f in left if abs(f.correlation) > LEAST]
+        forward = [(its, f) for its, f in ahead if f.correlation > _LEAST]
+        turn = [(its, f) for its, f in left if abs(f.correlation) > _LEAST]
         for (x, along), (y_r, across) in product([*forward, ({}, Fit())], [*turn, ({}, Fit())]):
             items = {_SPEED: v, **x, **y_r}
             # An acceleration without a lateral one may be the derivative of the speed.
@@ -150,7 +153,7 @@ def _with_units(
     seen = [(powers, f) for powers, f in relations if f.correlation]
     gains = [Gain(tuple(powers.get(q, 0) for q in items), f.slope, BY_DRIVING) for powers, f in seen]
     shares = posterior(units, gains)
-    surety = sum(math.atanh(min(abs(f.correlation), 0.999)) for _, f in seen)
+    surety = sum(math.atanh(min(abs(f.correlation), _LIMITS["noiseless"])) for _, f in seen)
     best = np.unravel_index(int(shares.argmax()), shares.shape)
     names = {quantity: ways[i].name for quantity, ways, i in zip(items, units, best, strict=True)}
     if shares.max() > 0.0:

@@ -15,7 +15,7 @@ from pdhef_logtool.mapping import navigation
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role, anchors_of
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
-from pdhef_logtool.mapping.evidence import Pieces, Seen
+from pdhef_logtool.mapping.evidence import EVIDENCE, Pieces, Seen
 from pdhef_logtool.mapping.fields import PLACES, Fields, path_velocity
 from pdhef_logtool.mapping.joints import is_joints, joint_names
 from pdhef_logtool.mapping.mapping_file import missing_signals
@@ -47,8 +47,6 @@ OWN_PREFIX = "/pdhef/"
 
 #: Subject of a choice between runs, and formats of files that may contain several.
 RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3", "hdf5"})
-#: Largest difference of the mean acceleration from 1 for accelerations in g.
-NEAR_1_G = 0.08
 #: Largest difference of the length of a quaternion from 1.
 NEAR_UNIT = 0.01
 #: Descriptions of quantities with a covariance, by the first of them.
@@ -136,8 +134,9 @@ class _Draft:
     def take(self, into: _Sources, topic: TopicInfo, *names: str, scale: float = 1.0) -> None:
         """Add these quantities of a topic, as far as its type gives them, to signals or ground truth."""
         for source in (self.given[topic.name][name] for name in names if self.has(topic, name)):
-            is_si = scale == 1.0 or isinstance(source.scale, tuple)
-            into[source.name] = source if is_si else replace(source, scale=scale * source.scale)
+            into[source.name] = source
+            if isinstance(source.scale, float):
+                into[source.name] = replace(source, scale=scale * source.scale)
 
     def doubt(self, subject: str, candidates: tuple[str, ...], chosen: str | None, reason: str) -> None:
         """Note an ambiguity."""
@@ -510,7 +509,8 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     gyro = next((t for t in (imu, *imus) if draft.span(t, "yaw_rate_rad_s") > 0.0), imu)
     if draft.has(imu, *_FORCES):
         means = [_mean(draft.values(imu, name)) for name in _FORCES]
-        in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
+        is_level = np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
+        in_g = bool(is_level and abs(abs(means[2]) - 1.0) < EVIDENCE["gravity"]["in_g"])
     if in_g:
         fast = np.abs(draft.values(gyro, "yaw_rate_rad_s"))
         in_deg = fast.shape[0] > 0 and float(np.quantile(fast, 0.995)) > MOST["rate"]

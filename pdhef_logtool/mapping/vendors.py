@@ -196,9 +196,11 @@ def _tables(raw: Mapping[str, Any], key: str, kind: type[_Table], problems: list
 
 def _sources(tables: Iterable[_FieldTable]) -> tuple[tuple[SignalSource, ...], tuple[SignalSource, ...]]:
     """Return the sources of signals and of ground truth."""
-    signals, truth = [], []
+    signals: list[SignalSource] = []
+    truth: list[SignalSource] = []
     for table in tables:
-        field_, scale = (tuple(v) if isinstance(v, list) else v for v in (table.field, table.scale))
+        path = tuple(table.field) if isinstance(table.field, list) else table.field
+        scale = tuple(table.scale) if isinstance(table.scale, list) else table.scale
         its = signals if table.signal else truth
-        its.append(SignalSource(table.signal or table.truth, "", field_, scale=scale, offset=table.offset))
+        its.append(SignalSource(table.signal or table.truth, "", path, scale=scale, offset=table.offset))
     return tuple(signals), tuple(truth)

@@ -16,7 +16,6 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import (
     CONSTANT,
     HYPOTHESES,
-    LEAST_SCORE,
     Candidate,
     Field,
     Role,
@@ -26,7 +25,7 @@ from pdhef_logtool.mapping.candidates import (
     place_of,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, ratio
+from pdhef_logtool.mapping.evidence import EVIDENCE, LOG_ODDS, Fit, Pieces, fit, ratio
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
     PLACES,
@@ -56,26 +55,18 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Correlation with speeding up below which an acceleration is along another axis.
-FOLLOWS = 0.5
-#: Speed over that over ground below which it is vertical.
-VERTICAL = 0.2
+_RELATIONS, _UNITS = EVIDENCE["relations"], EVIDENCE["units"]
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
-_STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
-#: Signals that may have an unknown sign; largest log ratio between the length of a steering angle and a usual length if
-#: the signal could also be a share of the largest angle.
+_STEERING_M: dict[str, tuple[float, float]] = _RELATIONS["wheelbases_m"]
+#: Signals that may have an unknown sign.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
-USUAL = 0.6
 #: Units of wheel speeds, which are mostly named as speeds.
-#: Usual radius of a wheel, and 1-sigma of the logarithm of a radius that a car assumes for its wheel speeds.
-USUAL_RADIUS_M, WHEEL_RADIUS = 0.3, 0.015
+_RADIUS_M: float = _RELATIONS["radius_m"]
 WHEEL_UNITS = (
     *(Unit(*u, "wheel speed") for u in HYPOTHESES["wheel speed"]),
-    *(Unit(n, f * USUAL_RADIUS_M, "wheel rate", 0.4) for n, f in HYPOTHESES["wheel rate"]),
+    *(Unit(n, f * _RADIUS_M, "wheel rate", _RELATIONS["radius"]) for n, f in HYPOTHESES["wheel rate"]),
 )
-#: Probability of a unit over the highest one from which the unit is a doubt: of wheels, and of a steering angle.
-POSSIBLE, LIKELY = 0.05, 0.25
 
 
 def weigh(
@@ -108,7 +99,7 @@ def weigh(
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     its = [f for f in may_be_true if f.topic.name == weighing.truth_from and _truth_name(f) in _SLIP and f.seen.changes]
-    weighing.slip = min(its, key=lambda f: (f.role != "truth", f.role != "navigation", -f.score), default=None)
+    weighing.slip = min(its, key=lambda f: (f.role != "truth", f.role != "navigation", -f.log_odds), default=None)
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
     return weighing
@@ -144,7 +135,7 @@ class Weighing:
         for name in _SENSORS:
             if name not in have and not (wheels and name == "speed_m_s"):
                 fields = (f for f in usable if name in names_of(f.meaning.quantity, f.meaning.part))
-                self._choose([(f.score, name, f) for f in fields])
+                self._choose([(f.log_odds, name, f) for f in fields])
         self._turn_level()
         if not wheels:
             self._wheels(usable)
@@ -164,7 +155,7 @@ class Weighing:
         # Sensors of the ground truth's instrument rank below others.
         kinships = [(f.meaning.quantity, f.meaning.part, self._kinship(f)) for f in usable]
         for item, (*meant, kinship) in zip(usable, kinships, strict=True):
-            item.bonus -= 0.2 * any(meant == other and kinship > less for *other, less in kinships)
+            item.evidence += ["instrument"] * any(meant == other and kinship > less for *other, less in kinships)
         return usable
 
     def _kinship(self, item: Field) -> int:
@@ -196,7 +187,7 @@ class Weighing:
     def drop_vertical_speeds(self) -> None:
         """Leave out speeds that are small against the velocity over ground of their message."""
         for side in (*self.fields.open("over ground"), *self.taken.values()):
-            least = VERTICAL * abs(side.seen.largest * side.scale)
+            least = EVIDENCE["ground"]["vertical"] * abs(side.seen.largest * side.scale)
             speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
             for item in [f for f in speeds if abs(f.seen.largest * f.scale) < least]:
                 self.fields.candidates.remove(item)
@@ -230,11 +221,11 @@ class Weighing:
             is_other = (f.role == "navigation", f.meaning.part, f.seen.is_off_centre)
             return -score, *is_other, -f.topic.messages, f.topic.name, f.path
 
-        good = sorted((j for j in judged if j[0] >= LEAST_SCORE), key=rank)
+        good = sorted((j for j in judged if j[0] >= 0.0), key=rank)
         if not good:
             return
         score, name, best = good[0]
-        near = [f for s, n, f in good[1:] if s > score - 0.1 and n == name and not agree(best.si, f.si)]
+        near = [f for s, n, f in good[1:] if s > score - LOG_ODDS["rival"] and n == name and not agree(best.si, f.si)]
         self._select(name, best, near)
 
     def _select(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
@@ -252,7 +243,7 @@ class Weighing:
             return
         ay, change = across[0], pieces.rate_of(speed.si)
         along, ahead = (fit(pieces.smooth(f.si), change) for f in (ax, ay))
-        if not ahead.is_clear or abs(along.correlation) >= FOLLOWS:
+        if not ahead.is_clear or abs(along.correlation) >= EVIDENCE["gravity"]["follows"]:
             return
         for name, item, factor in (("ax_m_s2", ay, ahead.slope), ("ay_m_s2", ax, -ahead.slope)):
             item.sign, item.is_turned = item.sign * math.copysign(1.0, factor), True
@@ -275,10 +266,10 @@ class Weighing:
         mean = mean_of([f.seen.cells for f in wheels])
         times, sigma, by = self._per_turning(mean), BY_DRIVING, "a_y ≈ v r"
         if speed is not None:
-            times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
+            times, sigma, by = ratio(mean, speed.si, SLOW_M_S), _RELATIONS["assumed_radius"], "the speed"
         times = times if times is not None and times > 0.0 else 0.0
         units = [u for u in WHEEL_UNITS if first.meaning.quantity in ("wheel speed", u.quantity)]
-        best, *others = _likely(units, times, sigma, POSSIBLE) if times else units[:1]
+        best, *others = _likely(units, Gain((1,), times, sigma), _UNITS["wheel_doubt"]) if times else units[:1]
         reasons = [f"{times:.4g} of it is 1 m/s by {by}"] if times else []
         doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
         if not times:
@@ -286,7 +277,7 @@ class Weighing:
         elif not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
         for item in wheels:
-            item.factors = ((best.name, best.factor / (USUAL_RADIUS_M if best.spread else 1.0)),)
+            item.factors = ((best.name, best.factor / (_RADIUS_M if best.spread else 1.0)),)
             item.unit_known = not doubt
             item.reasons += reasons
             item.doubts += [doubt] if doubt else []
@@ -304,7 +295,7 @@ class Weighing:
         speed, *turning = (self._speed(), self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2"))
         # Wheel speeds are in their likeliest unit, rotational ones of usual wheels.
         spun = [f for n, f in self.taken.items() if n.startswith("wheel_speed")]
-        wheels = [f.si * (USUAL_RADIUS_M if f.meaning.quantity == "wheel rate" else 1.0) for f in spun]
+        wheels = [f.si * (_RADIUS_M if f.meaning.quantity == "wheel rate" else 1.0) for f in spun]
         pace = speed.si if speed is not None else mean_of(wheels) if wheels else None
         curvature = self.fields.curvature(pace, *(None if f is None else f.si for f in turning))
         judged: list[tuple[float, str, Field]] = []
@@ -314,7 +305,7 @@ class Weighing:
                 continue
             relation = Fit() if curvature is None else fit(self.fields.pieces.smooth(item.seen.cells), curvature)
             name, follows = self._steering_kind(item, relation)
-            judged.append((item.score + 0.3 * follows, name, item))
+            judged.append((item.log_odds + LOG_ODDS["curvature"] * follows, name, item))
         self._choose(judged)
 
     def _steer_by_command(self) -> None:
@@ -324,7 +315,7 @@ class Weighing:
             self._select(measured[0], self.taken[measured[0]], [f for f in commands if f.fixed])
             return
         for item in commands:
-            item.bonus -= 0.3
+            item.evidence.append("command")
         self._steering([f for f in commands if f.seen.changes or f.fixed])
 
     def _steering_kind(self, item: Field, relation: Fit) -> tuple[str, bool]:
@@ -333,8 +324,9 @@ class Weighing:
         if not relation.is_clear:
             return _steering_by_range(item, kinds, relation), False
         metres = abs(relation.slope)
-        ways = [Unit(u, f / USUAL_LENGTH_M[k], k, 0.7) for k in kinds for u, f in item.units]
-        likely = _likely(ways, metres, BY_DRIVING, LIKELY, broken=1e-3)
+        ways = [Unit(u, f / USUAL_LENGTH_M[k], k, _RELATIONS["length"]) for k in kinds for u, f in item.units]
+        gain = Gain((1,), metres, BY_DRIVING, _RELATIONS["steering_broken"])
+        likely = _likely(ways, gain, _UNITS["steering_doubt"])
         name, unit = likely[0].quantity, likely[0].name
         usual = metres * likely[0].factor
         low, high = _STEERING_M[name]
@@ -343,7 +335,7 @@ class Weighing:
             return kinds[0], False
         item.use(unit)
         item.reasons.append(f"ratio to the path's curvature {length:.3g} m: {name} in {unit}")
-        if abs(math.log(usual)) < USUAL:
+        if abs(math.log(usual)) < _RELATIONS["usual"]:
             item.doubts = [d for d in item.doubts if "a share" not in d]
         if likely[1:] and not item.fixed:
             item.doubts.append(f"it could be {likely[1].quantity} in {likely[1].name} as well")
@@ -481,7 +473,7 @@ def _truth_of(candidates: Sequence[Field], kinship: Callable[[Field], int]) -> d
     """
     truth: dict[str, Field] = {}
     along = {"lng", "long", "longitudinal", "forward"}
-    for item in sorted(candidates, key=lambda f: (-kinship(f), -f.score, along.isdisjoint(words_of(f.path)))):
+    for item in sorted(candidates, key=lambda f: (-kinship(f), -f.log_odds, along.isdisjoint(words_of(f.path)))):
         name = _truth_name(item)
         if name and item.seen.changes:
             truth.setdefault(name, item)
@@ -501,7 +493,7 @@ def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
             sets.setdefault(key, {}).setdefault(item.meaning.part, item)
     apart = {corner: f for group in sets.values() if len(group) == 1 for corner, f in group.items()}
     complete = [g for g in sets.values() if len(g) >= 2]
-    return max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
+    return max(complete, key=lambda g: (len(g), sum(f.log_odds for f in g.values())), default=apart)
 
 
 def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit) -> str:
@@ -520,21 +512,21 @@ def truth_topic(weighable: Sequence[Field]) -> str:
     for item in weighable:
         if item.role in ("truth", "navigation", "sensor"):
             topics.setdefault(item.topic.name, []).append(item)
-    best = (0.0, "")
+    best, of = (0.0, ""), EVIDENCE["truth"]
     for name, fields in topics.items():
         kinds = {f.meaning.quantity for f in fields if f.seen.changes}
-        worth = 2.0 * ("velocity" in kinds and "speed" in kinds) + 1.5 * ("sideslip" in kinds)
-        worth += 0.5 * (fields[0].role == "truth") + 0.2 * ("latitude" in kinds) if worth else 0.0
+        worth = of["velocity"] * ("velocity" in kinds and "speed" in kinds) + of["sideslip"] * ("sideslip" in kinds)
+        worth += of["named"] * (fields[0].role == "truth") + of["position"] * ("latitude" in kinds) if worth else 0.0
         if worth == 0.0 and fields[0].fixed and {"latitude", "longitude"} <= kinds:
-            worth = 0.1
-        if worth > best[0] and (fields[0].role != "sensor" or worth >= 1.5 or fields[0].fixed):
+            worth = of["documented_position"]
+        if worth > best[0] and (fields[0].role != "sensor" or worth >= of["sideslip"] or fields[0].fixed):
             best = (worth, name)
     return best[1]
 
 
-def _likely(units: Sequence[Unit], gain: float, sigma: float, least: float, broken: float = 0.01) -> Sequence[Unit]:
+def _likely(units: Sequence[Unit], gain: Gain, least: float) -> Sequence[Unit]:
     """Return the likely units of a field with this gain, the likeliest first; ``least``: share of the highest one."""
-    shares = posterior([units], [Gain((1,), gain, sigma, broken)])
+    shares = posterior([units], [gain])
     return [units[i] for i in np.argsort(-shares) if shares[i] >= least * shares.max()]
 
 
