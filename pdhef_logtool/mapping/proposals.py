@@ -63,24 +63,36 @@ def proposed_fields(
     items = {quantity: item for quantity in _LARGEST if (item := _surest(measured, quantity)) is not None}
     steers = any(f.meaning.quantity == "steering" for f in measured)
     columns = [] if len(items) == len(_LARGEST) and steers else [*_open_columns(log, fields, topics, named)]
-    ways = sorted(_ways(fields, items, columns), key=lambda way: -way.score)
-    if not ways or any(way.score > ways[0].score - _LIMITS["margin"] and way.items != ways[0].items for way in ways):
+    if (best := _only([*_ways(fields, items, columns)])) is None:
         return
-    best = ways[0]
     for quantity, column in best.items.items():
         if isinstance(column, _Column):
             items[quantity] = _field(log, column, quantity, best.units[quantity])
             yield items[quantity]
+    if not steers:
+        free = [c for c in columns if c not in best.items.values() and not c.seen.is_off_centre]
+        if (steering := _steering(fields, items, free)) is not None:
+            yield _field(log, steering, ("steering", ""), "")
+
+
+def _only(ways: Sequence[_Way]) -> _Way | None:
+    """Return the surest assignment, or None if another one is nearly as sure."""
+    best = max(ways, key=lambda way: way.score, default=None)
+    others = (way.score for way in ways if best is not None and way.items != best.items)
+    return None if best is None or max(others, default=-math.inf) > best.score - _LIMITS["margin"] else best
+
+
+def _steering(fields: Fields, items: Mapping[_Quantity, Field], columns: Sequence[_Column]) -> _Column | None:
+    """Return the column that follows the path's curvature best, or None."""
     v, ay, rate = (None if (item := items.get(q)) is None else item.si for q in (_SPEED, _AY, _RATE))
     curvature = fields.curvature(v, rate, ay)
-    if steers or v is None or curvature is None:
-        return
-    free = [c for c in columns if c not in best.items.values() and not c.seen.is_off_centre]
-    follows = [abs(fit(fields.pieces.smooth(c.seen.cells), curvature).correlation) for c in free]
-    surest, steering = max(zip(follows, free, strict=True), key=lambda f: f[0], default=(0.0, None))
+    if v is None or curvature is None or not columns:
+        return None
+    follows = [abs(fit(fields.pieces.smooth(c.seen.cells), curvature).correlation) for c in columns]
+    steering = columns[int(np.argmax(follows))]
     # A roll angle follows the lateral acceleration better than the curvature.
-    if steering is not None and surest > max(_LEAST, abs(fit(steering.seen.cells, curvature * v**2).correlation)):
-        yield _field(log, steering, ("steering", ""), "")
+    rolls = abs(fit(steering.seen.cells, curvature * v**2).correlation)
+    return steering if max(follows) > max(_LEAST, rolls) else None
 
 
 def _surest(fields: Sequence[Field], quantity: _Quantity) -> Field | None:
@@ -126,17 +138,22 @@ def _ways(fields: Fields, named: Mapping[_Quantity, Field], columns: Sequence[_C
     of = {quantity: [named[quantity]] if quantity in named else columns for quantity in _LARGEST}
     for v in (v for v in of[_SPEED] if np.fmin.reduce(cells[id(v)]) > -_LIMITS["reverse"] * v.seen.largest):
         change = pieces.rate_of(v.seen.cells)
-        ahead = [({_AX: x}, fit(cells[id(x)], change)) for x in of[_AX] if x is not v]
-        pairs = [(y, r) for y, r in product(of[_AY], of[_RATE]) if y is not r and v not in (y, r)]
+        ahead = [({_AX: x}, fit(cells[id(x)], change)) for x in of[_AX]]
+        pairs = [(y, r) for y, r in product(of[_AY], of[_RATE]) if y is not r]
         left = [({_AY: y, _RATE: r}, fit(cells[id(y)], cells[id(r)] * cells[id(v)])) for y, r in pairs]
-        forward = [(its, f) for its, f in ahead if f.correlation > _LEAST]
-        turn = [(its, f) for its, f in left if abs(f.correlation) > _LEAST]
+        forward = [(x, f) for x, f in ahead if f.correlation > _LEAST]
+        turn = [(y_r, f) for y_r, f in left if abs(f.correlation) > _LEAST]
         for (x, along), (y_r, across) in product([*forward, ({}, Fit())], [*turn, ({}, Fit())]):
-            items = {_SPEED: v, **x, **y_r}
-            # An acceleration without a lateral one may be the derivative of the speed.
-            is_derivative = bool(x) and _AX not in named and not (y_r or _AY in named)
-            if (x or y_r or _SPEED in named) and not (is_derivative or any(x.get(_AX) is i for i in y_r.values())):
-                yield from _with_units(items, [(_FORWARD, along), (_TURN, across)])
+            if _is_possible({_SPEED: v, **x, **y_r}, named):
+                yield from _with_units({_SPEED: v, **x, **y_r}, [(_FORWARD, along), (_TURN, across)])
+
+
+def _is_possible(items: Mapping[_Quantity, Field | _Column], named: Mapping[_Quantity, Field]) -> bool:
+    """Return whether each item has one quantity, and a relation or a name."""
+    # An acceleration without a lateral one may be the derivative of the speed.
+    is_derivative = _AX in items and _AX not in named and not {_AY} & (items.keys() | named.keys())
+    is_related = len(items) > 1 or _SPEED in named
+    return is_related and not is_derivative and len({*map(id, items.values())}) == len(items)
 
 
 def _with_units(
