@@ -16,17 +16,17 @@ from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
 from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, IntArray
 
 NANOSECONDS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 #: A longer median delay is not a transport delay: the two clocks differ.
-MAX_CREDIBLE_DELAY_NS = 1_000_000_000
+MAX_CREDIBLE_DELAY_NS = NS_PER_S
 
 #: Logs up to this length are surveyed as a whole, longer ones in evenly spread windows.
-SURVEY_WHOLE_NS = 600_000_000_000
+SURVEY_WHOLE_NS = 600 * NS_PER_S
 SURVEY_WINDOWS = 30
-SURVEY_WINDOW_NS = 10_000_000_000
+SURVEY_WINDOW_NS = 10 * NS_PER_S
 
 #: The lower envelope is this quantile of the delays in each of at most this many bins.
 ENVELOPE_BINS = 64
@@ -34,7 +34,7 @@ ENVELOPE_QUANTILE = 0.02
 MIN_BIN_SAMPLES = 20
 
 #: Longest transport delay: a stamp that differs more from log time than the other stamps is invalid.
-OUTLIER_STAMP_NS = 60_000_000_000
+OUTLIER_STAMP_NS = 60 * NS_PER_S
 #: If at least this share of stamps has the same error, all stamps are replaced by log time.
 UNUSABLE_SHARE = 0.1
 #: If messages with equal stamps were recorded apart by at least this share of the usual spacing, the clock is too
@@ -116,10 +116,10 @@ def fit_clock_line(stamps_ns: IntArray, log_time_ns: IntArray) -> tuple[int, int
     bins = min(ENVELOPE_BINS, max(1, stamps.shape[0] // MIN_BIN_SAMPLES))
     at_s, low_s = np.empty(bins), np.empty(bins)
     for i, chunk in enumerate(np.array_split(np.arange(stamps.shape[0]), bins)):
-        in_bin = (delays[chunk] - base) * 1e-9
+        in_bin = (delays[chunk] - base) * S_PER_NS
         low = np.quantile(in_bin, ENVELOPE_QUANTILE, method="lower")
         low_s[i] = low
-        at_s[i] = float((stamps[chunk[np.argmin(np.abs(in_bin - low))]] - reference) * 1e-9)
+        at_s[i] = float((stamps[chunk[np.argmin(np.abs(in_bin - low))]] - reference) * S_PER_NS)
     first, second = np.triu_indices(bins, 1)
     apart = at_s[second] - at_s[first]
     usable = apart > 0.0
@@ -129,7 +129,7 @@ def fit_clock_line(stamps_ns: IntArray, log_time_ns: IntArray) -> tuple[int, int
     residual_s = low_s - drift * at_s
     offset_s = float(np.median(residual_s))
     worst_s = float(np.abs(residual_s - offset_s).max())
-    return reference, reference + base + round(offset_s * 1e9), drift, worst_s
+    return reference, reference + base + round(offset_s * NS_PER_S), drift, worst_s
 
 
 def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> dict[str, ClockModel]:
@@ -185,12 +185,12 @@ def _why_replaced(source: SignalSource, stamps: _Stamps) -> str:
 def _of_other_clocks(clocks: Mapped[str, ClockModel]) -> dict[str, str]:
     """Return why clocks disagree with the others, by key; an offset that all clocks share is accepted."""
     delays_s = {key: clock.median_delay_s for key, clock in clocks.items() if clock.samples}
-    if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= MAX_CREDIBLE_DELAY_NS * 1e-9:
+    if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= MAX_CREDIBLE_DELAY_NS * S_PER_NS:
         return {}
     return {
         key: f"it is {abs(delay_s):.1f} s {'behind' if delay_s > 0.0 else 'ahead of'} log time, other topics are not"
         for key, delay_s in delays_s.items()
-        if delay_s * 1e9 < -MAX_CREDIBLE_DELAY_NS or delay_s * 1e9 > OUTLIER_STAMP_NS
+        if delay_s * NS_PER_S < -MAX_CREDIBLE_DELAY_NS or delay_s * NS_PER_S > OUTLIER_STAMP_NS
     }
 
 
@@ -206,7 +206,7 @@ def _survey(
         for key, source in wanted.items():
             if (topic := columns.get(source.read_topic)) is not None:
                 raw, usable = raw_stamps(log, topic, source)
-                steps = np.diff(np.unique(raw[usable])).astype(np.float64) * 1e-9
+                steps = np.diff(np.unique(raw[usable])).astype(np.float64) * S_PER_NS
                 parts[key].append(_Stamps(raw[usable], topic.log_time_ns[usable], steps, topic.log_time_ns))
     return parts
 
@@ -229,7 +229,7 @@ def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
         return ""
     back = steps_back(stamps_ns)
     if back.size:
-        by_s = float(stamps_ns[back[0] - 1] - stamps_ns[back[0]]) * 1e-9
+        by_s = float(stamps_ns[back[0] - 1] - stamps_ns[back[0]]) * S_PER_NS
         return f"its stamps step back by {by_s:.1f} s while log time continues"
     order = np.argsort(stamps_ns, kind="stable")
     repeats = np.flatnonzero(np.diff(stamps_ns[order]) == 0)
@@ -257,7 +257,7 @@ def stamps_on_log_clock(
     stamps = apply_clock(raw, clock)
     if source.stamp != "log_time" and clock.samples:
         delay_ns = (columns.log_time_ns - stamps).astype(np.float64)
-        usable = usable & (np.abs(delay_ns - clock.median_delay_s * 1e9) <= OUTLIER_STAMP_NS)
+        usable = usable & (np.abs(delay_ns - clock.median_delay_s * NS_PER_S) <= OUTLIER_STAMP_NS)
     return stamps, usable
 
 
@@ -326,7 +326,7 @@ def _clock_of(source: SignalSource, stamps: _Stamps, unusable: str) -> ClockMode
     stamps_ns, log_time_ns, steps_s, recorded_ns = stamps
     if unusable:  # log time replaces the stamps; they do not show the period either
         source, stamps_ns, log_time_ns = replace(source, clock="utc"), recorded_ns, recorded_ns
-        steps_s = np.diff(recorded_ns) * 1e-9
+        steps_s = np.diff(recorded_ns) * S_PER_NS
     n = int(stamps_ns.shape[0])
     period_s = float(np.median(steps_s)) if steps_s.shape[0] else float("nan")
     if n == 0:
@@ -346,9 +346,9 @@ def _clock_of(source: SignalSource, stamps: _Stamps, unusable: str) -> ClockMode
     return replace(
         line,
         delay_known=is_known,
-        median_delay_s=median_ns * 1e-9,
-        p95_delay_s=high_ns * 1e-9,
-        min_delay_s=low_ns * 1e-9,
+        median_delay_s=median_ns * S_PER_NS,
+        p95_delay_s=high_ns * S_PER_NS,
+        min_delay_s=low_ns * S_PER_NS,
         median_period_s=period_s,
         samples=n,
         unusable=unusable,

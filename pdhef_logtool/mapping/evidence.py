@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.interpolation import Bracket
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, IntArray
 
 #: Number and length of the pieces of the log to read; a shorter log is read whole.
 PIECES = 8
-PIECE_NS = 10_000_000_000
+PIECE_NS = 10 * NS_PER_S
 #: Cell size of the grid; a car's motion changes little within it.
-CELL_NS = 100_000_000
+CELL_NS = NS_PER_S // 10
+CELL_S = CELL_NS * S_PER_NS
 #: Larger numbers are no measurements of a car.
 LARGEST = 1e12
 #: Longest gap that is interpolated, for sensors with one sample per second.
@@ -153,13 +154,13 @@ class Pieces:
         with np.errstate(invalid="ignore", divide="ignore"):
             cells = _filled((total / count).reshape(len(self.starts), -1)).ravel()
         busy = max(1, int(np.count_nonzero(count)))
-        return cells, float(values.shape[0]) / (busy * CELL_NS * 1e-9)
+        return cells, float(values.shape[0]) / (busy * CELL_S)
 
     def rate_of(self, cells: NDArray[Any]) -> NDArray[Any]:
         """Return the time derivative of values on the grid [M], real or complex, within each piece."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
-        out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_NS * 1e-9)
+        out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_S)
         return out.ravel()
 
     def turning(self, direction: NDArray[np.complex128]) -> FloatArray:

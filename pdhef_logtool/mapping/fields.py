@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import Field, leaf_group, place_of, triad_of
-from pdhef_logtool.mapping.evidence import CELL_NS, EVIDENCE, Fit, Pieces, fit, ratio, spread
+from pdhef_logtool.mapping.evidence import CELL_S, EVIDENCE, Fit, Pieces, fit, ratio, spread
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
@@ -114,7 +114,7 @@ def _over_seconds(pieces: Pieces, cells: FloatArray) -> FloatArray:
     """Return the time derivative [M] over a window that is long against the resolution of positions."""
     rows = cells.reshape(len(pieces.starts), -1)
     out = np.full_like(rows, np.nan)
-    seconds = 2 * _HALF * CELL_NS * 1e-9
+    seconds = 2 * _HALF * CELL_S
     out[:, _HALF:-_HALF] = (rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]) / seconds
     return out.ravel()
 

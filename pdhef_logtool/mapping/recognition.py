@@ -329,19 +329,19 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, fi
 
 
 def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, named: Fields) -> None:
-    """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
+    """Take GNSS as a sensor: from ground truth without heading, from receivers, else from a twist over ground."""
     draft.signals |= navigation.gnss_signals(draft.signals, draft.truth)
     is_ins = navigation.has_heading(draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values() if is_ins}
     others = [t for t in topics if not _named(t, "truth") and _device(t.name) not in instruments]
-    receivers = list(_receivers(draft, others, vendors, named))
-    for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
-        if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
+    readings = sorted(_receivers(draft, others, vendors, named), key=lambda s: not has_gnss(s))
+    if not any(map(has_gnss, (draft.signals, *readings))):
+        readings.insert(0, _twist_over_ground(draft, others))
+    is_place_true = is_ins and bool({"lat_deg", "x_m"} & set(draft.truth))
+    for signals in readings:
+        is_useful = has_gnss(signals) or has_gnss(draft.signals) or not is_place_true
+        if is_useful and not set(signals) & set(draft.signals):
             draft.signals |= signals
-    if not has_gnss(draft.signals):
-        _map_twist(draft, others)
-        if has_gnss(draft.signals) or not (is_ins and {"lat_deg", "x_m"} & set(draft.truth)):
-            draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
 def _receivers(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, named: Fields) -> Iterator[_Sources]:
@@ -356,17 +356,16 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, named: 
                 yield signals
 
 
-def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take the GNSS velocity from a twist over ground, of a navigation system first."""
+def _twist_over_ground(draft: _Draft, topics: list[TopicInfo]) -> _Sources:
+    """Return the GNSS velocity from a twist over ground, of a navigation system first."""
     twists = [t for t in topics if draft.has(t, "vx_m_s", "vy_m_s") and type_of(t) not in BODY_TWIST_TYPES]
-    twists = [t for t in twists if not is_command(t.name)]
     for topic in sorted(twists, key=lambda t: (_named(t, "estimate"), not _is_truth(t))):
-        x, y = (draft.given[topic.name][name] for name in ("vx_m_s", "vy_m_s"))
-        axes = _axes(draft, topic, topics)
+        axes = "body" if is_command(topic.name) else _axes(draft, topic, topics)
         if axes not in ("", "body"):
-            for name, source in zip(("east", "north"), (y, x) if axes == "north, east" else (x, y), strict=True):
-                draft.signals[f"gnss_velocity_{name}_m_s"] = replace(source, name=f"gnss_velocity_{name}_m_s")
-            return
+            sides = ("north", "east") if axes == "north, east" else ("east", "north")
+            names = zip((f"gnss_velocity_{side}_m_s" for side in sides), ("vx_m_s", "vy_m_s"), strict=True)
+            return {name: replace(draft.given[topic.name][axis], name=name) for name, axis in names}
+    return {}
 
 
 def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> navigation.Axes:
@@ -535,7 +534,7 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
             twists.append(topic)
             continue
         if not is_body:
-            continue  # a velocity over ground: _map_twist
+            continue  # a velocity over ground: _twist_over_ground
         draft.doubt("speed", (topic.name,), None, "its name suggests neither a speed sensor nor ground truth")
     why = "a velocity report is preferred to an odometry or a twist"
     chosen = draft.choose("speed", [*reports, *twists], lambda t: (t not in reports,), why)
