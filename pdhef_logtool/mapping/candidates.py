@@ -24,7 +24,7 @@ from pdhef_logtool.mapping.evidence import EVIDENCE, LOG_ODDS, MOST_COLUMNS, Pie
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.mapping.vendors import Vendors, VendorType, meaning_of_source, names_of
+from pdhef_logtool.mapping.vendors import Vendors, VendorType, meaning_of_source
 from pdhef_logtool.records.signals import FloatArray
 
 #: Kind of data in a field, according to the names around it.
@@ -83,7 +83,7 @@ class Field:
     factors : possible units, the likeliest first. fixed : unit and sign are documented.
     section : ``signals`` or ``truth`` by its documentation.
     evidence : names of evidence for or against the quantity, in log odds (``evidence.toml``).
-    unit_known : its unit is certain. anchor : the mapping already contains it. sign : sign of the scale.
+    unit_known : its unit is certain. sign : sign of the scale.
     sign_path : path of the field that contains its sign.
     is_weak : its values cannot identify the quantity, so that it is never taken.
     is_turned : its axis and sign are those of a usual mounting.
@@ -100,7 +100,6 @@ class Field:
     fixed: bool = False
     section: str = ""
     unit_known: bool = False
-    anchor: bool = False
     sign: float = 1.0
     reasons: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
@@ -245,7 +244,7 @@ def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
 
 def look(
     log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
-) -> tuple[Pieces, list[Field]]:
+) -> tuple[Pieces, list[Field], dict[str, Field]]:
     """Read the named fields and the mapped sources in a few pieces of the log.
 
     Fields without a number are excluded, as are fields that exceed a car's range in every unit.
@@ -266,7 +265,7 @@ def look(
     weighable = [item for entry in named for item in _weighable(log, entry, samples, vendors) if item.factors]
     for item in weighable:
         item.sign_path = signs.get((item.topic.name, item.path), "")
-    return pieces, weighable + anchors_of(log, sources, samples)
+    return pieces, weighable, anchors_of(log, sources, samples)
 
 
 def _weighable(
@@ -337,25 +336,19 @@ def _is_control(item: Field, info: FieldInfo, fields: tuple[FieldInfo, ...]) -> 
     return info.code == "i1" or bool({"throttle", "brake", "gas"} & beside)
 
 
-def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Field]:
-    """Return mapped sources as fields with a fixed meaning."""
+def anchors_of(
+    log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]
+) -> dict[str, Field]:
+    """Return mapped sources of one field as fields with a fixed meaning, by name."""
     topics = {t.name: t for t in log.topics}
-    results = []
+    anchors = {}
     for source in sources:
         seen = read.get((source.topic, source.paths[0]))
-        if seen is None or isinstance(source.scale, tuple):
-            continue
-        item = Field(topics[source.topic], source.paths[0], meaning_of_source(source), "sensor", source.stamp, seen, ())
-        item.fix(source)
-        item.anchor = True
-        results.append(item)
-    return results
-
-
-def anchor_of(name: str, results: Sequence[Field]) -> Field | None:
-    """Return the anchor of a mapped signal or ground truth."""
-    its = (f for f in results if f.anchor)
-    return next((f for f in its if name in names_of(f.meaning.quantity, f.meaning.part, (name,))), None)
+        if seen is not None and isinstance(source.scale, float):
+            topic, meaning = topics[source.topic], meaning_of_source(source)
+            anchors[source.name] = Field(topic, source.paths[0], meaning, "sensor", source.stamp, seen, ())
+            anchors[source.name].fix(source)
+    return anchors
 
 
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:

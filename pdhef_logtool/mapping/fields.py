@@ -43,7 +43,7 @@ class Fields:
     def all(self, quantity: str, part: str | None = None) -> list[Field]:
         """Return anchors and candidates of a quantity, the surest first."""
         every = [f for f in (*self.anchors.values(), *self.candidates) if f.meaning.quantity == quantity]
-        every = [f for f in every if f.role not in ("command", "estimate", "truth") or f.anchor]
+        every = [f for f in every if f.role not in ("command", "estimate", "truth")]
         return sorted((f for f in every if part is None or f.meaning.part == part), key=lambda f: -f.log_odds)
 
     def open(self, quantity: str, part: str | None = None) -> list[Field]:

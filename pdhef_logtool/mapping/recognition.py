@@ -16,7 +16,7 @@ from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role, anchors_of
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.evidence import EVIDENCE, Pieces, Seen
-from pdhef_logtool.mapping.fields import PLACES, Fields, path_velocity
+from pdhef_logtool.mapping.fields import Fields, path_velocity
 from pdhef_logtool.mapping.joints import is_joints, joint_names
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command, words_of
@@ -383,9 +383,9 @@ def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> navigatio
     if x is None or y is None:
         return ""
     anchors = anchors_of(draft.log, sources, draft.samples)
-    rate = next((f.si for f in anchors if f.meaning.quantity == "rate"), None)
-    steps = path_velocity(pieces, [f for f in anchors if f.meaning.quantity in PLACES])
-    return navigation.axes_of(pieces, x.cells, y.cells, steps, rate)
+    rate = anchors.pop("yaw_rate_rad_s", None)
+    steps = path_velocity(pieces, [*anchors.values()])
+    return navigation.axes_of(pieces, x.cells, y.cells, steps, None if rate is None else rate.si)
 
 
 def _device(topic: str) -> str:

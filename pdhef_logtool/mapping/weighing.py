@@ -19,7 +19,6 @@ from pdhef_logtool.mapping.candidates import (
     Candidate,
     Field,
     Role,
-    anchor_of,
     look,
     named_fields,
     place_of,
@@ -87,13 +86,12 @@ def weigh(
         return Weighing(Fields(Pieces(log), {}, [], []))
     named = named_fields(log, topics, vendors)
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
-    pieces, weighable = look(log, named, vendors, [*signals.values(), *true])
-    anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
-    places = [f for f in weighable if f.meaning.quantity in PLACES]
-    fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
+    pieces, candidates, anchors = look(log, named, vendors, [*signals.values(), *true])
+    places = [f for f in (*candidates, *anchors.values()) if f.meaning.quantity in PLACES]
+    fields = Fields(pieces, {n: f for n, f in anchors.items() if n in signals}, candidates, places)
     fields.candidates += proposed_fields(log, topics, named, fields)
     decide_units(fields)
-    weighing = Weighing(fields, anchor_of("vx_m_s", weighable))
+    weighing = Weighing(fields, anchors.get("vx_m_s"))
     weighing.drop_vectors_over_ground()
     weighing.drop_vertical_speeds()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
