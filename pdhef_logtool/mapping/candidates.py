@@ -1,8 +1,8 @@
 """Search all numeric fields of a log for signals and ground truth, first by names, then by values.
 
 Recognised message types have priority (``recognition.py``); this module searches for the remaining signals. A candidate
-is *taken* if its name or a documented type gives its quantity and no value contradicts. If its unit or sign is
-uncertain, an undecided check records this. Other candidates are listed in the mapping as comments.
+is *taken* if the evidence for it, in log odds (``evidence.toml``), is positive and higher than that for others. If its
+unit or sign is uncertain, an undecided check records this. Other candidates are listed in the mapping as comments.
 """
 
 from __future__ import annotations

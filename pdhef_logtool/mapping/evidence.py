@@ -176,15 +176,15 @@ class Pieces:
         return out.ravel()
 
 
-def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
-    """Return the ratio y/x where x is above ``slow``; None unless it is nearly constant."""
+def ratio(y: FloatArray, x: FloatArray, slow: float) -> float:
+    """Return the ratio y/x where x is above ``slow``; 0 unless it is positive and nearly constant."""
     use = np.isfinite(y) & np.isfinite(x)
     use[use] &= x[use] > slow
     if np.count_nonzero(use) < FEWEST_CELLS:
-        return None
+        return 0.0
     times = y[use] / x[use]
     low, middle, high = np.quantile(times, [0.2, 0.5, 0.8])
-    return float(middle) if high - low < 0.1 * abs(middle) else None
+    return float(middle) if high - low < 0.1 * middle else 0.0
 
 
 def spread(cells: FloatArray) -> float:

@@ -232,7 +232,7 @@ def _speeds(fields: Fields) -> None:
     for item in fields.all("speed"):
         others = along_path + ([] if reference is None or reference is item else [reference.si])
         times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others]
-        settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x is not None and x > 0.0], "other speeds")
+        settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x > 0.0], "other speeds")
 
 
 def _by_speeding_up(fields: Fields) -> None:

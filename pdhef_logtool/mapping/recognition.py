@@ -281,11 +281,11 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     """Take candidates for signals without a well-known type."""
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not type_of(t).startswith(NO_SENSORS)]
     weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
-    draft.signals.update(weighed.signals)
+    draft.signals |= weighed.sources("signals")
     joints = (t for t, role in rest if is_joints(t) and role != "command" and not joint_names(draft.log, t))
     draft.notes += [f"{t.name} is not used: the joints or their order differ between messages" for t in joints]
-    if weighed.truth:
-        draft.replace_truth(weighed.truth)
+    if truth := weighed.sources("truth"):
+        draft.replace_truth(truth)
     draft.notes += weighed.notes
     for name, fields in weighed.rivals:
         draft.doubt(name, fields, fields[0], "the best score, then most messages")
@@ -457,9 +457,9 @@ def type_of(topic: TopicInfo) -> str:
 
 def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     """Return whether a topic has the fields of its type; the name of the type alone is no proof."""
-    needed, either = (_TYPES[which].get(type_of(topic), "").split() for which in ("needed", "either"))
-    fields = log.fields(topic.name) if needed or either else ()
-    return all(has_path(fields, p) for p in needed) and (not either or any(has_path(fields, p) for p in either))
+    needed = _TYPES["fields"].get(type_of(topic), ())
+    fields = log.fields(topic.name) if needed else ()
+    return all(any(has_path(fields, path) for path in either.split()) for either in needed)
 
 
 def _named(topic: TopicInfo, kind: str) -> bool:

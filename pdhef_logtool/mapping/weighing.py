@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -99,7 +100,9 @@ def weigh(
     its = [f for f in may_be_true if f.topic.name == weighing.truth_from and _truth_name(f) in _SLIP and f.seen.changes]
     weighing.slip = min(its, key=lambda f: (f.role != "truth", f.role != "navigation", -f.log_odds), default=None)
     weighing.choose_signals(set(signals))
-    weighing.choose_truth()
+    weighing.taken |= weighing.choose_truth()
+    for name, item in weighing.taken.items():
+        weighing.tell(name, item)
     return weighing
 
 
@@ -110,7 +113,7 @@ class Weighing:
     Attributes
     ----------
     true_speed : of mapped ground truth. truth_from, slip : topic of other ground truth, and its lateral velocity.
-    taken, true : selected fields by signal and by ground-truth quantity.
+    taken : selected fields by signal, and by ``truth.NAME``.
     rivals : fields of a signal with nearly the same score. checks : undecided points.
     """
 
@@ -119,7 +122,6 @@ class Weighing:
     truth_from: str = ""
     slip: Field | None = None
     taken: dict[str, Field] = field(default_factory=dict)
-    true: dict[str, Field] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rivals: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
@@ -140,8 +142,6 @@ class Weighing:
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
             self._steer_by_command()
-        for name, item in self.taken.items():
-            self._tell(name, item)
 
     def _usable(self) -> list[Field]:
         """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
@@ -265,7 +265,6 @@ class Weighing:
         times, sigma, by = self._per_turning(mean), BY_DRIVING, "a_y ≈ v r"
         if speed is not None:
             times, sigma, by = ratio(mean, speed.si, SLOW_M_S), _RELATIONS["assumed_radius"], "the speed"
-        times = times if times is not None and times > 0.0 else 0.0
         units = [u for u in WHEEL_UNITS if first.meaning.quantity in ("wheel speed", u.quantity)]
         best, *others = _likely(units, Gain((1,), times, sigma), _UNITS["wheel_doubt"]) if times else units[:1]
         reasons = [f"{times:.4g} of it is 1 m/s by {by}"] if times else []
@@ -281,11 +280,11 @@ class Weighing:
             item.doubts += [doubt] if doubt else []
         return best.quantity
 
-    def _per_turning(self, speed: FloatArray) -> float | None:
-        """Return how much of a speed [M] in another unit is 1 m/s by a_y ≈ v r; None if the drive does not show it."""
+    def _per_turning(self, speed: FloatArray) -> float:
+        """Return how much of a speed [M] in another unit is 1 m/s by a_y ≈ v r; 0 if the drive does not show it."""
         rate, ay = self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2")
         relation = Fit() if rate is None or ay is None else self.fields.turning(ay.si, rate.si, speed)
-        return 1.0 / abs(relation.slope) if relation.is_clear else None
+        return 1.0 / abs(relation.slope) if relation.is_clear else 0.0
 
     # --------------------------------------------------------------------------------------------- steering
 
@@ -343,10 +342,10 @@ class Weighing:
     def open_signs(self) -> tuple[tuple[str, ...], ...]:
         """Return the signals with an unknown sign (documentation, name, mounting); signals of one axis as a group."""
         open_fields = {n: f for n, f in self.taken.items() if n in _SIGNED and _has_open_sign(f)}
-        open_truth = {n: f for n, f in self.true.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
-        lateral, across = open_fields.get("ay_m_s2"), open_truth.get("vy_m_s")
+        of_truth = ("truth.vy_m_s", "truth.yaw_rate_rad_s")
+        open_fields |= {n: f for n, f in self.taken.items() if n in of_truth and not f.fixed}
+        lateral, across = open_fields.get("ay_m_s2"), open_fields.get("truth.vy_m_s")
         groups: list[tuple[str, ...]] = [(n,) for n in open_fields]
-        groups += [(f"truth.{n}",) for n in open_truth]
         if lateral is not None and across is not None and _share_axis(lateral, across):
             groups = [g for g in groups if g not in (("ay_m_s2",), ("truth.vy_m_s",))]
             groups.append(("ay_m_s2", "truth.vy_m_s"))
@@ -356,28 +355,29 @@ class Weighing:
         """Return the best speed to compare other signals with, selected or not."""
         return self._chosen("speed_m_s") or self.fields.best("speed") or self.true_speed
 
-    def _chosen(self, *names: str) -> Field | None:
-        """Return the field of the first of these signals that is selected or mapped."""
-        return next((f for n in names if (f := self.taken.get(n) or self.fields.anchors.get(n)) is not None), None)
+    def _chosen(self, name: str) -> Field | None:
+        """Return the field of a signal that is selected or mapped."""
+        return self.taken.get(name) or self.fields.anchors.get(name)
 
     # ------------------------------------------------------------------------------------------------ ground truth
 
-    def choose_truth(self) -> None:
-        """Select the ground truth of the topic chosen by :func:`truth_topic`."""
+    def choose_truth(self) -> dict[str, Field]:
+        """Return the ground truth of the topic chosen by :func:`truth_topic`, by ``truth.NAME``."""
         if not self.truth_from:
-            return
+            return {}
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
         documented, named = (_truth_of(fields, self._kinship) for fields in ([f for f in its if f.fixed], its))
         # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
-        self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
-        if not self.true:
-            return
-        self._head()
+        true = named if not documented or _SLIP & set(named) - set(documented) else documented
+        if not true:
+            return {}
+        if (heading := self._heading()) is not None:
+            true["yaw_rad"] = heading
         first = its[0]
-        if first.role == "sensor" and self.true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
-            self.true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
+        if first.role == "sensor" and true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
+            true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
         # Fields of ground truth are no inputs, except the speed of a navigation system without another speed.
-        mine = set(map(id, self.true.values()))
+        mine = set(map(id, true.values()))
         for signal in [n for n, f in self.taken.items() if id(f) in mine and n != "speed_m_s"]:
             if first.role != "navigation":
                 del self.taken[signal]
@@ -386,11 +386,10 @@ class Weighing:
             remedy = 'name it under [truth] in a mapping file, or --waive "truth.source"'
             self.checks.append(Check("truth.source", "truth", "undecided", evidence, remedy))
         self.notes.append(f"ground truth comes from {first.topic.name}, by the names of its fields")
-        for name, item in self.true.items():
-            self._tell(f"truth.{name}", item)
+        return {f"truth.{name}": item for name, item in true.items()}
 
-    def _head(self) -> None:
-        """Add the heading that turns as fast as the car.
+    def _heading(self) -> Field | None:
+        """Return the heading that turns as fast as the car, or None.
 
         Values of a full turn count clockwise from north, as a compass does; others have the sense of the yaw rate, and
         count from east if it is to the left.
@@ -403,12 +402,12 @@ class Weighing:
             if sense and rate is not None and (is_compass or not _has_open_sign(rate)):
                 item.sign = -1.0 if is_compass and not rate.fixed else sense
                 item.offset = 0.0 if item.sign > 0.0 else math.pi / 2.0
-                self.true["yaw_rad"] = item
-                return
+                return item
+        return None
 
     # ------------------------------------------------------------------------------------------------- reporting
 
-    def _tell(self, name: str, item: Field) -> None:
+    def tell(self, name: str, item: Field) -> None:
         """Add an undecided check for the doubts about a field; note a speed from the navigation system."""
         if item.role == "command":
             lacks = "actuator lag and steering play are missing"
@@ -426,21 +425,19 @@ class Weighing:
             remedy = f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"'
             self.checks.append(Check(f"{name}.candidate", name, "undecided", evidence, remedy))
 
-    @property
-    def signals(self) -> dict[str, SignalSource]:
-        """Sources of the selected signals."""
-        return {n: f.candidate(n, "signals", taken=True).source for n, f in self.taken.items()}
+    def sources(self, section: Literal["signals", "truth"]) -> dict[str, SignalSource]:
+        """Return the selected sources of a section."""
+        return {c.source.name: c.source for c in self._selected if c.section == section}
 
     @property
-    def truth(self) -> dict[str, SignalSource]:
-        """Sources of the selected ground truth."""
-        return {n: f.candidate(n, "truth", taken=True).source for n, f in self.true.items()}
+    def _selected(self) -> list[Candidate]:
+        names = ((n.removeprefix("truth."), n.startswith("truth."), f) for n, f in self.taken.items())
+        return [f.candidate(name, "truth" if is_true else "signals", taken=True) for name, is_true, f in names]
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
         """All fields that may be a signal or ground truth, the selected and the surest first."""
-        candidates = [f.candidate(n, "signals", taken=True) for n, f in self.taken.items()]
-        candidates += [f.candidate(n, "truth", taken=True) for n, f in self.true.items()]
+        candidates, is_true = self._selected, any(n.startswith("truth.") for n in self.taken)
         used = {(c.section, c.source.label) for c in candidates}
         for item in self.fields.candidates:
             for name in names_of(item.meaning.quantity, item.meaning.part)[:1]:
@@ -448,7 +445,7 @@ class Weighing:
                 if (record.section, record.source.label) not in used and (item.role != "truth"):
                     candidates.append(record)
             name = _truth_name(item)
-            if name and item.role in ("truth", "navigation") and not self.true:
+            if name and item.role in ("truth", "navigation") and not is_true:
                 candidates.append(item.candidate(name, "truth", taken=False))
         return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
 
