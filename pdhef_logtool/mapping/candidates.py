@@ -1,8 +1,8 @@
 """Search all numeric fields of a log for signals and ground truth, first by names, then by values.
 
 Recognised message types have priority (``recognition.py``); this module searches for the remaining signals. A candidate
-is *taken* if its name or a documented type gives its quantity and no value contradicts. If its unit or sign is
-uncertain, an undecided check records this. Other candidates are listed in the mapping as comments.
+is *taken* if the evidence for it, in log odds (``evidence.toml``), is positive and higher than that for others. If its
+unit or sign is uncertain, an undecided check records this. Other candidates are listed in the mapping as comments.
 """
 
 from __future__ import annotations
@@ -18,15 +18,13 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping import naming
-from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
-from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
+from pdhef_logtool.mapping.evidence import EVIDENCE, LOG_ODDS, MOST_COLUMNS, Pieces, Seen
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import NOT_VALUES, STATES, VOCABULARY, Meaning, is_command, words_of
-from pdhef_logtool.mapping.proposals import MOST_PROPOSED, ROLES, Column, Units, propose
+from pdhef_logtool.mapping.naming import VOCABULARY, Meaning, is_command, words_of
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
+from pdhef_logtool.mapping.vendors import Vendors, VendorType, meaning_of_source
 from pdhef_logtool.records.signals import FloatArray
 
 #: Kind of data in a field, according to the names around it.
@@ -38,17 +36,9 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
 #: Words of a field in a table of several instruments that make it ground truth, or of a receiver.
 _TRUTH_WORDS, _RECEIVERS = frozenset(VOCABULARY["topics"]["truth"].split()), {"gps", "gnss", "ins", "rtk"}
-#: Words that leave the quantity of a field open: it may be any of them.
-_OPEN_WORDS = naming.COUNTING | {"angle", "yaw"}
 #: Affix that distinguishes the name of a sign from the name of its magnitude; YawToRight belongs to YawRate.
 _SIGN = re.compile("|".join(VOCABULARY["patterns"]["sign"]), re.IGNORECASE)
-#: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
-MOST_FIELDS = 3000
-#: Maximum number of fields to read; the best names have priority.
-MOST_READ = 160
-#: Candidates with a lower score are listed as comments only.
-LEAST_SCORE = 0.45
-
+_NAMES = EVIDENCE["names"]
 #: Possible units of a field without one, with their factors, by quantity; the conventional one is first.
 HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
     quantity: tuple(units.items()) for quantity, units in VOCABULARY["possible_units"].items()
@@ -56,8 +46,7 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
 #: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
 MOST: dict[str, float] = VOCABULARY["largest"]
 CONSTANT = "constant in the parts of the log that were read"
-#: Strength of the meaning of a field that only the drive gives, and least strength of a name.
-PROPOSED, LEAST_NAMED = 0.55, 0.6
+PROPOSED: float = _NAMES["proposed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +56,8 @@ class Candidate:
     Attributes
     ----------
     section : ``signals`` or ``truth``. source : the field, with its likeliest scale and offset.
-    score : 0 to 1. reason : evidence for the quantity. doubt : uncertain properties; empty if there are none.
-    taken : the mapping contains it.
+    score : probability of the reading. reason : evidence for the quantity.
+    doubt : uncertain properties; empty if there are none. taken : the mapping contains it.
     """
 
     section: Literal["signals", "truth"]
@@ -93,7 +82,8 @@ class Field:
     ----------
     factors : possible units, the likeliest first. fixed : unit and sign are documented.
     section : ``signals`` or ``truth`` by its documentation.
-    unit_known : its unit is certain. anchor : the mapping already contains it. sign : sign of the scale.
+    evidence : names of evidence for or against the quantity, in log odds (``evidence.toml``).
+    unit_known : its unit is certain. sign : sign of the scale.
     sign_path : path of the field that contains its sign.
     is_weak : its values cannot identify the quantity, so that it is never taken.
     is_turned : its axis and sign are those of a usual mounting.
@@ -110,11 +100,10 @@ class Field:
     fixed: bool = False
     section: str = ""
     unit_known: bool = False
-    anchor: bool = False
     sign: float = 1.0
-    bonus: float = 0.0
     reasons: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
+    evidence: list[str] = field(default_factory=list)
     offset: float = 0.0
     is_weak: bool = False
     is_turned: bool = False
@@ -135,6 +124,11 @@ class Field:
     def units(self) -> tuple[tuple[str, float], ...]:
         """Units that are still possible."""
         return self.factors[:1] if self.unit_known or self.fixed else self.factors
+
+    @property
+    def is_named(self) -> bool:
+        """Return whether its name gives the quantity."""
+        return self.meaning.strength >= float(_NAMES["least"])
 
     @property
     def unit_doubt(self) -> list[str]:
@@ -165,21 +159,31 @@ class Field:
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
 
     @property
-    def score(self) -> float:
-        """Confidence in the quantity given by the name, 0 to 1."""
-        if self.fixed:
-            return 0.95
-        score = 0.45 * self.meaning.strength + 0.1 + self.bonus
-        score += 0.15 if self.meaning.unit else 0.0
-        score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
-        score -= 0.1 if self.role == "navigation" and self.meaning.quantity == "speed" else 0.0
-        score -= 0.01 if not self.seen.changes else 0.0
-        return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
+    def log_odds(self) -> float:
+        """Log odds of the quantity, by the evidence of ``evidence.toml``."""
+        if self.fixed or self.is_weak:
+            return LOG_ODDS["documented" if self.fixed else "weak"]
+        applies = {
+            "unit": bool(self.meaning.unit),
+            "often": self.seen.rate_hz >= _NAMES["often_hz"],
+            "seldom": self.seen.rate_hz < _NAMES["seldom_hz"],
+            "receiver": self.role == "navigation" and self.meaning.quantity == "speed",
+            "constant": not self.seen.changes,
+        }
+        evidence = (*self.evidence, *(name for name, is_so in applies.items() if is_so))
+        return LOG_ODDS["prior"] + LOG_ODDS["name"] * self.meaning.strength + sum(LOG_ODDS[name] for name in evidence)
 
     def use(self, unit: str) -> None:
         """Select a unit."""
         self.factors = tuple(sorted(self.factors, key=lambda f: f[0] != unit))
         self.unit_known = True
+
+    def fix(self, source: SignalSource) -> None:
+        """Use the unit, sign and offset of a documented or mapped source of one field."""
+        scale, offset = source.scale, source.offset
+        if isinstance(scale, float) and isinstance(offset, float):
+            self.factors, self.sign, self.offset = ((self.meaning.unit, abs(scale)),), math.copysign(1.0, scale), offset
+        self.fixed = self.unit_known = True
 
     def candidate(self, name: str, section: Literal["signals", "truth"], *, taken: bool) -> Candidate:
         """Return the field as a candidate source of a signal."""
@@ -192,7 +196,8 @@ class Field:
             source = replace(source, valid_min=-most, valid_max=most)
         reason = "; ".join([self.meaning.why, *self.reasons])
         doubts = dict.fromkeys([*self.doubts, *([] if self.seen.changes else [CONSTANT])])
-        return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
+        probability = round(1.0 / (1.0 + math.exp(-self.log_odds)), 2)
+        return Candidate(section, source, probability, reason, "; ".join(doubts), taken)
 
 
 def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendors: Vendors) -> list[Named]:
@@ -200,7 +205,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     results = []
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
-        if len(fields) > MOST_FIELDS or vendors.of(topic.type_name).left_out:
+        if len(fields) > _NAMES["most_fields"] or vendors.of(topic.type_name).left_out:
             continue
         if is_joints(topic):
             joints = () if role == "command" else joint_meanings(log, topic)
@@ -210,76 +215,19 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         there = {f.path for f in fields}
         no_values = _no_values(topic, fields)
         for info in (f for f in fields if f.path not in no_values):
-            if not _is_column(info) or is_command(info.path):
+            if not is_column(info) or is_command(info.path):
                 continue
             if its := documented.entries(info.path):
-                results += [(topic, role, replace(info, path=p), entry.meaning, True) for p, entry in its.items()]
+                results += [(topic, role, replace(info, path=p), meaning_of_source(s), True) for p, s in its.items()]
             elif not documented.fields or info.path.count(".") or documented.has:
                 meaning = naming.meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
 
 
-def _is_column(info: FieldInfo) -> bool:
+def is_column(info: FieldInfo) -> bool:
     """Return whether a field has one number, or one array of numbers, a message."""
     return info.kind == "number" and info.path.count("[]") <= info.path.endswith("[]")
-
-
-def proposed_fields(
-    log: DriveLog, pieces: Pieces, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], fields: list[Field]
-) -> Iterator[Field]:
-    """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives.
-
-    ``fields`` have a quantity, mapped or by name.
-    """
-    measured = [f for f in fields if f.role != "command"]
-    there = {(f.meaning.quantity, part) for f in measured for part in (f.meaning.part, "any")}
-    wanted = [role for role in ROLES if role not in there and (role[0], "") not in there]
-    wanted += [] if ("steering", "any") in there else [("steering", "")]
-    open_fields = _open_fields(log, topics, named) if wanted else {}
-    sides = [column for role in ROLES for column in _named_column(measured, role)]
-    read = pieces.read([*open_fields][: MOST_PROPOSED - len(sides)])
-    others = []
-    for (name, path), seen in read.items():
-        topic, info, units = open_fields.get((name, path)) or open_fields[name, path.partition("[")[0]]
-        others += [(topic, replace(info, path=path), Column(seen, units))] if seen.changes else []
-    columns = [*sides, *(column for _, _, column in others)]
-    why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
-    for place, (quantity, part, unit) in propose(pieces, columns, wanted).items() if others else ():
-        topic, info, column = others[place - len(sides)]
-        scale = dict(column.units[quantity]).get(unit)
-        meaning = Meaning(quantity, part, PROPOSED, unit if scale else "", scale, why)
-        yield _field_of(log.fields(topic.name, quiet=True), topic, "sensor", info, meaning, column.seen)
-
-
-def _open_fields(
-    log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]
-) -> dict[tuple[str, str], tuple[TopicInfo, FieldInfo, Units]]:
-    """Return the sensors' fields without a meaning, with their possible units, by topic and path."""
-    by_name = {(topic.name, info.path) for topic, _, info, _, _ in named}
-    open_fields = {}
-    for topic in (t for t, role in topics if role == "sensor"):
-        fields = log.fields(topic.name, quiet=True)
-        for info in () if holds_frames(topic.name, fields) else filter(_is_column, fields):
-            if (units := _units_without_name(info)) and (topic.name, info.path) not in by_name:
-                open_fields[topic.name, info.path.removesuffix("[]")] = topic, info, units
-    return open_fields
-
-
-def _named_column(fields: Sequence[Field], role: tuple[str, str]) -> Iterator[Column]:
-    """Yield the surest field of one of :data:`ROLES`; a wheel speed replaces a missing speed."""
-    its = [f for f in fields if f.meaning.quantity == role[0] and f.meaning.part in (role[1], "")]
-    its = its or [f for f in fields if role[0] == "speed" and f.meaning.quantity == "wheel speed"]
-    for item in sorted(its, key=lambda f: -f.meaning.strength)[:1]:
-        yield Column(item.seen, {role[0]: item.units}, role)
-
-
-def _units_without_name(info: FieldInfo) -> Units:
-    """Return the possible units of a field without a unit by quantity, if no word of its name has a meaning."""
-    words = set(words_of(info.path)) - STATES
-    unknown = all(len(w) == 1 or w.isdigit() or w in _OPEN_WORDS or w not in naming.KNOWN for w in words)
-    quantities = ("speed", "acceleration", "rate", "steering")
-    return {q: HYPOTHESES[q][:2] for q in quantities} if unknown and not info.unit and not words & NOT_VALUES else {}
 
 
 def _signs_of(paths: Collection[str]) -> dict[str, str]:
@@ -296,12 +244,12 @@ def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
 
 def look(
     log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
-) -> tuple[Pieces, list[Field]]:
+) -> tuple[Pieces, list[Field], dict[str, Field]]:
     """Read the named fields and the mapped sources in a few pieces of the log.
 
     Fields without a number are excluded, as are fields that exceed a car's range in every unit.
     """
-    named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[:MOST_READ]
+    named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[: _NAMES["most_read"]]
     fields = [(topic.name, info.path.removesuffix("[]")) for topic, _, info, _, _ in named]
     of_topics = {t: _signs_of({f.path for f in log.fields(t, quiet=True)}) for t in dict.fromkeys(t for t, _ in fields)}
     signs = {(t, p): of_topics[t][p] for t, p in fields if p in of_topics[t]}
@@ -317,7 +265,7 @@ def look(
     weighable = [item for entry in named for item in _weighable(log, entry, samples, vendors) if item.factors]
     for item in weighable:
         item.sign_path = signs.get((item.topic.name, item.path), "")
-    return pieces, weighable + anchors_of(log, sources, samples)
+    return pieces, weighable, anchors_of(log, sources, samples)
 
 
 def _weighable(
@@ -336,40 +284,39 @@ def _weighable(
             continue
         if role == "sensor" and (words := set(words_of(name))) & (_TRUTH_WORDS | _RECEIVERS):
             role = "truth" if words & _TRUTH_WORDS else "navigation"
-        entry = vendors.of(topic.type_name).fields[info.path] if documented else None
-        yield _field_of(fields, topic, role, replace(info, path=name), its, seen, entry)
+        kind = vendors.of(topic.type_name) if documented else None
+        yield field_of(fields, topic, role, replace(info, path=name), its, seen, kind)
 
 
-def _field_of(
+def field_of(
     fields: tuple[FieldInfo, ...],
     topic: TopicInfo,
     role: Role,
     info: FieldInfo,
     meaning: Meaning,
     seen: Seen,
-    entry: VendorField | None = None,
+    documented: VendorType | None = None,
 ) -> Field:
-    """Return a field with its possible units and what its name or documentation (``entry``) leaves open."""
+    """Return a field with its possible units and what its name, or its documented type, leaves open."""
     factors = _factors(meaning, seen)
     if meaning.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
         meaning = replace(meaning, quantity="wheel rate")
         factors = _factors(meaning, seen)
     item = Field(topic, info.path, meaning, role, stamp_of(fields, info.path), seen, factors)
-    if entry is not None:
-        item.fixed = item.unit_known = True
-        item.section = entry.section
-        item.factors = ((entry.unit, abs(entry.scale)),)
-        item.sign, item.offset = math.copysign(1.0, entry.scale), entry.offset
-        item.reasons.append(f"documented: {entry.page}")
+    if documented is not None:
+        entry = documented.fields[info.path]
+        item.section = "truth" if entry in documented.truth else "signals"
+        item.fix(entry)
+        item.reasons.append(f"documented: {documented.page}")
     elif meaning.scale is not None:
         item.unit_known = True
         item.reasons.append(f"unit {naming.UNIT_TEXTS.get(meaning.unit, meaning.unit)}")
-    if meaning.strength < LEAST_NAMED:
+    if not item.is_named:
         item.doubts.append("its values alone identify it")
     if _may_be_share(item, info):
         item.is_weak = _is_control(item, info, fields)
         item.doubts.append("it may be a share of the largest angle, which needs a scale")
-    if item.is_downward and entry is None:
+    if item.is_downward and not item.fixed:
         item.sign = -1.0
         item.reasons.append("positive downward by its name")
     return item
@@ -389,26 +336,19 @@ def _is_control(item: Field, info: FieldInfo, fields: tuple[FieldInfo, ...]) -> 
     return info.code == "i1" or bool({"throttle", "brake", "gas"} & beside)
 
 
-def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Field]:
-    """Return mapped sources as fields with a fixed meaning."""
+def anchors_of(
+    log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]
+) -> dict[str, Field]:
+    """Return mapped sources of one field as fields with a fixed meaning, by name."""
     topics = {t.name: t for t in log.topics}
-    results = []
+    anchors = {}
     for source in sources:
         seen = read.get((source.topic, source.paths[0]))
-        if seen is None or isinstance(source.scale, tuple) or not isinstance(source.offset, float):
-            continue
-        meaning = meaning_of_signal(source.name)
-        item = Field(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))
-        item.factors, item.sign = (("", abs(source.scale)),), math.copysign(1.0, source.scale)
-        item.offset, item.fixed, item.unit_known, item.anchor = source.offset, True, True, True
-        results.append(item)
-    return results
-
-
-def anchor_of(name: str, results: Sequence[Field]) -> Field | None:
-    """Return the anchor of a mapped signal or ground truth."""
-    meaning = meaning_of_signal(name)
-    return next((f for f in results if f.anchor and f.meaning == meaning), None)
+        if seen is not None and isinstance(source.scale, float):
+            topic, meaning = topics[source.topic], meaning_of_source(source)
+            anchors[source.name] = Field(topic, source.paths[0], meaning, "sensor", source.stamp, seen, ())
+            anchors[source.name].fix(source)
+    return anchors
 
 
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +16,17 @@ from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
 from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.signals import FloatArray, IntArray
-
-#: Usable stamps, their log times, and the steps between stamps in s.
-_Stamps: TypeAlias = tuple[IntArray, IntArray, FloatArray]
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, IntArray
 
 NANOSECONDS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 #: A longer median delay is not a transport delay: the two clocks differ.
-MAX_CREDIBLE_DELAY_NS = 1_000_000_000
+MAX_CREDIBLE_DELAY_NS = NS_PER_S
 
 #: Logs up to this length are surveyed as a whole, longer ones in evenly spread windows.
-SURVEY_WHOLE_NS = 600_000_000_000
+SURVEY_WHOLE_NS = 600 * NS_PER_S
 SURVEY_WINDOWS = 30
-SURVEY_WINDOW_NS = 10_000_000_000
+SURVEY_WINDOW_NS = 10 * NS_PER_S
 
 #: The lower envelope is this quantile of the delays in each of at most this many bins.
 ENVELOPE_BINS = 64
@@ -37,7 +34,7 @@ ENVELOPE_QUANTILE = 0.02
 MIN_BIN_SAMPLES = 20
 
 #: Longest transport delay: a stamp that differs more from log time than the other stamps is invalid.
-OUTLIER_STAMP_NS = 60_000_000_000
+OUTLIER_STAMP_NS = 60 * NS_PER_S
 #: If at least this share of stamps has the same error, all stamps are replaced by log time.
 UNUSABLE_SHARE = 0.1
 #: If messages with equal stamps were recorded apart by at least this share of the usual spacing, the clock is too
@@ -119,10 +116,10 @@ def fit_clock_line(stamps_ns: IntArray, log_time_ns: IntArray) -> tuple[int, int
     bins = min(ENVELOPE_BINS, max(1, stamps.shape[0] // MIN_BIN_SAMPLES))
     at_s, low_s = np.empty(bins), np.empty(bins)
     for i, chunk in enumerate(np.array_split(np.arange(stamps.shape[0]), bins)):
-        in_bin = (delays[chunk] - base) * 1e-9
+        in_bin = (delays[chunk] - base) * S_PER_NS
         low = np.quantile(in_bin, ENVELOPE_QUANTILE, method="lower")
         low_s[i] = low
-        at_s[i] = float((stamps[chunk[np.argmin(np.abs(in_bin - low))]] - reference) * 1e-9)
+        at_s[i] = float((stamps[chunk[np.argmin(np.abs(in_bin - low))]] - reference) * S_PER_NS)
     first, second = np.triu_indices(bins, 1)
     apart = at_s[second] - at_s[first]
     usable = apart > 0.0
@@ -132,7 +129,7 @@ def fit_clock_line(stamps_ns: IntArray, log_time_ns: IntArray) -> tuple[int, int
     residual_s = low_s - drift * at_s
     offset_s = float(np.median(residual_s))
     worst_s = float(np.abs(residual_s - offset_s).max())
-    return reference, reference + base + round(offset_s * 1e9), drift, worst_s
+    return reference, reference + base + round(offset_s * NS_PER_S), drift, worst_s
 
 
 def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> dict[str, ClockModel]:
@@ -154,68 +151,69 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     resolved = resolve_mapping(log, mapping)
     log = with_can_signals(log, resolved)
     wanted = sources_by_clock(resolved)
-    parts, recorded = _survey(log, wanted, survey_windows(start_ns, end_ns))
+    parts = _survey(log, wanted, survey_windows(start_ns, end_ns))
     # A clock may have stepped between the parts of a survey: read all of its stamps.
-    doubtful = {key: source for key, source in wanted.items() if _offset_changes(parts[key])}
-    whole: dict[str, list[_Stamps]] = {}
-    if doubtful and end_ns - start_ns > SURVEY_WHOLE_NS:
-        whole, _ = _survey(log, doubtful, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.recording_span))
-    clocks = {}
-    for key, source in wanted.items():
-        raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
-        seen, recorded_ns, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
-        times = np.concatenate(recorded[key])
-        is_asked_for = source.stamp == "log_time" or source.clock == "device"
-        missing = 1.0 - raw.shape[0] / times.shape[0] if times.shape[0] and not is_asked_for else 0.0
-        unusable = f"{missing:.0%} of its stamps are zero or no time" if missing > UNUSABLE_SHARE else ""
-        if unusable:
-            raw = log_time = times
-        elif source.stamp != "log_time":
-            unusable = why_unusable(seen, recorded_ns)
-        if unusable:  # the stamps do not show the period either
-            steps = np.diff(times) * 1e-9
-        clocks[key] = _clock_of(source, raw, log_time, steps, unusable)
-    for key, why in _of_other_clocks(clocks).items():
-        raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
-        clocks[key] = _clock_of(wanted[key], raw, log_time, steps, why)
-    return clocks
+    stepped = {key: source for key, source in wanted.items() if _offset_changes(parts[key])}
+    if stepped and end_ns - start_ns > SURVEY_WHOLE_NS:
+        parts |= _survey(log, stepped, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.recording_span))
+    stamps = {key: _Stamps(*map(np.concatenate, zip(*its, strict=True))) for key, its in parts.items()}
+    clocks = {key: _clock_of(source, stamps[key], _why_replaced(source, stamps[key])) for key, source in wanted.items()}
+    others = _of_other_clocks(clocks)
+    return clocks | {key: _clock_of(wanted[key], stamps[key], why) for key, why in others.items()}
+
+
+class _Stamps(NamedTuple):
+    """Usable stamps of a clock, their log times, the steps between stamps, and the log times of all messages."""
+
+    stamps_ns: IntArray
+    log_time_ns: IntArray
+    steps_s: FloatArray
+    recorded_ns: IntArray
+
+
+def _why_replaced(source: SignalSource, stamps: _Stamps) -> str:
+    """Return why log time replaces the stamps of a source; empty if they are used."""
+    if source.stamp == "log_time":
+        return ""
+    recorded = stamps.recorded_ns.shape[0]
+    missing = 1.0 - stamps.stamps_ns.shape[0] / recorded if recorded and source.clock != "device" else 0.0
+    if missing > UNUSABLE_SHARE:
+        return f"{missing:.0%} of its stamps are zero or no time"
+    return why_unusable(stamps.stamps_ns, stamps.log_time_ns)
 
 
 def _of_other_clocks(clocks: Mapped[str, ClockModel]) -> dict[str, str]:
     """Return why clocks disagree with the others, by key; an offset that all clocks share is accepted."""
     delays_s = {key: clock.median_delay_s for key, clock in clocks.items() if clock.samples}
-    if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= MAX_CREDIBLE_DELAY_NS * 1e-9:
+    if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= MAX_CREDIBLE_DELAY_NS * S_PER_NS:
         return {}
     return {
         key: f"it is {abs(delay_s):.1f} s {'behind' if delay_s > 0.0 else 'ahead of'} log time, other topics are not"
         for key, delay_s in delays_s.items()
-        if delay_s * 1e9 < -MAX_CREDIBLE_DELAY_NS or delay_s * 1e9 > OUTLIER_STAMP_NS
+        if delay_s * NS_PER_S < -MAX_CREDIBLE_DELAY_NS or delay_s * NS_PER_S > OUTLIER_STAMP_NS
     }
 
 
 def _survey(
     log: DriveLog, wanted: Mapped[str, SignalSource], spans: Iterable[tuple[int, int]]
-) -> tuple[dict[str, list[_Stamps]], dict[str, list[IntArray]]]:
-    """Read the usable stamps of each clock and the log times of all messages, window by window."""
-    none = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
+) -> dict[str, list[_Stamps]]:
+    """Read the stamps of each clock, window by window."""
+    none = _Stamps(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
     requests = requests_of(log, wanted.values(), values=False)
     parts: dict[str, list[_Stamps]] = {key: [none] for key in wanted}
-    recorded: dict[str, list[IntArray]] = {key: [none[0]] for key in wanted}
     for start_ns, end_ns in spans:
         columns = log.read(requests, start_ns, end_ns)
         for key, source in wanted.items():
-            if source.read_topic not in columns:
-                continue
-            raw, usable = raw_stamps(log, columns[source.read_topic], source)
-            steps = np.diff(np.unique(raw[usable])).astype(np.float64) * 1e-9
-            parts[key].append((raw[usable], columns[source.read_topic].log_time_ns[usable], steps))
-            recorded[key].append(columns[source.read_topic].log_time_ns)
-    return parts, recorded
+            if (topic := columns.get(source.read_topic)) is not None:
+                raw, usable = raw_stamps(log, topic, source)
+                steps = np.diff(np.unique(raw[usable])).astype(np.float64) * S_PER_NS
+                parts[key].append(_Stamps(raw[usable], topic.log_time_ns[usable], steps, topic.log_time_ns))
+    return parts
 
 
 def _offset_changes(parts: Sequence[_Stamps]) -> bool:
     """Return whether the smallest delays of successive parts differ by more than clock drift explains."""
-    least = np.array([float((log_time - raw).min()) for raw, log_time, _ in parts if raw.shape[0]])
+    least = np.array([float((p.log_time_ns - p.stamps_ns).min()) for p in parts if p.stamps_ns.shape[0]])
     return bool((np.abs(np.diff(least)) > STEP_BACK_NS).any())
 
 
@@ -231,7 +229,7 @@ def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
         return ""
     back = steps_back(stamps_ns)
     if back.size:
-        by_s = float(stamps_ns[back[0] - 1] - stamps_ns[back[0]]) * 1e-9
+        by_s = float(stamps_ns[back[0] - 1] - stamps_ns[back[0]]) * S_PER_NS
         return f"its stamps step back by {by_s:.1f} s while log time continues"
     order = np.argsort(stamps_ns, kind="stable")
     repeats = np.flatnonzero(np.diff(stamps_ns[order]) == 0)
@@ -259,7 +257,7 @@ def stamps_on_log_clock(
     stamps = apply_clock(raw, clock)
     if source.stamp != "log_time" and clock.samples:
         delay_ns = (columns.log_time_ns - stamps).astype(np.float64)
-        usable = usable & (np.abs(delay_ns - clock.median_delay_s * 1e9) <= OUTLIER_STAMP_NS)
+        usable = usable & (np.abs(delay_ns - clock.median_delay_s * NS_PER_S) <= OUTLIER_STAMP_NS)
     return stamps, usable
 
 
@@ -324,11 +322,11 @@ def survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
     return [(int(s), int(s) + SURVEY_WINDOW_NS) for s in starts]
 
 
-def _clock_of(
-    source: SignalSource, stamps_ns: IntArray, log_time_ns: IntArray, steps_s: FloatArray, unusable: str = ""
-) -> ClockModel:
-    if unusable:
-        source, stamps_ns = replace(source, clock="utc"), log_time_ns
+def _clock_of(source: SignalSource, stamps: _Stamps, unusable: str) -> ClockModel:
+    stamps_ns, log_time_ns, steps_s, recorded_ns = stamps
+    if unusable:  # log time replaces the stamps; they do not show the period either
+        source, stamps_ns, log_time_ns = replace(source, clock="utc"), recorded_ns, recorded_ns
+        steps_s = np.diff(recorded_ns) * S_PER_NS
     n = int(stamps_ns.shape[0])
     period_s = float(np.median(steps_s)) if steps_s.shape[0] else float("nan")
     if n == 0:
@@ -348,9 +346,9 @@ def _clock_of(
     return replace(
         line,
         delay_known=is_known,
-        median_delay_s=median_ns * 1e-9,
-        p95_delay_s=high_ns * 1e-9,
-        min_delay_s=low_ns * 1e-9,
+        median_delay_s=median_ns * S_PER_NS,
+        p95_delay_s=high_ns * S_PER_NS,
+        min_delay_s=low_ns * S_PER_NS,
         median_period_s=period_s,
         samples=n,
         unusable=unusable,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES
-from pdhef_logtool.mapping.recognition import TWIST_COVARIANCES, TWIST_FIELDS
+from pdhef_logtool.mapping.recognition import COVARIANCES, SOURCES
 from pdhef_logtool.mapping.records import CanSettings, SignalSource, near
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.mapping.vendors import plain_type
@@ -22,8 +22,7 @@ BASE_ORDER = ("sideslip_rad", "vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2")
 STDS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
 _STATE_FIELDS = (*BASE_ORDER, "sideslip_std_rad", "valid", "diverged")
-#: Part and axis of a twist.
-_TWIST = {"vx_m_s": ("linear", "x"), "vy_m_s": ("linear", "y"), "yaw_rate_rad_s": ("angular", "z")}
+_TWIST = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,10 +161,10 @@ def _recognise(
     if kind == STATE_TYPE:
         path_of = {name: name for name in _STATE_FIELDS}
         covariance = [CovarianceSource(topic.name, "covariance", 3, (0, 1, 2))]
-    elif kind in TWIST_FIELDS:
-        path_of = {name: f"{TWIST_FIELDS[kind].format(part)}.{axis}" for name, (part, axis) in _TWIST.items()}
-        if kind in TWIST_COVARIANCES:
-            covariance = [CovarianceSource(topic.name, TWIST_COVARIANCES[kind].removesuffix("[0]"), 6, (0, 1, 5))]
+    elif "vx_m_s" in SOURCES.get(kind, {}):
+        path_of = {name: SOURCES[kind][name].paths[0] for name in _TWIST}
+        its = [path for path, names in COVARIANCES.get(kind, {}).items() if "vx_m_s" in names]
+        covariance = [CovarianceSource(topic.name, path.removesuffix("[0]"), 6, (0, 1, 5)) for path in its]
     matches = {name: field_path for name, field_path in path_of.items() if name in units and path in ("", field_path)}
     if not matches:
         expected = "SIGNAL=TOPIC.FIELD, as the type does not give the signal"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,29 +15,39 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.interpolation import Bracket
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, IntArray
 
 #: Number and length of the pieces of the log to read; a shorter log is read whole.
 PIECES = 8
-PIECE_NS = 10_000_000_000
+PIECE_NS = 10 * NS_PER_S
 #: Cell size of the grid; a car's motion changes little within it.
-CELL_NS = 100_000_000
+CELL_NS = NS_PER_S // 10
+CELL_S = CELL_NS * S_PER_NS
 #: Larger numbers are no measurements of a car.
 LARGEST = 1e12
 #: Longest gap that is interpolated, for sensors with one sample per second.
 BRIDGED_CELLS = 12
 #: Maximum number of columns to read of an array of unknown length.
 MOST_COLUMNS = 16
+#: Evidence and limits by subject, and the evidence for a reading in log odds (evidence.toml).
+EVIDENCE: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+LOG_ODDS: dict[str, float] = EVIDENCE["log_odds"]
+CLEAR: float = EVIDENCE["relations"]["clear"]
 #: Smallest number of cells that gives information.
 FEWEST_CELLS = 40
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """``y = slope * x + a`` over cells of 0.1 s, and the correlation of the two."""
+    """``y = slope * x + a`` over cells of 0.1 s, and the correlation of the two; both are 0 without a relation."""
 
-    slope: float
-    correlation: float
+    slope: float = 0.0
+    correlation: float = 0.0
+
+    @property
+    def is_clear(self) -> bool:
+        """Return whether the correlation, of any sign, counts as a relation."""
+        return abs(self.correlation) > CLEAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,13 +154,13 @@ class Pieces:
         with np.errstate(invalid="ignore", divide="ignore"):
             cells = _filled((total / count).reshape(len(self.starts), -1)).ravel()
         busy = max(1, int(np.count_nonzero(count)))
-        return cells, float(values.shape[0]) / (busy * CELL_NS * 1e-9)
+        return cells, float(values.shape[0]) / (busy * CELL_S)
 
     def rate_of(self, cells: NDArray[Any]) -> NDArray[Any]:
         """Return the time derivative of values on the grid [M], real or complex, within each piece."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
-        out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_NS * 1e-9)
+        out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_S)
         return out.ravel()
 
     def turning(self, direction: NDArray[np.complex128]) -> FloatArray:
@@ -164,15 +176,15 @@ class Pieces:
         return out.ravel()
 
 
-def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
-    """Return the ratio y/x where x is above ``slow``; None unless it is nearly constant."""
+def ratio(y: FloatArray, x: FloatArray, slow: float) -> float:
+    """Return the ratio y/x where x is above ``slow``; 0 unless it is positive and nearly constant."""
     use = np.isfinite(y) & np.isfinite(x)
     use[use] &= x[use] > slow
     if np.count_nonzero(use) < FEWEST_CELLS:
-        return None
+        return 0.0
     times = y[use] / x[use]
     low, middle, high = np.quantile(times, [0.2, 0.5, 0.8])
-    return float(middle) if high - low < 0.1 * abs(middle) else None
+    return float(middle) if high - low < 0.1 * middle else 0.0
 
 
 def spread(cells: FloatArray) -> float:
@@ -199,22 +211,16 @@ def _filled(rows: FloatArray) -> FloatArray:
     return rows
 
 
-def fit(y: FloatArray, x: FloatArray) -> Fit | None:
-    """Fit a line through the finite cells [M]; None if there are too few or one of the two is constant."""
+def fit(y: FloatArray, x: FloatArray) -> Fit:
+    """Fit a line through the finite cells [M]; no relation if there are too few or one of the two is constant."""
     use = np.isfinite(y) & np.isfinite(x)
     if np.count_nonzero(use) < FEWEST_CELLS:
-        return None
+        return Fit()
     # Exclude a few outliers, such as a sensor's "invalid".
     a, b = (np.clip(values, *np.quantile(values, [0.005, 0.995])) for values in (y[use], x[use]))
     da, db = a - a.mean(), b - b.mean()
     sa, sb = float(np.sqrt(np.mean(da * da))), float(np.sqrt(np.mean(db * db)))
     if not (sa > 1e-12 and sb > 1e-12):
-        return None
+        return Fit()
     both = float(np.mean(da * db))
     return Fit(both / (sb * sb), both / (sa * sb))
-
-
-def correlation(y: FloatArray, x: FloatArray) -> float:
-    """Return the correlation of the finite cells [M]; 0 where :func:`fit` has no line."""
-    relation = fit(y, x)
-    return 0.0 if relation is None else relation.correlation

@@ -13,33 +13,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, place_of, triad_of
-from pdhef_logtool.mapping.evidence import CELL_NS, Fit, Pieces, fit, ratio, spread
+from pdhef_logtool.mapping.candidates import Field, leaf_group, place_of, triad_of
+from pdhef_logtool.mapping.evidence import CELL_S, EVIDENCE, Fit, Pieces, fit, ratio, spread
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
 
-#: Smallest correlation that counts as a relation.
-CLEAR = 0.75
-#: Smallest standard deviation of an acceleration that excites a relation.
-EXCITED_A_M_S2 = 0.25
-#: Standard deviation of the curvature below which a path counts as straight; speed at standstill.
-EXCITED_CURVATURE_1_M, SLOW_M_S = 0.0001, 1.0
+_RELATIONS, _UNITS, _GRAVITY = EVIDENCE["relations"], EVIDENCE["units"], EVIDENCE["gravity"]
+SLOW_M_S: float = _RELATIONS["slow_m_s"]
+SAME: float = _RELATIONS["same"]
+BY_DRIVING: float = _RELATIONS["driving"]
+#: Usual lengths that convert curvature to an angle: a wheelbase, times a steering ratio for the steering wheel.
+USUAL_LENGTH_M: dict[str, float] = _RELATIONS["wheelbase_m"]
 #: Half of the window for a course from positions, in cells.
-_HALF = 5
+_HALF: int = EVIDENCE["ground"]["half_window"]
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
-#: 1-sigma of the logarithm of a gain: of one quantity measured twice, by accelerations with roll,
-#: grade and slip, and of the usual tracks among cars; usual track.
-SAME, BY_DRIVING, USUAL_TRACKS, USUAL_TRACK_M = 0.03, 0.15, 0.2, 1.55
-#: Share of the mean acceleration that is along one axis, and largest difference of gravity from 1 g.
-UPRIGHT, NEAR_1_G = 0.9, 0.25
-#: Probability at which a unit counts as known.
-CERTAIN = 0.9
-#: Usual lengths that convert curvature to an angle: a wheelbase, times a steering ratio for the steering wheel.
-USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
-#: Energies of rare units.
-RARE = {"mph": 1.5, "mg": 1.5, "ft/s²": 3.0, "kn": 5.0}
 
 
 @dataclass(slots=True)
@@ -54,8 +43,8 @@ class Fields:
     def all(self, quantity: str, part: str | None = None) -> list[Field]:
         """Return anchors and candidates of a quantity, the surest first."""
         every = [f for f in (*self.anchors.values(), *self.candidates) if f.meaning.quantity == quantity]
-        every = [f for f in every if f.role not in ("command", "estimate", "truth") or f.anchor]
-        return sorted((f for f in every if part is None or f.meaning.part == part), key=lambda f: -f.score)
+        every = [f for f in every if f.role not in ("command", "estimate", "truth")]
+        return sorted((f for f in every if part is None or f.meaning.part == part), key=lambda f: -f.log_odds)
 
     def open(self, quantity: str, part: str | None = None) -> list[Field]:
         """Return the fields of a quantity and part that are not constant."""
@@ -65,12 +54,11 @@ class Fields:
         """Return the surest field of a quantity that is not constant."""
         return next(iter(self.open(quantity)), None)
 
-    def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit | None:
-        """Fit a_y to v r; None if the car does not turn."""
+    def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit:
+        """Fit a_y to v r; no relation if the car does not turn."""
         expected = rate * speed
-        if not spread(expected) > EXCITED_A_M_S2:
-            return None
-        return fit(self.pieces.smooth(ay), self.pieces.smooth(expected))
+        turns = spread(expected) > _RELATIONS["excited_m_s2"]
+        return fit(self.pieces.smooth(ay), self.pieces.smooth(expected)) if turns else Fit()
 
     def curvature(
         self, speed: FloatArray | None, rate: FloatArray | None, ay: FloatArray | None = None
@@ -80,15 +68,16 @@ class Fields:
             return None
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             turning = ay / speed if rate is None and ay is not None else rate
-            moving = speed > max(SLOW_M_S, 0.25 * float(np.nanquantile(speed, 0.95)))
+            moving = speed > max(SLOW_M_S, _RELATIONS["moving_share"] * float(np.nanquantile(speed, 0.95)))
             curve = None if turning is None else self.pieces.smooth(np.where(moving, turning / speed, np.nan))
-        return curve if curve is not None and spread(curve) > EXCITED_CURVATURE_1_M else None
+        return curve if curve is not None and spread(curve) > _RELATIONS["excited_1_m"] else None
 
 
 def agree(a: FloatArray, b: FloatArray) -> bool:
     """Return whether two fields on the grid [M] have the same values."""
     relation = fit(a, b)
-    return relation is not None and relation.correlation > 0.97 and 0.9 < relation.slope < 1.1
+    low, high = _RELATIONS["same_ratio"]
+    return bool(relation.correlation > _RELATIONS["same_correlation"] and low < relation.slope < high)
 
 
 def mean_of(columns: Sequence[FloatArray]) -> FloatArray:
@@ -125,7 +114,7 @@ def _over_seconds(pieces: Pieces, cells: FloatArray) -> FloatArray:
     """Return the time derivative [M] over a window that is long against the resolution of positions."""
     rows = cells.reshape(len(pieces.starts), -1)
     out = np.full_like(rows, np.nan)
-    seconds = 2 * _HALF * CELL_NS * 1e-9
+    seconds = 2 * _HALF * CELL_S
     out[:, _HALF:-_HALF] = (rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]) / seconds
     return out.ravel()
 
@@ -152,7 +141,7 @@ class Gain(NamedTuple):
     powers: tuple[int, ...]
     gain: float
     sigma: float
-    broken: float = 0.01
+    broken: float = _RELATIONS["broken"]
 
 
 def posterior(units: Sequence[Sequence[Unit]], gains: Sequence[Gain]) -> FloatArray:
@@ -172,23 +161,23 @@ def posterior(units: Sequence[Sequence[Unit]], gains: Sequence[Gain]) -> FloatAr
         for factor, width, power in zip(factors, spreads, gain.powers, strict=True):
             off, variance = off + power * np.log(factor), variance + (power * width) ** 2
         density = (1.0 - gain.broken) * np.exp(-(off**2) / (2.0 * variance)) / np.sqrt(2.0 * np.pi * variance)
-        applies, total = applies * density, total * (density + 0.25 * gain.broken)
+        applies, total = applies * density, total * (density + _RELATIONS["broken_density"] * gain.broken)
     return np.asarray(applies / total.sum())
 
 
-def settle(items: Sequence[Field], gains: Sequence[Gain], by: str, bonus: float = 0.0) -> None:
-    """Select the units that are certain given these gains; fields with an uncertain name gain the score ``bonus``."""
+def settle(items: Sequence[Field], gains: Sequence[Gain], by: str, *evidence: str) -> None:
+    """Select the units that are certain given these gains; they are ``evidence`` for fields with an uncertain name."""
     if not gains:
         return
-    joint = posterior([[Unit(*u, energy=RARE.get(u[0], 0.0)) for u in f.units] for f in items], gains)
+    joint = posterior([[Unit(*u, energy=_UNITS["rare"].get(u[0], 0.0)) for u in f.units] for f in items], gains)
     for axis, item in enumerate(items):
         share = joint.sum(axis=tuple(i for i in range(joint.ndim) if i != axis))
-        if share.max() < CERTAIN or item.fixed:
+        if share.max() < _UNITS["certain"] or item.fixed:
             continue
         if not item.unit_known:
             item.use(item.units[int(share.argmax())][0])
             item.reasons.append(f"unit {item.factors[0][0]} by {by}")
-        item.bonus += bonus if item.score < LEAST_SCORE else 0.0
+        item.evidence += evidence if item.log_odds < 0.0 else ()
 
 
 def decide_units(fields: Fields) -> None:
@@ -213,13 +202,13 @@ def _by_gravity(fields: Fields) -> None:
             for item in axes.values() if size > 0.0 else ():
                 settle((item,), [Gain((1,), size / G_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
             up = max(means, key=lambda axis: abs(means[axis]))
-            is_gravity = abs(size * axes["z"].scale / G_M_S2 - 1.0) < NEAR_1_G and abs(means[up]) > UPRIGHT * size
-            if len(means) > 1 and is_gravity:
+            is_upright = abs(means[up]) > _GRAVITY["upright"] * size
+            if len(means) > 1 and is_upright and abs(size * axes["z"].scale / G_M_S2 - 1.0) < _GRAVITY["near_1_g"]:
                 _turn(fields, axes, f"{'-' if means[up] < 0.0 else '+'}{up}")
     # Beside an accelerometer, an acceleration without gravity is computed from it, or is of the earth's axes.
     sensing = {item.topic.name for item in fields.candidates if item.has_gravity}
     for item in (f for f in fields.candidates if f.topic.name in sensing and not f.has_gravity):
-        item.bonus -= 0.2 * (item.meaning.quantity == "acceleration" and item.is_axis)
+        item.evidence += ["no_gravity"] * (item.meaning.quantity == "acceleration" and item.is_axis)
 
 
 def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
@@ -237,13 +226,13 @@ def _turn(fields: Fields, axes: dict[str, Field], up: str) -> None:
 def _speeds(fields: Fields) -> None:
     """Determine the units of speeds by a known speed and by positions."""
     settled = [f for f in fields.all("speed") if f.unit_known or f.fixed]
-    reference = max(settled, key=lambda f: f.score, default=None)
+    reference = max(settled, key=lambda f: f.log_odds, default=None)
     velocity = path_velocity(fields.pieces, fields.positions)
     along_path = [] if velocity is None else [np.hypot(*velocity)]
     for item in fields.all("speed"):
         others = along_path + ([] if reference is None or reference is item else [reference.si])
         times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others]
-        settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x is not None and x > 0.0], "other speeds")
+        settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x > 0.0], "other speeds")
 
 
 def _by_speeding_up(fields: Fields) -> None:
@@ -251,10 +240,11 @@ def _by_speeding_up(fields: Fields) -> None:
     along = fields.open("acceleration", "x") + fields.open("acceleration", "ahead")
     for speed, ax in itertools.product(fields.open("speed"), along):
         relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
-        if relation is not None and relation.correlation >= CLEAR:
-            settle((ax, speed), [Gain((1, -1), relation.slope, BY_DRIVING)], "a_x ≈ v̇", bonus=0.3)
+        if relation.is_clear and relation.slope > 0.0:
+            settle((ax, speed), [Gain((1, -1), relation.slope, BY_DRIVING)], "a_x ≈ v̇", "relation")
             if ax.meaning.part == "ahead":
-                ax.meaning, ax.bonus = replace(ax.meaning, part="x"), ax.bonus - 0.1
+                ax.meaning = replace(ax.meaning, part="x")
+                ax.evidence.append("no_axis")
                 ax.doubts.append("its name gives no axis; it follows the derivative of the speed")
 
 
@@ -265,8 +255,8 @@ def _by_turning(fields: Fields) -> None:
         return
     for rate, ay in itertools.product(fields.open("rate", "z")[:4], fields.open("acceleration", "y")[:4]):
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
-        if relation is not None and abs(relation.correlation) > CLEAR:
-            settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
+        if relation.is_clear:
+            settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", "relation")
 
 
 def _by_track(fields: Fields) -> None:
@@ -276,8 +266,9 @@ def _by_track(fields: Fields) -> None:
     if speed is None or rate is None or len(wheels) < 2 or not agree(wheels[1], speed.seen.cells):
         return
     relation = fit(fields.pieces.smooth(wheels[1] - wheels[0]), fields.pieces.smooth(rate.seen.cells))
-    if relation is not None and abs(relation.correlation) > CLEAR:
-        settle((speed, rate), [Gain((1, -1), relation.slope / USUAL_TRACK_M, USUAL_TRACKS)], "the track of its wheels")
+    if relation.is_clear:
+        gain = Gain((1, -1), relation.slope / _RELATIONS["track_m"], _RELATIONS["track"])
+        settle((speed, rate), [gain], "the track of its wheels")
 
 
 def _by_siblings(fields: Fields) -> None:
@@ -285,8 +276,8 @@ def _by_siblings(fields: Fields) -> None:
     for kinds in ({"acceleration"}, {"speed", "velocity"}):
         certain = [f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known]
         settled = {leaf_group(f): f for f in certain} | {triad_of(f): f for f in certain}
-        mine = (f for f in fields.candidates if f.meaning.quantity in kinds and f.meaning.strength > 0.6)
-        for item in [f for f in mine if not f.unit_known and leaf_group(f) in settled]:
+        mine = [f for f in fields.candidates if f.meaning.quantity in kinds and f.is_named and not f.unit_known]
+        for item in (f for f in mine if leaf_group(f) in settled):
             other = settled.get(triad_of(item), settled[leaf_group(item)])
             same = [u for u, s in item.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
             if same:

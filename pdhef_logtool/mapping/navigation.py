@@ -19,29 +19,21 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.mapping.candidates import MOST, Field, anchors_of
+from pdhef_logtool.mapping.candidates import MOST, Field
 from pdhef_logtool.mapping.checking import stamp_path_of
-from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, fit
-from pdhef_logtool.mapping.fields import CLEAR, PLACES, SLOW_M_S, Fields, path_velocity
+from pdhef_logtool.mapping.evidence import EVIDENCE, FEWEST_CELLS, Fit, Pieces, fit
+from pdhef_logtool.mapping.fields import SLOW_M_S, Fields, path_velocity
 from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.records.signals import GNSS_POSITION, FloatArray
 
-#: Minimum speed for the course to be the direction of the car.
-MOVING_M_S = 3.0
-#: Median difference from the course: below NEAR_RAD for the right convention, above FAR_RAD for all others.
-NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
+_GROUND = EVIDENCE["ground"]
 #: Quantities of a position.
 _PLACES = ("latitude", "longitude")
-#: Largest plausible extent of a log.
-WIDEST_DEG = 10.0
 #: Senses of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
 _SENSES = (("clockwise from north", -1.0, math.pi / 2.0), ("counter-clockwise from east", 1.0, 0.0))
-#: Speed over ground over that along the path if the axes are the earth's; share of the time that a body moves ahead.
-SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
-#: Least share of its y axis in a path: along the x axis, velocities over ground and of the body are equal.
-ACROSS_SHARE = 0.1
+SAME_STEPS: tuple[float, float] = _GROUND["same_steps"]
 #: Axes of the x and y of a velocity; empty if the drive does not show them, "not ahead" if they are not the body's.
 Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.
@@ -78,37 +70,22 @@ def axes_of(
         orders = (("east, north", east, north), ("north, east", north, east))
     for order, *along in orders:
         fits = [fit(a, b) for a, b in zip(along, (x, y), strict=True)]
-        is_across = np.nanmean(along[1] ** 2) > ACROSS_SHARE**2 * np.nanmean(along[0] ** 2 + along[1] ** 2)
-        if is_across and all(
-            f is not None and f.correlation > CLEAR and SAME_STEPS[0] < f.slope < SAME_STEPS[1] for f in fits
-        ):
+        is_across = np.nanmean(along[1] ** 2) > _GROUND["across_share"] ** 2 * np.nanmean(along[0] ** 2 + along[1] ** 2)
+        if is_across and all(f.is_clear and SAME_STEPS[0] < f.slope < SAME_STEPS[1] for f in fits):
             return order
     length = np.hypot(x, y)
     moving = length > SLOW_M_S
     turning = pieces.turning(np.where(moving, x + 1j * y, np.nan))
-    relation = None if rate is None else fit(pieces.smooth(rate), turning)
+    relation = Fit() if rate is None else fit(pieces.smooth(rate), turning)
     # The direction over ground turns as fast as the car, in rad/s or deg/s; a sideslip that follows it turns less.
-    slope = relation.slope if relation is not None and relation.correlation > CLEAR else 0.0
-    if any(SAME_STEPS[0] < slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0))):
+    as_fast = any(SAME_STEPS[0] < relation.slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0)))
+    if relation.is_clear and as_fast:
         return "east, north"
     enough = np.count_nonzero(moving) >= FEWEST_CELLS
-    is_ahead = not enough or bool(np.mean((x > np.abs(y))[moving]) >= AHEAD_SHARE)
+    is_ahead = not enough or bool(np.mean((x > np.abs(y))[moving]) >= _GROUND["ahead_share"])
     if not is_ahead:
         return "not ahead"
-    return "" if relation is None else "body"
-
-
-def twist_axes(log: DriveLog, velocity: SignalSource, references: Sequence[SignalSource]) -> Axes:
-    """Return the axes of a velocity's first two fields by positions and a yaw rate among ``references``."""
-    pieces = Pieces(log)
-    read = pieces.read((source.topic, path) for source in (velocity, *references) for path in source.paths)
-    x, y = (read.get((velocity.topic, path)) for path in velocity.paths[:2])
-    if x is None or y is None:
-        return ""
-    anchors = anchors_of(log, references, read)
-    rate = next((f.si for f in anchors if f.meaning.quantity == "rate"), None)
-    steps = path_velocity(pieces, [f for f in anchors if f.meaning.quantity in PLACES])
-    return axes_of(pieces, x.cells, y.cells, steps, rate)
+    return "body" if relation.correlation else ""
 
 
 # ------------------------------------------------------------------------------------------------ receivers
@@ -156,11 +133,8 @@ def receiver_signals(
                 continue
             if any(f"{base}{name}" in there for name in receiver.without):
                 return {}
-            sources = {
-                f.name: SignalSource(f.name, topic, there[f"{base}{path}"], stamp, f.scale, f.offset)
-                for path, f in receiver.fields.items()
-                if f"{base}{path}" in there
-            }
+            its = ((s, there.get(f"{base}{path}")) for path, s in receiver.fields.items())
+            sources = {s.name: replace(s, topic=topic, field=path, stamp=stamp) for s, path in its if path}
             struct = there.get(f"{base}latitude", "").removesuffix("latitude")
             if any(p.startswith(f"{struct}position_covariance[") for p in paths):  # 1 sigma: mean of east and north
                 squared = tuple(f"{struct}position_covariance[{i}]" for i in (0, 4))
@@ -195,8 +169,7 @@ class _Instrument:
     @property
     def has_place(self) -> bool:
         """Return whether there are degrees of latitude and longitude of a moving car."""
-        limits = zip(self.places, (90.0, 180.0), strict=False)
-        return len(self.places) == len(_PLACES) and all(_is_place(f, most) for f, most in limits)
+        return len(self.places) == len(_PLACES) and all(map(_is_place, self.places))
 
     @cached_property
     def course(self) -> FloatArray | None:
@@ -244,7 +217,7 @@ def named_gnss(fields: Fields, topic: str) -> dict[str, SignalSource]:
         return {}
     sources = [_source(name, item) for item, name in zip(its.places, GNSS_POSITION, strict=True)]
     velocity = its.velocities[0] if its.velocities else None
-    if velocity and _median_off(np.arctan2(velocity["n"].si, velocity["e"].si) - its.course) < NEAR_RAD:
+    if velocity and _degrees_off(np.arctan2(velocity["n"].si, velocity["e"].si) - its.course) < _GROUND["near_deg"]:
         sources += its.over_ground
     else:
         sources += _speed_and_course(its, its.course)
@@ -319,19 +292,18 @@ def _ecef_vectors(topic: str, fields: tuple[FieldInfo, ...]) -> Iterator[SignalS
 def turns(pieces: Pieces, angle_rad: FloatArray, rate: FloatArray) -> float:
     """Return the sign with which an angle [M] turns as fast as a yaw rate, rad/s [M]; 0 if it does not."""
     relation = fit(pieces.smooth(rate), pieces.smooth(pieces.turning(np.exp(1j * angle_rad))))
-    slope = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.slope
-    return math.copysign(float(SAME_STEPS[0] < abs(slope) < SAME_STEPS[1]), slope)
+    is_same = relation.is_clear and SAME_STEPS[0] < abs(relation.slope) < SAME_STEPS[1]
+    return math.copysign(float(is_same), relation.slope)
 
 
-def _is_place(item: Field, most: float) -> bool:
+def _is_place(item: Field) -> bool:
     """Return whether values can be degrees of latitude or longitude of a moving car."""
-    if not item.seen.changes or not 0.01 < item.seen.largest * item.scale <= most:
-        return False
-    return float(np.nanmax(item.seen.cells) - np.nanmin(item.seen.cells)) * item.scale < WIDEST_DEG
+    is_angle = _GROUND["least_deg"] < item.seen.largest * item.scale <= MOST[item.meaning.quantity]
+    return item.seen.changes and is_angle and float(np.nanmax(item.si) - np.nanmin(item.si)) < _GROUND["widest_deg"]
 
 
 def _direction(north: FloatArray, east: FloatArray) -> FloatArray:
-    return np.where(np.hypot(north, east) > MOVING_M_S, np.arctan2(north, east), np.nan)
+    return np.where(np.hypot(north, east) > _GROUND["moving_m_s"], np.arctan2(north, east), np.nan)
 
 
 def _convention(item: Field, course: FloatArray | None) -> tuple[str, float, float] | None:
@@ -342,16 +314,16 @@ def _convention(item: Field, course: FloatArray | None) -> tuple[str, float, flo
     if course is None:
         return None
     unit = item.meaning.scale or (math.radians(1.0) if item.seen.largest > 2.1 * math.pi else 1.0)
-    off = [_median_off(sign * unit * item.seen.cells + angle - course) for _, sign, angle in _SENSES]
-    if not (min(off) < NEAR_RAD and FAR_RAD < max(off) < math.inf):
+    off = [_degrees_off(sign * unit * item.seen.cells + angle - course) for _, sign, angle in _SENSES]
+    if not (min(off) < _GROUND["near_deg"] and _GROUND["far_deg"] < max(off) < math.inf):
         return None
     sense, sign, angle = _SENSES[int(np.argmin(off))]
     words = "radians" if unit == 1.0 else f"{math.degrees(unit):.3g} degrees".removeprefix("1 ")
     return f"{words} {sense}", sign * unit, angle
 
 
-def _median_off(angles: FloatArray) -> float:
-    """Return the median magnitude of angles; infinite with too few."""
-    away = np.abs(np.angle(np.exp(1j * angles)))
+def _degrees_off(angles_rad: FloatArray) -> float:
+    """Return the median magnitude of angles, degrees; infinite with too few."""
+    away = np.abs(np.angle(np.exp(1j * angles_rad), deg=True))
     away = away[np.isfinite(away)]
     return float(np.median(away)) if away.shape[0] >= FEWEST_CELLS else math.inf

@@ -1,126 +1,177 @@
 """Quantities of columns without a meaning by name, by physics: a_x ≈ v̇, a_y ≈ v r, and steering against curvature.
 
-Columns with a named quantity take part in the relations; units, where a column has one, exclude quantities.
+Fields with a quantity by name take part in the relations; the likelihood that decides their units decides these, too.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.mapping.evidence import Fit, Pieces, Seen, correlation, fit
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.mapping import naming
+from pdhef_logtool.mapping.can_frames import holds_frames
+from pdhef_logtool.mapping.candidates import HYPOTHESES, PROPOSED, Field, Named, Role, field_of, is_column
+from pdhef_logtool.mapping.evidence import EVIDENCE, Fit, Seen, fit
+from pdhef_logtool.mapping.fields import BY_DRIVING, Fields, Gain, Unit, posterior
+from pdhef_logtool.mapping.naming import Meaning, words_of
 
-#: Quantities and parts that a proposal consists of, and the range of the largest value of each in a drive, SI.
-ROLES = (("speed", "x"), ("acceleration", "x"), ("acceleration", "y"), ("rate", "z"))
-_LARGEST = {"speed": (4.0, 90.0), "acceleration": (0.7, 16.0), "rate": (0.04, 2.5)}
-#: Most columns that are compared; least correlation of a relation; 1-sigma of the logarithm of its gain; how much surer
-#: the best proposal must be.
-MOST_PROPOSED, LEAST, SIGMA, MARGIN = 24, 0.8, 0.15, 1.0
-#: Possible units and their factors to SI, by quantity.
-Units: TypeAlias = Mapping[str, Sequence[tuple[str, float]]]
-#: Column of each quantity, None without one.
-_Places: TypeAlias = tuple[int | None, ...]
+#: Quantity and part.
+_Quantity: TypeAlias = tuple[str, str]
+_SPEED, _AX, _AY, _RATE = ("speed", "x"), ("acceleration", "x"), ("acceleration", "y"), ("rate", "z")
+#: Exponents of the quantities in the gains of a_x ≈ v̇ and a_y ≈ v r.
+_FORWARD, _TURN = {_AX: 1, _SPEED: -1}, {_AY: 1, _RATE: -1, _SPEED: -1}
+#: Range of the largest value of each quantity in a drive, SI.
+_LIMITS = EVIDENCE["proposals"]
+_LARGEST: dict[_Quantity, tuple[float, float]] = {q: _LIMITS["largest"][" ".join(q)] for q in (_SPEED, _AX, _AY, _RATE)}
+_LEAST: float = _LIMITS["correlation"]
+#: Words that leave the quantity of a field open: it may be any of them.
+_OPEN_WORDS = naming.COUNTING | {"angle", "yaw"}
 
 
-class Column(NamedTuple):
-    """Values of a column, and its possible units by quantity; ``role``: its quantity by name, or None."""
+class _Column(NamedTuple):
+    """A field of a sensor without a quantity by name."""
 
+    topic: TopicInfo
+    info: FieldInfo
     seen: Seen
-    units: Units
-    role: tuple[str, str] | None = None
 
 
-def propose(
-    pieces: Pieces, columns: Sequence[Column], wanted: Sequence[tuple[str, str]]
-) -> dict[int, tuple[str, str, str]]:
-    """Return quantity, part and unit by the place of a column without a name, for the wanted ones of :data:`ROLES`.
+class _Way(NamedTuple):
+    """An assignment of fields and columns to quantities, with their units; ``score`` in log odds."""
+
+    score: float
+    items: Mapping[_Quantity, Field | _Column]
+    units: Mapping[_Quantity, str]
+
+
+def proposed_fields(
+    log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named], fields: Fields
+) -> Iterator[Field]:
+    """Yield the fields without a usable name that the drive's motion explains, for quantities that nothing gives.
 
     Only one assignment may explain the drive: without speeding up, a yaw rate, a_y and a steering angle are alike. The
-    unit of a steering angle stays open (empty).
+    unit of a steering angle stays open.
     """
-    cells = [pieces.smooth(c.seen.cells) for c in columns]
-    options = [_options(columns, role, wanted) for role in ROLES]
-    ways = sorted(_ways(pieces, columns, cells, options), key=lambda way: -way[0])
-    if not ways or any(score > ways[0][0] - MARGIN and places != ways[0][1] for score, places, _ in ways):
-        return {}
-    _, places, units = ways[0]
-    chosen = {p: (*q, u) for p, q, u in zip(places, ROLES, units, strict=True) if p is not None}
-    factor = {p: dict(columns[p].units[q])[u] for p, (q, _, u) in chosen.items()}
-    proposed = {p: meaning for p, meaning in chosen.items() if columns[p].role is None}
-    steering = _steering(columns, cells, places, factor) if ("steering", "") in wanted else None
-    return proposed if steering is None else {**proposed, steering: ("steering", "", "")}
+    measured = [f for f in (*fields.anchors.values(), *fields.candidates) if f.role != "command"]
+    items = {quantity: item for quantity in _LARGEST if (item := _surest(measured, quantity)) is not None}
+    steers = any(f.meaning.quantity == "steering" for f in measured)
+    columns = [] if len(items) == len(_LARGEST) and steers else [*_open_columns(log, fields, topics, named)]
+    if (best := _only([*_ways(fields, items, columns)])) is None:
+        return
+    for quantity, column in best.items.items():
+        if isinstance(column, _Column):
+            items[quantity] = _field(log, column, quantity, best.units[quantity])
+            yield items[quantity]
+    if not steers:
+        free = [c for c in columns if c not in best.items.values() and not c.seen.is_off_centre]
+        if (steering := _steering(fields, items, free)) is not None:
+            yield _field(log, steering, ("steering", ""), "")
 
 
-def _steering(
-    columns: Sequence[Column], cells: Sequence[FloatArray], places: _Places, factor: Mapping[int, float]
-) -> int | None:
-    """Return the column without a name that follows the path's curvature best, or None."""
-    v, _, y, r = places
-    turning = y if r is None else r
-    if v is None or turning is None:
+def _only(ways: Sequence[_Way]) -> _Way | None:
+    """Return the surest assignment, or None if another one is nearly as sure."""
+    best = max(ways, key=lambda way: way.score, default=None)
+    others = (way.score for way in ways if best is not None and way.items != best.items)
+    return None if best is None or max(others, default=-math.inf) > best.score - _LIMITS["margin"] else best
+
+
+def _steering(fields: Fields, items: Mapping[_Quantity, Field], columns: Sequence[_Column]) -> _Column | None:
+    """Return the column that follows the path's curvature best, or None."""
+    v, ay, rate = (None if (item := items.get(q)) is None else item.si for q in (_SPEED, _AY, _RATE))
+    curvature = fields.curvature(v, rate, ay)
+    if v is None or curvature is None or not columns:
         return None
-    speed = cells[v] * factor[v]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rate = cells[turning] * factor[turning] / (speed if r is None else 1.0)
-        curvature, lateral = np.where(speed > 1.0, rate / speed, np.nan), rate * speed
-    free = {i for i, c in enumerate(columns) if c.role is None and "steering" in c.units and not c.seen.is_off_centre}
-    surest, steering = max(((abs(correlation(cells[i], curvature)), i) for i in free - {*places}), default=(0.0, 0))
+    follows = [abs(fit(fields.pieces.smooth(c.seen.cells), curvature).correlation) for c in columns]
+    steering = columns[int(np.argmax(follows))]
     # A roll angle follows the lateral acceleration better than the curvature.
-    return steering if surest > max(LEAST, abs(correlation(cells[steering], lateral))) else None
+    rolls = abs(fit(steering.seen.cells, curvature * v**2).correlation)
+    return steering if max(follows) > max(_LEAST, rolls) else None
 
 
-def _options(columns: Sequence[Column], role: tuple[str, str], wanted: Sequence[tuple[str, str]]) -> list[int | None]:
-    """Return the columns that may be a quantity: the named ones, else those without a name if it is wanted."""
-    named: list[int | None] = [i for i, c in enumerate(columns) if c.role == role]
-    free = [i for i, c in enumerate(columns) if c.role is None and role[0] in c.units] if role in wanted else []
-    return named[:1] or [*free, None]
+def _surest(fields: Sequence[Field], quantity: _Quantity) -> Field | None:
+    """Return the field of a quantity with the best name; a wheel speed replaces a missing speed."""
+    its = [f for f in fields if f.meaning.quantity == quantity[0] and f.meaning.part in (quantity[1], "")]
+    its = its or [f for f in fields if quantity == _SPEED and f.meaning.quantity == "wheel speed"]
+    return max(its, key=lambda f: f.meaning.strength, default=None)
 
 
-def _ways(
-    pieces: Pieces, columns: Sequence[Column], cells: Sequence[FloatArray], options: Sequence[Sequence[int | None]]
-) -> Iterator[tuple[float, _Places, tuple[str, ...]]]:
-    """Yield evidence, columns and units of the assignments that the drive's motion supports."""
-    of_v, *others = options
-    for v in (i for i in of_v if i is not None and np.fmin.reduce(cells[i]) > -0.05 * columns[i].seen.largest):
-        ahead, left = _relations(pieces.rate_of(columns[v].seen.cells), cells, v, others)
-        for x, y, r in product(*others):
-            used = [p for p in (v, x, y, r) if p is not None]
-            free = {p for p in used if columns[p].role is None}
-            related = ({v, x} if x in ahead else set()) | ({v, y, r} if (y, r) in left else set())
-            # An acceleration without a lateral one may be the derivative of the speed.
-            if free <= related and len({*used}) == len(used) and not (x in free and y is None):
-                relations = [(f, i) for i, f in enumerate((ahead.get(x), left.get((y, r)))) if f is not None]
-                yield from _with_units(columns, (v, x, y, r), relations)
+def _open_columns(
+    log: DriveLog, fields: Fields, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]
+) -> Iterator[_Column]:
+    """Yield the columns of the sensors' fields without a unit, and without a word that has a meaning."""
+    by_name = {(topic.name, info.path) for topic, _, info, _, _ in named}
+    infos: dict[tuple[str, str], tuple[TopicInfo, FieldInfo]] = {}
+    for topic in (t for t, role in topics if role == "sensor"):
+        its = log.fields(topic.name, quiet=True)
+        for info in () if holds_frames(topic.name, its) else filter(is_column, its):
+            words = set(words_of(info.path)) - naming.STATES
+            unknown = all(len(w) == 1 or w.isdigit() or w in _OPEN_WORDS or w not in naming.KNOWN for w in words)
+            if unknown and not (info.unit or words & naming.NOT_VALUES or (topic.name, info.path) in by_name):
+                infos[topic.name, info.path.removesuffix("[]")] = topic, info
+    for (name, path), seen in fields.pieces.read([*infos][: _LIMITS["most"]]).items():
+        topic, info = infos.get((name, path)) or infos[name, path.partition("[")[0]]
+        if seen.changes:
+            yield _Column(topic, replace(info, path=path), seen)
 
 
-def _relations(
-    change: FloatArray, cells: Sequence[FloatArray], v: int, others: Sequence[Sequence[int | None]]
-) -> tuple[dict[int | None, Fit], dict[tuple[int | None, int | None], Fit]]:
-    """Return the fits of a_x ≈ v̇ and of a_y ≈ v r for a speed ``v``, by columns."""
-    of_x, of_y, of_r = ([i for i in its if i is not None] for its in others)
-    ahead = {x: fit(cells[x], change) for x in of_x}
-    left = {(y, r): fit(cells[y], cells[r] * cells[v]) for y, r in product(of_y, of_r) if y != r}
-    return (
-        {x: f for x, f in ahead.items() if f is not None and f.correlation > LEAST},
-        {pair: f for pair, f in left.items() if f is not None and abs(f.correlation) > LEAST},
+def _field(log: DriveLog, column: _Column, quantity: _Quantity, unit: str) -> Field:
+    why = "named by the drive: a_x ≈ v̇, a_y ≈ v r and the path's curvature"
+    meaning = Meaning(*quantity, PROPOSED, unit, dict(HYPOTHESES[quantity[0]]).get(unit), why)
+    return field_of(
+        log.fields(column.topic.name, quiet=True), column.topic, "sensor", column.info, meaning, column.seen
     )
 
 
+def _ways(fields: Fields, named: Mapping[_Quantity, Field], columns: Sequence[_Column]) -> Iterator[_Way]:
+    """Yield the assignments that the drive's motion supports."""
+    pieces = fields.pieces
+    every: list[Field | _Column] = [*named.values(), *columns]
+    cells = {id(item): pieces.smooth(item.seen.cells) for item in every}
+    of: dict[_Quantity, Sequence[Field | _Column]]
+    of = {quantity: [named[quantity]] if quantity in named else columns for quantity in _LARGEST}
+    for v in (v for v in of[_SPEED] if np.fmin.reduce(cells[id(v)]) > -_LIMITS["reverse"] * v.seen.largest):
+        change = pieces.rate_of(v.seen.cells)
+        ahead = [({_AX: x}, fit(cells[id(x)], change)) for x in of[_AX]]
+        pairs = [(y, r) for y, r in product(of[_AY], of[_RATE]) if y is not r]
+        left = [({_AY: y, _RATE: r}, fit(cells[id(y)], cells[id(r)] * cells[id(v)])) for y, r in pairs]
+        forward = [(x, f) for x, f in ahead if f.correlation > _LEAST]
+        turn = [(y_r, f) for y_r, f in left if abs(f.correlation) > _LEAST]
+        for (x, along), (y_r, across) in product([*forward, ({}, Fit())], [*turn, ({}, Fit())]):
+            if _is_possible({_SPEED: v, **x, **y_r}, named):
+                yield from _with_units({_SPEED: v, **x, **y_r}, [(_FORWARD, along), (_TURN, across)])
+
+
+def _is_possible(items: Mapping[_Quantity, Field | _Column], named: Mapping[_Quantity, Field]) -> bool:
+    """Return whether each item has one quantity, and a relation or a name."""
+    # An acceleration without a lateral one may be the derivative of the speed.
+    is_derivative = _AX in items and _AX not in named and not {_AY} & (items.keys() | named.keys())
+    is_related = len(items) > 1 or _SPEED in named
+    return is_related and not is_derivative and len({*map(id, items.values())}) == len(items)
+
+
 def _with_units(
-    columns: Sequence[Column], places: _Places, relations: Sequence[tuple[Fit, int]]
-) -> Iterator[tuple[float, _Places, tuple[str, ...]]]:
-    """Yield an assignment with its possible units; relations are a_x ≈ v̇ (0) and a_y ≈ v r (1)."""
-    of_roles = [*zip(places, ROLES, strict=True)]
-    surety = sum(math.atanh(min(abs(f.correlation), 0.999)) for f, _ in relations)
-    for units in product(*(columns[p].units[q] if p is not None else (("", 1.0),) for p, (q, _) in of_roles)):
-        v, x, y, r = (factor for _, factor in units)
-        off = sum((math.log(abs(f.slope) * (x / v, y / (r * v))[i]) / SIGMA) ** 2 for f, i in relations)
-        new = [(columns[p], u, q) for (p, (q, _)), (_, u) in zip(of_roles, units, strict=True) if p is not None]
-        sizes = ((c.seen.largest * u, _LARGEST[q]) for c, u, q in new if c.role is None)
-        if all(low < size < high for size, (low, high) in sizes):
-            yield surety - 0.5 * off, places, tuple(name for name, _ in units)
+    items: Mapping[_Quantity, Field | _Column], relations: Sequence[tuple[Mapping[_Quantity, int], Fit]]
+) -> Iterator[_Way]:
+    """Yield an assignment with its likeliest units, if any are possible."""
+    units = []
+    for quantity, item in items.items():
+        low, high = _LARGEST[quantity]
+        its = item.units if isinstance(item, Field) else HYPOTHESES[quantity[0]][:2]
+        units.append([Unit(*u) for u in its if isinstance(item, Field) or low < item.seen.largest * u[1] < high])
+    if not all(units):
+        return
+    seen = [(powers, f) for powers, f in relations if f.correlation]
+    gains = [Gain(tuple(powers.get(q, 0) for q in items), f.slope, BY_DRIVING) for powers, f in seen]
+    shares = posterior(units, gains)
+    surety = sum(math.atanh(min(abs(f.correlation), _LIMITS["noiseless"])) for _, f in seen)
+    best = np.unravel_index(int(shares.argmax()), shares.shape)
+    names = {quantity: ways[i].name for quantity, ways, i in zip(items, units, best, strict=True)}
+    if shares.max() > 0.0:
+        yield _Way(surety + math.log(shares.max()), items, names)

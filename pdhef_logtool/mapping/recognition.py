@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping import navigation
 from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds_frames
-from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
+from pdhef_logtool.mapping.candidates import MOST, Candidate, Role, anchors_of
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
-from pdhef_logtool.mapping.evidence import Pieces, Seen
-from pdhef_logtool.mapping.fields import Fields
+from pdhef_logtool.mapping.evidence import EVIDENCE, Pieces, Seen
+from pdhef_logtool.mapping.fields import Fields, path_velocity
 from pdhef_logtool.mapping.joints import is_joints, joint_names
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command, words_of
@@ -23,28 +25,38 @@ from pdhef_logtool.mapping.vendors import Vendors, load_vendors, plain_type
 from pdhef_logtool.mapping.weighing import Weighing, weigh
 from pdhef_logtool.records.signals import FloatArray, has_gnss
 
+#: Sources by signal.
+_Sources: TypeAlias = dict[str, SignalSource]
+
+
+def _source(name: str, field: str | list[str], scale: float = 1.0, offset: float = 0.0) -> SignalSource:
+    return SignalSource(name, "", tuple(field) if isinstance(field, list) else field, scale=scale, offset=offset)
+
+
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
-_FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
-#: Path of the velocity by type, and first covariance entries; −1 there marks a quantity as not provided (REP 145).
-TWIST_FIELDS, TWIST_COVARIANCES = _FIELDS["twist"], _FIELDS["twist_covariance"]
+_TYPES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("types.toml").read_text(encoding="utf-8"))
+#: Sources of well-known types by type and quantity, without a topic; quantities by the covariance that describes them.
+SOURCES = {
+    kind: {name: _source(name, **(e if isinstance(e, dict) else {"field": e})) for name, e in entries.items()}
+    for kind, entries in _TYPES["quantities"].items()
+}
+COVARIANCES: dict[str, dict[str, list[str]]] = _TYPES["covariances"]
 NO_SENSORS = tuple(VOCABULARY["topics"]["no_sensors"].split())
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
 #: Subject of a choice between runs, and formats of files that may contain several.
 RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3", "hdf5"})
-#: Largest difference of the mean acceleration from 1 for accelerations in g.
-NEAR_1_G = 0.08
+#: Largest difference of the length of a quaternion from 1.
+NEAR_UNIT = 0.01
+#: Descriptions of quantities with a covariance, by the first of them.
+_WHAT = {"ax_m_s2": "acceleration", "yaw_rate_rad_s": "angular rate", "vx_m_s": "velocity", "x_m": "pose"}
 
 #: Types with velocities in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove/Odometry"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove/LocationFix"})
-_GRAVITY_PATHS = tuple(f"linear_acceleration.{axis}" for axis in "xyz")
-
-
-#: Sources by signal.
-_Sources: TypeAlias = dict[str, SignalSource]
+_FORCES, _RATES = ("ax_m_s2", "ay_m_s2", "az_m_s2"), ("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,40 +102,41 @@ class AutoMapping:
 
 @dataclass(slots=True)
 class _Draft:
-    """A mapping under construction by :func:`auto_map`."""
+    """A mapping under construction by :func:`auto_map`.
+
+    ``given`` has the sources of topics of well-known types, by topic and quantity; ``samples`` has their values.
+    """
 
     log: DriveLog
-    samples: dict[tuple[str, str], Seen]
+    samples: dict[tuple[str, str], Seen] = field(default_factory=dict)
+    given: dict[str, _Sources] = field(default_factory=dict)
     signals: dict[str, SignalSource] = field(default_factory=dict)
     truth: dict[str, SignalSource] = field(default_factory=dict)
     quality: QualityGate | None = None
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    axes: dict[tuple[str, ...], navigation.Axes] = field(default_factory=dict)
 
-    def values(self, topic: str, path: str) -> FloatArray:
-        seen = self.samples.get((topic, path))
-        return np.empty(0) if seen is None else seen.values
+    def values(self, topic: TopicInfo, name: str, column: int = 0) -> FloatArray:
+        """Return the finite raw values of a quantity of a well-known type, or of a column of it; empty without any."""
+        source = self.given.get(topic.name, {}).get(name)
+        seen = None if source is None else self.samples.get((topic.name, source.paths[column]))
+        return np.empty(0) if seen is None else seen.values[np.isfinite(seen.values)]
 
-    def is_given(self, topic: str, path: str) -> bool:
-        """Return whether the type has a field and its samples, if any, are not all NaN."""
-        if not has_path(self.log.fields(topic), path):
-            return False
-        seen = self.values(topic, path)
-        return seen.shape[0] == 0 or bool(np.isfinite(seen).any())
+    def span(self, topic: TopicInfo, name: str) -> float:
+        """Return the range of the values of a quantity; 0 of a filler."""
+        values = self.values(topic, name)
+        return float(np.ptp(values)) if values.shape[0] else 0.0
 
-    def is_disowned(self, topic: str, covariance: str) -> bool:
-        """Return whether a covariance of −1 marks a quantity as not provided (REP 145)."""
-        seen = self.values(topic, covariance)
-        return seen.shape[0] > 0 and bool((seen == -1.0).all())
+    def has(self, topic: TopicInfo, *names: str) -> bool:
+        """Return whether a topic gives all of these quantities by its type."""
+        return set(names) <= self.given.get(topic.name, {}).keys()
 
-    def take(self, into: _Sources, name: str, topic: str, path: str, scale: float = 1.0, offset: float = 0.0) -> None:
-        """Add a source of one field for a signal or a truth channel."""
-        into[name] = SignalSource(name, topic, path, self.stamp(topic), scale, offset)
-
-    def stamp(self, topic: str) -> str:
-        """Return the path of a topic's measurement time."""
-        return stamp_path_of(self.log.fields(topic))
+    def take(self, into: _Sources, topic: TopicInfo, *names: str, scale: float = 1.0) -> None:
+        """Add these quantities of a topic, as far as its type gives them, to signals or ground truth."""
+        for source in (self.given[topic.name][name] for name in names if self.has(topic, name)):
+            into[source.name] = source
+            if isinstance(source.scale, float):
+                into[source.name] = replace(source, scale=scale * source.scale)
 
     def doubt(self, subject: str, candidates: tuple[str, ...], chosen: str | None, reason: str) -> None:
         """Note an ambiguity."""
@@ -166,7 +179,8 @@ def auto_map(
     there = [vendors.typed(t, log.fields(t.name, quiet=True)) for t in there]
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
-    draft = _Draft(log=log, samples=_probe(log, topics))
+    draft = _Draft(log)
+    _probe(draft, topics)
     why = {t.name: log.unreadable(t.name) or f"its fields differ from {t.type_name}" for t in unlike}
     draft.notes += [f"{name} is not used: {reason}" for name, reason in why.items()]
     draft.notes += _what_cannot_be_read(log, [t for t in topics if not type_of(t).startswith(NO_SENSORS)])
@@ -267,11 +281,11 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     """Take candidates for signals without a well-known type."""
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not type_of(t).startswith(NO_SENSORS)]
     weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
-    draft.signals.update(weighed.signals)
+    draft.signals |= weighed.sources("signals")
     joints = (t for t, role in rest if is_joints(t) and role != "command" and not joint_names(draft.log, t))
     draft.notes += [f"{t.name} is not used: the joints or their order differ between messages" for t in joints]
-    if weighed.truth:
-        draft.replace_truth(weighed.truth)
+    if truth := weighed.sources("truth"):
+        draft.replace_truth(truth)
     draft.notes += weighed.notes
     for name, fields in weighed.rivals:
         draft.doubt(name, fields, fields[0], "the best score, then most messages")
@@ -282,18 +296,12 @@ def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendo
     """Take ground truth from an INS of a documented type if recognised types provide at most a position."""
     if {"vx_m_s", "enu_velocity_m_s", "quat_wxyz", "yaw_rad", "x_m"} & set(draft.truth):
         return
-    whole: dict[str, dict[str, SignalSource]] = {}
+    whole: dict[str, _Sources] = {}
     for topic in topics:
         fields = draft.log.fields(topic.name, quiet=True)
-        sources = [
-            SignalSource(f.name, topic.name, path, stamp_path_of(fields), f.scale, f.offset)
-            for path, f in vendors.of(topic.type_name).fields.items()
-            if f.section == "truth" and has_path(fields, path)
-        ]
-        vectors = [v for v in vendors.of(topic.type_name).vectors if all(has_path(fields, p) for p in v.paths)]
-        sources += [replace(v, topic=topic.name, stamp=stamp_path_of(fields)) for v in vectors]
-        if vectors:
-            whole[topic.name] = {s.name: s for s in sources}
+        its = [s for s in vendors.of(topic.type_name).truth if all(has_path(fields, p) for p in s.paths)]
+        if any(s.columns > 1 for s in its):
+            whole[topic.name] = {s.name: replace(s, topic=topic.name, stamp=stamp_path_of(fields)) for s in its}
     candidates = [t for t in topics if t.name in whole]
     chosen = draft.choose("truth", candidates, lambda t: (-len(whole[t.name]),), "the one with most quantities")
     if chosen is None:
@@ -321,19 +329,19 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, fi
 
 
 def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, named: Fields) -> None:
-    """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
+    """Take GNSS as a sensor: from ground truth without heading, from receivers, else from a twist over ground."""
     draft.signals |= navigation.gnss_signals(draft.signals, draft.truth)
     is_ins = navigation.has_heading(draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values() if is_ins}
     others = [t for t in topics if not _named(t, "truth") and _device(t.name) not in instruments]
-    receivers = list(_receivers(draft, others, vendors, named))
-    for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
-        if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
+    readings = sorted(_receivers(draft, others, vendors, named), key=lambda s: not has_gnss(s))
+    if not any(map(has_gnss, (draft.signals, *readings))):
+        readings.insert(0, _twist_over_ground(draft, others))
+    is_place_true = is_ins and bool({"lat_deg", "x_m"} & set(draft.truth))
+    for signals in readings:
+        is_useful = has_gnss(signals) or has_gnss(draft.signals) or not is_place_true
+        if is_useful and not set(signals) & set(draft.signals):
             draft.signals |= signals
-    if not has_gnss(draft.signals):
-        _map_twist(draft, others)
-        if has_gnss(draft.signals) or not (is_ins and {"lat_deg", "x_m"} & set(draft.truth)):
-            draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
 def _receivers(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, named: Fields) -> Iterator[_Sources]:
@@ -348,38 +356,36 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], vendors: Vendors, named: 
                 yield signals
 
 
-def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take the GNSS velocity from a twist over ground, of a navigation system first."""
-    twists = [t for t in topics if type_of(t) in TWIST_FIELDS and type_of(t) not in BODY_TWIST_TYPES]
-    twists = [t for t in twists if not is_command(t.name)]
+def _twist_over_ground(draft: _Draft, topics: list[TopicInfo]) -> _Sources:
+    """Return the GNSS velocity from a twist over ground, of a navigation system first."""
+    twists = [t for t in topics if draft.has(t, "vx_m_s", "vy_m_s") and type_of(t) not in BODY_TWIST_TYPES]
     for topic in sorted(twists, key=lambda t: (_named(t, "estimate"), not _is_truth(t))):
-        paths = tuple(_twist(topic, "linear", axis) for axis in "xy")
-        axes = _axes(draft, topic, topics)
+        axes = "body" if is_command(topic.name) else _axes(draft, topic, topics)
         if axes not in ("", "body"):
-            for name, path in zip(("east", "north"), paths[::-1] if axes == "north, east" else paths, strict=True):
-                draft.take(draft.signals, f"gnss_velocity_{name}_m_s", topic.name, path)
-            return
+            sides = ("north", "east") if axes == "north, east" else ("east", "north")
+            names = zip((f"gnss_velocity_{side}_m_s" for side in sides), ("vx_m_s", "vy_m_s"), strict=True)
+            return {name: replace(draft.given[topic.name][axis], name=name) for name, axis in names}
+    return {}
 
 
 def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> navigation.Axes:
     """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate."""
-    x, y = (_twist(twist, "linear", axis) for axis in "xy")
-    if not (draft.is_given(twist.name, x) and draft.is_given(twist.name, y)):
-        return ""
-    references: _Sources = {}
+    references = {n: s for n, s in draft.signals.items() if n == "yaw_rate_rad_s"}
     if _has_pose(draft, twist):
-        for axis in "xy":
-            draft.take(references, f"{axis}_m", twist.name, _pose(twist, f"position.{axis}"))
-    elif fix := next((t for t in topics if _has_fix(draft, t)), None):
-        for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude")):
-            draft.take(references, name, fix.name, path)
-    if "yaw_rate_rad_s" in draft.signals:
-        references["yaw_rate_rad_s"] = draft.signals["yaw_rate_rad_s"]
-    key = (twist.name, *(source.label for source in references.values()))
-    if key not in draft.axes:  # asked for speed, ground truth and GNSS
-        velocity = SignalSource("speed_m_s", twist.name, (x, y))
-        draft.axes[key] = navigation.twist_axes(draft.log, velocity, [*references.values()])
-    return draft.axes[key]
+        draft.take(references, twist, "x_m", "y_m")
+    elif fix := next((t for t in topics if type_of(t) in FIX_TYPES and draft.has(t, "lat_deg", "lon_deg")), None):
+        draft.take(references, fix, "lat_deg", "lon_deg")
+    pieces, sources = Pieces(draft.log), [*references.values()]
+    fields = [(source.topic, source.paths[0]) for source in sources]
+    draft.samples |= pieces.read(f for f in fields if f not in draft.samples)
+    its = draft.given.get(twist.name, {})
+    x, y = (draft.samples.get((twist.name, its[n].paths[0])) if n in its else None for n in ("vx_m_s", "vy_m_s"))
+    if x is None or y is None:
+        return ""
+    anchors = anchors_of(draft.log, sources, draft.samples)
+    rate = anchors.pop("yaw_rate_rad_s", None)
+    steps = path_velocity(pieces, [*anchors.values()])
+    return navigation.axes_of(pieces, x.cells, y.cells, steps, None if rate is None else rate.si)
 
 
 def _device(topic: str) -> str:
@@ -389,9 +395,7 @@ def _device(topic: str) -> str:
 
 def _is_well_known(topic: TopicInfo) -> bool:
     """Return whether a topic was mapped by its type already."""
-    tables = (TWIST_FIELDS, _FIELDS["pose"], _FIELDS["speed"], _FIELDS["several_positions"])
-    kind = type_of(topic)
-    return kind in IMU_TYPES | FIX_TYPES or any(kind in table for table in tables)
+    return type_of(topic) in (*SOURCES, *_TYPES["several_positions"])
 
 
 def _role(topic: TopicInfo) -> Role:
@@ -412,14 +416,13 @@ def _map_yaw_rate_of_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
     """Without a sensor, take the yaw rate from an odometry of the vehicle or a velocity report, with a note."""
     if "yaw_rate_rad_s" in draft.signals:
         return
-    twists = [t for t in topics if type_of(t) in TWIST_FIELDS and _named(t, "vehicle") and not is_command(t.name)]
+    twists = [t for t in topics if draft.has(t, "vx_m_s") and _named(t, "vehicle") and not is_command(t.name)]
     odometries = [t for t in twists if not (_is_truth(t) or _named(t, "estimate"))]
-    paths = {t: _twist(t, "angular", "z") for t in odometries}
-    paths |= {t: "heading_rate" for t in topics if type_of(t) in _FIELDS["speed"]}
-    turning = [t for t, path in paths.items() if _span(draft.values(t.name, path)) > 0.0]
+    reports = [t for t in topics if draft.has(t, "speed_m_s")]
+    turning = [t for t in (*odometries, *reports) if draft.span(t, "yaw_rate_rad_s") > 0.0]
     chosen = draft.choose("yaw rate", turning, lambda _: (), "the first of its kind")
     if chosen is not None:
-        draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, paths[chosen])
+        draft.take(draft.signals, chosen, "yaw_rate_rad_s")
         draft.notes.append(f"yaw_rate_rad_s comes from the twist {chosen.name}, as no IMU gives it")
 
 
@@ -452,15 +455,11 @@ def type_of(topic: TopicInfo) -> str:
     return plain_type(topic.type_name)
 
 
-def _twist(topic: TopicInfo, part: str, axis: str) -> str:
-    return f"{TWIST_FIELDS[type_of(topic)].format(part)}.{axis}"
-
-
 def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
     """Return whether a topic has the fields of its type; the name of the type alone is no proof."""
-    needed, either = (_FIELDS[which].get(type_of(topic), "").split() for which in ("needed", "either"))
-    fields = log.fields(topic.name) if needed or either else ()
-    return all(has_path(fields, p) for p in needed) and (not either or any(has_path(fields, p) for p in either))
+    needed = _TYPES["fields"].get(type_of(topic), ())
+    fields = log.fields(topic.name) if needed else ()
+    return all(any(has_path(fields, path) for path in either.split()) for either in needed)
 
 
 def _named(topic: TopicInfo, kind: str) -> bool:
@@ -472,15 +471,26 @@ def _is_truth(topic: TopicInfo) -> bool:
     return _named(topic, "truth") or _named(topic, "navigation")
 
 
-def _pose(topic: TopicInfo, part: str) -> str:
-    return f"{_FIELDS['pose'][type_of(topic)]}.{part}".removeprefix(".")
+def _probe(draft: _Draft, topics: list[TopicInfo]) -> None:
+    """Read pieces of the fields of well-known types, and find the quantities that they give.
 
-
-def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen]:
-    """Read pieces of the fields of well-known types that may contain constant fillers."""
-    probed = {t.name: _FIELDS["probed"].get(type_of(t), "").split() for t in topics}
-    fields = {name: log.fields(name) for name, paths in probed.items() if paths}
-    return Pieces(log).read((n, p) for n, paths in probed.items() for p in paths if has_path(fields[n], p))
+    A quantity without a number, or with a covariance of -1 (REP 145), is not given.
+    """
+    fields = {t: draft.log.fields(t.name) for t in topics if type_of(t) in SOURCES}
+    paths = {t: [p for s in SOURCES[type_of(t)].values() for p in s.paths] for t in fields}
+    paths = {t: [*its, *COVARIANCES.get(type_of(t), {})] for t, its in paths.items()}
+    draft.samples = Pieces(draft.log).read((t.name, p) for t in paths for p in paths[t] if has_path(fields[t], p))
+    for topic, its in fields.items():
+        seen = {path: s.values for (name, path), s in draft.samples.items() if name == topic.name}
+        absent = {p for p in paths[topic] if not has_path(its, p) or not np.isfinite(seen.get(p, np.zeros(1))).any()}
+        sources = {n: s for n, s in SOURCES[type_of(topic)].items() if absent.isdisjoint(s.paths)}
+        for path, names in COVARIANCES.get(type_of(topic), {}).items():
+            if path in seen and bool((seen[path] == -1.0).all()) and sources.keys() & set(names):
+                draft.notes.append(f"{topic.name} provides no {_WHAT[names[0]]} (covariance -1)")
+                sources = {n: s for n, s in sources.items() if n not in names}
+        draft.given[topic.name] = {
+            n: replace(s, topic=topic.name, stamp=stamp_path_of(its)) for n, s in sources.items()
+        }
 
 
 # ------------------------------------------------------------------------------------------------ sensors
@@ -491,44 +501,32 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
     in_g = in_deg = False
     why = "an IMU of the vehicle is preferred to one of a camera or lidar"
     # Drivers with a message for each sensor leave the vectors of the other one at zero.
-    forces = [t for t in imus if any(_span(draft.values(t.name, path)) > 0.0 for path in _GRAVITY_PATHS)]
+    forces = [t for t in imus if any(draft.span(t, name) > 0.0 for name in _FORCES)]
     imu = draft.choose("imu", forces or imus, lambda t: (_named(t, "device"),), why)
     if imu is None:
         return
-    gyros = [t for t in imus if _span(draft.values(t.name, "angular_velocity.z")) > 0.0]
-    gyro = imu if imu in gyros else next(iter(gyros), imu)
-    if draft.is_disowned(imu.name, "linear_acceleration_covariance[0]"):
-        draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
-    else:
-        means = [_mean(draft.values(imu.name, path)) for path in _GRAVITY_PATHS]
-        in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
-        if in_g:
-            fast = np.abs(draft.values(gyro.name, "angular_velocity.z"))
-            in_deg = bool(np.isfinite(fast).any()) and float(np.nanquantile(fast, 0.995)) > MOST["rate"]
-            also = ", its rates in deg/s, as no car turns so fast in rad/s" if in_deg else ""
-            reason = f"its accelerations are in g, as gravity is 1{also}; its type's unit is m/s²"
-            draft.doubt("imu", (imu.name,), imu.name, reason)
-        for name, path in zip(("ax_m_s2", "ay_m_s2"), _GRAVITY_PATHS, strict=False):
-            if draft.is_given(imu.name, path):
-                draft.take(draft.signals, name, imu.name, path, G_M_S2 if in_g else 1.0)
-    _map_rates(draft, gyro, float(np.radians(1.0)) if in_deg else 1.0)
-
-
-def _map_rates(draft: _Draft, gyro: TopicInfo, scale: float) -> None:
-    if draft.is_disowned(gyro.name, "angular_velocity_covariance[0]"):
-        draft.notes.append(f"{gyro.name} provides no angular rate (covariance -1)")
-    elif draft.is_given(gyro.name, "angular_velocity.z"):
-        draft.take(draft.signals, "yaw_rate_rad_s", gyro.name, "angular_velocity.z", scale)
-        for name, axis in (("roll_rate_rad_s", "x"), ("pitch_rate_rad_s", "y")):
-            if _span(draft.values(gyro.name, f"angular_velocity.{axis}")) > 0.0:  # fillers are constant
-                draft.take(draft.signals, name, gyro.name, f"angular_velocity.{axis}", scale)
+    gyro = next((t for t in (imu, *imus) if draft.span(t, "yaw_rate_rad_s") > 0.0), imu)
+    if draft.has(imu, *_FORCES):
+        means = [_mean(draft.values(imu, name)) for name in _FORCES]
+        is_level = np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
+        in_g = bool(is_level and abs(abs(means[2]) - 1.0) < EVIDENCE["gravity"]["in_g"])
+    if in_g:
+        fast = np.abs(draft.values(gyro, "yaw_rate_rad_s"))
+        in_deg = fast.shape[0] > 0 and float(np.quantile(fast, 0.995)) > MOST["rate"]
+        also = ", its rates in deg/s, as no car turns so fast in rad/s" if in_deg else ""
+        reason = f"its accelerations are in g, as gravity is 1{also}; its type's unit is m/s²"
+        draft.doubt("imu", (imu.name,), imu.name, reason)
+    draft.take(draft.signals, imu, *_FORCES[:2], scale=G_M_S2 if in_g else 1.0)
+    yaw, *others = _RATES
+    turns = [yaw, *(name for name in others if draft.span(gyro, name) > 0.0)]  # fillers are constant
+    draft.take(draft.signals, gyro, *turns, scale=float(np.radians(1.0)) if in_deg else 1.0)
 
 
 def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
-    reports = [t for t in topics if type_of(t) in _FIELDS["speed"] and not is_command(t.name)]
+    reports = [t for t in topics if draft.has(t, "speed_m_s") and not is_command(t.name)]
     twists = []
     for topic in topics:
-        if type_of(topic) not in TWIST_FIELDS or _is_truth(topic) or is_command(topic.name):
+        if not draft.has(topic, "vx_m_s") or _is_truth(topic) or is_command(topic.name):
             continue
         words = set(words_of(topic.name))
         is_body = type_of(topic) in BODY_TWIST_TYPES or _axes(draft, topic, topics) in ("", "body")
@@ -536,16 +534,15 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
             twists.append(topic)
             continue
         if not is_body:
-            continue  # a velocity over ground: _map_twist
+            continue  # a velocity over ground: _twist_over_ground
         draft.doubt("speed", (topic.name,), None, "its name suggests neither a speed sensor nor ground truth")
     why = "a velocity report is preferred to an odometry or a twist"
-    chosen = draft.choose("speed", [*reports, *twists], lambda t: (type_of(t) not in _FIELDS["speed"],), why)
+    chosen = draft.choose("speed", [*reports, *twists], lambda t: (t not in reports,), why)
     if chosen is None:
         return
-    kind = type_of(chosen)
-    path = _FIELDS["speed"][kind] if kind in _FIELDS["speed"] else _twist(chosen, "linear", "x")
-    draft.take(draft.signals, "speed_m_s", chosen.name, path)
-    if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
+    its = draft.given[chosen.name]
+    draft.signals["speed_m_s"] = replace(its.get("speed_m_s") or its["vx_m_s"], name="speed_m_s")
+    if draft.span(chosen, "vy_m_s") > 0.0:
         why = "its name does not suggest ground truth"
         draft.notes.append(f"{chosen.name} contains a lateral velocity, which is not used: {why}")
 
@@ -558,12 +555,13 @@ def _truth_group(topic: TopicInfo) -> str:
 
 
 def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
-    types = set(TWIST_FIELDS) | set(_FIELDS["pose"]) | FIX_TYPES
-    candidates = [t for t in topics if type_of(t) in types and (_is_truth(t) or type_of(t) in FIX_TYPES)]
-    if not any(type_of(t) in TWIST_FIELDS for t in candidates):
+    quantities = {t: SOURCES.get(type_of(t), {}).keys() for t in topics}
+    places = [t for t in topics if {"vx_m_s", "x_m", "lat_deg"} & quantities[t]]
+    candidates = [t for t in places if _is_truth(t) or type_of(t) in FIX_TYPES]
+    if not any("vx_m_s" in quantities[t] for t in candidates):
         odometry = [t for t in topics if type_of(t) in BODY_TWIST_TYPES and _named(t, "simulators")]
         # An odometry from wheels has no lateral velocity.
-        simulated = [t for t in odometry if _span(draft.values(t.name, _twist(t, "linear", "y"))) > 0.0]
+        simulated = [t for t in odometry if draft.span(t, "vy_m_s") > 0.0]
         candidates += [t for t in simulated if t not in candidates]
         draft.notes += [f"{t.name} is used as ground truth: a simulator's odometry with v_y" for t in simulated]
     groups = {_truth_group(t) for t in candidates}
@@ -573,21 +571,21 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
         draft.notes.append(f"{prefer} ground truth used; {', '.join(left)} not used")
         candidates = kept
     for topic in topics:
-        if _is_truth(topic) and type_of(topic) in _FIELDS["several_positions"]:
-            draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][type_of(topic)])
+        if _is_truth(topic) and type_of(topic) in _TYPES["several_positions"]:
+            draft.doubt("ground-truth position", (topic.name,), None, _TYPES["several_positions"][type_of(topic)])
     velocity = _map_truth_velocity(draft, candidates)
     _map_truth_position(draft, candidates, velocity)
 
 
 def _map_truth_friction(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
     for topic in topics:
-        path = _FIELDS["friction"].get(type_of(topic), "")
-        if path and _truth_group(topic) == prefer and draft.is_given(topic.name, path):
-            draft.take(draft.truth, "friction", topic.name, path)
+        path = _TYPES["friction"].get(type_of(topic), "")
+        if path and _truth_group(topic) == prefer and has_path(fields := draft.log.fields(topic.name), path):
+            draft.truth["friction"] = SignalSource("friction", topic.name, path, stamp_path_of(fields))
 
 
 def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:
-    twists = [t for t in candidates if type_of(t) in TWIST_FIELDS and _has_twist(draft, t)]
+    twists = [t for t in candidates if _has_twist(draft, t)]
     why = "topics named as ground truth first, then topics with a pose"
     chosen = draft.choose(
         "ground-truth velocity", twists, lambda t: (not _named(t, "truth"), not _has_pose(draft, t)), why
@@ -601,14 +599,12 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     if axes == "not ahead":
         why = "the type's convention is the body frame, although x is mostly not the direction of travel"
         draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
-    imus = [t.name for t in draft.log.topics if type_of(t) in IMU_TYPES and _device(t.name) == _device(chosen.name)]
-    down = any(_mean(draft.values(imu, _GRAVITY_PATHS[2])) < -0.5 for imu in imus)  # m/s² or g
-    for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
-        full = _twist(chosen, part, axis)
-        values = draft.values(chosen.name, full)
-        filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
-        if draft.is_given(chosen.name, full) and not filler:
-            draft.take(draft.truth, name, chosen.name, full, -1.0 if down and axis != "x" else 1.0)
+    imus = [t for t in draft.log.topics if type_of(t) in IMU_TYPES and _device(t.name) == _device(chosen.name)]
+    down = any(_mean(draft.values(imu, "az_m_s2")) < -0.5 for imu in imus)  # m/s² or g
+    rates = draft.values(chosen, "yaw_rate_rad_s")
+    is_filler = rates.shape[0] > 0 and not rates.any()
+    draft.take(draft.truth, chosen, "vx_m_s")
+    draft.take(draft.truth, chosen, "vy_m_s", *_RATES[: not is_filler], scale=-1.0 if down else 1.0)
     if down:
         draft.doubt("ground-truth velocity", (chosen.name,), chosen.name, "z of its IMU is downward, as gravity shows")
     return chosen
@@ -620,64 +616,45 @@ def _take_earth_velocity(draft: _Draft, chosen: TopicInfo, axes: str, *, is_body
     is_down = axes == "north, east"
     earth = "north, east, down" if is_down else "east, north, up"
     readings = (f"{chosen.name} as body velocity", f"{chosen.name} as {earth}")
-    up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
-    if not axes or (not is_body and not np.isfinite(up).any()):
+    if not axes or not (is_body or draft.values(chosen, "vz_m_s").shape[0]):
         draft.doubt("ground-truth velocity frame", readings, None, "too little motion to identify the frame")
         return None
     why = "x is not the direction of travel" if axes == "not ahead" else "it has the direction of its path"
     draft.doubt("ground-truth velocity frame", readings, readings[1], why)
-    paths = tuple(_twist(chosen, "linear", a) for a in ("yxz" if is_down else "xyz"))
+    its = SOURCES[type_of(chosen)]
+    paths = tuple(its[f"v{axis}_m_s"].paths[0] for axis in ("yxz" if is_down else "xyz"))
     scale = (1.0, 1.0, -1.0) if is_down else 1.0
-    name, stamp = "enu_velocity_m_s", draft.stamp(chosen.name)
-    draft.truth[name] = SignalSource(name, chosen.name, paths, stamp, scale)
-    rates = draft.values(chosen.name, _twist(chosen, "angular", "z"))
-    if is_body and _span(rates) > 0.0:
-        draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
+    stamp = draft.given[chosen.name]["vx_m_s"].stamp
+    draft.truth["enu_velocity_m_s"] = SignalSource("enu_velocity_m_s", chosen.name, paths, stamp, scale)
+    if is_body and draft.span(chosen, "yaw_rate_rad_s") > 0.0:
+        draft.take(draft.truth, chosen, "yaw_rate_rad_s")
     return chosen
 
 
 def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:
-    forward, left = _twist(topic, "linear", "x"), _twist(topic, "linear", "y")
-    if draft.is_disowned(topic.name, TWIST_COVARIANCES.get(type_of(topic), "")):
+    if not draft.has(topic, "vx_m_s", "vy_m_s"):
         return False
-    if not (draft.is_given(topic.name, forward) and draft.is_given(topic.name, left)):
-        return False
-    v = np.concatenate([draft.values(topic.name, forward), draft.values(topic.name, left)])
-    if v.shape[0] and (v == 0.0).all() and type_of(topic) in _FIELDS["pose"]:
-        # Converters from fixes to odometry leave the twist at zero while the pose changes.
-        return all(_span(draft.values(topic.name, _pose(topic, f"position.{a}"))) <= 1.0 for a in "xy")
-    return True
+    v = np.concatenate([draft.values(topic, name) for name in ("vx_m_s", "vy_m_s")])
+    # Converters from fixes to odometry leave the twist at zero while the pose changes.
+    is_filler = v.shape[0] > 0 and not v.any()
+    return not (is_filler and any(draft.span(topic, name) > 1.0 for name in ("x_m", "y_m")))
 
 
 def _mean(values: FloatArray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.mean(finite)) if finite.shape[0] else 0.0
-
-
-def _span(values: FloatArray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.ptp(finite)) if finite.shape[0] else 0.0
+    return float(np.mean(values)) if values.shape[0] else 0.0
 
 
 def _has_pose(draft: _Draft, topic: TopicInfo) -> bool:
-    kind = type_of(topic)
-    if kind not in _FIELDS["pose"] or draft.is_disowned(topic.name, _FIELDS["pose_covariance"].get(kind, "")):
-        return False
-    paths = [_pose(topic, f"position.{a}") for a in "xy"]
     # A pose that stays at the origin is a filler.
-    xy = np.concatenate([draft.values(topic.name, path) for path in paths])
-    return all(draft.is_given(topic.name, path) for path in paths) and (xy.shape[0] == 0 or bool((xy != 0.0).any()))
-
-
-def _has_fix(draft: _Draft, topic: TopicInfo) -> bool:
-    return type_of(topic) in FIX_TYPES and all(draft.is_given(topic.name, p) for p in ("latitude", "longitude"))
+    xy = np.concatenate([draft.values(topic, name) for name in ("x_m", "y_m")])
+    return draft.has(topic, "x_m", "y_m") and (xy.shape[0] == 0 or bool(xy.any()))
 
 
 def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: TopicInfo | None) -> None:
     if velocity is not None and _has_pose(draft, velocity):
         chosen: TopicInfo | None = velocity
     else:
-        positions = [t for t in candidates if _has_pose(draft, t) or _has_fix(draft, t)]
+        positions = [t for t in candidates if _has_pose(draft, t) or draft.has(t, "lat_deg", "lon_deg")]
         why = "topics named as ground truth first, then poses before satellite fixes"
         chosen = draft.choose(
             "ground-truth position", positions, lambda t: (not _named(t, "truth"), type_of(t) in FIX_TYPES), why
@@ -687,37 +664,28 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
     if type_of(chosen) in FIX_TYPES:
         _map_fix(draft, chosen, alone=velocity is None)
         return
-    for name, axis in (("x_m", "x"), ("y_m", "y")):
-        draft.take(draft.truth, name, chosen.name, _pose(chosen, f"position.{axis}"))
-    paths = tuple(_pose(chosen, f"orientation.{a}") for a in "wxyz")
-    if not all(draft.is_given(chosen.name, path) for path in paths):  # the log's own definition decides
-        return
-    norms = np.linalg.norm(np.stack([draft.values(chosen.name, path) for path in paths]), axis=0)
-    if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < 0.01)):
-        draft.truth["quat_wxyz"] = SignalSource("quat_wxyz", chosen.name, paths, draft.stamp(chosen.name))
+    draft.take(draft.truth, chosen, "x_m", "y_m")
+    parts = [draft.values(chosen, "quat_wxyz", column) for column in range(4)] if draft.has(chosen, "quat_wxyz") else []
+    norms = np.linalg.norm(np.stack(parts), axis=0) if parts else np.zeros(1)  # the log's own definition decides
+    if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < NEAR_UNIT)):
+        draft.take(draft.truth, chosen, "quat_wxyz")
 
 
 def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
-    for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude"), ("alt_m", "altitude")):
-        if draft.is_given(fix.name, path):
-            draft.take(draft.truth, name, fix.name, path)
-    # Angles of Foxglove's fixes are clockwise from north; angles of vehicles are counter-clockwise from east.
-    angles = {p: draft.values(fix.name, p) for p in ("heading", "course")}
-    given = {p for p, values in angles.items() if np.isfinite(values).any()}
-    if given == {"heading", "course"} and np.array_equal(angles["heading"], angles["course"], equal_nan=True):
-        given.remove("heading")
+    draft.take(draft.truth, fix, "lat_deg", "lon_deg", "alt_m", "course_rad")
+    heading, course = (draft.values(fix, name) for name in ("yaw_rad", "course_rad"))
+    if heading.shape[0] and np.array_equal(heading, course):
         draft.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it gives no sideslip")
-    for name, path in (("yaw_rad", "heading"), ("course_rad", "course")):
-        if path in given:
-            draft.take(draft.truth, name, fix.name, path, -1.0, np.pi / 2.0)
-    if "heading" in given:
+    elif draft.has(fix, "yaw_rad"):
+        draft.take(draft.truth, fix, "yaw_rad")
         draft.notes.append(
             f"ground-truth yaw comes from {fix.name}.heading: it is one only with two antennas or an INS"
         )
-    status = draft.values(fix.name, "status.status")
+    status = draft.values(fix, "truth_quality")
     if not alone or status.shape[0] == 0:
         return
     # 0 is any fix; 2 is a ground-based augmented fix, which receivers report for RTK.
     lowest = 2.0 if "rtk" in words_of(fix.name) and bool((status == 2.0).any()) else 0.0
-    draft.quality = QualityGate(fix.name, "status.status", min=lowest, stamp=draft.stamp(fix.name))
-    draft.notes.append(f"ground truth is used where {fix.name}.status.status is at least {lowest:g}")
+    gate = draft.given[fix.name]["truth_quality"]
+    draft.quality = QualityGate(fix.name, gate.paths[0], min=lowest, stamp=gate.stamp)
+    draft.notes.append(f"ground truth is used where {gate.label} is at least {lowest:g}")

@@ -210,9 +210,7 @@ class Mapping:
 
     def changed(self, change: Callable[[SignalSource], SignalSource]) -> Mapping:
         """Return the mapping with the result of ``change`` for each source of a signal or of ground truth."""
-        sections = (self.signals, self.truth)
-        signals, truth = ({name: change(source) for name, source in section.items()} for section in sections)
-        return replace(self, signals=signals, truth=truth)
+        return self.with_sources({name: change(source) for name, source in self.by_subject.items()})
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, ground truth, the gate."""

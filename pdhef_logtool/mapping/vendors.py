@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -78,33 +78,12 @@ class _ReceiverTable(_Entry):
 _Table = TypeVar("_Table", _TypeTable, _ReceiverTable)
 
 
-@dataclass(frozen=True, slots=True)
-class VendorField:
-    """A documented field: ``value_SI = scale * raw + offset``.
-
-    Attributes
-    ----------
-    section, name : ``signals`` or ``truth``, and the quantity there.
-    unit : unit of the raw value, for reports. page : address of the documentation.
-    """
-
-    section: Literal["signals", "truth"]
-    name: str
-    scale: float
-    offset: float
-    unit: str
-    page: str
-
-    @property
-    def meaning(self) -> Meaning:
-        """The equivalent meaning of a name."""
-        return replace(meaning_of_signal(self.name), unit=self.unit, scale=abs(self.scale))
-
-
-def meaning_of_signal(name: str) -> Meaning:
-    """Return the meaning of a signal or ground-truth quantity."""
-    quantity, part = _QUANTITIES.get(name, ("", ""))
-    return Meaning(quantity, part, 1.0, "", 1.0, "its type is documented")
+def meaning_of_source(source: SignalSource) -> Meaning:
+    """Return the meaning of a source of one field; its unit is for reports."""
+    quantity, part = _QUANTITIES.get(source.name, ("", ""))
+    scale = source.scale if isinstance(source.scale, float) else 1.0
+    unit = (SIGNAL_UNITS | TRUTH_UNITS).get(source.name, "") + ("" if scale == 1.0 else f" / {scale:.6g}")
+    return Meaning(quantity, part, 1.0, unit, abs(scale), "its type is documented")
 
 
 def names_of(quantity: str, part: str, among: Iterable[str] = SIGNAL_UNITS) -> tuple[str, ...]:
@@ -115,24 +94,31 @@ def names_of(quantity: str, part: str, among: Iterable[str] = SIGNAL_UNITS) -> t
 
 @dataclass(frozen=True, slots=True)
 class VendorType:
-    """A documented type: its fields by path, and vectors of ground truth, with an empty topic.
+    """A documented type: its sources of signals and of ground truth, with an empty topic.
 
     Attributes
     ----------
+    page : address of the documentation.
     left_out : why no field is used; empty if fields are used.
     has : fields that identify a recorder's export, which has no type name; it may contain other channels. Of a
         receiver's message, at any depth. without : fields of an attitude, by which a message is ground truth.
     """
 
-    fields: Mapping[str, VendorField] = field(default_factory=dict)
-    vectors: tuple[SignalSource, ...] = ()
+    signals: tuple[SignalSource, ...] = ()
+    truth: tuple[SignalSource, ...] = ()
+    page: str = ""
     left_out: str = ""
     has: frozenset[str] = frozenset()
     without: frozenset[str] = frozenset()
 
-    def entries(self, path: str) -> dict[str, VendorField]:
-        """Return the entry of a field, or of the elements of an array of unknown length, by path."""
-        return {p: e for p, e in self.fields.items() if p in (path, path.replace("[]", p[len(path) - 2 :]))}
+    @property
+    def fields(self) -> dict[str, SignalSource]:
+        """Sources of one field by path."""
+        return {s.field: s for s in (*self.signals, *self.truth) if isinstance(s.field, str)}
+
+    def entries(self, path: str) -> dict[str, SignalSource]:
+        """Return the source of a field, or of the elements of an array of unknown length, by path."""
+        return {p: s for p, s in self.fields.items() if p in (path, path.replace("[]", p[len(path) - 2 :]))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,12 +173,11 @@ def _read(path: Path) -> Vendors:
     ]
     types: dict[str, VendorType] = {}
     for model in _tables(raw, "types", _TypeTable, problems):
-        fields = _single_fields(model.fields, f"{model.page}, read {model.read}")
-        several = tuple(_vector(f) for f in model.fields if isinstance(f.field, list))
-        kind = VendorType(fields, several, model.leave_out, frozenset(model.has))
+        page = f"{model.page}, read {model.read}"
+        kind = VendorType(*_sources(model.fields), page, model.leave_out, frozenset(model.has))
         types |= {plain_type(name): kind for name in model.type}
     receivers = tuple(
-        VendorType(_single_fields(m.fields, m.page), has=frozenset(m.has), without=frozenset(m.without))
+        VendorType(*_sources(m.fields), m.page, has=frozenset(m.has), without=frozenset(m.without))
         for m in _tables(raw, "receivers", _ReceiverTable, problems)
     )
     if problems:
@@ -209,19 +194,13 @@ def _tables(raw: Mapping[str, Any], key: str, kind: type[_Table], problems: list
             yield model
 
 
-def _single_fields(tables: Iterable[_FieldTable], page: str) -> dict[str, VendorField]:
-    """Return the fields of one column by path."""
-    single = ((f.field, f.scale, f) for f in tables)
-    return {p: _field(f, x, page) for p, x, f in single if isinstance(p, str) and isinstance(x, float)}
-
-
-def _field(table: _FieldTable, scale: float, page: str) -> VendorField:
-    name = table.signal or table.truth
-    unit = (SIGNAL_UNITS | TRUTH_UNITS)[name]
-    text = unit if scale == 1.0 else f"{unit} / {scale:.6g}"
-    return VendorField("signals" if table.signal else "truth", name, scale, table.offset, text, page)
-
-
-def _vector(table: _FieldTable) -> SignalSource:
-    scale = tuple(table.scale) if isinstance(table.scale, list) else table.scale
-    return SignalSource(table.truth, "", tuple(table.field), scale=scale, offset=table.offset)
+def _sources(tables: Iterable[_FieldTable]) -> tuple[tuple[SignalSource, ...], tuple[SignalSource, ...]]:
+    """Return the sources of signals and of ground truth."""
+    signals: list[SignalSource] = []
+    truth: list[SignalSource] = []
+    for table in tables:
+        path = tuple(table.field) if isinstance(table.field, list) else table.field
+        scale = tuple(table.scale) if isinstance(table.scale, list) else table.scale
+        its = signals if table.signal else truth
+        its.append(SignalSource(table.signal or table.truth, "", path, scale=scale, offset=table.offset))
+    return tuple(signals), tuple(truth)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -16,21 +17,18 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import (
     CONSTANT,
     HYPOTHESES,
-    LEAST_SCORE,
     Candidate,
     Field,
     Role,
-    anchor_of,
     look,
     named_fields,
     place_of,
-    proposed_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, Pieces, correlation, fit, ratio
+from pdhef_logtool.mapping.evidence import EVIDENCE, LOG_ODDS, Fit, Pieces, fit, ratio
 from pdhef_logtool.mapping.fields import (
     BY_DRIVING,
-    CLEAR,
+    PLACES,
     SLOW_M_S,
     USUAL_LENGTH_M,
     Fields,
@@ -44,6 +42,7 @@ from pdhef_logtool.mapping.fields import (
 )
 from pdhef_logtool.mapping.naming import tags_of, words_of
 from pdhef_logtool.mapping.navigation import axes_of, has_heading, turns
+from pdhef_logtool.mapping.proposals import proposed_fields
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
@@ -56,26 +55,18 @@ _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
 _OF_BODY = frozenset({"twist", "linear", "body", "vessel"})
 #: Signals of a single field, in the order of their selection.
 _SENSORS = ("speed_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
-#: Correlation with speeding up below which an acceleration is along another axis.
-FOLLOWS = 0.5
-#: Speed over that over ground below which it is vertical.
-VERTICAL = 0.2
+_RELATIONS, _UNITS = EVIDENCE["relations"], EVIDENCE["units"]
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
-_STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
-#: Signals that may have an unknown sign; largest log ratio between the length of a steering angle and a usual length if
-#: the signal could also be a share of the largest angle.
+_STEERING_M: dict[str, tuple[float, float]] = _RELATIONS["wheelbases_m"]
+#: Signals that may have an unknown sign.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
-USUAL = 0.6
 #: Units of wheel speeds, which are mostly named as speeds.
-#: Usual radius of a wheel, and 1-sigma of the logarithm of a radius that a car assumes for its wheel speeds.
-USUAL_RADIUS_M, WHEEL_RADIUS = 0.3, 0.015
+_RADIUS_M: float = _RELATIONS["radius_m"]
 WHEEL_UNITS = (
     *(Unit(*u, "wheel speed") for u in HYPOTHESES["wheel speed"]),
-    *(Unit(n, f * USUAL_RADIUS_M, "wheel rate", 0.4) for n, f in HYPOTHESES["wheel rate"]),
+    *(Unit(n, f * _RADIUS_M, "wheel rate", _RELATIONS["radius"]) for n, f in HYPOTHESES["wheel rate"]),
 )
-#: Probability of a unit over the highest one from which the unit is a doubt: of wheels, and of a steering angle.
-POSSIBLE, LIKELY = 0.05, 0.25
 
 
 def weigh(
@@ -96,22 +87,22 @@ def weigh(
         return Weighing(Fields(Pieces(log), {}, [], []))
     named = named_fields(log, topics, vendors)
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
-    pieces, weighable = look(log, named, vendors, [*signals.values(), *true])
-    anchors = {n: f for n in signals if (f := anchor_of(n, weighable)) is not None}
-    meant = [*anchors.values(), *(f for f in weighable if not f.anchor)]
-    weighable += proposed_fields(log, pieces, topics, named, meant)
-    places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
-    fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
+    pieces, candidates, anchors = look(log, named, vendors, [*signals.values(), *true])
+    places = [f for f in (*candidates, *anchors.values()) if f.meaning.quantity in PLACES]
+    fields = Fields(pieces, {n: f for n, f in anchors.items() if n in signals}, candidates, places)
+    fields.candidates += proposed_fields(log, topics, named, fields)
     decide_units(fields)
-    weighing = Weighing(fields, anchor_of("vx_m_s", weighable))
+    weighing = Weighing(fields, anchors.get("vx_m_s"))
     weighing.drop_vectors_over_ground()
     weighing.drop_vertical_speeds()
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing.truth_from = truth_topic(may_be_true)
     its = [f for f in may_be_true if f.topic.name == weighing.truth_from and _truth_name(f) in _SLIP and f.seen.changes]
-    weighing.slip = min(its, key=lambda f: (f.role != "truth", f.role != "navigation", -f.score), default=None)
+    weighing.slip = min(its, key=lambda f: (f.role != "truth", f.role != "navigation", -f.log_odds), default=None)
     weighing.choose_signals(set(signals))
-    weighing.choose_truth()
+    weighing.taken |= weighing.choose_truth()
+    for name, item in weighing.taken.items():
+        weighing.tell(name, item)
     return weighing
 
 
@@ -122,7 +113,7 @@ class Weighing:
     Attributes
     ----------
     true_speed : of mapped ground truth. truth_from, slip : topic of other ground truth, and its lateral velocity.
-    taken, true : selected fields by signal and by ground-truth quantity.
+    taken : selected fields by signal, and by ``truth.NAME``.
     rivals : fields of a signal with nearly the same score. checks : undecided points.
     """
 
@@ -131,7 +122,6 @@ class Weighing:
     truth_from: str = ""
     slip: Field | None = None
     taken: dict[str, Field] = field(default_factory=dict)
-    true: dict[str, Field] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rivals: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
     checks: list[Check] = field(default_factory=list)
@@ -145,15 +135,13 @@ class Weighing:
         for name in _SENSORS:
             if name not in have and not (wheels and name == "speed_m_s"):
                 fields = (f for f in usable if name in names_of(f.meaning.quantity, f.meaning.part))
-                self._choose([(f.score, name, f) for f in fields])
+                self._choose([(f.log_odds, name, f) for f in fields])
         self._turn_level()
         if not wheels:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
             self._steer_by_command()
-        for name, item in self.taken.items():
-            self._tell(name, item)
 
     def _usable(self) -> list[Field]:
         """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
@@ -165,7 +153,7 @@ class Weighing:
         # Sensors of the ground truth's instrument rank below others.
         kinships = [(f.meaning.quantity, f.meaning.part, self._kinship(f)) for f in usable]
         for item, (*meant, kinship) in zip(usable, kinships, strict=True):
-            item.bonus -= 0.2 * any(meant == other and kinship > less for *other, less in kinships)
+            item.evidence += ["instrument"] * any(meant == other and kinship > less for *other, less in kinships)
         return usable
 
     def _kinship(self, item: Field) -> int:
@@ -197,7 +185,7 @@ class Weighing:
     def drop_vertical_speeds(self) -> None:
         """Leave out speeds that are small against the velocity over ground of their message."""
         for side in (*self.fields.open("over ground"), *self.taken.values()):
-            least = VERTICAL * abs(side.seen.largest * side.scale)
+            least = EVIDENCE["ground"]["vertical"] * abs(side.seen.largest * side.scale)
             speeds = [f for f in self.fields.open("speed") if f.topic is side.topic and not f.fixed]
             for item in [f for f in speeds if abs(f.seen.largest * f.scale) < least]:
                 self.fields.candidates.remove(item)
@@ -231,11 +219,11 @@ class Weighing:
             is_other = (f.role == "navigation", f.meaning.part, f.seen.is_off_centre)
             return -score, *is_other, -f.topic.messages, f.topic.name, f.path
 
-        good = sorted((j for j in judged if j[0] >= LEAST_SCORE), key=rank)
+        good = sorted((j for j in judged if j[0] >= 0.0), key=rank)
         if not good:
             return
         score, name, best = good[0]
-        near = [f for s, n, f in good[1:] if s > score - 0.1 and n == name and not agree(best.si, f.si)]
+        near = [f for s, n, f in good[1:] if s > score - LOG_ODDS["rival"] and n == name and not agree(best.si, f.si)]
         self._select(name, best, near)
 
     def _select(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
@@ -252,10 +240,10 @@ class Weighing:
         if ax is None or speed is None or ax.fixed or not ax.is_axis or len(across) != 1:
             return
         ay, change = across[0], pieces.rate_of(speed.si)
-        along, ahead = (correlation(pieces.smooth(f.si), change) for f in (ax, ay))
-        if abs(ahead) <= CLEAR or abs(along) >= FOLLOWS:
+        along, ahead = (fit(pieces.smooth(f.si), change) for f in (ax, ay))
+        if not ahead.is_clear or abs(along.correlation) >= EVIDENCE["gravity"]["follows"]:
             return
-        for name, item, factor in (("ax_m_s2", ay, ahead), ("ay_m_s2", ax, -ahead)):
+        for name, item, factor in (("ax_m_s2", ay, ahead.slope), ("ay_m_s2", ax, -ahead.slope)):
             item.sign, item.is_turned = item.sign * math.copysign(1.0, factor), True
             item.doubts.append("the axes of its device are turned, as its accelerations and the motion show")
             self.taken[name] = item
@@ -276,10 +264,9 @@ class Weighing:
         mean = mean_of([f.seen.cells for f in wheels])
         times, sigma, by = self._per_turning(mean), BY_DRIVING, "a_y ≈ v r"
         if speed is not None:
-            times, sigma, by = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS, "the speed"
-        times = times if times is not None and times > 0.0 else 0.0
+            times, sigma, by = ratio(mean, speed.si, SLOW_M_S), _RELATIONS["assumed_radius"], "the speed"
         units = [u for u in WHEEL_UNITS if first.meaning.quantity in ("wheel speed", u.quantity)]
-        best, *others = _likely(units, times, sigma, POSSIBLE) if times else units[:1]
+        best, *others = _likely(units, Gain((1,), times, sigma), _UNITS["wheel_doubt"]) if times else units[:1]
         reasons = [f"{times:.4g} of it is 1 m/s by {by}"] if times else []
         doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
         if not times:
@@ -287,17 +274,17 @@ class Weighing:
         elif not (doubt or speed is None or speed.unit_known):
             doubt = "the unit of the speed that they are compared with is unsure"
         for item in wheels:
-            item.factors = ((best.name, best.factor / (USUAL_RADIUS_M if best.spread else 1.0)),)
+            item.factors = ((best.name, best.factor / (_RADIUS_M if best.spread else 1.0)),)
             item.unit_known = not doubt
             item.reasons += reasons
             item.doubts += [doubt] if doubt else []
         return best.quantity
 
-    def _per_turning(self, speed: FloatArray) -> float | None:
-        """Return how much of a speed [M] in another unit is 1 m/s by a_y ≈ v r; None if the drive does not show it."""
+    def _per_turning(self, speed: FloatArray) -> float:
+        """Return how much of a speed [M] in another unit is 1 m/s by a_y ≈ v r; 0 if the drive does not show it."""
         rate, ay = self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2")
-        relation = None if rate is None or ay is None else self.fields.turning(ay.si, rate.si, speed)
-        return None if relation is None or abs(relation.correlation) < CLEAR else 1.0 / abs(relation.slope)
+        relation = Fit() if rate is None or ay is None else self.fields.turning(ay.si, rate.si, speed)
+        return 1.0 / abs(relation.slope) if relation.is_clear else 0.0
 
     # --------------------------------------------------------------------------------------------- steering
 
@@ -305,7 +292,7 @@ class Weighing:
         speed, *turning = (self._speed(), self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2"))
         # Wheel speeds are in their likeliest unit, rotational ones of usual wheels.
         spun = [f for n, f in self.taken.items() if n.startswith("wheel_speed")]
-        wheels = [f.si * (USUAL_RADIUS_M if f.meaning.quantity == "wheel rate" else 1.0) for f in spun]
+        wheels = [f.si * (_RADIUS_M if f.meaning.quantity == "wheel rate" else 1.0) for f in spun]
         pace = speed.si if speed is not None else mean_of(wheels) if wheels else None
         curvature = self.fields.curvature(pace, *(None if f is None else f.si for f in turning))
         judged: list[tuple[float, str, Field]] = []
@@ -313,9 +300,9 @@ class Weighing:
             if item.is_weak:
                 self.notes.append(f"{item.topic.name}.{item.path} is not used: {item.doubts[-1]}")
                 continue
-            relation = None if curvature is None else fit(self.fields.pieces.smooth(item.seen.cells), curvature)
+            relation = Fit() if curvature is None else fit(self.fields.pieces.smooth(item.seen.cells), curvature)
             name, follows = self._steering_kind(item, relation)
-            judged.append((item.score + 0.3 * follows, name, item))
+            judged.append((item.log_odds + LOG_ODDS["curvature"] * follows, name, item))
         self._choose(judged)
 
     def _steer_by_command(self) -> None:
@@ -325,17 +312,18 @@ class Weighing:
             self._select(measured[0], self.taken[measured[0]], [f for f in commands if f.fixed])
             return
         for item in commands:
-            item.bonus -= 0.3
+            item.evidence.append("command")
         self._steering([f for f in commands if f.seen.changes or f.fixed])
 
-    def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool]:
+    def _steering_kind(self, item: Field, relation: Fit) -> tuple[str, bool]:
         """Return the signal for a steering angle, and whether it follows the car's turning as a usual one."""
         kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
-        if relation is None or abs(relation.correlation) < CLEAR:
+        if not relation.is_clear:
             return _steering_by_range(item, kinds, relation), False
         metres = abs(relation.slope)
-        ways = [Unit(u, f / USUAL_LENGTH_M[k], k, 0.7) for k in kinds for u, f in item.units]
-        likely = _likely(ways, metres, BY_DRIVING, LIKELY, broken=1e-3)
+        ways = [Unit(u, f / USUAL_LENGTH_M[k], k, _RELATIONS["length"]) for k in kinds for u, f in item.units]
+        gain = Gain((1,), metres, BY_DRIVING, _RELATIONS["steering_broken"])
+        likely = _likely(ways, gain, _UNITS["steering_doubt"])
         name, unit = likely[0].quantity, likely[0].name
         usual = metres * likely[0].factor
         low, high = _STEERING_M[name]
@@ -344,7 +332,7 @@ class Weighing:
             return kinds[0], False
         item.use(unit)
         item.reasons.append(f"ratio to the path's curvature {length:.3g} m: {name} in {unit}")
-        if abs(math.log(usual)) < USUAL:
+        if abs(math.log(usual)) < _RELATIONS["usual"]:
             item.doubts = [d for d in item.doubts if "a share" not in d]
         if likely[1:] and not item.fixed:
             item.doubts.append(f"it could be {likely[1].quantity} in {likely[1].name} as well")
@@ -354,10 +342,10 @@ class Weighing:
     def open_signs(self) -> tuple[tuple[str, ...], ...]:
         """Return the signals with an unknown sign (documentation, name, mounting); signals of one axis as a group."""
         open_fields = {n: f for n, f in self.taken.items() if n in _SIGNED and _has_open_sign(f)}
-        open_truth = {n: f for n, f in self.true.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
-        lateral, across = open_fields.get("ay_m_s2"), open_truth.get("vy_m_s")
+        of_truth = ("truth.vy_m_s", "truth.yaw_rate_rad_s")
+        open_fields |= {n: f for n, f in self.taken.items() if n in of_truth and not f.fixed}
+        lateral, across = open_fields.get("ay_m_s2"), open_fields.get("truth.vy_m_s")
         groups: list[tuple[str, ...]] = [(n,) for n in open_fields]
-        groups += [(f"truth.{n}",) for n in open_truth]
         if lateral is not None and across is not None and _share_axis(lateral, across):
             groups = [g for g in groups if g not in (("ay_m_s2",), ("truth.vy_m_s",))]
             groups.append(("ay_m_s2", "truth.vy_m_s"))
@@ -367,28 +355,29 @@ class Weighing:
         """Return the best speed to compare other signals with, selected or not."""
         return self._chosen("speed_m_s") or self.fields.best("speed") or self.true_speed
 
-    def _chosen(self, *names: str) -> Field | None:
-        """Return the field of the first of these signals that is selected or mapped."""
-        return next((f for n in names if (f := self.taken.get(n) or self.fields.anchors.get(n)) is not None), None)
+    def _chosen(self, name: str) -> Field | None:
+        """Return the field of a signal that is selected or mapped."""
+        return self.taken.get(name) or self.fields.anchors.get(name)
 
     # ------------------------------------------------------------------------------------------------ ground truth
 
-    def choose_truth(self) -> None:
-        """Select the ground truth of the topic chosen by :func:`truth_topic`."""
+    def choose_truth(self) -> dict[str, Field]:
+        """Return the ground truth of the topic chosen by :func:`truth_topic`, by ``truth.NAME``."""
         if not self.truth_from:
-            return
+            return {}
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
         documented, named = (_truth_of(fields, self._kinship) for fields in ([f for f in its if f.fixed], its))
         # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
-        self.true = named if not documented or _SLIP & set(named) - set(documented) else documented
-        if not self.true:
-            return
-        self._head()
+        true = named if not documented or _SLIP & set(named) - set(documented) else documented
+        if not true:
+            return {}
+        if (heading := self._heading()) is not None:
+            true["yaw_rad"] = heading
         first = its[0]
-        if first.role == "sensor" and self.true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
-            self.true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
+        if first.role == "sensor" and true.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
+            true.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
         # Fields of ground truth are no inputs, except the speed of a navigation system without another speed.
-        mine = set(map(id, self.true.values()))
+        mine = set(map(id, true.values()))
         for signal in [n for n, f in self.taken.items() if id(f) in mine and n != "speed_m_s"]:
             if first.role != "navigation":
                 del self.taken[signal]
@@ -397,11 +386,10 @@ class Weighing:
             remedy = 'name it under [truth] in a mapping file, or --waive "truth.source"'
             self.checks.append(Check("truth.source", "truth", "undecided", evidence, remedy))
         self.notes.append(f"ground truth comes from {first.topic.name}, by the names of its fields")
-        for name, item in self.true.items():
-            self._tell(f"truth.{name}", item)
+        return {f"truth.{name}": item for name, item in true.items()}
 
-    def _head(self) -> None:
-        """Add the heading that turns as fast as the car.
+    def _heading(self) -> Field | None:
+        """Return the heading that turns as fast as the car, or None.
 
         Values of a full turn count clockwise from north, as a compass does; others have the sense of the yaw rate, and
         count from east if it is to the left.
@@ -414,12 +402,12 @@ class Weighing:
             if sense and rate is not None and (is_compass or not _has_open_sign(rate)):
                 item.sign = -1.0 if is_compass and not rate.fixed else sense
                 item.offset = 0.0 if item.sign > 0.0 else math.pi / 2.0
-                self.true["yaw_rad"] = item
-                return
+                return item
+        return None
 
     # ------------------------------------------------------------------------------------------------- reporting
 
-    def _tell(self, name: str, item: Field) -> None:
+    def tell(self, name: str, item: Field) -> None:
         """Add an undecided check for the doubts about a field; note a speed from the navigation system."""
         if item.role == "command":
             lacks = "actuator lag and steering play are missing"
@@ -437,21 +425,19 @@ class Weighing:
             remedy = f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"'
             self.checks.append(Check(f"{name}.candidate", name, "undecided", evidence, remedy))
 
-    @property
-    def signals(self) -> dict[str, SignalSource]:
-        """Sources of the selected signals."""
-        return {n: f.candidate(n, "signals", taken=True).source for n, f in self.taken.items()}
+    def sources(self, section: Literal["signals", "truth"]) -> dict[str, SignalSource]:
+        """Return the selected sources of a section."""
+        return {c.source.name: c.source for c in self._selected if c.section == section}
 
     @property
-    def truth(self) -> dict[str, SignalSource]:
-        """Sources of the selected ground truth."""
-        return {n: f.candidate(n, "truth", taken=True).source for n, f in self.true.items()}
+    def _selected(self) -> list[Candidate]:
+        names = ((n.removeprefix("truth."), n.startswith("truth."), f) for n, f in self.taken.items())
+        return [f.candidate(name, "truth" if is_true else "signals", taken=True) for name, is_true, f in names]
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
         """All fields that may be a signal or ground truth, the selected and the surest first."""
-        candidates = [f.candidate(n, "signals", taken=True) for n, f in self.taken.items()]
-        candidates += [f.candidate(n, "truth", taken=True) for n, f in self.true.items()]
+        candidates, is_true = self._selected, any(n.startswith("truth.") for n in self.taken)
         used = {(c.section, c.source.label) for c in candidates}
         for item in self.fields.candidates:
             for name in names_of(item.meaning.quantity, item.meaning.part)[:1]:
@@ -459,7 +445,7 @@ class Weighing:
                 if (record.section, record.source.label) not in used and (item.role != "truth"):
                     candidates.append(record)
             name = _truth_name(item)
-            if name and item.role in ("truth", "navigation") and not self.true:
+            if name and item.role in ("truth", "navigation") and not is_true:
                 candidates.append(item.candidate(name, "truth", taken=False))
         return tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score)))
 
@@ -482,7 +468,7 @@ def _truth_of(candidates: Sequence[Field], kinship: Callable[[Field], int]) -> d
     """
     truth: dict[str, Field] = {}
     along = {"lng", "long", "longitudinal", "forward"}
-    for item in sorted(candidates, key=lambda f: (-kinship(f), -f.score, along.isdisjoint(words_of(f.path)))):
+    for item in sorted(candidates, key=lambda f: (-kinship(f), -f.log_odds, along.isdisjoint(words_of(f.path)))):
         name = _truth_name(item)
         if name and item.seen.changes:
             truth.setdefault(name, item)
@@ -502,15 +488,15 @@ def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
             sets.setdefault(key, {}).setdefault(item.meaning.part, item)
     apart = {corner: f for group in sets.values() if len(group) == 1 for corner, f in group.items()}
     complete = [g for g in sets.values() if len(g) >= 2]
-    return max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
+    return max(complete, key=lambda g: (len(g), sum(f.log_odds for f in g.values())), default=apart)
 
 
-def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit | None) -> str:
+def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit) -> str:
     """Return the signal for a steering angle by the range of values, if the curvature is not conclusive."""
     name = kinds[-1] if item.seen.largest * item.factors[0][1] > 0.9 else kinds[0]
     if len(kinds) == 2 and not item.fixed:
         item.doubts.append(f"its name gives neither steering wheel nor road wheels; taken as {name}")
-    if relation is not None and not item.fixed:
+    if relation.correlation and not item.fixed:
         item.doubts.append(f"its correlation with the path's curvature is only {relation.correlation:.2f}")
     return name
 
@@ -521,21 +507,21 @@ def truth_topic(weighable: Sequence[Field]) -> str:
     for item in weighable:
         if item.role in ("truth", "navigation", "sensor"):
             topics.setdefault(item.topic.name, []).append(item)
-    best = (0.0, "")
+    best, of = (0.0, ""), EVIDENCE["truth"]
     for name, fields in topics.items():
         kinds = {f.meaning.quantity for f in fields if f.seen.changes}
-        worth = 2.0 * ("velocity" in kinds and "speed" in kinds) + 1.5 * ("sideslip" in kinds)
-        worth += 0.5 * (fields[0].role == "truth") + 0.2 * ("latitude" in kinds) if worth else 0.0
+        worth = of["velocity"] * ("velocity" in kinds and "speed" in kinds) + of["sideslip"] * ("sideslip" in kinds)
+        worth += of["named"] * (fields[0].role == "truth") + of["position"] * ("latitude" in kinds) if worth else 0.0
         if worth == 0.0 and fields[0].fixed and {"latitude", "longitude"} <= kinds:
-            worth = 0.1
-        if worth > best[0] and (fields[0].role != "sensor" or worth >= 1.5 or fields[0].fixed):
+            worth = of["documented_position"]
+        if worth > best[0] and (fields[0].role != "sensor" or worth >= of["sideslip"] or fields[0].fixed):
             best = (worth, name)
     return best[1]
 
 
-def _likely(units: Sequence[Unit], gain: float, sigma: float, least: float, broken: float = 0.01) -> Sequence[Unit]:
+def _likely(units: Sequence[Unit], gain: Gain, least: float) -> Sequence[Unit]:
     """Return the likely units of a field with this gain, the likeliest first; ``least``: share of the highest one."""
-    shares = posterior([units], [Gain((1,), gain, sigma, broken)])
+    shares = posterior([units], [gain])
     return [units[i] for i in np.argsort(-shares) if shares[i] >= least * shares.max()]
 
 

@@ -13,7 +13,7 @@ from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.mapping_file import mapping_from_dict
 from pdhef_logtool.mapping.naming import meaning_among, meaning_of
-from pdhef_logtool.mapping.vendors import load_vendors
+from pdhef_logtool.mapping.vendors import load_vendors, meaning_of_source
 from pdhef_logtool.records.errors import MappingFileError
 
 N = 3000
@@ -436,10 +436,10 @@ def test_an_export_is_told_by_its_fields():
 def test_every_shipped_entry_names_its_page():
     vendors = load_vendors()
     assert len(vendors.types) > 20
-    for f in (f for kind in vendors.types.values() for f in kind.fields.values()):
-        assert f.page.startswith(("https://", "truthsim/"))
-        assert "read 20" in f.page
-        assert f.meaning.quantity
+    for kind in vendors.types.values():
+        assert kind.page.startswith(("https://", "truthsim/"))
+        assert "read 20" in kind.page
+        assert all(meaning_of_source(source).quantity for source in kind.fields.values())
 
 
 def test_a_users_file_comes_first(tmp_path, monkeypatch):
