@@ -12,13 +12,7 @@ import pytest
 from scipy.signal import lfilter
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
-from pdhef_logtool.learning.network.train_command import (
-    CHECKPOINT,
-    FeatureSequence,
-    Recipe,
-    run_training,
-    train,
-)
+from pdhef_logtool.learning.network.train_command import CHECKPOINT, FeatureSequence, Recipe, run_training, train
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
