@@ -179,23 +179,23 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
         return None
     if NOT_VALUES & _described(leaf_words) or NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None
-    index = re.search(r"\[(\d+)\]$", leaf)
-    column = None if index is None else int(index[1])
+    column = int(index[1]) if (index := re.search(r"\[(\d+)\]$", leaf)) else None
     named = f"{leaf}_{plain_unit(unit_text)}" if unit_text else leaf
     of_leaf = _strength_of_leaf(leaf_words, inner, named, has_unit=bool(unit_text))
     if of_leaf is None:
         return None
     scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
     scopes.append((0.9, (*inner, *leaf_words), path))
-    # The topic's name describes its fields only if the leaf identifies no quantity, and if it names measurements.
-    is_value = not NOT_VALUES & _described(words_of(topic.rpartition("/")[2]))
-    if is_value and all(w in _BARE or not w.isalpha() for w in leaf_words):
-        scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
-        quantity = _quantity(words, leaf_words, column, strength, named)
-        if quantity is not None:
+        if quantity := _quantity(words, leaf_words, column, strength, named):
             return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
-    return None
+    # The topic's name describes its fields only if the leaf identifies no quantity, and if it names measurements.
+    last = topic.rpartition("/")[2]
+    if NOT_VALUES & _described(words_of(last)) or not all(w in _BARE or not w.isalpha() for w in leaf_words):
+        return None
+    named_by = leaf_words if set(leaf_words) - COUNTING else tuple(w for w in words_of(last) if w not in COUNTING)
+    quantity = _quantity((*outer, *inner, *leaf_words), named_by, column, 0.7, named)
+    return quantity and _with_unit(quantity, 0.7, f"{topic} {path}", inner, (named, *parents[-1:], last))
 
 
 def _described(leaf_words: tuple[str, ...]) -> set[str]:
