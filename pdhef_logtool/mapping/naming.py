@@ -42,9 +42,8 @@ COUNTING, NOT_VALUES = _WORDS["counting"], _WORDS["not_values"]
 #: Words by which names that are written as one word are cut.
 KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
 _WHOLE, _BARE = KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS
-_CORNERS: dict[str, str] = VOCABULARY["corners"]
-#: Words for a wheel, and the wheels that are abbreviated so beside them.
-_BESIDE = tuple((frozenset(words.split()), corners) for words, corners in VOCABULARY["wheels_beside"].items())
+#: Words for a wheel, and the wheels that are abbreviated so beside them; without words, always.
+_CORNERS = tuple((frozenset(words.split()), its) for words, its in VOCABULARY["corners"].items())
 _AXES: dict[str, str] = {word: axis for axis, words in VOCABULARY["axes"].items() for word in words.split()}
 _PATTERNS = {name: re.compile("|".join(either)) for name, either in VOCABULARY["patterns"].items()}
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -155,9 +154,11 @@ def meaning_among(topic: str, type_name: str, path: str, unit_text: str, there: 
 
 
 def _spelled_out(path: str, there: Collection[str]) -> str:
-    """Return a path with a longer name if the other names of its struct give its meaning: g_x beside a_x."""
+    """Return a path with a longer name if other names of its struct give its meaning: g_x beside a_x, or an array."""
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
         return f"{gyro[1]}gyro_{gyro[2]}"
+    if (part := re.fullmatch(r"(.*)_(\d)", path)) and [f"{part[1]}_{i}" in there for i in range(4)] == [1, 1, 1, 0]:
+        return f"{part[1]}[{part[2]}]"
     leaf = path.rpartition(".")[2]
     struct = path.removesuffix(leaf)
     beside = {p.removeprefix(struct).lower() for p in there if p.startswith(struct)}
@@ -300,9 +301,8 @@ def corner_of(words: tuple[str, ...], leaf_words: tuple[str, ...] = ()) -> str:
     """Return the wheel (fl, fr, rl, rr) in the words of a name, of the leaf first; empty without one."""
     for group in (leaf_words, words):
         for word in group:
-            if word in _CORNERS:
-                return _CORNERS[word]
-            if corner := next((its[word] for beside, its in _BESIDE if word in its and beside & set(words)), ""):
+            its = (ends[word] for beside, ends in _CORNERS if word in ends and (not beside or beside & set(words)))
+            if corner := next(its, ""):
                 return corner
         ends = {"front": "f", "rear": "r", "back": "r"}, {"left": "l", "right": "r"}
         if "axle" in group:
