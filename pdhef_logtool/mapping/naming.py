@@ -42,9 +42,8 @@ COUNTING, NOT_VALUES = _WORDS["counting"], _WORDS["not_values"]
 #: Words by which names that are written as one word are cut.
 KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
 _WHOLE, _BARE = KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS
-_CORNERS: dict[str, str] = VOCABULARY["corners"]
-#: Words for a wheel, and the wheels that are abbreviated so beside them.
-_BESIDE = tuple((frozenset(words.split()), corners) for words, corners in VOCABULARY["wheels_beside"].items())
+#: Words for a wheel, and the wheels that are abbreviated so beside them; without words, always.
+_CORNERS = tuple((frozenset(words.split()), its) for words, its in VOCABULARY["corners"].items())
 _AXES: dict[str, str] = {word: axis for axis, words in VOCABULARY["axes"].items() for word in words.split()}
 _PATTERNS = {name: re.compile("|".join(either)) for name, either in VOCABULARY["patterns"].items()}
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -155,9 +154,11 @@ def meaning_among(topic: str, type_name: str, path: str, unit_text: str, there: 
 
 
 def _spelled_out(path: str, there: Collection[str]) -> str:
-    """Return a path with a longer name if the other names of its struct give its meaning: g_x beside a_x."""
+    """Return a path with a longer name if other names of its struct give its meaning: g_x beside a_x, or an array."""
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
         return f"{gyro[1]}gyro_{gyro[2]}"
+    if (part := re.fullmatch(r"(.*)_(\d)", path)) and [f"{part[1]}_{i}" in there for i in range(4)] == [1, 1, 1, 0]:
+        return f"{part[1]}[{part[2]}]"
     leaf = path.rpartition(".")[2]
     struct = path.removesuffix(leaf)
     beside = {p.removeprefix(struct).lower() for p in there if p.startswith(struct)}
@@ -179,23 +180,23 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
         return None
     if NOT_VALUES & _described(leaf_words) or NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None
-    index = re.search(r"\[(\d+)\]$", leaf)
-    column = None if index is None else int(index[1])
+    column = int(index[1]) if (index := re.search(r"\[(\d+)\]$", leaf)) else None
     named = f"{leaf}_{plain_unit(unit_text)}" if unit_text else leaf
     of_leaf = _strength_of_leaf(leaf_words, inner, named, has_unit=bool(unit_text))
     if of_leaf is None:
         return None
     scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
     scopes.append((0.9, (*inner, *leaf_words), path))
-    # The topic's name describes its fields only if the leaf identifies no quantity, and if it names measurements.
-    is_value = not NOT_VALUES & _described(words_of(topic.rpartition("/")[2]))
-    if is_value and all(w in _BARE or not w.isalpha() for w in leaf_words):
-        scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
-        quantity = _quantity(words, leaf_words, column, strength, named)
-        if quantity is not None:
+        if quantity := _quantity(words, leaf_words, column, strength, named):
             return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
-    return None
+    # The topic's name describes its fields only if the leaf identifies no quantity, and if it names measurements.
+    last = topic.rpartition("/")[2]
+    if NOT_VALUES & _described(words_of(last)) or not all(w in _BARE or not w.isalpha() for w in leaf_words):
+        return None
+    named_by = leaf_words if set(leaf_words) - COUNTING else tuple(w for w in words_of(last) if w not in COUNTING)
+    quantity = _quantity((*outer, *inner, *leaf_words), named_by, column, 0.7, named)
+    return quantity and _with_unit(quantity, 0.7, f"{topic} {path}", inner, (named, *parents[-1:], last))
 
 
 def _described(leaf_words: tuple[str, ...]) -> set[str]:
@@ -300,9 +301,8 @@ def corner_of(words: tuple[str, ...], leaf_words: tuple[str, ...] = ()) -> str:
     """Return the wheel (fl, fr, rl, rr) in the words of a name, of the leaf first; empty without one."""
     for group in (leaf_words, words):
         for word in group:
-            if word in _CORNERS:
-                return _CORNERS[word]
-            if corner := next((its[word] for beside, its in _BESIDE if word in its and beside & set(words)), ""):
+            its = (ends[word] for beside, ends in _CORNERS if word in ends and (not beside or beside & set(words)))
+            if corner := next(its, ""):
                 return corner
         ends = {"front": "f", "rear": "r", "back": "r"}, {"left": "l", "right": "r"}
         if "axle" in group:

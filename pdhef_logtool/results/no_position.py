@@ -26,7 +26,7 @@ _VOCABULARY = frozenset().union(
     *(VOCABULARY["words"][name].split() for name in _LISTS),
     *(words.split() for words in VOCABULARY["axes"].values()),
     *VOCABULARY["units"].values(),
-    VOCABULARY["corners"],
+    VOCABULARY["corners"][""],
     _MOTION,
     _STATE,
 )
