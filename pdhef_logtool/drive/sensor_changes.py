@@ -260,7 +260,8 @@ class _Block(NamedTuple):
         few = (1.0 + LEAST_CELLS / np.maximum(count, 1.0)) ** 2 / np.maximum(count, 1.0)
         moment, least = total * few[:, None, None], self.least**2
         raised = np.maximum(least - np.einsum("npp->n", moment) / p, 0.01 * least)
-        information = np.linalg.inv(moment + raised[:, None, None] * np.eye(p))
+        moment = moment + raised[:, None, None] * np.eye(p)
+        information = 1.0 / moment if p == 1 else np.linalg.inv(moment)
         information[~finite | (count < LEAST_CELLS)] = 0.0
         return np.asarray(information)
 
