@@ -157,11 +157,12 @@ def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signa
         return signals, ()
     cells = cells_of(signals)
     sound, changes = _without_stuck(signals, cells, [n for n in ("steer_rad", "speed_m_s") if n not in ignored])
-    fitted, after_ns = sound, 0
-    while len(changes) < MOST_CHANGES and (step := _first_step(fitted, after_ns, ignored)) is not None:
+    fitted, after_ns, cells = sound, 0, cells if sound is signals else cells_of(sound)
+    while len(changes) < MOST_CHANGES and (step := _first_step(fitted, cells, after_ns, ignored)) is not None:
         changes.append(step)
         after_ns = step.start_ns
         fitted = step.removed(fitted, step.start_ns, step.size)
+        cells = cells_of(fitted)
         sound = step.removed(sound, step.known_ns, step.size)
     return sound, tuple(sorted(changes, key=lambda c: c.start_ns))
 
@@ -354,9 +355,8 @@ def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, Flo
     return is_named, best, evidence, match[k, best] / power[k, best], std
 
 
-def _first_step(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
+def _first_step(signals: Signals, cells: Cells, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
     """Return the first change of the bias or gain of a sensor after a time; None without one."""
-    cells = cells_of(signals)
     is_named, best, evidence, size, std = _likeliest(signals, cells)
     is_named &= np.array([name not in ignored for name, _ in HYPOTHESES])[best]
     is_named[: cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)] + WINDOW_CELLS + 1] = False
@@ -375,12 +375,15 @@ def _first_step(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
 def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tuple[Signals, list[SensorChange]]:
     """Replace stuck steering by the steering relation, and remove stuck speeds."""
     cell, changes = cells.of_stamp, []
+    runs = {name: long_runs(getattr(signals, name), cells, cells.speed > LEAST_SPEED_M_S) for name in names}
+    if not any(runs.values()):
+        return signals, []
     steering = _fitted(_tables(cells)[1])
     error = _std_so_far(steering.residual(steering.table))
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
-        for run in long_runs(column, cells, cells.speed > LEAST_SPEED_M_S):
+        for run in runs[name]:
             start, end = run.start, run.end
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
             if name == "steer_rad":
