@@ -179,7 +179,7 @@ class Hypothesis:
     @cached_property
     def energy(self) -> float:
         """Negative logarithm of the prior odds."""
-        if self.kind.startswith("open"):
+        if self.kind == "open sign":
             return PRIORS[self.kind]
         names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
         rank = max(_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names)

@@ -232,15 +232,6 @@ class CarFit:
         """Return residuals [2 K] with the soft L1 weights of the errors ``centre``."""
         return np.asarray(self._weight * scaled / (1.0 + centre**2) ** 0.25, dtype=np.float64).ravel()
 
-    def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the inverse curvature of the cost [n, n], and its gradient by block [blocks, n]."""
-        centre = self.errors_of(theta)
-        residuals, jacobian = linearised(self.errors_of, self._residuals, theta, centre, DESCENT["derivative_step"])
-        inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
-        gradients = np.zeros((int(self._block.max()) + 1, theta.size))
-        np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
-        return inverse, gradients
-
     def posterior(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of the parameters from the lowest cost with tyres as cars have.
 
@@ -268,9 +259,12 @@ class CarFit:
 
     def _laplace(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Return log evidence and covariance of the parameters at the lowest cost."""
-        inverse, gradients = self._curvature(theta)
-        evidence = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - self._cost(self.errors_of(theta), theta))
-        count = len(gradients)
+        centre, count = self.errors_of(theta), int(self._block.max()) + 1
+        residuals, jacobian = linearised(self.errors_of, self._residuals, theta, centre, DESCENT["derivative_step"])
+        inverse = np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size))
+        evidence = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - self._cost(centre, theta))
+        gradients = np.zeros((count, theta.size))  # of the cost, by block
+        np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         spread = gradients.T @ gradients * (count / (count - 1) if count > 1 else 0.0)
         shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
         return evidence, np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
