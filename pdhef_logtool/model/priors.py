@@ -99,6 +99,15 @@ def front_stiffness(vehicle: VehicleParameters, ratio: float, rear: float) -> fl
     return ratio * rear * vehicle.axle_load_n(True) / vehicle.axle_load_n(False)
 
 
+def coefficients(vehicle: VehicleParameters) -> tuple[float, float]:
+    """Return the cornering coefficients of front and rear axle, 1/rad."""
+    mu = vehicle.assumed_friction
+    front, rear = (
+        vehicle.cornering_stiffness_n_per_rad(axle, mu) / vehicle.axle_load_n(axle) for axle in (True, False)
+    )
+    return front, rear
+
+
 def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     """Return the parameters of a fit, with tyres as cars have.
 
@@ -127,10 +136,7 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
 
 def with_file_tyres(parameters: Sequence[Parameter], vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     """Return the parameters with a prior for a file that describes the driven tyres."""
-    mu = vehicle_file.assumed_friction
-    front, rear = (
-        vehicle_file.cornering_stiffness_n_per_rad(axle, mu) / vehicle_file.axle_load_n(axle) for axle in (True, False)
-    )
+    front, rear = coefficients(vehicle_file)
     tyres = {p.name: p for p in _tyres(vehicle_file, rear, front / rear, FILE_STDS)}
     return tuple(tyres.get(p.name, p) for p in parameters)
 
