@@ -21,6 +21,7 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_v
 from pdhef_logtool.drive.check_table import FAILS_STD, TABLE, TEXTS, judge, result
 from pdhef_logtool.drive.columns import (
     GRID_S,
+    MS_PER_S,
     derivative,
     earlier,
     fit,
@@ -243,8 +244,8 @@ def _accelerometer(drive: CheckedDrive) -> Iterator[Check]:
         is_other = not low < errors.ay_gain[0] < high
         yield judge("ay_m_s2.gain", *errors.ay_gain, doubt="ground_truth" if is_other and unit_is_right else "")
     delay = ay_delay(errors, drive.latency)
-    if delay is not None and 1e3 * delay[1] <= TABLE["ay_m_s2.delay"]["limits"][1]:
-        yield judge("ay_m_s2.delay", 1e3 * delay[0], 1e3 * delay[1], delay_s=delay[0])
+    if delay is not None and MS_PER_S * delay[1] <= TABLE["ay_m_s2.delay"]["limits"][1]:
+        yield judge("ay_m_s2.delay", MS_PER_S * delay[0], MS_PER_S * delay[1], delay_s=delay[0])
 
 
 def _gyro(drive: CheckedDrive) -> Iterator[Check]:
@@ -254,7 +255,8 @@ def _gyro(drive: CheckedDrive) -> Iterator[Check]:
         yield judge("yaw_rate_rad_s.gain", gain / file, std, gain=gain)
     if drive.measured.has_truth and latency is not None and latency.reliable and not latency.identical:
         late_s, error_s, delay_s = latency.gyro_delay_s - latency.latency_s, latency.std_error_s, latency.gyro_delay_s
-        yield judge("yaw_rate_rad_s.delay", 1e3 * delay_s, late_ms=1e3 * late_s, std_ms=1e3 * error_s, delay_s=delay_s)
+        value, late_ms, std_ms = (MS_PER_S * x for x in (delay_s, late_s, error_s))
+        yield judge("yaw_rate_rad_s.delay", value, late_ms=late_ms, std_ms=std_ms, delay_s=delay_s)
 
 
 def delay_checks(late: Iterable[LateSensor]) -> list[Check]:
@@ -316,21 +318,20 @@ def _is_speed(drive: CheckedDrive, column: FloatArray) -> bool:
     """Return whether a column equals the speed of the sensors."""
     if drive.speed is None or str(drive.measured.speed_name).startswith("truth."):
         return False
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = median_known(np.where(moving_at(drive.speed), np.abs(column / drive.speed), np.nan))
+    share = median_known(np.where(moving_at(drive.speed), np.abs(column / drive.speed), np.nan))
     low, high = law("speed", name="", pace="").gains
     return low < share < high
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def sideslip_offset(columns: Mapping[str, FloatArray]) -> Figure:
     """Return the ground-truth sideslip on straights, rad; :data:`UNKNOWN` if too little is known."""
     names = ("yaw_rate_rad_s", "ay_m_s2", "truth.vx_m_s", "truth.vy_m_s")
     if not set(names) <= columns.keys():
         return UNKNOWN
     rate, ay, vx, vy = (columns[n] for n in names)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        regressors = [np.ones_like(vx), rate / vx, ay]
-    solved = fit(_sideslip(columns), regressors, gentle_at(rate * vx, moving_at(np.hypot(vx, vy))))
+    gentle = gentle_at(rate * vx, moving_at(np.hypot(vx, vy)))
+    solved = fit(_sideslip(columns), [np.ones_like(vx), rate / vx, ay], gentle)
     if solved is None:
         return UNKNOWN
     return float(solved[0][0]), math.hypot(solved[1][0], solved[0][2] * AY_BIAS_M_S2)
@@ -374,9 +375,7 @@ def _steering(drive: CheckedDrive) -> Iterator[Check]:
     is_misread = drive.wrong & {"yaw_rate_rad_s", "steer_rad", "steering_wheel_rad"}
     if not drive.has_file or speed is None or rate is None or steer is None or is_misread:
         return
-    with np.errstate(divide="ignore", invalid="ignore"):
-        curved = vehicle.wheelbase_m * rate / speed
-    lateral = rate * speed
+    curved, lateral = vehicle.wheelbase_m * rate / speed, rate * speed
     gentle = gentle_at(lateral, moving_at(speed))
     solved = fit(steer, [curved, lateral, np.ones_like(steer)], gentle)
     speeds = np.abs(speed[gentle & np.isfinite(speed)])
@@ -428,6 +427,7 @@ FUNCTIONS: tuple[Callable[[CheckedDrive], Iterable[Check]], ...] = (
 )
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def check_drive(
     measured: Measured,
     vehicle: VehicleParameters | None = None,

@@ -12,6 +12,7 @@ from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, Channel, FloatArray
 from pdhef_logtool.records.student import student_quantile
 
+MS_PER_S = 1e3
 GRID_S = 0.05
 #: −3 dB at 1 Hz: removes noise and vibration, keeps manoeuvres.
 LOW_PASS_HZ = 1.0
@@ -81,8 +82,7 @@ def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray
     if finite.shape[0] == 0:
         return np.zeros(speed.shape[0], np.bool_)
     limit = max(least_m_s, MOVING_SHARE * float(np.quantile(finite, 0.9)))
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.abs(speed) > limit, dtype=np.bool_)
+    return np.asarray(np.abs(speed) > limit, dtype=np.bool_)
 
 
 def independent_samples(use: BoolArray) -> float:

@@ -13,14 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.drive.columns import GRID_S
-from pdhef_logtool.drive.correlation import (
-    CommonGrid,
-    find_shift,
-    on_common_grid,
-    shift_error,
-    without_trend,
-)
+from pdhef_logtool.drive.columns import GRID_S, MS_PER_S
+from pdhef_logtool.drive.correlation import CommonGrid, find_shift, on_common_grid, shift_error, without_trend
 from pdhef_logtool.drive.measured import Measured
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, channel_of, same_share
 from pdhef_logtool.records.signals import Channel
@@ -142,7 +136,7 @@ def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) 
         and abs(speed.latency_s - latency.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
     ):
         return replace(latency, reason=f"{latency.reason}; the speed sensor is late by as much")
-    reason = f"the gyro is {leads * 1e3:.1f} ms late against ground truth, which leads no motion"
+    reason = f"the gyro is {leads * MS_PER_S:.1f} ms late against ground truth, which leads no motion"
     return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
 
 
@@ -158,7 +152,7 @@ def late_sensors(measured: Measured) -> tuple[LateSensor, ...]:
         if not lag.reliable or error_s > beyond_s / SURE:
             continue
         name = law.late[shift_s >= low]
-        late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift_s, error_s, low, high))
+        late_ms, sd_ms, low_ms, high_ms = (MS_PER_S * x for x in (shift_s, error_s, low, high))
         evidence = (
             f"{law.text}: delay {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
         )

@@ -100,7 +100,7 @@ class FrictionSource:
 
 
 def friction_source(
-    choice: str | float, vehicle: VehicleParameters, available: frozenset[str], topic: str = ""
+    choice: str | float | None, vehicle: VehicleParameters, available: frozenset[str], topic: str = ""
 ) -> FrictionSource:
     """Choose the source of a drive's friction.
 
@@ -108,16 +108,19 @@ def friction_source(
 
     Parameters
     ----------
-    choice : of :func:`parse_friction`. available : signals that the log provides. topic : of its friction, ``/a.b``.
+    choice : of :func:`parse_friction`, or None for the friction of the log, if any.
+    available : signals that the log provides. topic : of its friction, ``/a.b``.
 
     Raises
     ------
     UsageError : The vehicle file has no friction.
     """
+    if choice is None and not topic:
+        return FrictionSource(FrictionFrom.NONE)
+    if choice is None or (choice == "auto" and "friction" in available):
+        return FrictionSource(FrictionFrom.TOPIC, topic=topic)
     if not isinstance(choice, str):
         return FrictionSource(FrictionFrom.OPTION, choice, constant=choice)
-    if choice == "auto" and "friction" in available:
-        return FrictionSource(FrictionFrom.TOPIC, topic=topic)
     if vehicle.friction is not None:
         source = FrictionFrom.SEDAN if vehicle.name == DEFAULT_VEHICLE_NAME else FrictionFrom.FILE
         constant = vehicle.friction if "friction" in available else None

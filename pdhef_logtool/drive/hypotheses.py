@@ -44,16 +44,9 @@ SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
 LEAST_WIDTH, EDGE, WIDE_EDGE = 0.05, 0.15, 0.04
 #: Largest energy of one relation (sensors fail and cars slide), and its energy if a wrong field is mapped.
 MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
-#: Energies of hypotheses (negative logarithms of their prior odds). Mistakes are rare; units of another quantity come
-#: from copied templates, and a wrong field explains any gain.
-PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0, "open": 0.0}
-PRIORS |= {"open sign": 1.0}  # an undocumented sign: for most recorders, left is positive
-#: One in ten scales of correct mappings is not a unit factor: raw counts, a ratio, a calibration.
-PRIORS |= {"odd scale": math.log(10.0)}
-#: Signals by the frequency of their mistakes, most frequent first: no standard defines the sign of a steering angle,
-#: and IMU axes are rotated more often than a gyro on the right axis has the wrong sign.
-_OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
-_SELDOM, _SELDOM_STEP = 1.0, 0.3
+#: Energies of hypotheses (negative logarithms of their prior odds), and signals by the frequency of their mistakes.
+PRIORS: dict[str, float] = TABLE["priors"]
+_OFTEN_WRONG: list[str] = TABLE["often_wrong"]["signals"]
 #: Number of blocks of a drive with separate gains.
 BLOCKS = 8
 
@@ -186,11 +179,12 @@ class Hypothesis:
     @cached_property
     def energy(self) -> float:
         """Negative logarithm of the prior odds."""
-        if self.kind.startswith("open"):
+        if self.kind == "open sign":
             return PRIORS[self.kind]
         names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
         rank = max(_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names)
-        seldom = 0.0 if rank < 2 else (_SELDOM + _SELDOM_STEP * rank) * (2.0 if self.kind == "foreign" else 1.0)
+        seldom = 0.0 if rank < 2 else (PRIORS["seldom"] + PRIORS["seldom step"] * rank)
+        seldom *= 2.0 if self.kind == "foreign" else 1.0
         return PRIORS[self.kind] + seldom + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
 
     def is_about(self, names: set[str]) -> bool:

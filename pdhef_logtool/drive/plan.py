@@ -146,7 +146,7 @@ def plan_drive(
     refused = looked_at.refused(waived, is_causal=sensors is not None)
     mapping, sound = without_refused_truth(mapping, refused), looked_at
     if mapping is not looked_at.mapping:
-        sound = survey_log(log, mapping, clocks, span_ns, given, rescale=False)
+        sound = looked_at.with_truth(mapping.truth)
     truth, derived = sound.truth_plan, sound.truth
     derivation = {} if derived is None else dict(derived.derivation)
     return DrivePlan(

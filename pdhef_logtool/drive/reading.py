@@ -338,20 +338,14 @@ def _tell_doubts(plan: DrivePlan, notes: int, options: ReadOptions, tell: Tell) 
 
 
 def friction_of(
-    plan: DrivePlan,
-    vehicle: VehicleParameters,
-    options: ReadOptions,
-    *,
-    of_truth: bool = False,
+    plan: DrivePlan, vehicle: VehicleParameters, options: ReadOptions, *, of_truth: bool = False
 ) -> FrictionSource:
     """Return the friction source of a drive by its options.
 
     With ``of_truth``, ``auto`` uses the friction of the ground truth if the log contains it.
     """
-    if of_truth and options.friction == "auto" and (true := plan.mapping.truth.get("friction")) is not None:
+    true = plan.mapping.truth.get("friction") if of_truth and options.friction == "auto" else None
+    if true is not None:
         return FrictionSource(FrictionFrom.TRUTH, topic=true.label)
     source = plan.mapping.signals.get("friction")
-    topic = "" if source is None else source.label
-    if options.friction is None:
-        return FrictionSource(FrictionFrom.TOPIC if topic else FrictionFrom.NONE, topic=topic)
-    return friction_source(options.friction, vehicle, plan.alignment.available, topic)
+    return friction_source(options.friction, vehicle, plan.alignment.available, "" if source is None else source.label)

@@ -12,15 +12,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known, moving_at
-from pdhef_logtool.drive.hypotheses import (
-    BLOCKS,
-    MIN_SAMPLES,
-    TABLE,
-    Law,
-    Relation,
-    block_gains,
-    kind_of,
-)
+from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_SAMPLES, TABLE, Law, Relation, block_gains, kind_of
 from pdhef_logtool.mapping.naming import CACHED_NAMES
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
@@ -39,6 +31,12 @@ TURNING = "truth.yaw_rad"
 GNSS_COURSE_RATE = "gnss_course_rate_rad_s"
 #: Columns of the course rate and the speed of a GNSS receiver's positions; their sign is that of the longitude.
 GNSS_PATH = "gnss_path_rate_rad_s", "gnss_path_speed_m_s"
+#: Quantities that sensors and ground truth measure, by their relation.
+TWICE = (
+    ("rate", "yaw_rate_rad_s", "truth.yaw_rate_rad_s"),
+    ("rate", "yaw_rate_rad_s", TURNING),
+    ("acceleration", "ay_m_s2", "truth.ay_m_s2"),
+)
 #: Columns of the velocity along the axes of the ground-truth positions.
 POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: A signal that moves by more, 1-sigma, shows that the car is driven.
@@ -117,9 +115,7 @@ def measured_relations(
         pace = _Pace.of(columns, speed_name)
         relations += [*_steering(pace, vehicle), *_speeds(pace), *_wheel_differences(pace), *_courses(of_path, pace)]
     relations += _poses(of_path)
-    twice = (("rate", "truth.yaw_rate_rad_s"), ("rate", TURNING), ("acceleration", "truth.ay_m_s2"))
-    for key, other in twice:
-        name = "yaw_rate_rad_s" if key == "rate" else "ay_m_s2"
+    for key, name, other in TWICE:
         if {name, other} <= columns.keys():
             relations += compare(law(key, other=other, name=name), columns[name], columns[other])
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
@@ -203,8 +199,7 @@ def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
     finite = moving & np.isfinite(size)
     if not finite.any():
         return moving
-    with np.errstate(invalid="ignore"):
-        return np.asarray(moving & (size <= STEERING_SHARE * np.quantile(size[finite], 0.95)))
+    return np.asarray(moving & (size <= STEERING_SHARE * np.quantile(size[finite], 0.95)))
 
 
 def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
@@ -464,16 +459,12 @@ def _partial(
     finite = use & np.isfinite(np.stack([predicted, measured, *others])).all(axis=0)
     if independent_samples(finite) < 2.0 * MIN_SAMPLES:
         return []
-    aside = np.stack(others, axis=1)[finite]
-    left = []
-    for column in (predicted, measured):
-        out = np.full(column.shape[0], np.nan)
-        out[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
-        left.append(out)
-    relations = compare(law, left[0], left[1], finite)
+    aside, left = np.stack(others, axis=1)[finite], np.full((2, len(finite)), np.nan)
+    for rest, column in zip(left, (predicted, measured), strict=True):
+        rest[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
+    strict = replace(law, least_correlation=MIN_PARTIAL_CORRELATION)
     # Agreement of most blocks on the sign is not random.
-    is_steady = [len(r.blocks) > BLOCKS // 2 and len(set(np.sign(r.blocks))) == 1 for r in relations]
     return [
-        r if steady else replace(r, law=replace(law, least_correlation=MIN_PARTIAL_CORRELATION))
-        for r, steady in zip(relations, is_steady, strict=True)
+        r if len(r.blocks) > BLOCKS // 2 and len(set(np.sign(r.blocks))) == 1 else replace(r, law=strict)
+        for r in compare(law, left[0], left[1], finite)
     ]

@@ -124,29 +124,6 @@ class Cells(NamedTuple):
         return int(self.stamps_ns[row]) if row < len(self.stamps_ns) else int(self.stamps_ns[-1]) + 1
 
 
-class _Relation(NamedTuple):
-    """A measured column and its regressors [n, 1 + m], with the fit to the drive before each cell.
-
-    Attributes
-    ----------
-    fit : coefficients [n, m]; NaN before ``LEAST_CELLS``. information : of the regressors [n, m, m].
-    """
-
-    table: FloatArray
-    fit: FloatArray
-    information: FloatArray
-
-    def residual(self, table: FloatArray) -> FloatArray:
-        """Return the part of the first column of a table [n, 1 + m] that the others do not explain, [n]."""
-        return np.asarray(table[:, 0] - (table[:, 1:] * self.fit).sum(axis=1))
-
-    def leverages(self, changes: FloatArray) -> FloatArray:
-        """Return the factors [n, p] of an uncertain fit on the 1-sigma of residuals; changed regressors [n, m, p]."""
-        changes = np.nan_to_num(changes)
-        share = (changes * np.linalg.solve(self.information, changes)).sum(axis=1)
-        return np.asarray(np.sqrt(1.0 + INDEPENDENT_CELLS * share))
-
-
 def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signals, tuple[SensorChange, ...]]:
     """Return the signals [N] without the changes of their sensors, and the changes in order of time.
 
@@ -157,11 +134,12 @@ def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signa
         return signals, ()
     cells = cells_of(signals)
     sound, changes = _without_stuck(signals, cells, [n for n in ("steer_rad", "speed_m_s") if n not in ignored])
-    fitted, after_ns = sound, 0
-    while len(changes) < MOST_CHANGES and (step := _first_step(fitted, after_ns, ignored)) is not None:
+    fitted, after_ns, cells = sound, 0, cells if sound is signals else cells_of(sound)
+    while len(changes) < MOST_CHANGES and (step := _first_step(fitted, cells, after_ns, ignored)) is not None:
         changes.append(step)
         after_ns = step.start_ns
         fitted = step.removed(fitted, step.start_ns, step.size)
+        cells = cells_of(fitted)
         sound = step.removed(sound, step.known_ns, step.size)
     return sound, tuple(sorted(changes, key=lambda c: c.start_ns))
 
@@ -225,15 +203,28 @@ def _tables(cells: Cells) -> tuple[FloatArray, ...]:
     return kinematics, steering, np.stack([v - gained, constant], axis=1)
 
 
-def _fitted(table: FloatArray) -> _Relation:
-    """Regress the first column of a table [n, 1 + m] on the others, over the rows before each."""
+def _fitted(table: FloatArray, changes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Regress the first column of a table [n, 1 + m] on the others, over the rows before each.
+
+    Returns
+    -------
+    coefficients [n, m], NaN before ``LEAST_CELLS``; factors [n, p] on the 1-sigma of residuals for ``changes`` of the
+    regressors [n, m, p], because the fit is uncertain.
+    """
     finite = np.asarray(np.isfinite(table).all(axis=1))
     rows = np.where(finite[:, None], table, 0.0)
     products = np.cumsum(rows[:, :, None] * rows[:, None, :], axis=0)
     products = np.concatenate([np.zeros_like(products[:1]), products[:-1]])
     square = products[:, 1:, 1:] * (1.0 + RIDGE * np.eye(table.shape[1] - 1)) + 1e-9 * np.eye(table.shape[1] - 1)
-    fit = np.linalg.solve(square, products[:, 1:, :1])[..., 0]
-    return _Relation(table, np.where(np.cumsum(finite)[:, None] > LEAST_CELLS, fit, np.nan), square)
+    changes = np.nan_to_num(changes)
+    solved = np.linalg.solve(square, np.concatenate([products[:, 1:, :1], changes], axis=2))
+    fit = np.where(np.cumsum(finite)[:, None] > LEAST_CELLS, solved[..., 0], np.nan)
+    return fit, np.asarray(np.sqrt(1.0 + INDEPENDENT_CELLS * (changes * solved[..., 1:]).sum(axis=1)))
+
+
+def _residual(table: FloatArray, fit: FloatArray) -> FloatArray:
+    """Return the part of the first column of a table [n, 1 + m] that the others do not explain, [n]."""
+    return np.asarray(table[:, 0] - (table[:, 1:] * fit).sum(axis=1))
 
 
 # ------------------------------------------------------------------------------------------------ steps
@@ -260,7 +251,8 @@ class _Block(NamedTuple):
         few = (1.0 + LEAST_CELLS / np.maximum(count, 1.0)) ** 2 / np.maximum(count, 1.0)
         moment, least = total * few[:, None, None], self.least**2
         raised = np.maximum(least - np.einsum("npp->n", moment) / p, 0.01 * least)
-        information = np.linalg.inv(moment + raised[:, None, None] * np.eye(p))
+        moment = moment + raised[:, None, None] * np.eye(p)
+        information = 1.0 / moment if p == 1 else np.linalg.inv(moment)
         information[~finite | (count < LEAST_CELLS)] = 0.0
         return np.asarray(information)
 
@@ -270,15 +262,14 @@ def _relation_block(index: int, tables: Sequence[FloatArray]) -> _Block:
 
     ``tables`` : of the drive, and with each hypothesis tried.
     """
-    relation = _fitted(tables[0])
-    units = [(other - relation.table) / TRIED for other in tables[1:]]
-    after, *moved = (_mean(table, 0, PART_CELLS) for table in (relation.table, *units))
+    units = [(other - tables[0]) / TRIED for other in tables[1:]]
+    after, *moved = (_mean(table, 0, PART_CELLS) for table in (tables[0], *units))
     n, starts = len(after), range(MEAN_CELLS, WINDOW_CELLS, PART_CELLS)
     before = _later(after, -PART_CELLS, n)
     changes = [_later(after, start, n) - before for start in starts]
-    leverages = relation.leverages(np.stack(changes, axis=2)[:, 1:])
-    steps = np.stack([relation.residual(change) for change in changes], axis=1) / leverages
-    effects = [[relation.residual(_later(unit, start, n)) for unit in moved] for start in starts]
+    fit, leverages = _fitted(tables[0], np.stack(changes, axis=2)[:, 1:])
+    steps = np.stack([_residual(change, fit) for change in changes], axis=1) / leverages
+    effects = [[_residual(_later(unit, start, n), fit) for unit in moved] for start in starts]
     return _Block(steps, np.transpose(effects, (2, 1, 0)) / leverages[:, None], np.full(n, LEAST_STDS[index]))
 
 
@@ -353,9 +344,8 @@ def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, Flo
     return is_named, best, evidence, match[k, best] / power[k, best], std
 
 
-def _first_step(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
+def _first_step(signals: Signals, cells: Cells, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
     """Return the first change of the bias or gain of a sensor after a time; None without one."""
-    cells = cells_of(signals)
     is_named, best, evidence, size, std = _likeliest(signals, cells)
     is_named &= np.array([name not in ignored for name, _ in HYPOTHESES])[best]
     is_named[: cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)] + WINDOW_CELLS + 1] = False
@@ -374,16 +364,20 @@ def _first_step(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
 def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tuple[Signals, list[SensorChange]]:
     """Replace stuck steering by the steering relation, and remove stuck speeds."""
     cell, changes = cells.of_stamp, []
-    steering = _fitted(_tables(cells)[1])
-    error = _std_so_far(steering.residual(steering.table))
+    runs = {name: long_runs(getattr(signals, name), cells, cells.speed > LEAST_SPEED_M_S) for name in names}
+    if not any(runs.values()):
+        return signals, []
+    steering = _tables(cells)[1]
+    fit = _fitted(steering, np.empty((*steering[:, 1:].shape, 0)))[0]
+    error = _std_so_far(_residual(steering, fit))
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
-        for run in long_runs(column, cells, cells.speed > LEAST_SPEED_M_S):
+        for run in runs[name]:
             start, end = run.start, run.end
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
             if name == "steer_rad":
-                expected = steering.table[k, 1:] @ steering.fit[k0]
+                expected = steering[k, 1:] @ fit[k0]
                 change, limit, std = expected - expected[0], LEAST_STEER_CHANGE_RAD + MISSED * error[k0], error[k0]
             else:  # what a_x measured before beyond the change of the speed is grade, or a bias
                 before = max(k0 - round(GRADE_S / CELL_S), 0)

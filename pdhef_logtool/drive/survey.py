@@ -8,7 +8,7 @@ order of their application does not matter.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,14 +26,7 @@ from pdhef_logtool.drive.checks import (
 )
 from pdhef_logtool.drive.delays import LATE_GYRO_S, LatencyEstimate, LateSensor, late_sensors, truth_latency
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.mounting import (
-    ACCELERATIONS,
-    MOUNTED,
-    RATES,
-    Mounting,
-    find_mounting,
-    find_triads,
-)
+from pdhef_logtool.drive.mounting import ACCELERATIONS, MOUNTED, RATES, Mounting, find_mounting, find_triads
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.relations import effective_wheelbase_m
 from pdhef_logtool.drive.truth import TruthPlan, TruthTrack, derive_truth, plan_truth
@@ -99,6 +92,13 @@ class Survey:
         refused = {n: why for n, why in by_everything.items() if n.startswith("truth.")}
         return refused if is_causal else refused | misread_channels(self.sensor_checks, waived)
 
+    def with_truth(self, names: Collection[str]) -> Survey:
+        """Return the survey with the ground truth of some channels only, for its plan, track and latency."""
+        channels = replace(self.channels, truth={n: c for n, c in self.channels.truth.items() if n in names})
+        plan, truth = _derived(channels, self.vehicle)
+        latency = truth_latency(channels.signals, channels.truth, truth)
+        return replace(self, channels=channels, truth_plan=plan, truth=truth, latency=latency)
+
     def _of(self, measured: Measured, latency: LatencyEstimate | None) -> tuple[Check, ...]:
         return check_drive(measured, self.vehicle, latency=latency, late=self.late)
 
@@ -147,9 +147,7 @@ def survey_log(
     triads = find_triads(log, mapping)
     extra = {} if triads is None else triads[0].components(ACCELERATIONS) | triads[1].components(RATES)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
-    truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
-    truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
+    truth_plan, truth = _derived(channels, vehicle)
     measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     # The inputs of an estimator must not depend on ground truth: a mounting from ground truth is only checked.
     mounting = find_mounting(measured.without_truth(), triads, mapping)
@@ -171,6 +169,13 @@ def survey_log(
     measured, latency = replace(measured, is_mounted=is_mounted), truth_latency(channels.signals, channels.truth, truth)
     survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, mounting, tuple(corrected))
     return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
+
+
+def _derived(channels: MappedChannels, vehicle: VehicleParameters) -> tuple[TruthPlan | None, TruthTrack | None]:
+    """Return plan and track of the ground truth; None without any."""
+    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
+    plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
+    return plan, None if plan is None else derive_truth(channels.truth, plan=plan)
 
 
 def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:

@@ -157,8 +157,7 @@ def derive_truth(
         Empty without ground truth, with the stamps of the plan's base channel. Sideslip is the atan2 of the velocities
         at the CG, or the mapped sideslip without velocities. ``yaw_rad`` is wrapped.
     """
-    if plan is None:
-        plan = plan_truth(truth_channels, truth_position_m=truth_position_m)
+    plan = plan or plan_truth(truth_channels, truth_position_m=truth_position_m)
     if plan is None:
         return TruthTrack(track=make_track("truth", np.empty(0, dtype=np.int64)), max_gap_s=0.0)
     source = _Source(truth_channels, plan)

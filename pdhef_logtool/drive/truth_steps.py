@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pdhef_logtool.drive.check_table import TABLE
 from pdhef_logtool.drive.sensor_changes import SensorChange, cells_of, part_means, sample_steps
 from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -21,12 +22,8 @@ BLOCK_S, LEAST_BLOCKS, FILLED = 1.0, 3, 0.8
 MOVING_M_S = 0.5
 #: Least F statistic, after the correlation of the remainder.
 EVIDENCE = 40.0
-#: Least steps that are reported, by signal and kind (gain and delay of a_y change with bank and sliding).
-LEAST = {
-    "yaw_rate_rad_s": {"jump": 0.006, "gain": 0.05, "delay": 0.03},
-    "ay_m_s2": {"jump": 0.4},
-    "speed_m_s": {"gain": 0.03},
-}
+#: Least steps that are reported, by signal and kind.
+LEAST: dict[str, dict[str, float]] = TABLE["SIGNAL.change"]["least"]
 #: Deviation that every remainder is assumed to have, and share of a jump that neighbouring samples have, by signal.
 LEAST_STD = {"yaw_rate_rad_s": 0.001, "ay_m_s2": 0.05, "speed_m_s": 0.05}
 SHARP = {"yaw_rate_rad_s": 0.5, "ay_m_s2": 0.75}

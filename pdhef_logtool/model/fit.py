@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +54,8 @@ CORRELATION_S = 1.0
 KEPT_STEPS = 4
 #: Length of the blocks for the spread of gradients: longer than a bend, so that blocks are nearly independent.
 BLOCK_S = 3.0
-ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
+#: Limits of a descent.
+DESCENT: dict[str, Any] = {"iterations": 40, "least_gain": lambda _: 1e-3, "derivative_step": 0.02, "max_step": 1.0}
 #: Lower limit of the peak force, as a share of this quantile of a_y, which includes bank and body roll.
 REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
 #: Model error common to a whole drive, as a share of each prior's standard deviation: with it at least 95 % of the
@@ -159,16 +161,7 @@ class CarFit:
         return theta
 
     def _descend(self, theta: FloatArray) -> FloatArray:
-        return descend(
-            self.errors_of,
-            self._cost,
-            self._residuals,
-            theta,
-            iterations=ITERATIONS,
-            least_gain=lambda _: LEAST_GAIN,
-            derivative_step=DERIVATIVE_STEP,
-            max_step=MAX_STEP,
-        ).theta
+        return descend(self.errors_of, self._cost, self._residuals, theta, **DESCENT).theta
 
     def rms(self, theta: FloatArray) -> FloatArray:
         """Return the RMS error of yaw rate and a_y, [2]."""
@@ -239,15 +232,6 @@ class CarFit:
         """Return residuals [2 K] with the soft L1 weights of the errors ``centre``."""
         return np.asarray(self._weight * scaled / (1.0 + centre**2) ** 0.25, dtype=np.float64).ravel()
 
-    def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the inverse curvature of the cost [n, n], and its gradient by block [blocks, n]."""
-        centre = self.errors_of(theta)
-        residuals, jacobian = linearised(self.errors_of, self._residuals, theta, centre, DERIVATIVE_STEP)
-        inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
-        gradients = np.zeros((int(self._block.max()) + 1, theta.size))
-        np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
-        return inverse, gradients
-
     def posterior(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of the parameters from the lowest cost with tyres as cars have.
 
@@ -275,9 +259,12 @@ class CarFit:
 
     def _laplace(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Return log evidence and covariance of the parameters at the lowest cost."""
-        inverse, gradients = self._curvature(theta)
-        evidence = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - self._cost(self.errors_of(theta), theta))
-        count = len(gradients)
+        centre, count = self.errors_of(theta), int(self._block.max()) + 1
+        residuals, jacobian = linearised(self.errors_of, self._residuals, theta, centre, DESCENT["derivative_step"])
+        inverse = np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size))
+        evidence = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - self._cost(centre, theta))
+        gradients = np.zeros((count, theta.size))  # of the cost, by block
+        np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         spread = gradients.T @ gradients * (count / (count - 1) if count > 1 else 0.0)
         shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
         return evidence, np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
