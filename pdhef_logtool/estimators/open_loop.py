@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pdhef_logtool.car.nominal_model import (
     model_parameters,
     planar_lateral_acceleration,
-    rk4_step,
+    rk4_steps,
     state_derivative,
     substeps,
 )
@@ -34,7 +34,7 @@ def _open_loop(inputs, hold_s, default_friction, p, state, values, rates, valid)
         ok = math.isfinite(state[0]) and math.isfinite(steer[k])
         if ok and dt[k] <= RESTART_GAP_S and math.isfinite(before + state[2] + state[4]):
             n = substeps(before, dt[k], state[5], p)
-            _, state[2], state[3] = rk4_step(before, state[2], state[3], state[4], 0.0, state[5], dt[k], n, p)
+            _, state[2], state[3] = rk4_steps(before, state[2], state[3], state[4], 0.0, state[5], dt[k], n, p)
         elif ok:
             state[3] = state[0] * math.tan(steer[k]) / (p.front_m + p.rear_m)
             state[2] = p.rear_m * state[3]
