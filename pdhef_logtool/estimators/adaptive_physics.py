@@ -95,7 +95,7 @@ class AdaptiveState:
 
 @njit(cache=True)
 def gather_evidence(kept, likelihood, evidence):  # type: ignore[no-untyped-def]
-    """Return Λ [K, H], the sum of log-likelihoods [K, H], of which a share [K] is kept at each step.
+    """Return Λ [K, H], the decaying sum of log-likelihoods [K, H]; each step keeps the share ``kept`` [K] of the sum.
 
     ``evidence`` [H] is Λ before the first step and becomes that of the last.
     """

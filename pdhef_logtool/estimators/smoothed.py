@@ -41,15 +41,6 @@ BLOCK_S = 60.0
 NOT_CAUSAL = "not causal: estimates use later measurements; to be ranked apart from causal estimators"
 
 
-def smooth_steps(forward: LinkedSteps) -> tuple[FloatArray, FloatArray]:
-    """Return the smoothed states [K, n] and covariances [K, n, n] of steps."""
-    steps, linked = forward.posterior, forward.linked[:, None]
-    predicted_x = np.where(linked, steps.prior, steps.x)
-    predicted_P = np.where(linked[:, :, None], forward.predicted_P, steps.P)
-    cross = np.where(linked[:, :, None], forward.cross, 0.0)
-    return smooth_states(steps.x, predicted_x, predicted_P, cross), smooth_covariances(steps.P, predicted_P, cross)
-
-
 def for_smoothing(physics: VehicleUkf, factors: Sequence[float]) -> VehicleUkf:
     """Return a filter with factors on its process noise of v_y and yaw rate."""
     along, vy, rate, *rest = physics.q_std
@@ -135,10 +126,15 @@ class SmoothedPhysics:
 
 def smoothed_track(physics: VehicleUkf, steps: LinkedSteps, following: LinkedSteps | None) -> StateTrack:
     """Return the smoothed track of steps, with those that follow them."""
-    x, P = smooth_steps(steps if following is None else steps.joined(following))
-    posterior = steps.posterior
-    count, in_place = len(posterior.stamps_ns), Extrapolation.none(posterior.valid)
-    return physics.predict(replace(posterior, x=x[:count], P=P[:count]), in_place, posterior.stamps_ns)
+    joined = steps if following is None else steps.joined(following)
+    run, linked, count = joined.posterior, joined.linked[:, None], len(steps.posterior.stamps_ns)
+    predicted_x = np.where(linked, run.prior, run.x)
+    predicted_P = np.where(linked[:, :, None], joined.predicted_P, run.P)
+    cross = np.where(linked[:, :, None], joined.cross, 0.0)
+    x = smooth_states(run.x, predicted_x, predicted_P, cross)[:count]
+    P = smooth_covariances(run.P, predicted_P, cross)[:count]
+    smoothed = replace(steps.posterior, x=x, P=P)
+    return physics.predict(smoothed, Extrapolation.none(smoothed.valid), smoothed.stamps_ns)
 
 
 def blocks(stamps_ns: IntArray, block_s: float) -> Iterator[slice]:

@@ -54,13 +54,7 @@ from typing import Any, Final, Literal, cast
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.presets import (
-    AIDED,
-    OPEN_LOOP,
-    SELF_CALIBRATED,
-    calibration_of,
-    preset_of,
-)
+from pdhef_logtool.estimators.presets import AIDED, OPEN_LOOP, SELF_CALIBRATED, calibration_of, preset_of
 from pdhef_logtool.estimators.presets import Options as Options
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.printable import printable

@@ -71,8 +71,8 @@ FORCE_SCALE_TIME_S = 2.0
 BANK_TIME_S = 5.0
 #: Largest product of step and the roll mode's frequency; longer steps are divided.
 _MAX_ROLL_STEP = 0.5
-#: Minimum share of the grip that braking leaves for lateral forces.
-_LEAST_GRIP = 0.2
+#: Minimum share of the grip that braking leaves for lateral forces; minimum factor on forces by their scale.
+_LEAST_GRIP, LEAST_FORCE = 0.2, 0.1
 #: Below this roll gradient, rad/(m/s²), roll does not indicate load transfer, which then follows the acceleration.
 LEAST_ROLL_GRADIENT = 1e-3
 
@@ -229,6 +229,12 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
 
 
 @_inline
+def force_factor(scale):  # type: ignore[no-untyped-def]
+    """Return the factor on the tyres' forces by their scale."""
+    return max(LEAST_FORCE, 1.0 + scale)
+
+
+@_inline
 def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
     """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x is limited to 1, where the inner wheel lifts."""
     x = min(1.0, abs(f.transfer_per_ay * ay))
@@ -253,7 +259,7 @@ def _tyre_forces(points, columns, row, angle, axle, f):  # type: ignore[no-untyp
     for j in range(columns):
         points[row * WIDTH + j] = shape * arctangent(points[row * WIDTH + j], 1.0)
     for j in range(columns):
-        steady, scale = peak * sine(points[row * WIDTH + j]), max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        steady, scale = peak * sine(points[row * WIDTH + j]), force_factor(points[FORCE_SCALE * WIDTH + j])
         factor = _transfer_factor(points[LEAN * WIDTH + j], f.load_sensitivity, f)
         points[row * WIDTH + j] = steady * scale * factor / _transfer_factor(steady / share, held, f)
 
@@ -367,7 +373,7 @@ def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
     """
     share = dynamic_share(vx, p) * dt
     for j in range(columns):
-        force = share * max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        force = share * force_factor(points[FORCE_SCALE * WIDTH + j])
         points[VY * WIDTH + j] += force * rate[0]
         points[YAW_RATE * WIDTH + j] += force * rate[1]
 
@@ -391,7 +397,7 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
             ay, turn = front + rear, inertia * (p.front_m * front - p.rear_m * rear)
         else:
             ay, turn = accelerations(vx, vy, r, steer, nominal, p)
-        ay = w * (ay + max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
+        ay = w * (ay + force_factor(points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
         ay = (1.0 + tilt) * ay + w * turn * p.imu_x_m - r * r * p.imu_y_m + GRAVITY_M_S2 * points[ROLL * WIDTH + j]
         out[j] = ay
 
@@ -422,6 +428,6 @@ def planar_ay(x, steer, friction, rate_vy, layout, p):  # type: ignore[no-untype
     w = dynamic_share(x[VX], p)
     if layout.forces < 0:
         return planar_lateral_acceleration(x[VX], x[VY], x[YAW_RATE], steer, friction, p) + w * rate_vy
-    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    force = force_factor(x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     forces = x[FRONT] * math.cos(steer) + x[REAR]
     return w * (forces + force * rate_vy) + (1.0 - w) * x[VX] * x[YAW_RATE]

@@ -901,7 +901,7 @@ class VehicleUkf:
         rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
         tuning = self.tuning._replace(q_std=self.tuning.q_std.copy())  # it changes with the steering
-        _filter(window, tuning, self.parameters, after[:3], _scratch(n), steps.written, links)
+        _filter(window, tuning, self.parameters, after[:3], make_scratch(n), steps.written, links)
         return LinkedSteps(steps, *links), after._replace(slip=slip)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
@@ -930,7 +930,7 @@ def _expected_ay(x, inputs, model, out):  # type: ignore[no-untyped-def]
             out[k] = reading[0] + (x[k, layout.sensor_bias] if layout.sensor_bias >= 0 else 0.0)
 
 
-def _scratch(n: int) -> tuple[Any, ...]:
+def make_scratch(n: int) -> tuple[Any, ...]:
     """Return the arrays of a kernel for ``n`` states that keep nothing between steps, of the readings those from ν."""
     root, of_readings = padded(n, n), np.zeros((3, READINGS))
     block = (np.zeros(PLACES * WIDTH), np.zeros((root.shape[1], WIDTH)), np.zeros(WIDTH))
