@@ -1,11 +1,10 @@
 """Run the speed benchmarks and print their tables; ``--write-docs`` puts them into docs/reliability.md.
 
-    python -m benchmarks.performance [NAME ...] [--write-docs]
-    python -m benchmarks.performance --against TREE
+    python -m benchmarks.performance [NAME ...] [--against TREE] [--write-docs]
 
 A benchmark is a module of this package: its docstring heads its section of the page, ``rows()`` measures.
 ``--against`` compares with another source tree, for example of the last release (``git worktree add``): commands of
-both run in turns (:mod:`benchmarks.against`).
+both run in turns (:mod:`benchmarks.versions`).
 """
 
 from __future__ import annotations
@@ -16,12 +15,13 @@ from collections.abc import Sequence
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
+from types import ModuleType
 
-from benchmarks import against
 from benchmarks.measuring import Row, machine_facts
 from studies.pages import DOCS, table, update
 
-NAMES = ("hour", "reading", "reading_mdf", "fleet_drive", "starting")
+NAMES = ("hour", "where", "reading", "reading_mdf", "fleet_drive", "starting")
+VERSIONS = "versions"
 PAGE = "reliability.md"
 _HEAD = "work, figure, target, , against peers"
 
@@ -39,9 +39,9 @@ def _number(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
 
 
-def section(name: str, rows: Sequence[Row]) -> str:
+def section(module: ModuleType, rows: Sequence[Row]) -> str:
     """Return the section of one benchmark."""
-    about = cleandoc(import_module(f"benchmarks.{name}").__doc__ or "")
+    about = cleandoc(module.__doc__ or "")
     machine = ", ".join(f"{key} {value}" for key, value in machine_facts().items())
     return f"{about}\n\n{table(_HEAD, map(cells, rows))}\n\nMachine: {machine}."
 
@@ -55,15 +55,13 @@ def main() -> int:
     arguments = parser.parse_args()
     if set(arguments.names) - set(NAMES):
         parser.error(f"expected names out of {', '.join(NAMES)}, got {', '.join(arguments.names)}")
-    if arguments.against is not None:
-        print(table(_HEAD, map(cells, against.rows(arguments.against.resolve()))))
-        return 0
-    for name in arguments.names or NAMES:
+    for name in (VERSIONS,) if arguments.against else arguments.names or NAMES:
         print(f"{name} ...", file=sys.stderr)
-        rows: list[Row] = import_module(f"benchmarks.{name}").rows()
+        module = import_module(f"benchmarks.{name}")
+        rows = module.rows(arguments.against.resolve()) if arguments.against else module.rows()
         print(table(_HEAD, map(cells, rows)), end="\n\n", flush=True)
         if arguments.write_docs:
-            update(DOCS, PAGE, {name: section(name, rows)})
+            update(DOCS, PAGE, {name: section(module, rows)})
     return 0
 
 

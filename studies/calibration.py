@@ -22,8 +22,9 @@ import numpy as np
 import polars as pl
 
 from pdhef_logtool import Car, PdhefError
+from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from studies.drawn_cars import KINDS, draw_car
-from studies.gates.tool import Tool, reports
+from studies.gates.tool import Tool, metrics, reports
 from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, update, write_toml, write_validated_car
 from truthsim.batch import sensor_noise
 from truthsim.drive import simulate_drive
@@ -39,7 +40,6 @@ CARS, SEED = 30, 99_005
 FRICTIONS, WRONG = (0.85, 1.0), (0.5, 2.0)
 #: Lowest and highest share of values that a ± with 95 % coverage may have.
 ACCEPTED = (0.90, 0.98)
-NORMAL_95 = 1.959964
 RIGHT, WRONG_FILE = "right", "wrong"
 ESTIMATORS = ("zero", "open-loop", "phy-ukf", "physics")
 _PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
@@ -142,10 +142,10 @@ def outcomes(tool: Tool, index: int) -> tuple[list[dict[str, Any]], list[dict[st
 
 def figures_of(run: Path, log: str) -> Iterator[dict[str, Any]]:
     """Yield RMSE in degrees, d2 in m/s, coverage and width of the 95 % intervals of each estimator on a drive."""
-    metrics = pl.read_parquet(run / "metrics.parquet").filter(log=log, segment="all")
+    of_log = metrics(run, log=log)
     tracks = pl.read_parquet(run / "logs" / log / "estimates.parquet").filter("valid")
     for name in ESTIMATORS:
-        rows = metrics.filter(estimator=name).select("signal", "metric", "value").iter_rows()
+        rows = of_log.filter(estimator=name).select("signal", "metric", "value").iter_rows()
         of = {(signal, metric): value for signal, metric, value in rows}
         std, rmse = tracks.filter(estimator=name)["sideslip_std_rad"].to_numpy(), of["sideslip_rad", "rmse"]
         yield {

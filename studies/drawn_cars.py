@@ -97,7 +97,7 @@ def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> Ve
     if not np.isfinite(motion.column("ay_m_s2")).all():
         raise SimulationError(expected="a finite ramp steer", got="NaN or infinity", where="fit of a vehicle file")
     tyres, loads_n = {}, nominal.axle_loads_n(car)
-    for axle, (alpha, force) in nominal.axle_curves(motion, car).items():
+    for axle, (alpha, force) in nominal.axle_curves(map(motion.column, nominal.MOTION), car).items():
         # Beyond the peak the car slides in ever other ways; the curve is fitted up to it.
         whole = slice(0, int(np.argmax(force)) + 1)
         tyres[axle] = nominal.fit_axle(alpha[whole] / friction, force[whole] / friction, loads_n[axle])

@@ -23,13 +23,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from pdhef_logtool import Car
+from pdhef_logtool.evaluation.track_errors import NORMAL_95
+from pdhef_logtool.records.geometry import DEGREES, wrap_angle
+from pdhef_logtool.records.signals import FloatArray, IntArray
 from studies import pages
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
-from studies.gates.tool import Tool, estimates, reports, sideslip_rmse_deg
+from studies.gates.tool import Tool, estimates, metrics, reports, sideslip_rmse_deg
 from studies.mcap_logs import Message, messages, write_log
 from studies.pages import DRIVES, ROOT, number, table, write_toml
 from studies.peers.drives import PEER_DRIVES, mapping_table, peer_drive, vehicle_table
@@ -38,12 +40,11 @@ from truthsim.batch import DriveSpec
 from truthsim.drive import DEFAULT_VEHICLE
 from truthsim.vehicle_choice import choose_vehicle
 
-FloatArray = NDArray[np.float64]
 STORED = "cases.json"
 #: Checks that a spin fails: its course does not turn as the car does.
 SPIN_CHECKS = ("yaw_rate_rad_s.unit", "truth.yaw_rate_rad_s.unit", "truth.sideslip_rad.frame")
-#: Sideslip is scored above this speed; 95 % interval of a normal distribution.
-LEAST_SPEED_M_S, NORMAL_95 = 3.0, 1.96
+#: Sideslip is scored above this speed.
+LEAST_SPEED_M_S = 3.0
 #: Where the antenna of made GNSS is from the CG, forward and left, and above the roll axis, m.
 ANTENNA_M, ANTENNA_HEIGHT_M = (-0.4, 0.1), 1.2
 #: From the stamp of made GNSS to its arrival, s.
@@ -92,16 +93,14 @@ class Case:
 class Motion(NamedTuple):
     """Ground truth [N] that GNSS is made from; heading up to a constant."""
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: IntArray
     vx_m_s: FloatArray
     vy_m_s: FloatArray
     heading_rad: FloatArray
     roll_rate_rad_s: FloatArray
 
 
-def made_gnss(
-    motion: Motion, receiver: Receiver, fault: str = "", seed: int = 7
-) -> tuple[NDArray[np.int64], FloatArray]:
+def made_gnss(motion: Motion, receiver: Receiver, fault: str = "", seed: int = 7) -> tuple[IntArray, FloatArray]:
     """Return the stamps [M] and the velocities [M, 2] to the east and north that a receiver would show."""
     rng = np.random.default_rng(seed)
     t = (motion.stamps_ns - motion.stamps_ns[0]) * 1e-9
@@ -131,7 +130,7 @@ def made_gnss(
     return stamps, velocity
 
 
-def add_gnss(log: Path, output: Path, stamps_ns: NDArray[np.int64], velocity_m_s: FloatArray) -> Path:
+def add_gnss(log: Path, output: Path, stamps_ns: IntArray, velocity_m_s: FloatArray) -> Path:
     """Copy an MCAP log and add a topic with GNSS velocity as JSON; it arrives ``LATE_S`` after its stamp."""
     types = {"type": "object", "properties": {name: {"type": "number"} for name in ("east", "north")}}
     schema, late_ns = ("Velocity", "jsonschema", json.dumps(types).encode()), round(1e9 * LATE_S)
@@ -293,22 +292,21 @@ def scored_run(folder: Path, case: Case, vehicle: dict[str, Any]) -> Figures:
     if case.fault == AT_ANTENNA:
         (antenna,) = (p["value"] for p in report["parameters"] if p["name"] == "antenna x")
         vy = vy + (vehicle.get("truth_position_m", (0.0,))[0] - antenna) * truth["yaw_rate_rad_s"].to_numpy()
-    beta = np.degrees(np.arctan2(vy, vx))
-    error = (np.degrees(reference["sideslip_rad"].to_numpy()) - beta + 180.0) % 360.0 - 180.0
-    std = np.degrees(reference["sideslip_std_rad"].to_numpy())
+    beta = np.arctan2(vy, vx)
+    error, std = wrap_angle(reference["sideslip_rad"].to_numpy() - beta), reference["sideslip_std_rad"].to_numpy()
     used = (vx > case.least_speed_m_s) & np.isfinite(error)
     valid = used & reference["valid"].to_numpy()
 
-    def rms(values: FloatArray) -> float:
-        return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
+    def rms_deg(values: FloatArray) -> float:
+        return DEGREES * float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
     return {
-        "truth": rms(beta[used]),
-        "rmse": rms(error[used]),
-        "std": rms(std[used]),
+        "truth": rms_deg(beta[used]),
+        "rmse": rms_deg(error[used]),
+        "std": rms_deg(std[used]),
         "coverage": float(np.mean(np.abs(error[used]) < NORMAL_95 * std[used])),
         "valid_share": float(valid.sum() / max(used.sum(), 1)),
-        "valid_rmse": rms(error[valid]),
+        "valid_rmse": rms_deg(error[valid]),
         "used_gnss": report["gnss"],
         "refused": str(report["refused"] or ""),
         "physics": math.nan,
@@ -319,9 +317,9 @@ def scored_run(folder: Path, case: Case, vehicle: dict[str, Any]) -> Figures:
 
 def rankings(folder: Path, errors: dict[str, float]) -> tuple[int, int, int, int]:
     """Return ``pairs`` of :class:`Figures`; ``errors``: RMSE against ground truth by estimator."""
-    rows = pl.read_parquet(folder / "metrics.parquet").filter(metric="reference_further", segment="all")
     ranked = {f"{a}~{b}": errors[a] - errors[b] for a, b in combinations([n for n in RANKED if n in errors], 2)}
-    claims = {pair: value for pair, value in rows.select("estimator", "value").iter_rows() if pair in ranked}
+    rows = metrics(folder, metric="reference_further").select("estimator", "value").iter_rows()
+    claims = {pair: value for pair, value in rows if pair in ranked}
     agreed = sum(claim * ranked[pair] > 0.0 for pair, claim in claims.items())
     clear = [pair for pair, value in ranked.items() if abs(value) > CLEAR_DEG]
     return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)

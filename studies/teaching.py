@@ -21,7 +21,7 @@ import numpy as np
 import polars as pl
 
 from studies import pages
-from studies.gates.tool import Tool, estimates
+from studies.gates.tool import Tool, estimates, metrics
 from studies.pages import DRIVES, ROOT, number, read_toml, table, write_toml
 from studies.peers.drives import FULL_SIZE, PEER_DRIVES, mapping_table, peer_drive, vehicle_table
 
@@ -117,7 +117,7 @@ def scores(tool: Tool, part: TeachPart, car: Path, names: Sequence[str], *option
     run_name = f"{car.stem}-{part.name}{''.join(options_of)}".replace(" ", "-")
     given = ["--keep", "estimates", "--estimators", ",".join(names), *options_of]
     folder = tool.run(run_name, *inputs(tool, part), "--car", car, *given)
-    figures = pl.read_parquet(folder / "metrics.parquet").filter(signal="sideslip_rad", segment="all")
+    figures = metrics(folder, signal="sideslip_rad")
     active = estimates(folder).group_by("estimator").agg((pl.col("network_trust").fill_null(0.0) > 0.0).mean())
     found = {}
     for name, share in active.filter(pl.col("estimator").is_in(names)).iter_rows():

@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 
 from pdhef_logtool.cli.app import app, main
+from pdhef_logtool.cli.printing import print_template
 
 
 def pdhef(*arguments: object) -> None:
@@ -25,6 +26,11 @@ def rendered(render: Callable[[Any, Console], None], result: object, width: int 
     out = io.StringIO()
     render(result, Console(file=out, width=width, highlight=False, markup=False, no_color=True))
     return out.getvalue()
+
+
+def printed(template: str, result: object, width: int = 80, **fields: object) -> str:
+    """Return what a command with a template prints of its result."""
+    return rendered(lambda r, console: print_template(template, console, r=r, **fields), result, width)
 
 
 def called(

@@ -1,11 +1,11 @@
 """Fixed mutants: a list of faults that the tests notice; all must still be noticed after a change.
 
-    python tests/fixed_mutants.py [--jobs 2] [--only estimators] [--file LIST.json] [--draw 30 | --add 20] [--seed 1]
+    python tests/fixed_mutants.py [--jobs 2] [--only estimators] [--file LIST.json] [--draw 30 [--add]] [--seed 1]
 
 An entry of ``fixed_mutants.json`` has the file, its lines that contain the fault (``old``, once in the file), the same
 lines with the fault (``new``) and the tests that fail. If these tests are gone, the quick tests of the package replace
-them. An entry is reported if its lines no longer exist; ``--add`` removes it, draws new mutants (``mutants.py``) and
-keeps those that a quick test notices. ``--draw`` runs the tests of their packages on new mutants and lists survivors.
+them. An entry is reported if its lines no longer exist. ``--draw`` runs the tests of their packages on new mutants
+(``mutants.py``) and lists survivors; ``--add`` adds those that died to the list, and removes entries without lines.
 
 Each mutant runs in a fork of this process, which has imported libraries only. The fault is inserted at import: no file
 changes, and numba's cache remains valid. A fault in a compiled function (``compiled``) runs without the compiler, as
@@ -22,7 +22,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, SourceFileLoader
@@ -186,18 +186,18 @@ def is_there(test: str) -> bool:
     return (ROOT / file).is_file() and f"def {name.rpartition('::')[2]}(" in (ROOT / file).read_text()
 
 
-def judge(mutants_: Sequence[FixedMutant], jobs: int) -> Iterator[tuple[FixedMutant, str]]:
-    """Yield the outcome of each mutant: DIED, SURVIVED or GONE."""
+def judge(mutants_: Sequence[FixedMutant], jobs: int) -> Iterator[tuple[FixedMutant, str, str]]:
+    """Yield the outcome of each mutant, DIED, SURVIVED or GONE, and the test that failed first."""
     work = []
     for mutant in mutants_:
         if mutant.source() is None:
-            yield mutant, GONE
+            yield mutant, GONE, ""
         else:
             tests = [t for t in mutant.tests if is_there(t)]
             work.append((mutant, mutant, tests or quick_tests(mutant.package)))
-    for mutant, code, _ in run_forked(work, jobs):
+    for mutant, code, failed in run_forked(work, jobs):
         unclear = code < 0 and "::" not in mutant.tests[0]  # the folders' time was up
-        yield mutant, SURVIVED if unclear or code in (0, 3, 4, 5) else DIED
+        yield mutant, SURVIVED if unclear or code in (0, 3, 4, 5) else DIED, failed
 
 
 def quick_tests(package: str) -> list[str]:
@@ -237,8 +237,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="mutants at a time")
     parser.add_argument("--only", default="", help="packages whose names contain this")
     parser.add_argument("--file", type=Path, default=LIST, help="the list")
-    parser.add_argument("--add", type=int, default=0, help="draw so many, and add those that a quick test notices")
     parser.add_argument("--draw", type=int, default=0, help="judge so many new ones in place of the list")
+    parser.add_argument("--add", action="store_true", help="add those of them that died to the list")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     known = read_list(options.file)
@@ -246,35 +246,25 @@ def main() -> int:
     if options.draw:
         drawn = candidates(options.draw, options.seed, options.only)
         chosen = [fixed(m, [f"tests/{m.package}", *SEAMS.get(m.package, ("tests/runs",))]) for m in drawn]
-    if max(options.add, len(chosen)) > MANY:
+    if len(chosen) > MANY:
         for name in LIBRARIES:
             import_module(name)
-    if options.add:
-        drawn = candidates(options.add, options.seed, options.only)
-        work = ((f, f, quick_tests(f.package)) for f in map(fixed, drawn) if not f.compiled)
-        new = list(_noticed(work, options.jobs))
-        there = {(m.file, m.old): m for m in (*new, *known) if m.source() is not None}
-        write_list(there.values(), options.file)
-        print(f"{len(new)} of {len(drawn)} were noticed and added; {len(there)} in the list")
-        return 0
     tests = sorted({test.partition("[")[0] for m in chosen for test in m.tests if is_there(test)})
     ((_, code, failed),) = run_forked([("no mutant", None, tests)], 1)
     if code:
         print(f"the tests do not pass without a mutant: {failed or f'pytest ended with {code}'}", file=sys.stderr)
         return 2
-    ends = []
-    for mutant, end in judge(chosen, options.jobs):
+    ends, new = [], []
+    for mutant, end, failed in judge(chosen, options.jobs):
         ends.append(end)
         if end != DIED:
             print(f"{end}: {mutant.file}: {mutant.old.strip()}  ->  {mutant.new.strip()}", flush=True)
+        elif "::" in failed and not mutant.compiled:
+            new.append(replace(mutant, tests=(stored_test(failed),)))
+    if options.add:
+        write_list({(m.file, m.old): m for m in (*new, *known) if m.source() is not None}.values(), options.file)
     print(f"{ends.count(DIED)} of {len(ends)} died, {ends.count(SURVIVED)} survived, {ends.count(GONE)} are gone")
     return int(ends.count(DIED) < len(ends))
-
-
-def _noticed(work: Iterable[tuple[FixedMutant, FixedMutant, Sequence[str]]], jobs: int) -> Iterator[FixedMutant]:
-    for mutant, code, failed in run_forked(work, jobs):
-        if code not in (0, 3, 4, 5) and "::" in failed:
-            yield FixedMutant(mutant.file, mutant.old, mutant.new, (stored_test(failed),), mutant.compiled)
 
 
 if __name__ == "__main__":

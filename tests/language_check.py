@@ -1,23 +1,18 @@
 """Check the texts for users and developers for retired terms: ``make lint`` runs it.
 
-    python tests/language_check.py [--list AREA] [--lower] [--draw N]
+    python tests/language_check.py [--list AREA] [--lower]
 
 Areas: documentation (pages written by hand), help (texts of the command line), messages (other literals with a space,
 HTML templates), comments (with docstrings), names (of variables and parameters). An area fails with more hits than
 ``language_limits.json`` allows; ``--lower`` lowers the limits to the present counts. Code spans, code blocks,
 names with an underscore, which are contracts of files and commands, and names of parameters in docstrings do not count.
-
-``--draw 60`` prints docstrings of the package to read aloud, drawn with the hash of the commit as the seed: an engineer
-of the field should understand at least 57 at first reading.
 """
 
 import argparse
 import ast
 import io
 import json
-import random
 import re
-import subprocess
 import sys
 import tokenize
 from collections import Counter
@@ -136,30 +131,12 @@ def hits(root: Path) -> Iterator[Hit]:
         yield from code(path, path.relative_to(root).as_posix())
 
 
-def drawn_docstrings(root: Path, count: int, seed: str) -> Iterator[str]:
-    """Yield place, signature and docstring of functions and classes of the package, drawn by a seed."""
-    found = []
-    for path in sorted((root / "pdhef_logtool").rglob("*.py")):
-        lines = path.read_text(encoding="utf-8").splitlines()
-        for node in ast.walk(ast.parse("\n".join(lines))):
-            if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node):
-                end = node.body[0].end_lineno
-                text = "\n".join(lines[node.lineno - 1 : end])
-                found.append(f"{path.relative_to(root).as_posix()}:{node.lineno}\n{text}\n")
-    yield from random.Random(seed).sample(found, count)
-
-
 def main() -> int:
     """Return 0 where no area has more hits than its limit."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--list", choices=AREAS, help="print the hits of an area")
     parser.add_argument("--lower", action="store_true", help="write the present counts where they are smaller")
-    parser.add_argument("--draw", type=int, metavar="N", help="print N docstrings, drawn by the hash of the commit")
     given = parser.parse_args()
-    if given.draw:
-        head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True)
-        sys.stdout.writelines(f"{text}\n" for text in drawn_docstrings(ROOT, given.draw, head.stdout.strip()))
-        return 0
     found_hits = list(hits(ROOT))
     for hit in found_hits:
         if hit.area == given.list:

@@ -33,7 +33,6 @@ class Mutant:
 
     package: str
     file: str
-    line: int
     function: str
     kind: str
     start: int
@@ -42,129 +41,83 @@ class Mutant:
     compiled: bool
 
 
-class _Finder(ast.NodeVisitor):
-    """Collects every possible fault in the functions of one file."""
-
-    def __init__(self, package: str, file: str, source: bytes, run_at_import: frozenset[str]) -> None:
-        self.found: list[Mutant] = []
-        self._package, self._file, self._source, self._run_at_import = package, file, source, run_at_import
-        self._lines = [0]
-        for line in source.splitlines(keepends=True):
-            self._lines.append(self._lines[-1] + len(line))
-        self._names: list[str] = []
-        self._compiled = [False]
-
-    def visit_Module(self, node: ast.Module) -> None:
-        self._definitions(node.body)
-
-    def visit_ClassDef(self, node: ast.ClassDef) -> None:
-        self._names.append(node.name)
-        self._definitions(node.body)
-        self._names.pop()
-
-    def _definitions(self, body: list[ast.stmt]) -> None:
-        for statement in body:
-            if isinstance(statement, ast.ClassDef | ast.FunctionDef):
-                self.visit(statement)
-
-    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        compiled = any("jit" in ast.unparse(d) for d in node.decorator_list) or node.name in self._run_at_import
-        self._names.append(node.name)
-        self._compiled.append(compiled or self._compiled[-1])
-        for statement in node.body:  # neither decorators, defaults nor annotations
-            self.visit(statement)
-        self._names.pop()
-        self._compiled.pop()
-
-    def _add(self, kind: str, node: ast.expr | ast.stmt, new: ast.expr | None) -> None:
-        assert node.end_lineno is not None and node.end_col_offset is not None
-        start = self._lines[node.lineno - 1] + node.col_offset
-        old = self._source[start : self._lines[node.end_lineno - 1] + node.end_col_offset].decode()
-        # As many lines as before: numba finds compiled functions by the line that they begin at.
-        rows = "\n" * old.count("\n")
-        text = f"pass{rows}" if new is None else f"({ast.unparse(new)}{rows})"
-        function = ".".join(self._names)
-        where = (self._package, self._file, node.lineno, function)
-        self.found.append(Mutant(*where, kind, start, old, text, self._compiled[-1]))
-
-    def visit_Compare(self, node: ast.Compare) -> None:
-        if len(node.ops) == 1:
-            self._add("comparison", node, ast.Compare(node.left, [_flip(node.ops[0])], node.comparators))
-        self.generic_visit(node)
-
-    def visit_BoolOp(self, node: ast.BoolOp) -> None:
-        self._add("and/or", node, ast.BoolOp(_flip(node.op), node.values))
-        self.generic_visit(node)
-
-    def visit_BinOp(self, node: ast.BinOp) -> None:
-        text = any(
-            isinstance(n, _TEXT) or (isinstance(n, ast.Constant) and isinstance(n.value, str))
-            for n in (node.left, node.right)
-        )
-        if type(node.op) in _OPPOSITE and not text:
-            self._add("sign", node, ast.BinOp(node.left, _flip(node.op), node.right))
-        self.generic_visit(node)
-
-    def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
-        if isinstance(node.op, ast.USub):
-            self._add("sign", node, node.operand)
-        self.generic_visit(node)
-
-    def visit_Constant(self, node: ast.Constant) -> None:
-        value = node.value
-        if isinstance(value, bool):
-            self._add("constant", node, ast.Constant(not value))
-        elif isinstance(value, int):
-            self._add("constant", node, ast.Constant(value + 1))
-        elif isinstance(value, float) and (value == 0.0 or abs(value) >= 1e-9):  # below: a guard against division by 0
-            self._add("constant", node, ast.Constant(value * 2.0 if value else 1.0))
-
-    def visit_Call(self, node: ast.Call) -> None:
-        name = ast.unparse(node.func)
-        if _WORDS.search(name):
-            return
-        plain = not any(isinstance(a, ast.Starred) for a in node.args)
-        if plain and name.rpartition(".")[2] not in _COMMUTATIVE:
-            for i in range(len(node.args) - 1):
-                first, second = node.args[i : i + 2]
+def _faults(node: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
+    """Yield the kind of each fault of a node, and what replaces it; None: nothing does."""
+    match node:
+        case ast.Compare(ops=[operator]):
+            yield "comparison", ast.Compare(node.left, [_flip(operator)], node.comparators)
+        case ast.BoolOp():
+            yield "and/or", ast.BoolOp(_flip(node.op), node.values)
+        case ast.BinOp() if type(node.op) in _OPPOSITE and not (_is_text(node.left) or _is_text(node.right)):
+            yield "sign", ast.BinOp(node.left, _flip(node.op), node.right)
+        case ast.UnaryOp(op=ast.USub()):
+            yield "sign", node.operand
+        case ast.Constant(value=bool(value)):
+            yield "constant", ast.Constant(not value)
+        case ast.Constant(value=int(value)):
+            yield "constant", ast.Constant(value + 1)
+        case ast.Constant(value=float(value)) if value == 0.0 or abs(value) >= 1e-9:  # below: a guard against 1 / 0
+            yield "constant", ast.Constant(value * 2.0 if value else 1.0)
+        case ast.Call() if _may_swap(node):
+            for i, (first, second) in enumerate(zip(node.args, node.args[1:], strict=False)):
                 if ast.dump(first) != ast.dump(second):
                     swapped = copy.copy(node)
                     swapped.args = [*node.args[:i], second, first, *node.args[i + 2 :]]
-                    self._add("swapped arguments", node, swapped)
-        for part in (node.func, *node.args, *(k.value for k in node.keywords if k.arg not in _IDLE_KEYWORDS)):
-            self.visit(part)
-
-    def _removable(self, node: ast.stmt) -> None:
-        self._add("removed statement", node, None)
-        self.generic_visit(node)
-
-    visit_AugAssign = visit_Continue = visit_Break = _removable
-
-    def visit_Assign(self, node: ast.Assign) -> None:
-        if all(isinstance(t, ast.Attribute | ast.Subscript) for t in node.targets):
-            self._add("removed statement", node, None)
-        self.generic_visit(node)
-
-    def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
-        if node.value is not None:
-            self.visit(node.value)
-
-    def visit_Expr(self, node: ast.Expr) -> None:
-        if isinstance(node.value, ast.Call) and not _WORDS.search(ast.unparse(node.value.func)):
-            self._removable(node)
-
-    def visit_Raise(self, node: ast.Raise) -> None:
-        self._add("removed statement", node, None)
-
-    def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
-        """Leave messages alone."""
-
-    def visit_Assert(self, node: ast.Assert) -> None:
-        """Leave assertions alone: they only narrow types."""
+                    yield "swapped arguments", swapped
+        case ast.AugAssign() | ast.Continue() | ast.Break() | ast.Raise() | ast.Expr(value=ast.Call()):
+            yield "removed statement", None
+        case ast.Assign() if all(isinstance(t, ast.Attribute | ast.Subscript) for t in node.targets):
+            yield "removed statement", None
 
 
 def _flip(operator: ast.AST) -> Any:
     return _OPPOSITE[type(operator)]()
+
+
+def _is_text(node: ast.expr) -> bool:
+    return isinstance(node, _TEXT) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+
+
+def _may_swap(call: ast.Call) -> bool:
+    name = ast.unparse(call.func).rpartition(".")[2]
+    return name not in _COMMUTATIVE and not any(isinstance(a, ast.Starred) for a in call.args)
+
+
+def _parts(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes below one that may have faults: no messages, assertions, annotations or idle keywords."""
+    match node:
+        case ast.JoinedStr() | ast.Assert() | ast.Raise():
+            return
+        case ast.FunctionDef() | ast.ClassDef():  # neither decorators, defaults nor annotations
+            yield from node.body
+        case ast.AnnAssign():
+            yield from [node.value] if node.value is not None else []
+        case ast.Call():
+            yield from (node.func, *node.args, *(k.value for k in node.keywords if k.arg not in _IDLE_KEYWORDS))
+        case _:
+            yield from ast.iter_child_nodes(node)
+
+
+def _is_message(node: ast.AST) -> bool:
+    call = node.value if isinstance(node, ast.Expr) else node
+    return isinstance(call, ast.Call) and bool(_WORDS.search(ast.unparse(call.func)))
+
+
+def _sites(node: ast.AST, function: str, is_compiled: bool, at_import: frozenset[str]) -> Iterator[tuple[Any, ...]]:
+    """Yield the faults below a node: kind, node, its replacement, function and whether numba compiles that."""
+    for part in _parts(node):
+        if isinstance(part, ast.FunctionDef | ast.ClassDef):
+            name = f"{function}.{part.name}".lstrip(".")
+            yield from _sites(part, name, is_compiled or _is_compiled(part, at_import), at_import)
+        elif not isinstance(node, ast.Module | ast.ClassDef) and not _is_message(part):
+            yield from ((kind, part, new, function, is_compiled) for kind, new in _faults(part))
+            yield from _sites(part, function, is_compiled, at_import)
+
+
+def _is_compiled(node: ast.FunctionDef | ast.ClassDef, at_import: frozenset[str]) -> bool:
+    """Tell whether numba may hold a function: compiled itself, or called at import."""
+    decorated = any("jit" in ast.unparse(d) for d in node.decorator_list)
+    return isinstance(node, ast.FunctionDef) and (decorated or node.name in at_import)
 
 
 @functools.cache
@@ -174,9 +127,17 @@ def possible(package: str, root: Path = ROOT) -> tuple[Mutant, ...]:
     found: list[Mutant] = []
     for path, tree in trees.items():
         if path.is_relative_to(root / SOURCES / package):
-            finder = _Finder(package, path.relative_to(root).as_posix(), path.read_bytes(), at_import)
-            finder.visit(tree)
-            found += finder.found
+            source, file = path.read_bytes(), path.relative_to(root).as_posix()
+            lines = [0]
+            for line in source.splitlines(keepends=True):
+                lines.append(lines[-1] + len(line))
+            for kind, node, new, function, compiled in _sites(tree, "", False, at_import):
+                start = lines[node.lineno - 1] + node.col_offset
+                old = source[start : lines[node.end_lineno - 1] + node.end_col_offset].decode()
+                # As many lines as before: numba finds compiled functions by the line that they begin at.
+                rows = "\n" * old.count("\n")
+                text = f"pass{rows}" if new is None else f"({ast.unparse(new)}{rows})"
+                found.append(Mutant(package, file, function, kind, start, old, text, compiled))
     return tuple(found)
 
 

@@ -61,11 +61,7 @@ def ran(name: str, **changes: Any) -> dict[str, Any]:
 
 
 def report(
-    main: MainFacts | None = MAIN,
-    *,
-    name: str = "drive",
-    vehicle: dict[str, Any] | None = None,
-    **changes: Any,
+    main: MainFacts | None = MAIN, *, name: str = "drive", vehicle: dict[str, Any] | None = None, **changes: Any
 ) -> dict[str, Any]:
     """Return a report; ``vehicle`` : changed entries of the vehicle."""
     nothing: dict[str, Any] = dict.fromkeys(("metrics", "segments", "losses", "warnings", "remarks", "checks"), ())

@@ -1,7 +1,5 @@
 """Logs of tables as a whole."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from contextlib import closing

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.writer import TopicBatch
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.records.signals import WHEELS, FloatArray, IntArray
 from truthsim.faults import KINDS, TARGETS, Fault
 from truthsim.sensors import IMU_PERIOD_S, RTK_FIXED, RTK_LOST, SensorChannel, SensorNoise
@@ -71,10 +71,10 @@ class Topic:
     fields: Mapping[str, NDArray[Any]]
     definition: str | None = None
 
-    def between(self, start_ns: int, end_ns: int) -> TopicBatch:
+    def between(self, start_ns: int, end_ns: int) -> Columns:
         """Return the messages that arrive in [start, end)."""
         rows = slice(*np.searchsorted(self.arrival_ns, [start_ns, end_ns], side="left").tolist())
-        return TopicBatch(
+        return Columns(
             topic=self.name,
             log_time_ns=self.arrival_ns[rows],
             publish_time_ns=self.stamps_ns[rows],

@@ -28,7 +28,6 @@ def compare(
     junit: Path | None = None,
 ) -> None:
     """Compare two runs drive by drive: better, worse, or no significant difference; more runs as a history."""
-    from pdhef_logtool.cli.compare_tables import render_comparison
     from pdhef_logtool.results import comparing
     from pdhef_logtool.storage.files import write_bytes
     from pdhef_logtool.storage.object_store import is_url
@@ -49,7 +48,7 @@ def compare(
         from pdhef_logtool.reports.comparison import comparison_page
 
         write_bytes(html, comparison_page(comparison))
-    console.finish(comparison, render_comparison)
+    console.finish(comparison, "comparison", comparing=comparing)
 
 
 @options.command()
@@ -64,7 +63,6 @@ def events(
     source: Path | None = None,
 ) -> None:
     """Find the times at which a condition is true, and cut clips there."""
-    from pdhef_logtool.cli.compare_tables import render_events
     from pdhef_logtool.results.events import event_condition, find_events
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.storage.object_store import is_url
@@ -84,7 +82,7 @@ def events(
         named = {r.track for r in condition.references.values() if r.track is not None}
         named |= set() if estimator is None else {estimator}
         events_found = write_clips(run, events_found, pad_s=pad_s, named=named, source=source, tell=console.warn)
-    console.finish(events_found, render_events)
+    console.finish(events_found, "events")
 
 
 def _seconds(text: str, option: str) -> float:
@@ -98,6 +96,8 @@ def _seconds(text: str, option: str) -> float:
 @options.command()
 def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
     """Ask about the drives of one or more runs, in SQL."""
+    from rich.markup import escape
+
     from pdhef_logtool.results import querying
 
     rows = querying.query(runs, sql)
@@ -108,10 +108,10 @@ def query(runs: list[str], sql: str, *, csv: bool = False) -> None:
     def text(value: object) -> str:
         return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else printable(str(value))
 
-    heads = [f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items()]
+    heads = [f"<{'>' * kind.is_numeric()}{escape(name)}" for name, kind in rows.schema.items()]
     texts, out = (map(text, row) for row in rows.iter_rows()), console.stdout()
     if sum(len(name) + 2 for name in rows.columns) <= out.width:
-        out.print(console.table(*heads, rows=texts, fold=len(heads)))
+        out.print(console.table(*heads, rows=texts))
         return
     for row in texts:  # too many columns: a line each
-        out.print(console.named_lines(dict(zip(rows.columns, row, strict=True))), "")
+        out.print(console.named_lines(zip(rows.columns, row, strict=True)), "")

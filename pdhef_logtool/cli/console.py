@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeVar
 
 import typer
 
@@ -35,6 +35,8 @@ _verbose = False
 as_json = False
 #: Interval between lines of progress without a terminal, s.
 PROGRESS_S = 30.0
+#: Line break within a cell of a table; printable texts contain no such character.
+BREAK = "\v"
 #: A line on stderr is an error or a warning of several parts.
 _MOST_SIGNS = 5000
 
@@ -56,35 +58,42 @@ def stdout() -> Console:
     )
 
 
-def table(*heads: str, rows: Iterable[Iterable[Any]] = (), fold: int = 0) -> Table:
-    """Return a table of rows without a box; a head that begins with ``>`` marks a column of numbers.
+def table(*heads: str, rows: Iterable[Iterable[Any]] = (), title: str = "") -> Table:
+    """Return a table of rows, with rules below its title if it has one.
 
-    ``fold``: number of columns from the left that wrap their text instead of truncating it.
+    Signs before a head, which is in the markup of Rich: ``>`` for a column of numbers, ``<`` to wrap texts instead of
+    truncating them, ``!`` to do neither.
     """
+    from rich import box
     from rich.table import Table
+    from rich.text import Text
 
     made = Table(box=None, header_style="bold")
-    for number, head in enumerate(heads):
-        side: Literal["left", "right"] = "right" if head.startswith(">") else "left"
-        made.add_column(head.removeprefix(">"), justify=side, overflow="fold" if number < fold else "ellipsis")
+    if title:
+        style: dict[str, Any] = {"box": box.SIMPLE_HEAD, "pad_edge": False, "padding": (0, 1, 0, 0)}
+        made = Table(title=Text.from_markup(title, emoji=False), title_justify="left", title_style="bold", **style)
+    for head in heads:
+        text = head.lstrip("<>!")
+        signs = head.removesuffix(text)
+        made.add_column(
+            Text.from_markup(text.replace(BREAK, "\n"), emoji=False),
+            justify="right" if ">" in signs else "left",
+            overflow="fold" if "<" in signs else "ellipsis",
+            no_wrap="!" in signs,
+        )
     for row in rows:
         made.add_row(*row)
     return made
 
 
-def three_lines(result: str | Text, assumed: str, following: str) -> Table:
-    """Return the first three lines on the terminal: result, assumptions, next step."""
-    return named_lines({"Result": result, "Assumed": assumed, "Next": following}, style="bold")
-
-
-def named_lines(texts: Mapping[str, str | Text], *, style: str = "") -> Table:
+def named_lines(texts: Iterable[tuple[str | Text, str | Text]]) -> Table:
     """Return a line per text, after its name."""
     from rich.table import Table
 
     lines = Table.grid(padding=(0, 2, 0, 0))
-    lines.add_column(no_wrap=True, style=style)
+    lines.add_column(no_wrap=True)
     lines.add_column(overflow="fold")
-    for name, text in texts.items():
+    for name, text in texts:
         lines.add_row(name, text)
     return lines
 
@@ -144,18 +153,22 @@ def print_facts(facts: dict[str, Any]) -> None:
         print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {printable(value)}")  # noqa: T201
 
 
-def show(result: _Shown, render: Callable[[_Shown, Console], None]) -> None:
-    """Print a result as a JSON document or as tables."""
+def show(result: _Shown, output: Callable[[_Shown, Console], None] | str, **fields: Any) -> None:
+    """Print a result as a JSON document, or by a function or a template; it is the template's field ``r``."""
     if as_json:
         print_json(result if isinstance(result, Mapping) else result.to_dict())
+    elif isinstance(output, str):
+        from pdhef_logtool.cli.printing import print_template
+
+        print_template(output, stdout(), r=all_printable(result), **fields)
     else:
-        render(all_printable(result), stdout())
+        output(all_printable(result), stdout())
 
 
-def finish(result: _Shown, render: Callable[[_Shown, Console], None], *, exit_code: int | None = None) -> NoReturn:
-    """Print a result and exit with ``exit_code``, otherwise with the exit code of the result or 0."""
-    show(result, render)
-    raise typer.Exit(getattr(result, "exit_code", EXIT_OK) if exit_code is None else exit_code)
+def finish(result: _Shown, output: Callable[[_Shown, Console], None] | str, **fields: Any) -> NoReturn:
+    """Print a result as :func:`show` does, and exit with its exit code or 0."""
+    show(result, output, **fields)
+    raise typer.Exit(getattr(result, "exit_code", EXIT_OK))
 
 
 def _progress_lines() -> Callable[[str, float], None]:

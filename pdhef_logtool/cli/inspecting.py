@@ -9,13 +9,18 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from pdhef_logtool.cli import console, options
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
+from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from pdhef_logtool.logs.drive_log import DriveLog
     from pdhef_logtool.logs.remote_place import LogPlace
     from pdhef_logtool.runs.config import RunConfig
     from pdhef_logtool.runs.inspection.report import Inspection
+
+#: Columns of the kind of a finding.
+_HEAD_WIDTH = 9
 
 
 @options.command()
@@ -33,7 +38,7 @@ def inspect(
 
     Of an MCAP file above 32 MB with an intact index, only a part of the chunks is read; the output states how many.
     """
-    from pdhef_logtool.runs.inspection import fields_of_log, render_fields, render_inspection
+    from pdhef_logtool.runs.inspection import fields_of_log
     from pdhef_logtool.runs.inspection import write_mapping as write_mapping_file
 
     if topic is not None and not fields:
@@ -42,7 +47,7 @@ def inspect(
         raise UsageError(expected="--fields alone", got="--report or --write-mapping as well", where="--fields")
     if fields:
         topic_fields = fields_of_log(_place(log, config), topic, config.read_options)
-        console.finish(topic_fields, render_fields, exit_code=EXIT_OK)
+        console.finish(topic_fields, "fields")
 
     def write_files(inspection: Inspection, open_log: DriveLog) -> None:
         if write_mapping is not None:
@@ -55,8 +60,32 @@ def inspect(
             console.say(f"page written to {report}")
 
     inspection = _inspect(log, config, whole=whole, then=write_files)
-    exit_code = EXIT_PARTIAL if inspection.is_partial else EXIT_OK
-    console.finish(inspection, render_inspection, exit_code=exit_code)
+    console.finish(inspection, render_inspection)
+
+
+def render_inspection(inspection: Inspection, out: Console) -> None:
+    """Print an inspection: its tables, then its findings."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from pdhef_logtool.cli.printing import print_template
+    from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
+    from pdhef_logtool.runs.inspection.report import findings_of
+
+    names = list(dict.fromkeys((*SIGNAL_UNITS, *TRUTH_UNITS)))
+    print_template("inspection", out, r=inspection, names=names, short=_short)
+    for head, style, text in findings_of(inspection):
+        line = Table.grid(padding=(0, 1))
+        line.add_column(width=_HEAD_WIDTH)
+        line.add_column(overflow="fold")
+        line.add_row(Text(head, style), Text(text))
+        out.print(line)
+
+
+def _short(field: str) -> str:
+    """Write several fields of one struct as ``struct.{w,x,y,z}``."""
+    stems, _, leaves = zip(*(path.rpartition(".") for path in field.split(", ")), strict=True)
+    return f"{stems[0]}.{{{','.join(leaves)}}}" if len(leaves) > 1 and stems[0] and len(set(stems)) == 1 else field
 
 
 @options.command()

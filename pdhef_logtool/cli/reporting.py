@@ -11,8 +11,6 @@ from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from pdhef_logtool.reports.pages import WrittenPages
 
 
@@ -35,7 +33,7 @@ def report(
             from pdhef_logtool.reports.pdf import write_pdf
 
             result = replace(result, pdf=write_pdf(open_run(folder), positions=positions))
-    console.show(result, _render)
+    console.show(result, "pages")
     for line in result.wrong:
         console.warn(line)
     if show:
@@ -53,17 +51,3 @@ def open_page(result: WrittenPages) -> None:
         return
     if not console.has_display() or not webbrowser.open(page.resolve().as_uri()):
         console.say(f"no browser is available; open {page.resolve()}, a single file, on any machine")
-
-
-def _render(result: WrittenPages, out: Console) -> None:
-    files = [page.file for page in (result.fleet, *result.pages) if page.file is not None]
-    logs = sum(page.file is not None for page in result.pages)
-    pdf = "" if result.pdf is None else f" and {result.pdf.name}"
-    wrong = f"; {len(result.wrong)} missing or incomplete" if result.wrong else ""
-    out.print(
-        console.three_lines(
-            f"pages{pdf} of the run and of {logs} log{'s' * (logs != 1)}{wrong}",
-            "the figures of the run; no estimator ran again",
-            "read the warnings" if result.wrong else f"open {result.pdf or files[0]}",
-        )
-    )

@@ -118,11 +118,10 @@ def _finish(result: RunResult) -> NoReturn:
             if entry.outcome.failed is not None and entry.report is not None:  # the tables show the others
                 console.error(f"pdhef: {entry.outcome.log}: {entry.outcome.failed}")
     plan = result.requirements
-    if plan is not None and plan.closes_gate:
-        for verdict in plan.verdicts:
-            if verdict.outcome == "FAIL" or (plan.strict and verdict.outcome == "INCONCLUSIVE"):
-                where = f"{verdict.requirement.id} ({verdict.requirement.label})"
-                console.error(f"pdhef: {verdict.outcome}: {where}: {verdict.reason}")
+    if plan is not None and plan.closing:
+        for verdict in plan.closing:
+            where = f"{verdict.requirement.id} ({verdict.requirement.label})"
+            console.error(f"pdhef: {verdict.outcome}: {where}: {verdict.reason}")
         for entry in result.results if not result.is_fleet else ():
             if entry.outcome.outcome != "ok":
                 console.error(f"pdhef: {entry.outcome.log} besides {entry.outcome.outcome}")

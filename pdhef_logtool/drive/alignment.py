@@ -32,6 +32,8 @@ from pdhef_logtool.records.signals import (
     GNSS,
     GNSS_COMPONENTS,
     GNSS_POSITION,
+    NS_PER_S,
+    S_PER_NS,
     WHEELS,
     BoolArray,
     Channel,
@@ -222,7 +224,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan) -> tuple[Signals
     gnss: dict[str, Any] = {}
     if has_gnss(columns):
         velocity = gnss["gnss_velocity_m_s"] = gnss_velocity(columns)
-        gnss["gnss_late_s"] = np.where(np.isfinite(velocity[:, 0]), (gnss_ready - stamps) * 1e-9, np.nan)
+        gnss["gnss_late_s"] = np.where(np.isfinite(velocity[:, 0]), (gnss_ready - stamps) * S_PER_NS, np.nan)
         if plan.speed_from == "GNSS":
             columns["speed_m_s"] = np.hypot(velocity[:, 0], velocity[:, 1])
     if has_position(columns):
@@ -257,7 +259,7 @@ def with_gnss_velocity(channels: Mapping[str, Channel]) -> Mapping[str, Channel]
     north, east = (channels[name] for name in GNSS_POSITION)
     stamps, i, j = np.intersect1d(north.stamps_ns, east.stamps_ns, assume_unique=True, return_indices=True)
     near = np.flatnonzero(np.diff(stamps) <= _ns(LONGEST_FIX_STEP_S))
-    step_s = (stamps[near + 1] - stamps[near]) * 1e-9
+    step_s = (stamps[near + 1] - stamps[near]) * S_PER_NS
     arrival = np.maximum(north.arrival_ns[i], east.arrival_ns[j])[near + 1]
     middle = (stamps[near] + stamps[near + 1]) // 2
     std = np.full(len(near), FIX_STD_M)
@@ -293,7 +295,7 @@ def combine_wheel_speeds(wheel_speed_m_s: FloatArray) -> FloatArray:
 
 
 def _ns(seconds: float) -> int:
-    return round(seconds * 1e9)
+    return round(seconds * NS_PER_S)
 
 
 def _max_gap_s(period_s: float | None) -> float:
@@ -302,7 +304,7 @@ def _max_gap_s(period_s: float | None) -> float:
 
 
 def _median_period_s(channel: Channel) -> float | None:
-    return float(np.median(np.diff(channel.stamps_ns))) * 1e-9 if len(channel) >= 2 else None
+    return float(np.median(np.diff(channel.stamps_ns))) * S_PER_NS if len(channel) >= 2 else None
 
 
 def _grid_channel(periods: Mapping[str, float | None]) -> str:
@@ -382,7 +384,7 @@ def _survey_delay(channel: Channel) -> tuple[float, float]:
     excess = delay - _fastest_nearby(channel.stamps_ns, delay)
     typical = float(np.median(excess))
     spread = float(np.median(np.abs(excess - typical)))
-    return float(np.median(delay)) * 1e-9, (typical + max(_ns(MIN_LATE_S), 5.0 * spread)) * 1e-9
+    return float(np.median(delay)) * S_PER_NS, (typical + max(_ns(MIN_LATE_S), 5.0 * spread)) * S_PER_NS
 
 
 # ---- lateness ----

@@ -36,7 +36,7 @@ from pdhef_logtool.drive.relations import CG_VY, gentle_at, law, position_factor
 from pdhef_logtool.drive.sensor_changes import SensorChange
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.running_mean import running_mean
-from pdhef_logtool.records.signals import SIGNAL_UNITS, WHEELS, BoolArray, FloatArray
+from pdhef_logtool.records.signals import S_PER_NS, SIGNAL_UNITS, WHEELS, BoolArray, FloatArray
 
 CHANGE_SUFFIX = ".change"
 #: If a check of one of these aspects fails, the channel is not the signal that it is mapped to.
@@ -129,11 +129,11 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         rest = columns[name] - driven
         finite = np.isfinite(rest)
         is_known = speed is not None and yaw is not None and bool((yaw[np.isfinite(yaw)] != 0.0).any())
-        if _samples(finite) < 6.0:
+        if independent_samples(finite) < 6.0:
             rest, finite, is_known = columns[name], np.isfinite(columns[name]), False
-        if _samples(finite) < 2.0:
+        if independent_samples(finite) < 2.0:
             continue
-        is_gentle_enough = _samples(finite & at_ease) >= LEVEL_SAMPLES
+        is_gentle_enough = independent_samples(finite & at_ease) >= LEVEL_SAMPLES
         use = finite & at_ease if is_gentle_enough else finite
         left, error = float(np.mean(rest[use])), 0.0
         # Roll and tyres near their limit change the gain; the tilt is the intercept at zero acceleration.
@@ -152,10 +152,6 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         elif driving_is_known and is_known and is_gentle_enough:
             tilt = math.degrees(math.asin(size / GRAVITY_M_S2))
             yield judge("SIGNAL.level", size, error, name, tilt=tilt, **figures)
-
-
-def _samples(use: BoolArray) -> float:
-    return independent_samples(int(np.count_nonzero(use)))
 
 
 def _driven(
@@ -277,7 +273,7 @@ def change_checks(changes: Iterable[SensorChange], start_ns: int) -> list[Check]
     """Return a failed check for each signal that changes in mid-drive; times are in s from the log's start."""
     texts: dict[str, list[str]] = {}
     for c in changes:
-        start_s, known_s, end_s = ((t - start_ns) * 1e-9 for t in (c.start_ns, c.known_ns, c.end_ns))
+        start_s, known_s, end_s = ((t - start_ns) * S_PER_NS for t in (c.start_ns, c.known_ns, c.end_ns))
         kind = "replaced" if c.kind == "stuck" and not math.isnan(c.std) else c.kind
         figures = {"size": c.size, "std": c.std, "unit": SIGNAL_UNITS[c.sensor]}
         text = TEXTS[kind].format(start_s=start_s, known_s=known_s, end_s=end_s, **figures)

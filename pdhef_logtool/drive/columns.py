@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from pdhef_logtool.records.interpolation import Bracket
-from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, Channel, FloatArray
 from pdhef_logtool.records.student import student_quantile
 
 GRID_S = 0.05
@@ -40,7 +40,7 @@ def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
     reach = int(MAX_CELLS * GRID_S * 0.5e9)
     middle = int(np.median([int(c.stamps_ns[len(c) // 2]) for c in used.values()]))
     start, end = max(start, middle - reach), min(end, middle + reach)
-    cells = int((end - start) * 1e-9 / GRID_S) + 1
+    cells = int((end - start) * S_PER_NS / GRID_S) + 1
     return {name: _on_grid(channel, start, cells) for name, channel in used.items()}
 
 
@@ -57,7 +57,7 @@ def without_spikes(channel: Channel) -> Channel:
     if not out.any():
         return channel
     first, end = np.flatnonzero(np.diff(out, prepend=False, append=False)).reshape(-1, 2).T
-    short = channel.stamps_ns[end - 1] - channel.stamps_ns[first] < SPIKE_S * 1e9
+    short = channel.stamps_ns[end - 1] - channel.stamps_ns[first] < SPIKE_S * NS_PER_S
     out &= np.repeat(short, end - first)[np.cumsum(out) - 1]
     return channel.take(~out)
 
@@ -85,9 +85,9 @@ def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray
         return np.asarray(np.abs(speed) > limit, dtype=np.bool_)
 
 
-def independent_samples(count: int) -> float:
-    """Return how many independent samples this many cells contain after the low pass."""
-    return 2.0 * LOW_PASS_HZ * GRID_S * count
+def independent_samples(use: BoolArray) -> float:
+    """Return how many independent samples the cells of a mask [N] contain after the low pass."""
+    return 2.0 * LOW_PASS_HZ * GRID_S * int(np.count_nonzero(use))
 
 
 def student(blocks: int) -> float:
@@ -97,14 +97,14 @@ def student(blocks: int) -> float:
 
 def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:
     """Average a channel into the grid's cells and low-pass it; NaN in gaps."""
-    cell_of = np.rint((channel.stamps_ns - start_ns) * (1e-9 / GRID_S)).astype(np.int64)
+    cell_of = np.rint((channel.stamps_ns - start_ns) * (S_PER_NS / GRID_S)).astype(np.int64)
     inside = (cell_of >= 0) & (cell_of < cells)
     count = np.bincount(cell_of[inside], minlength=cells).astype(np.float64)
     total = np.bincount(cell_of[inside], weights=channel.values[inside], minlength=cells)
     filled_cells = np.flatnonzero(count > 0.0)
     if filled_cells.shape[0] < 2:
         return np.full(cells, np.nan)
-    period_s = float(np.median(np.diff(channel.stamps_ns))) * 1e-9
+    period_s = float(np.median(np.diff(channel.stamps_ns))) * S_PER_NS
     gap_s = min(max(MAX_GAP_S, MAX_GAP_PERIODS * period_s), LONGEST_GAP_S)
     bracket = Bracket(filled_cells, np.arange(cells), int(gap_s / GRID_S + 1e-9))
     return _low_pass(bracket.linear(total[filled_cells] / count[filled_cells]), bracket.inside)
@@ -138,7 +138,7 @@ def fit(
     """
     matrix = np.stack(regressors, axis=1)
     usable = use & np.isfinite(measured) & np.isfinite(matrix).all(axis=1)
-    samples = independent_samples(int(np.count_nonzero(usable)))
+    samples = independent_samples(usable)
     if samples < least * len(regressors):
         return None
     a, b = matrix[usable], measured[usable]

@@ -11,7 +11,7 @@ import numpy as np
 from pdhef_logtool.drive.columns import student
 from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.running_mean import running_mean
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, IntArray
 
 #: A step of more than this many median periods is a gap.
 GAP_PERIODS = 3.0
@@ -63,12 +63,12 @@ def on_common_grid(
     """
     both = [stamps_a_ns] if stamps_a_ns is stamps_b_ns else [stamps_a_ns, stamps_b_ns]
     periods = [float(np.median(np.diff(stamps))) for stamps in both]
-    step_ns = round(float(np.clip(min(periods), MIN_STEP_S * 1e9, MAX_STEP_S * 1e9)))
+    step_ns = round(float(np.clip(min(periods), MIN_STEP_S * NS_PER_S, MAX_STEP_S * NS_PER_S)))
     start, end = max(int(s[0]) for s in both), min(int(s[-1]) for s in both)
     grid = np.arange(start, end + 1, step_ns, dtype=np.int64)
     brackets = [Bracket(s, grid, round(GAP_PERIODS * p)) for s, p in zip(both, periods, strict=True)]
     a, b = (without_trend(k.linear(v)) for k, v in ((brackets[0], values_a), (brackets[-1], values_b)))
-    return CommonGrid(step_ns * 1e-9, a, b)
+    return CommonGrid(step_ns * S_PER_NS, a, b)
 
 
 def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
@@ -93,9 +93,9 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
     A drifting or nonlinear gain, an offset and a trend can resemble a shift. They are fitted together with the shift,
     and the change of the shift by this fit is part of its error.
     """
-    steps = round(shift_s / grid.step_s)
-    parts = zip((grid.a, grid.b), _overlap(grid.a.shape[0], steps), strict=True)
-    pair = np.stack([values[part] for values, part in parts], axis=1)
+    steps, n = round(shift_s / grid.step_s), grid.a.shape[0]
+    ahead, behind = max(0, steps), max(0, -steps)
+    pair = np.stack([grid.a[behind : n - ahead], grid.b[ahead : n - behind]], axis=1)
     mean = running_mean(pair, max(1, round(0.5 * _ERROR_MEAN_S / grid.step_s)))
     both = np.isfinite(pair).all(axis=1)
     a, b, slope = (c[both] for c in (*mean.T, np.gradient(mean[:, 0], grid.step_s)))
@@ -156,11 +156,6 @@ def _correlations(grid: CommonGrid, reach: int) -> FloatArray:
         power_a, power_b = sums(2, 0) - sum_a**2 / count, sums(0, 2) - sum_b**2 / count
         shows = (count >= 2) & (np.minimum(power_a, power_b) > _LEAST_POWER * count)
         return np.where(shows, (sums(1, 1) - sum_a * sum_b / count) / np.sqrt(power_a * power_b), np.nan)
-
-
-def _overlap(n: int, shift: int) -> tuple[slice, slice]:
-    """Return the parts of ``a`` and ``b`` [N] that overlap after a shift."""
-    return slice(max(0, -shift), n - max(0, shift)), slice(max(0, shift), n - max(0, -shift))
 
 
 def _unit_power(values: FloatArray) -> FloatArray:

@@ -308,7 +308,7 @@ def _turned(
         mean = upward * axis + left1 * e1 + left2 * e2
         if np.linalg.norm(mean) > COMPENSATED_M_S2:
             axis = mean / np.linalg.norm(mean)
-    gain, samples = abs(factor), independent_samples(int(np.count_nonzero(used)))
+    gain, samples = abs(factor), independent_samples(used)
     power = float(np.var(level[used])) / 2.0
     unexplained = spread**2 * (1.0 - len(errors) / (2.0 * samples)) / power if power > 0.0 else 1.0
     correlation = math.sqrt(max(0.0, 1.0 - unexplained))

@@ -11,6 +11,7 @@ from typing import Literal
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.logs.table_file import TableSettings
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import NS_PER_S
 
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
@@ -90,10 +91,10 @@ def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:
         return int(text)
     relative = re.fullmatch(r"\+?(\d+(?:\.\d*)?|\.\d+)\s*s?", text)
     if relative:
-        return start_ns + round(float(relative[1]) * 1e9)
+        return start_ns + round(float(relative[1]) * NS_PER_S)
     from_end = re.fullmatch(r"end(?:\s*-\s*(\d+(?:\.\d*)?|\.\d+)\s*s?)?", text)
     if from_end:
-        return end_ns - round(float(from_end[1] or 0.0) * 1e9)
+        return end_ns - round(float(from_end[1] or 0.0) * NS_PER_S)
     try:
         when = dt.datetime.fromisoformat(text)
     except ValueError:
@@ -120,7 +121,7 @@ def time_slice(options: ReadOptions, start_ns: int, end_ns: int) -> tuple[int, i
     begin, finish = max(begin, start_ns), min(finish, end_ns)
     if begin >= finish:
         raise UsageError(
-            expected=f"a slice inside the log's {(end_ns - start_ns) / 1e9:.3f} s",
+            expected=f"a slice inside the log's {(end_ns - start_ns) / NS_PER_S:.3f} s",
             got=f"start {options.start or 'of the log'}, end {options.end or 'of the log'}",
             where="--start/--end",
         )

@@ -27,7 +27,7 @@ from pdhef_logtool.mapping import ClockModel, Mapping, check_mapping, clock_key,
 from pdhef_logtool.mapping.records import CanSettings, SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import VehicleError
-from pdhef_logtool.records.signals import Channel
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, Channel
 from pdhef_logtool.storage.documents import validated
 
 #: The offset of a device clock changes between logs: it is estimated from the messages of this duration.
@@ -135,7 +135,7 @@ def plan_drive(
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     if sensors is not None:
         clocks |= clocks_of(sensors, log, mapping, start_ns)
-    span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
+    span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * NS_PER_S)))
     looked_at = survey_log(log, mapping, clocks, span_ns, given)
     mapping, survey = looked_at.mapping, looked_at.channels
     if sensors is not None:
@@ -161,7 +161,7 @@ def plan_drive(
         survey_truth=sound.channels.truth,
         start_ns=start_ns,
         end_ns=end_ns,
-        decided_s=(end_ns - start_ns) * 1e-9 if sensors is None else sensors.decided_s,
+        decided_s=(end_ns - start_ns) * S_PER_NS if sensors is None else sensors.decided_s,
         checks=looked_at.checks,
         refused=refused,
     )
@@ -221,7 +221,7 @@ def clocks_of(sensors: Sensors, log: DriveLog, mapping: Mapping, start_ns: int) 
     """
     read = replace(mapping, truth={}, quality=None)
     check_mapping(read, log)
-    first = fit_clocks(log, read, start_ns, start_ns + round(CLOCK_START_S * 1e9))
+    first = fit_clocks(log, read, start_ns, start_ns + round(CLOCK_START_S * NS_PER_S))
     return {
         key: replace(clock, reference_stamp_ns=new.reference_stamp_ns, reference_log_ns=new.reference_log_ns)
         if is_device_clock(clock) and is_device_clock(new := first[key])

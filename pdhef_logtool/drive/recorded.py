@@ -21,7 +21,7 @@ from pdhef_logtool.mapping import ClockModel, clock_key, merge_losses, read_sign
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings, without_impossible
-from pdhef_logtool.records.signals import Channel, FloatArray, Loss, Signals
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, Channel, FloatArray, Loss, Signals
 from pdhef_logtool.records.steps import last_known
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -70,13 +70,13 @@ class WholeDrive:
     @property
     def seconds(self) -> float:
         """Time from first to last stamp."""
-        return float(self.signals.stamps_ns[-1] - self.signals.stamps_ns[0]) * 1e-9
+        return float(self.signals.stamps_ns[-1] - self.signals.stamps_ns[0]) * S_PER_NS
 
     @property
     def span_s(self) -> tuple[float, float]:
         """First and last stamp in seconds from the log's start."""
         stamps = self.signals.stamps_ns
-        return float(stamps[0] - self.log_start_ns) * 1e-9, float(stamps[-1] - self.log_start_ns) * 1e-9
+        return float(stamps[0] - self.log_start_ns) * S_PER_NS, float(stamps[-1] - self.log_start_ns) * S_PER_NS
 
 
 def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (), name: str = "") -> WholeDrive:
@@ -120,7 +120,7 @@ def channels_sha256(channels: Mapped[str, Channel], sources: Mapped[str, SignalS
     total = hashlib.sha256()
     full = [(name, channel) for name, channel in sorted(channels.items()) if len(channel)]
     for name, channel in full:
-        stamps_ns = channel.stamps_ns + round(sources[name].latency_s * 1e9)
+        stamps_ns = channel.stamps_ns + round(sources[name].latency_s * NS_PER_S)
         # -0.0 and 0.0 are one value.
         values = np.ascontiguousarray(channel.values + 0.0, dtype="<f8")
         total.update(name.encode() + b"\0" + hashlib.sha256(stamps_ns.astype("<i8").data).digest())
@@ -176,9 +176,9 @@ def _gaps(channel: Channel) -> list[Loss]:
     if stamps.shape[0] < 3:
         return []
     steps = np.diff(stamps)
-    least = max(TOLD_GAP_S * 1e9, TOLD_GAP_PERIODS * float(np.median(steps)))
+    least = max(TOLD_GAP_S * NS_PER_S, TOLD_GAP_PERIODS * float(np.median(steps)))
     text, times = "no samples for {:.2f} s", stamps.tolist()
     return [
-        Loss("gap", text.format(steps[i] * 1e-9), channel.source, times[i], times[i + 1], 1, "note")
+        Loss("gap", text.format(steps[i] * S_PER_NS), channel.source, times[i], times[i + 1], 1, "note")
         for i in np.flatnonzero(steps > least)
     ]

@@ -138,7 +138,7 @@ def compare(law: Law, predicted: FloatArray, measured: FloatArray, use: BoolArra
     """
     sides, finite = (predicted, measured), np.isfinite(predicted) & np.isfinite(measured)
     use = finite if use is None else use & finite
-    samples = independent_samples(int(np.count_nonzero(use)))
+    samples = independent_samples(use)
     if samples < MIN_SAMPLES:
         return []
     a, b = predicted[use] - predicted[use].mean(), measured[use] - measured[use].mean()
@@ -168,11 +168,11 @@ def compare(law: Law, predicted: FloatArray, measured: FloatArray, use: BoolArra
 def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
     """Yield a relation for each signal with values that no vehicle reaches; it needs no second signal."""
     for name in (n for n in columns if kind_of(n) in MOST):
-        most, finite = MOST[kind_of(name)], np.abs(columns[name][np.isfinite(columns[name])])
+        most, finite = MOST[kind_of(name)], np.isfinite(columns[name])
         share = WHEEL_SHARE if name.startswith("wheel") else SHARE
-        if finite.size and (large := float(np.quantile(finite, share))) > most:
+        if finite.any() and (large := float(np.quantile(np.abs(columns[name][finite]), share))) > most:
             reached = law("limit", name=name, share=f"{1.0 - share:.0%}", large=f"{large:.3g}", most=f"{most:.3g}")
-            yield Relation(reached, 1.0, large / most, independent_samples(finite.size))
+            yield Relation(reached, 1.0, large / most, independent_samples(finite))
 
 
 def _motion(columns: Mapping[str, FloatArray], of: str, pace_name: str) -> Iterator[Relation]:
@@ -289,20 +289,19 @@ def _speeds(pace: _Pace) -> Iterator[Relation]:
             column = np.where(np.isfinite(_scaled_to(column, pace)), column, np.nan)
         # Near the limit, wheel speeds differ from the speed of the car.
         uses = [where & np.isfinite(column) for where in (pace.gentle, pace.moving)]
-        counts = [independent_samples(int(np.count_nonzero(use))) for use in uses]
-        use, samples = next(((u, s) for u, s in zip(uses, counts, strict=True) if s >= MIN_SAMPLES), (None, 0.0))
+        use = next((u for u in uses if independent_samples(u) >= MIN_SAMPLES), None)
         if use is None:
             continue
         ratios = column[use] / speed[use]
         over = law(keys[name], name=name, pace=pace.name, mapped="" if name == GNSS_PATH[1] else name)
         blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
-        yield Relation(over, 1.0, float(np.median(ratios)), samples, blocks=blocks)
+        yield Relation(over, 1.0, float(np.median(ratios)), independent_samples(use), blocks=blocks)
     of_wheels = (
         any(n.startswith("wheel") and n.endswith("_rad_s") for n in pace.columns) and pace.name == "wheel_speeds"
     )
-    fast = speed[np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)]
-    if (samples := independent_samples(fast.size)) >= 2.0 * MIN_SAMPLES:
-        yield Relation(law("ahead", pace=pace.name), 1.0, float(np.sign(np.median(fast))), samples)
+    is_fast = np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)
+    if (samples := independent_samples(is_fast)) >= 2.0 * MIN_SAMPLES:
+        yield Relation(law("ahead", pace=pace.name), 1.0, float(np.sign(np.median(speed[is_fast]))), samples)
 
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
@@ -463,7 +462,7 @@ def _partial(
 ) -> list[Relation]:
     """Return the relation between the residuals of two columns after regression on others; none with few samples."""
     finite = use & np.isfinite(np.stack([predicted, measured, *others])).all(axis=0)
-    if independent_samples(int(np.count_nonzero(finite))) < 2.0 * MIN_SAMPLES:
+    if independent_samples(finite) < 2.0 * MIN_SAMPLES:
         return []
     aside = np.stack(others, axis=1)[finite]
     left = []

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Signals
 
 #: Cells of the grid; means of the relations; a window after a change, of three, behind the low pass, and the window
 #: before it.
@@ -140,10 +140,10 @@ class _Relation(NamedTuple):
         """Return the part of the first column of a table [n, 1 + m] that the others do not explain, [n]."""
         return np.asarray(table[:, 0] - (table[:, 1:] * self.fit).sum(axis=1))
 
-    def leverage(self, change: FloatArray) -> FloatArray:
-        """Return the factor on the 1-sigma of a residual that an uncertain fit has for changed regressors [n, m]."""
-        change = np.nan_to_num(change)
-        share = (change * np.linalg.solve(self.information, change[..., None])[..., 0]).sum(axis=1)
+    def leverages(self, changes: FloatArray) -> FloatArray:
+        """Return the factors [n, p] of an uncertain fit on the 1-sigma of residuals; changed regressors [n, m, p]."""
+        changes = np.nan_to_num(changes)
+        share = (changes * np.linalg.solve(self.information, changes)).sum(axis=1)
         return np.asarray(np.sqrt(1.0 + INDEPENDENT_CELLS * share))
 
 
@@ -172,25 +172,26 @@ def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signa
 def cells_of(signals: Signals) -> Cells:
     """Average the samples of each cell; a cell without one repeats the last, for up to a tenth of a second."""
     steps_ns = np.diff(signals.stamps_ns, prepend=signals.stamps_ns[0])
-    cell = np.cumsum(np.minimum(steps_ns, round(LONGEST_GAP_S * 1e9))) // round(CELL_S * 1e9)
+    cell = np.cumsum(np.minimum(steps_ns, round(LONGEST_GAP_S * NS_PER_S))) // round(CELL_S * NS_PER_S)
     count = int(cell[-1]) + 1
 
     def mean(column: FloatArray, most: int) -> FloatArray:
-        samples, total = samples_and_sums(column, cell, count)
-        last = np.maximum.accumulate(np.where(samples > 0, np.arange(count), -1))
-        fresh = (last >= 0) & (np.arange(count) - last <= most)
-        return np.where(fresh, total[last] / np.maximum(samples[last], 1), np.nan)
+        means, cells = part_means(column, cell, count), np.arange(count)
+        last = np.maximum.accumulate(np.where(np.isfinite(means), cells, -1))
+        return np.where((last >= 0) & (cells - last <= most), means[last], np.nan)
 
     s = signals
     columns = (s.ay_m_s2, s.yaw_rate_rad_s, s.steer_rad, s.speed_m_s, s.ax_m_s2)
     return Cells(signals.stamps_ns, cell, *map(mean, columns, (2, 2, 2, 10, 2)))
 
 
-def samples_and_sums(column: FloatArray, part: IntArray, count: int) -> tuple[IntArray, FloatArray]:
-    """Return the number and the sum of the finite samples of a column [N] in each part [count] of a drive."""
+def part_means(column: FloatArray, part: IntArray, count: int, share: float = 0.0) -> FloatArray:
+    """Return the means of a column [N] over parts [count] of a drive; NaN unless more than a share is finite."""
     finite = np.isfinite(column)
-    samples = np.bincount(part[finite], minlength=count).astype(np.int64)
-    return samples, np.bincount(part[finite], weights=column[finite], minlength=count).astype(np.float64)
+    samples = np.bincount(part[finite], minlength=count)
+    total = np.bincount(part[finite], weights=column[finite], minlength=count)
+    least = share * np.bincount(part, minlength=count) if share else 0.0
+    return np.where(samples > least, total / np.maximum(samples, 1), np.nan)
 
 
 def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
@@ -272,13 +273,13 @@ def _relation_block(index: int, tables: Sequence[FloatArray]) -> _Block:
     relation = _fitted(tables[0])
     units = [(other - relation.table) / TRIED for other in tables[1:]]
     after, *moved = (_mean(table, 0, PART_CELLS) for table in (relation.table, *units))
-    before, n, steps, effects = _later(after, -PART_CELLS, len(after)), len(after), [], []
-    for start in range(MEAN_CELLS, WINDOW_CELLS, PART_CELLS):
-        change = _later(after, start, n) - before
-        leverage = relation.leverage(change[:, 1:])
-        steps.append(relation.residual(change) / leverage)
-        effects.append([relation.residual(_later(unit, start, n)) / leverage for unit in moved])
-    return _Block(np.stack(steps, axis=1), np.transpose(effects, (2, 1, 0)), np.full(n, LEAST_STDS[index]))
+    n, starts = len(after), range(MEAN_CELLS, WINDOW_CELLS, PART_CELLS)
+    before = _later(after, -PART_CELLS, n)
+    changes = [_later(after, start, n) - before for start in starts]
+    leverages = relation.leverages(np.stack(changes, axis=2)[:, 1:])
+    steps = np.stack([relation.residual(change) for change in changes], axis=1) / leverages
+    effects = [[relation.residual(_later(unit, start, n)) for unit in moved] for start in starts]
+    return _Block(steps, np.transpose(effects, (2, 1, 0)) / leverages[:, None], np.full(n, LEAST_STDS[index]))
 
 
 def _sample_block(name: str, signals: Signals, cells: Cells, tried: Sequence[Cells]) -> _Block:
@@ -298,14 +299,16 @@ def sample_steps(column: FloatArray, cells: Cells) -> FloatArray:
     finite = np.isfinite(column)
     values, stamps, cell = column[finite], cells.stamps_ns[finite], cells.of_stamp[finite]
     largest = np.full(len(cells.speed), np.nan)
-    half = max(2, round(STEP_S * 1e9 / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 2
+    half = max(2, round(STEP_S * NS_PER_S / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 2
     if len(values) < 2 * half:
         return largest
     place = np.arange(2 * half) - (half - 0.5)
     weights = np.linalg.pinv(np.stack([np.ones(2 * half), place, 0.5 * np.sign(place)], axis=1))[2]
     steps = np.convolve(values, weights[::-1], "valid")
-    order = np.argsort(np.abs(steps), kind="stable")  # the largest of a cell is written last
-    largest[cell[half : half + len(steps)][order]] = steps[order]
+    cells_of_steps = cell[half : half + len(steps)]
+    first = np.flatnonzero(np.diff(cells_of_steps, prepend=-1))
+    low, high = (of.reduceat(steps, first) for of in (np.minimum, np.maximum))
+    largest[cells_of_steps[first]] = np.where(high > -low, high, low)
     return largest
 
 

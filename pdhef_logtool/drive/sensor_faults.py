@@ -27,7 +27,7 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2, Sensors, VehicleParameters
 from pdhef_logtool.drive.sample_noise import scan
 from pdhef_logtool.drive.sensor_changes import CELL_S, Cells, cells_of, long_runs
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 
 #: The two channels; the bits of the yaw rate are the bits of a_y, shifted left by one.
 COLUMNS = ("ay_m_s2", "yaw_rate_rad_s")
@@ -101,7 +101,7 @@ def _without_stuck(
         if run.repeats > COARSE_REPEATS:
             turned = turning[cells.of_stamp[run.start : run.end]] - turning[cells.of_stamp[run.start]]
             first = max(first, run.start + int(np.argmax(np.append(np.abs(turned) > MOVED_RAD_S, True))))
-        if signals.stamps_ns[run.end - 1] - signals.stamps_ns[run.start] >= STUCK_REPORTED_AFTER_S * 1e9:
+        if signals.stamps_ns[run.end - 1] - signals.stamps_ns[run.start] >= STUCK_REPORTED_AFTER_S * NS_PER_S:
             faults[first : run.end] |= STUCK_AY
         column[first : run.end] = np.nan
     return faults
@@ -112,7 +112,7 @@ def _without_spikes(
 ) -> tuple[FloatArray, IntArray]:
     """Remove the spikes of a column [N] in place; return its extra variance, and its reported faults of a_y."""
     extra, faults, rows = np.zeros(len(column)), np.zeros(len(column), np.int64), np.flatnonzero(np.isfinite(column))
-    time_s = (signals.stamps_ns[rows] - signals.stamps_ns[0]) * 1e-9
+    time_s = (signals.stamps_ns[rows] - signals.stamps_ns[0]) * S_PER_NS
     moves = ~(np.append(np.nan, cells.speed)[cells.of_stamp[rows]] <= STUCK_SPEED_M_S)
     s0 = (sensors.ay_std_m_s2, sensors.yaw_rate_std_rad_s)[channel]
     noise, usual, beyond = scan(time_s, column[rows], moves, s0, CURVATURE[channel], sensors.imu_span_s)

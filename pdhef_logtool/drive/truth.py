@@ -34,7 +34,7 @@ from pdhef_logtool.records.geometry import (
     wrap_angle,
 )
 from pdhef_logtool.records.interpolation import Bracket
-from pdhef_logtool.records.signals import TRUTH_UNITS, Channel, FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, TRUTH_UNITS, Channel, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 #: Half window of the smoothing derivative. A cubic over ±0.2 s passes 1 Hz with 1 % loss.
@@ -129,7 +129,7 @@ def plan_truth(
         return None
     origin = _find_origin(survey)
     source, base = _velocity_source(survey, origin)
-    periods = {name: float(np.median(np.diff(c.stamps_ns))) * 1e-9 for name, c in survey.items()}
+    periods = {name: float(np.median(np.diff(c.stamps_ns))) * S_PER_NS for name, c in survey.items()}
     gaps = {name: GAP_PERIODS * p for name, p in periods.items()}
     half_window = max(2, round(DIFFERENTIATION_HALF_S / periods[base]))
     place, gradient = truth_position_m, roll_gradient_rad_per_m_s2
@@ -190,7 +190,7 @@ def truth_at(
     ``truth.max_gap_s``. Sideslip is recomputed from the interpolated velocities where both are known.
     """
     track = truth.track
-    bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
+    bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * NS_PER_S), round(truth.max_gap_s * NS_PER_S))
     columns = {name: bracket.linear(getattr(track, name)) for name in (*_SCORED, "x_m", "y_m", _FRICTION)}
     columns |= {name: bracket.angle(getattr(track, name)) for name in ("sideslip_rad", "yaw_rad")}
     vx, vy = columns["vx_m_s"], columns["vy_m_s"]
@@ -353,7 +353,7 @@ class _Source:
         if channel is None or name not in self:
             n, k = self.stamps_ns.shape[0], VECTOR_COLUMNS.get(name, 1)
             return np.full((n, k) if k > 1 else n, np.nan)
-        bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * 1e9))
+        bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * NS_PER_S))
         if name in _ANGLES:
             return bracket.angle(channel.values)
         if name == "quat_wxyz":
@@ -409,7 +409,7 @@ class _Source:
 
     def derivative(self, values: FloatArray, *, angle: bool = False) -> FloatArray:
         """Differentiate a column [N] by time."""
-        gap_ns = round(self.plan.max_gap_s[self.plan.base] * 1e9)
+        gap_ns = round(self.plan.max_gap_s[self.plan.base] * NS_PER_S)
         return differentiate(self.stamps_ns, values, self.plan.half_window, gap_ns, angle=angle)
 
 
@@ -445,7 +445,7 @@ def differentiate(
     for start in range(0, firsts.shape[0], _CHUNK):
         first = firsts[start : start + _CHUNK]
         centre = first + h
-        t = (times[first] - stamps_ns[centre][:, None]) * 1e-9
+        t = (times[first] - stamps_ns[centre][:, None]) * S_PER_NS
         span = np.maximum(t[:, -1], -t[:, 0])
         y = np.asarray(samples[first] - values[centre][:, None], np.float64)
         if angle:

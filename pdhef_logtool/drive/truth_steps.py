@@ -9,12 +9,10 @@ road resembles a bias and a gain of a_y, but begins slowly, while the samples of
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from pdhef_logtool.drive.sensor_changes import SensorChange, cells_of, sample_steps, samples_and_sums
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.drive.sensor_changes import SensorChange, cells_of, part_means, sample_steps
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Duration of a mean, least means on each side of a step, and share of a block that must have samples.
@@ -34,15 +32,6 @@ LEAST_STD = {"yaw_rate_rad_s": 0.001, "ay_m_s2": 0.05, "speed_m_s": 0.05}
 SHARP = {"yaw_rate_rad_s": 0.5, "ay_m_s2": 0.75}
 
 
-class _Step(NamedTuple):
-    """The likeliest step: its block, size, 1-sigma and F statistic."""
-
-    block: int
-    size: float
-    std: float
-    evidence: float
-
-
 def steps_from_truth(signals: Signals, truth: StateTrack) -> tuple[SensorChange, ...]:
     """Return for each sensor of signals [N] its step from the ground truth in mid-drive, if there is one."""
     if not len(signals):
@@ -56,24 +45,24 @@ def steps_from_truth(signals: Signals, truth: StateTrack) -> tuple[SensorChange,
             continue
         basis = np.linalg.qr(table[rows])[0]
         steps = {kind: _likeliest(y[rows], basis, columns[kind][rows], LEAST_STD[name]) for kind in LEAST[name]}
-        kind = max(steps, key=lambda k: steps[k].evidence)
-        step = steps[kind]
-        if step.evidence < EVIDENCE or abs(step.size) < LEAST[name][kind]:
+        kind = max(steps, key=lambda k: steps[k][0])
+        evidence, block, size, std = steps[kind]
+        if evidence < EVIDENCE or abs(size) < LEAST[name][kind]:
             continue
-        start_ns = int(signals.stamps_ns[0]) + round(rows[step.block] * BLOCK_S * 1e9)
+        start_ns = int(signals.stamps_ns[0]) + round(rows[block] * BLOCK_S * NS_PER_S)
         if kind == "jump":
-            share, at_ns = _sharpest(signals, name, start_ns, step.size)
+            share, at_ns = _sharpest(signals, name, start_ns, size)
             if share < SHARP[name]:
                 continue
             start_ns = at_ns
-        changes.append(SensorChange(name, f"{kind}_from_truth", start_ns, end_ns, end_ns, step.size, step.std))
+        changes.append(SensorChange(name, f"{kind}_from_truth", start_ns, end_ns, end_ns, size, std))
     return tuple(changes)
 
 
 def _sharpest(signals: Signals, name: str, start_ns: int, size: float) -> tuple[float, int]:
     """Return the largest step of neighbouring samples near a time over ``size``, and the time of the best match."""
     cells = cells_of(signals)
-    near = np.array([start_ns - BLOCK_S * 1e9, start_ns + BLOCK_S * 1e9]).astype(np.int64)
+    near = np.array([start_ns - BLOCK_S * NS_PER_S, start_ns + BLOCK_S * NS_PER_S]).astype(np.int64)
     first, last = cells.of_stamp[np.searchsorted(signals.stamps_ns, near).clip(0, len(signals) - 1)]
     shares = np.nan_to_num(sample_steps(getattr(signals, name), cells)[first : last + 1] / size)
     likest = int(np.argmin(np.abs(shares - 1.0)))
@@ -82,14 +71,14 @@ def _sharpest(signals: Signals, name: str, start_ns: int, size: float) -> tuple[
 
 def _differences(signals: Signals, truth: StateTrack) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
     """Return for each sensor its mean difference to ground truth x, x, and the change of x over a block [J]."""
-    block = (signals.stamps_ns - signals.stamps_ns[0]) // round(BLOCK_S * 1e9)
+    block = (signals.stamps_ns - signals.stamps_ns[0]) // round(BLOCK_S * NS_PER_S)
     count = int(block[-1]) + 1
     first = np.searchsorted(block, np.arange(count))
-    seconds = np.diff(signals.stamps_ns[first] * 1e-9, append=np.nan)
+    seconds = np.diff(signals.stamps_ns[first] * S_PER_NS, append=np.nan)
     seconds = np.where(seconds > 0.0, seconds, np.nan)  # a block in a gap
 
     def mean(column: FloatArray) -> FloatArray:
-        return _means(column, block, count)
+        return part_means(column, block, count, FILLED)
 
     def gained(column: FloatArray) -> FloatArray:
         return np.asarray(np.diff(column[first], append=np.nan) / seconds)
@@ -105,14 +94,11 @@ def _differences(signals: Signals, truth: StateTrack) -> dict[str, tuple[FloatAr
     return {name: (moving * (mean(getattr(signals, name)) - x), x, turned) for name, (x, turned) in sides.items()}
 
 
-def _means(column: FloatArray, block: IntArray, count: int) -> FloatArray:
-    """Return the means of a column [N] over blocks [J]; NaN where too many samples are missing."""
-    samples, total = samples_and_sums(column, block, count)
-    return np.where(samples > FILLED * np.bincount(block, minlength=count), total / np.maximum(samples, 1), np.nan)
+def _likeliest(y: FloatArray, basis: FloatArray, u: FloatArray, least_std: float) -> tuple[float, int, float, float]:
+    """Return F statistic, first block, size and 1-sigma of the likeliest step.
 
-
-def _likeliest(y: FloatArray, basis: FloatArray, u: FloatArray, least_std: float) -> _Step:
-    """Return the likeliest step of the coefficient of ``u`` [J] in ``y`` [J] beside an orthonormal basis [J, m]."""
+    It is a step of the coefficient of ``u`` [J] in ``y`` [J] beside an orthonormal basis [J, m].
+    """
     rest = y - basis @ (basis.T @ y)
     # The column of a step is u from block k on: its products with others are sums from there.
     behind = np.cumsum((u[:, None] * np.column_stack([rest, u, basis]))[::-1], axis=0)[::-1]
@@ -126,4 +112,4 @@ def _likeliest(y: FloatArray, basis: FloatArray, u: FloatArray, least_std: float
     square = float(left @ left)
     correlation = float(np.clip(left[1:] @ left[:-1] / max(square, 1e-12), 0.0, 0.95))
     variance = (square / len(y) + least_std**2) * (1.0 + correlation) / (1.0 - correlation)
-    return _Step(k, size, float(np.sqrt(variance / power[k])), float(explained[k] / variance))
+    return float(explained[k] / variance), k, size, float(np.sqrt(variance / power[k]))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from pdhef_logtool.records.geometry import dead_reckon
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 ANCHOR_S = 1.0
@@ -41,9 +41,9 @@ def lateral_errors(estimate: StateTrack, truth: StateTrack) -> FloatArray:
     if not (pose & motion).any():
         return np.empty(0)
     start_ns = int(stamps[np.argmax(pose & motion)])
-    anchors = np.searchsorted(stamps, np.arange(start_ns, int(stamps[-1]) + 1, round(ANCHOR_S * 1e9)))
+    anchors = np.searchsorted(stamps, np.arange(start_ns, int(stamps[-1]) + 1, round(ANCHOR_S * NS_PER_S)))
     begin, end = anchors[:-1], anchors[1:]
-    gaps = np.cumsum(np.diff(stamps, prepend=stamps[:1]) > round(MAX_STEP_S * 1e9))
+    gaps = np.cumsum(np.diff(stamps, prepend=stamps[:1]) > round(MAX_STEP_S * NS_PER_S))
     lost = np.cumsum(~motion)
     whole = (lost[end] == (lost - ~motion)[begin]) & (gaps[end] == gaps[begin]) & pose[begin] & pose[end]
     whole &= end > begin

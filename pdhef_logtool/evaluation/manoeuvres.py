@@ -21,7 +21,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.smoothing import runs, smooth
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
 
 _STEP_NS, _STEP_S = 20_000_000, 0.02
@@ -169,7 +169,7 @@ def _on_grid(stamps_ns: IntArray, grid_ns: IntArray, values: FloatArray, cutoff_
     finite = np.isfinite(values)
     if not finite.any():
         return np.zeros(len(grid_ns))
-    times_s, to_s = ((t - stamps_ns[0]) * 1e-9 for t in (stamps_ns[finite], grid_ns))
+    times_s, to_s = ((t - stamps_ns[0]) * S_PER_NS for t in (stamps_ns[finite], grid_ns))
     return smooth(grid_ns, np.interp(to_s, times_s, values[finite]), cutoff_hz, _STEP_NS)
 
 

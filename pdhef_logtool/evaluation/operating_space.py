@@ -15,7 +15,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.segments import MANOEUVRE_SMOOTHING_HZ, driven_speed, taken
 from pdhef_logtool.evaluation.smoothing import median_step_ns, smooth
 from pdhef_logtool.evaluation.track_errors import signal_error
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import S_PER_NS, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Lower edges of the cells; the last cell has no upper edge. 60 m/s are 216 km/h.
@@ -48,8 +48,8 @@ def operating_space(
     step_ns = median_step_ns(stamps)
     speed, lateral = driven_speed(signals, truth), taken(signals, truth, "ay_m_s2")
     ay = np.abs(smooth(stamps, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns))
-    steps = np.diff(stamps, append=stamps[-1:]) * 1e-9
-    steps = np.minimum(np.where(steps > 0.0, steps, step_ns * 1e-9), MAX_STEP_S)
+    steps = np.diff(stamps, append=stamps[-1:]) * S_PER_NS
+    steps = np.minimum(np.where(steps > 0.0, steps, step_ns * S_PER_NS), MAX_STEP_S)
     finite = np.isfinite(speed) & np.isfinite(ay)
     i = np.searchsorted(SPEED_EDGES_M_S, speed[finite], side="right") - 1
     j = np.searchsorted(AY_EDGES_M_S2, ay[finite], side="right") - 1

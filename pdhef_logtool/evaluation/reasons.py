@@ -14,6 +14,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.smoothing import runs
 from pdhef_logtool.records.reasons import REASONS
+from pdhef_logtool.records.signals import S_PER_NS
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Largest number of intervals in a list of faults.
@@ -38,7 +39,7 @@ def sensor_fault(sensor: str, kind: str, intervals: Sequence[Interval]) -> dict[
     kind : ``burst``, ``spike``, ``stuck``, ``dead``, ``missing``, ``jump`` (of its bias) or ``gain``.
     intervals : all; the entry has up to :data:`LISTED_INTERVALS` of the longest, in order of time.
     """
-    seconds = sum(i.end_ns - i.start_ns for i in intervals) * 1e-9
+    seconds = sum(i.end_ns - i.start_ns for i in intervals) * S_PER_NS
     longest = sorted(intervals, key=lambda i: (i.start_ns - i.end_ns, i.start_ns))[:LISTED_INTERVALS]
     listed = sorted(longest, key=lambda i: i.start_ns)
     return {"sensor": sensor, "kind": kind, "count": len(intervals), "seconds": seconds, "intervals": listed}

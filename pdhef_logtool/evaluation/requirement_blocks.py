@@ -15,6 +15,7 @@ from pdhef_logtool.evaluation.smoothing import median_step_ns
 from pdhef_logtool.evaluation.track_errors import scorable, truth_speed
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import MEANS, POOLED, SQUARES, Requirement
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
 #: Errors are correlated over seconds (docs/method.md#evaluation).
@@ -93,8 +94,8 @@ def _blocks(
         return None
     estimated, metric = truth.name == REFERENCE, registered()[requirement.metric]
     since_ns = truth.stamps_ns - truth.stamps_ns[0]
-    block_s = BLOCK_S * max(1, math.ceil(float(since_ns[-1]) * 1e-9 / (BLOCK_S * _MOST_BLOCKS)))
-    step_s = median_step_ns(truth.stamps_ns) * 1e-9
+    block_s = BLOCK_S * max(1, math.ceil(float(since_ns[-1]) * S_PER_NS / (BLOCK_S * _MOST_BLOCKS)))
+    step_s = median_step_ns(truth.stamps_ns) * S_PER_NS
     scored = scorable(truth, requirement.signal, drive.low_speed_m_s)
     if estimated:
         scored = np.logical_and.reduce([truth.valid, *(t.vx_m_s > drive.low_speed_m_s for t in (truth, *tracks))])
@@ -102,7 +103,7 @@ def _blocks(
     if not all(columns_of.keys() >= {*metric.over} for columns_of in columns):
         return None
     used = np.all([np.isfinite(c[metric.over[0]]) for c in columns], axis=0) & drive.masks[requirement.segment]
-    numbers, firsts = np.unique(since_ns[used] // round(block_s * 1e9), return_index=True)
+    numbers, firsts = np.unique(since_ns[used] // round(block_s * NS_PER_S), return_index=True)
     if not len(numbers):
         return None
     parts, way = np.split(np.flatnonzero(used), firsts[1:]), np.nan_to_num(truth_speed(truth)) * step_s

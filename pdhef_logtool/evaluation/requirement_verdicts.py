@@ -342,17 +342,11 @@ def _times(requirement: Requirement, bounded: statistics.Bounded) -> float:
     return times if times > _MOST_TIMES else math.ceil(10.0 * times) / 10.0
 
 
-def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
-    """Return whether a verdict is a FAIL, or with ``strict`` an INCONCLUSIVE."""
-    return any(v.outcome == "FAIL" or (strict and v.outcome == "INCONCLUSIVE") for v in verdicts)
-
-
-def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return each note of the requirements once, with the ids of its requirements unless it applies to all."""
-    ids = statistics.gathered(
-        (note.rstrip("."), name) for name, of_requirement in notes.items() for note in of_requirement
-    )
-    return [note if len(names) == len(notes) else f"{', '.join(names)}: {note}" for note, names in ids.items()]
+def joint_notes(plan: Mapping[str, Any]) -> list[str]:
+    """Return each note of a document's requirements once, with the ids of its requirements unless it applies to all."""
+    of_all = plan["requirements"]
+    ids = statistics.gathered((note.rstrip("."), str(r["id"])) for r in of_all for note in r.get("notes") or ())
+    return [note if len(names) == len(of_all) else f"{', '.join(names)}: {note}" for note, names in ids.items()]
 
 
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:

@@ -28,7 +28,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Event, Manoeuvre, find_manoeuvres, manoeuvre_masks
 from pdhef_logtool.evaluation.smoothing import median_step_ns, runs, smooth
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -138,5 +138,5 @@ def find_intervals(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]
 def _lasting(stamps_ns: IntArray, mask: BoolArray, least_s: float) -> BoolArray:
     out = np.zeros_like(mask)
     for a, b in runs(stamps_ns, mask):
-        out[a:b] = stamps_ns[b - 1] - stamps_ns[a] >= least_s * 1e9
+        out[a:b] = stamps_ns[b - 1] - stamps_ns[a] >= least_s * NS_PER_S
     return out

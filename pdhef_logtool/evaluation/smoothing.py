@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, FloatArray, IntArray
 
 #: A longer step between stamps ends every run and every interval.
 RUN_GAP_S = 0.5
@@ -37,7 +37,7 @@ def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float, step_ns: f
 
 def _gaussian(step_ns: float, cutoff_hz: float) -> FloatArray:
     """Return the weights [2 K + 1] of a Gaussian with gain 1/√2 at ``cutoff_hz``, truncated at 4 σ."""
-    sigma_rows = float(np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz) / (step_ns * 1e-9))
+    sigma_rows = float(np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz) / (step_ns * S_PER_NS))
     reach = int(4.0 * sigma_rows + 0.5)
     weights = np.exp(-0.5 / (sigma_rows * sigma_rows) * np.arange(-reach, reach + 1) ** 2)
     return np.asarray(weights / weights.sum(), dtype=np.float64)
@@ -48,7 +48,7 @@ def runs(stamps_ns: IntArray, mask: BoolArray) -> list[tuple[int, int]]:
     n = mask.shape[0]
     if n == 0:
         return []
-    joined = mask[1:] & mask[:-1] & (np.diff(stamps_ns) <= RUN_GAP_S * 1e9)
+    joined = mask[1:] & mask[:-1] & (np.diff(stamps_ns) <= RUN_GAP_S * NS_PER_S)
     starts = np.flatnonzero(mask & ~np.concatenate([[False], joined]))
     ends = np.flatnonzero(mask & ~np.concatenate([joined, [False]])) + 1
     return list(zip(starts.tolist(), ends.tolist(), strict=True))

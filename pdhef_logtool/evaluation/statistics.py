@@ -30,7 +30,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.records.signals import FloatArray, IntArray, is_dated
+from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray, is_dated
 from pdhef_logtool.records.student import student_quantile
 from pdhef_logtool.storage.templates import one_line, template
 
@@ -196,7 +196,7 @@ def day_and_route(start_ns: int, metadata: Mapping[str, Any]) -> tuple[str | Non
     from datetime import UTC, datetime
 
     texts = {str(k).rpartition(".")[2].lower(): str(v) for k, v in metadata.items()}
-    day = datetime.fromtimestamp(start_ns * 1e-9, UTC).date().isoformat() if is_dated(start_ns) else None
+    day = datetime.fromtimestamp(start_ns * S_PER_NS, UTC).date().isoformat() if is_dated(start_ns) else None
     return day, next((texts[key] for key in ROUTE_KEYS if key in texts), None)
 
 

@@ -16,12 +16,12 @@ from threading import Lock
 from typing import BinaryIO
 
 from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.logs.resource_limits import KIB, MIB
 from pdhef_logtool.records.errors import LogError
 
 #: Small reads come from a block read ahead, which grows while reads follow each other and shrinks where they jump.
-_LEAST_AHEAD_BYTES = 64 << 10
-_MOST_AHEAD_BYTES = 2 << 20
-_LARGE_READ_BYTES = 64 << 10
+_LEAST_AHEAD_BYTES = _LARGE_READ_BYTES = 64 * KIB
+_MOST_AHEAD_BYTES = 2 * MIB
 _KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket"}
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.logs.resource_limits import MIB
 from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
@@ -28,12 +29,16 @@ if TYPE_CHECKING:
     from pdhef_logtool.logs.table_log import Table
 
 CAN_TYPE = "can/msg/Frame"
-_MAX_DBC_BYTES = 32 << 20
+_MAX_DBC_BYTES = 32 * MIB
 #: Bits of a signal that become a number.
 MOST_BITS = 64
 _CAN = CONSTANTS["can"]
-ID_BITS = _CAN["id_bits"]
-_BYTE = 0xFF
+ID_BITS, EXTENDED_FLAG = _CAN["id_bits"], _CAN["extended_flag"]
+_BYTE, BYTE_BITS = 0xFF, 8
+#: Identifiers in the number of a source.
+_IDS = 1 << 32
+#: Identifiers that a note names.
+_SHOWN = 5
 #: Names of raw values without a measurement, in signals of at least 8 bits; shorter ones are states.
 _NO_VALUE = re.compile(r"(?<![a-z])(?<!no[ _-])(?:sna|invalid|error|fehler|(?:not|un|n)[ _-]?available)", re.I)
 #: Maximum number of distinct values outside of a correct range, and their share of all distinct values.
@@ -97,10 +102,10 @@ class Frames:
         zero = np.zeros(len(ids), np.int64)
         bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids > _CAN["base_id_bits"])
         rows = np.flatnonzero((self.parts.get("is_error", zero) == 0) & (self.parts.get("is_remote", zero) == 0))
-        keys = (2 * bus.astype(np.int64) + (extended > 0) << 32) + (ids & ID_BITS)
+        keys = (2 * bus.astype(np.int64) + (extended > 0)) * _IDS + (ids & ID_BITS)
         keys, inverse, counts = np.unique(keys[rows], return_inverse=True, return_counts=True)
         parts = np.split(rows[np.argsort(inverse, kind="stable")], np.cumsum(counts)[:-1])
-        sources = (Source(key >> 33, bool(key >> 32 & 1), key & ID_BITS) for key in keys.tolist())
+        sources = (Source(key // (2 * _IDS), bool(key // _IDS & 1), key & ID_BITS) for key in keys.tolist())
         return dict(zip(sources, parts, strict=False))
 
 
@@ -157,8 +162,8 @@ class Decoder:
                 yield from self._messages(message, ending, parts[bus, address], is_j1939=id(message) in addressed)
         if unknown:
             names, count = ", ".join(name for name, _ in self.databases), sum(unknown.values())
-            shown = ", ".join(f"0x{identifier:X}" for identifier in [*unknown][:5])
-            what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > 5)}"
+            shown = ", ".join(f"0x{identifier:X}" for identifier in [*unknown][:_SHOWN])
+            what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > _SHOWN)}"
             self.lost.append(Loss("unknown-frame", what, names, count=count, severity="note"))
 
     def _messages(self, message: Message, ending: str, rows: IntArray, *, is_j1939: bool) -> Iterator[Table]:
@@ -222,13 +227,13 @@ def has_j1939_identifier(message: Message) -> bool:
 
 def parameter_group(identifier: int) -> int:
     """Return the PGN of a 29-bit identifier, without the destination address where it contains one."""
-    group: int = identifier >> 8 & _CAN["pgn_bits"]
+    group: int = identifier >> BYTE_BITS & _CAN["pgn_bits"]
     return group if _is_broadcast(identifier) else group & ~_BYTE
 
 
 def _is_broadcast(identifier: int) -> bool:
     """Return whether the PDU format of a 29-bit identifier has no destination address."""
-    return identifier >> 16 & _BYTE >= int(_CAN["broadcast"])
+    return identifier >> 2 * BYTE_BITS & _BYTE >= int(_CAN["broadcast"])
 
 
 def described_sources(database: Database, sources: Iterable[Source]) -> dict[Source, Message]:
@@ -255,11 +260,12 @@ def _bytes_of(signal: Signal) -> tuple[int, int, int]:
     Its start is the least significant bit of a little-endian signal, the most significant one of a big-endian signal.
     """
     if signal.byte_order == "little_endian":
-        first, skipped = divmod(signal.start, 8)
-        return first, (signal.start + signal.length - 1) // 8, skipped
-    top = 8 * (signal.start // 8) + 7 - signal.start % 8
-    last = (top + signal.length - 1) // 8
-    return top // 8, last, 8 * (last + 1) - (top + signal.length)
+        first, skipped = divmod(signal.start, BYTE_BITS)
+        return first, (signal.start + signal.length - 1) // BYTE_BITS, skipped
+    first, place = divmod(signal.start, BYTE_BITS)
+    end = BYTE_BITS * (first + 1) - 1 - place + signal.length
+    last = (end - 1) // BYTE_BITS
+    return first, last, BYTE_BITS * (last + 1) - end
 
 
 def bytes_of(signal: Signal) -> int:
@@ -274,7 +280,7 @@ def raw_bits(data: NDArray[np.uint8], signal: Signal) -> NDArray[np.uint64]:
     columns = range(first, last + 1) if signal.byte_order == "little_endian" else range(last, first - 1, -1)
     for i, column in enumerate(columns):
         byte = data[:, column].astype(np.uint64)
-        shift = 8 * i - skipped
+        shift = BYTE_BITS * i - skipped
         value |= byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
     return value & np.uint64((1 << signal.length) - 1)
 
@@ -298,19 +304,20 @@ def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = F
     raw = raw_bits(data, signal)
     number: NDArray[Any] = raw
     if signal.is_float:
-        width = signal.length // 8
+        width = signal.length // BYTE_BITS
         with np.errstate(invalid="ignore"):  # numpy warns about a signalling NaN
             number = raw.astype(f"<u{width}").view(f"<f{width}").astype(np.float64)
     elif signal.is_signed:
         sign = np.uint64(1 << (signal.length - 1))
         number = ((raw ^ sign) - sign).view(np.int64)
     values = np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
-    for code, text in (signal.choices or {}).items() if signal.length >= 8 else ():
+    for code, text in (signal.choices or {}).items() if signal.length >= BYTE_BITS else ():
         if _NO_VALUE.search(str(text)):
             values[number == code] = np.nan
     if is_j1939 and not signal.is_float and not signal.is_signed and signal.length > 1:
-        top = max(0, signal.length - 8)
-        values[raw >> np.uint64(top) >= (0xFE if signal.length >= 8 else (1 << signal.length) - 1)] = np.nan
+        top_bits = min(signal.length, BYTE_BITS)
+        least = _CAN["no_value"] if top_bits == BYTE_BITS else (1 << top_bits) - 1
+        values[raw >> np.uint64(signal.length - top_bits) >= least] = np.nan
     return values
 
 
@@ -368,7 +375,7 @@ def load_dbc(path: Path) -> Database:
 
 
 def _no_dbc(path: Path, got: str) -> MappingFileError:
-    expected = f"a DBC file of at most {_MAX_DBC_BYTES >> 20} MiB"
+    expected = f"a DBC file of at most {_MAX_DBC_BYTES // MIB} MiB"
     return MappingFileError(expected=expected, got=got, where=str(path), remedy="correct [can] dbc")
 
 

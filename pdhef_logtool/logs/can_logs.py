@@ -18,13 +18,13 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.can_decoding import ID_BITS, Frames
+from pdhef_logtool.logs.can_decoding import EXTENDED_FLAG, ID_BITS, Frames
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
-from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.table_clocks import ascending_rows, placed
+from pdhef_logtool.logs.container import LOSSES_OF_A_KIND, describe_damage
+from pdhef_logtool.logs.table_clocks import ascending_rows, hour_of_day, placed, to_ns
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import NS_PER_S, IntArray, Loss
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
 _ROW = struct.Struct(f"{len(_PARTS)}i")
@@ -43,7 +43,7 @@ def _tables(
         remedy = "candump -l and candump -t a record times" * (kind == "candump")
         raise LogError(expected="CAN frames with times", got=got, where=file.name, remedy=remedy)
     widest = max(1, int(numbers[:, 1].max()))
-    file.limits.check_table(len(stamps) * (_ROW_BYTES + widest), file.size, f"{len(stamps)} frames")
+    file.check(len(stamps) * (_ROW_BYTES + widest), f"{len(stamps)} frames")
     rows = np.zeros((len(stamps), widest), np.uint8)
     rows[np.arange(widest) < numbers[:, 1:2]] = data
     order = np.argsort(stamps, kind="stable")
@@ -57,7 +57,7 @@ def _start_ns(year: int, month: int, day: int, hour: int, minute: int, second: i
         seconds = dt.datetime(year, month, day, hour, minute, second, micro, dt.UTC).timestamp()
     except ValueError:
         return 0
-    return round(seconds * 1e6) * 1000 if 0.0 < seconds < 4e9 else 0
+    return int(to_ns(seconds)) if 0.0 < seconds < CONSTANTS["can"]["last_date_s"] else 0
 
 
 # BLF: objects "LOBJ", most of them in compressed containers. An object may continue in the next container.
@@ -67,8 +67,6 @@ _CONTAINER, _CONTAINER_HEAD = _BLF["container"], _BLF["container_head"]
 _HEAD, _PADDING, _LONGEST = _BLF["head"], _BLF["padding"], _BLF["longest"]
 _FILE_HEAD = struct.Struct("<4xI8xQ16x8H")
 _OBJECT_HEAD = struct.Struct("<4xHHII")
-#: Maximum number of losses; further ones are counted.
-_MOST_NAMED = 20
 
 
 def _layout(parts: Mapping[str, tuple[str, int]]) -> np.dtype[np.void]:
@@ -125,7 +123,7 @@ class _Blf:
 
     def _lose(self, kind: str, what: str) -> None:
         """Add a loss; the last one counts all losses beyond the limit."""
-        count = (self._losses.pop().count or 1) + 1 if len(self._losses) > _MOST_NAMED else None
+        count = (self._losses.pop().count or 1) + 1 if len(self._losses) > LOSSES_OF_A_KIND else None
         self._losses.append(Loss(kind, what, self._file.name, count=count))
 
     def _read_container(self, start: int, end: int, place: str) -> None:
@@ -134,7 +132,7 @@ class _Blf:
         stored = self._data[start + _CONTAINER_HEAD : end]
         try:
             self._file.limits.check_unpacked(size, len(stored), place)
-            self._file.limits.check_table(self._unpacked + size, self._file.size, f"{place} and those before it")
+            self._file.check(self._unpacked + size, f"{place} and those before it")
             block = _unpacked(stored, size, is_cut=end == self._file.size) if method else stored
         except (ValueError, LogError, zlib.error) as error:
             kind, text = describe_damage(error)
@@ -203,7 +201,8 @@ class _Blf:
             count = np.where(is_remote, 0, np.minimum(part["length"], content.shape[1]))
             number, bus = part["id"].astype(np.int64), part["bus"].astype(np.int64) - 1
             is_error = np.full(len(number), name == "error")
-            numbers = np.stack((number & ID_BITS, count, number >> 31, bus, is_error, is_remote), axis=1)
+            is_extended = (number & EXTENDED_FLAG) > 0
+            numbers = np.stack((number & ID_BITS, count, is_extended, bus, is_error, is_remote), axis=1)
             unit = np.where(times["unit"] == 1, _BLF["time_unit_ns"], 1)
             most = np.iinfo(np.int64).max // 2 // unit  # no sum overflows
             stamps = self._start_ns + np.clip(times["time"], -most, most) * unit
@@ -244,7 +243,9 @@ _FD_FRAME = re.compile(
 )
 _FRAME_SHAPE = re.compile(rb"\d+\s+(?:\S+\s+[rt]x\s|errorframe)|canfd\s", re.I)
 #: A step back in time by more begins a measurement.
-_STEP_NS = 10**9
+_STEP_NS = NS_PER_S
+#: Bases of numbers.
+_HEX, _DECIMAL = 16, 10
 
 
 #: A frame: time in ns, data, and the numbers of ``_PARTS``.
@@ -303,19 +304,19 @@ class _Asc:
     """Reader of the lines of an ASC file."""
 
     def __init__(self) -> None:
-        self._base, self._is_relative, self._is_empty = 16, False, True
+        self._base, self._is_relative, self._is_empty = _HEX, False, True
         self._begins_ns: int | None = None
         self._start_ns = self._now_ns = 0
 
     def _read_head(self, line: str) -> None:
         """Read a line without a time. A date begins a measurement."""
         if match := _BASE.match(line):
-            self._base = 16 if match[1].lower() == "hex" else 10
+            self._base = _HEX if match[1].lower() == "hex" else _DECIMAL
             self._is_relative = (match[2] or "").lower() == "relative"
         elif begin := _BEGIN.match(line):
             if date := _DATE.match(begin[1]):
                 month, day, hour, minute, second, fraction, half, year = date.groups()
-                hours = int(hour) % 12 + 12 * (half.lower() == "pm") if half else int(hour)
+                hours = hour_of_day(int(hour), half.lower() == "pm") if half else int(hour)
                 # Milliseconds; python-can does not pad them to three digits.
                 time = hours, int(minute), int(second), int((fraction or "0").zfill(3).ljust(6, "0")[:6])
                 self._begins_ns = _start_ns(int(year), _MONTHS.get(month.lower()[:3], 0), int(day), *time)
@@ -327,7 +328,7 @@ class _Asc:
         if event is None:
             self._read_head(line.decode("ascii", "ignore"))
             return None
-        time_ns, text = round(float(event[1]) * 1e9), event[2].rstrip()
+        time_ns, text = round(float(event[1]) * NS_PER_S), event[2].rstrip()
         if self._begins_ns is None and not self._is_relative and time_ns < self._now_ns - _STEP_NS:
             self._begins_ns = 0
         if self._begins_ns is not None:
@@ -339,7 +340,7 @@ class _Asc:
                 raise ValueError(text)
             return None
         bus, is_error, identifier, extended, remote, length, content = match.groups()
-        base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
+        base, most = (self._base, 8) if match.re is _CLASSIC else (_DECIMAL, _MOST_BYTES)
         count = min(int(length or b"0", base), most)
         data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
         number = int(identifier or b"0", self._base)
@@ -391,10 +392,10 @@ def _candump_frame(line: bytes, interfaces: dict[bytes, int]) -> _Frame | None:
         return None
     time, interface, identifier, remote, data, count, remote_too, listed = match.groups()
     whole, _, fraction = time.partition(b".")
-    stamp_ns = int(whole) * 10**9 if whole.isdigit() else int(np.datetime64(whole.decode(), "ns").astype(np.int64))
+    stamp_ns = int(whole) * NS_PER_S if whole.isdigit() else int(np.datetime64(whole.decode(), "ns").astype(np.int64))
     is_remote = bool(remote or remote_too)
     content = b"" if is_remote else bytes.fromhex((listed if data is None else data.replace(b".", b"")).decode())
-    number, bus = int(identifier, 16), interfaces.setdefault(interface, len(interfaces))
+    number, bus = int(identifier, _HEX), interfaces.setdefault(interface, len(interfaces))
     is_error, number = bool(number & _ERROR_FLAG), number & ~_ERROR_FLAG
     if len(content) > _MOST_BYTES or (count and not is_remote and len(content) != int(count)) or number > ID_BITS:
         raise ValueError(line)

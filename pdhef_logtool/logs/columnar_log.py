@@ -33,14 +33,14 @@ from pdhef_logtool.logs.message_schema import (
 )
 from pdhef_logtool.logs.recording_span import RecordingSpan, survey
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import LimitError
+from pdhef_logtool.logs.resource_limits import KIB, MIB, LimitError
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 from pdhef_logtool.storage.files import scratch_folder, write_bytes
 
 #: Loaded spans are kept up to this size, without payloads above ``_LARGE_BYTES`` (images, point clouds): the samples
 #: that recognition reads, and all of a short log, are decompressed once.
-_KEPT_BYTES, _LARGE_BYTES = 16 << 20, 16 << 10
+_KEPT_BYTES, _LARGE_BYTES = 16 * MIB, 16 * KIB
 #: What of a span is lost: all of it.
 _ALL = ""
 #: A message in the text of a DBC file.

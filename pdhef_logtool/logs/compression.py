@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from pdhef_logtool.logs.container import Block, SpanDamageError
-from pdhef_logtool.logs.resource_limits import LimitError, Meter, ResourceLimits
+from pdhef_logtool.logs.resource_limits import MIB, LimitError, Meter, ResourceLimits
 
 if TYPE_CHECKING:
     import zstandard
 
 _Bytes: TypeAlias = bytes | memoryview
 _OF_THREAD = local()
-_BLOCK_BYTES = 1 << 20
+_BLOCK_BYTES = MIB
 _FRAME_HEAD_BYTES = 18
 #: Free disk space that a decompressed copy leaves.
-_DISK_RESERVE_BYTES = 256 << 20
+_DISK_RESERVE_BYTES = 256 * MIB
 
 
 def decompress(compression: str, stored: _Bytes, size: int, limits: ResourceLimits) -> bytes:

@@ -32,7 +32,8 @@ MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 #: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
 UNVERIFIED = "unverified"
 RecordT = TypeVar("RecordT", Attachment, Metadata)
-_LOSSES_OF_A_KIND = 20  # of one file; further ones become one loss
+#: Losses of one file; further ones become one loss.
+LOSSES_OF_A_KIND = 20
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
 _RECORDS_A_CHECK = 256  # of the time that a walk takes
@@ -342,7 +343,7 @@ class Container(ABC):
     ) -> None:
         """Record damage of this file; the 21st and later losses of a kind are merged."""
         self._losses[kind] += 1
-        more = self._losses[kind] - _LOSSES_OF_A_KIND
+        more = self._losses[kind] - LOSSES_OF_A_KIND
         if more > 0:
             what = f"{more} more of this kind, the last: {what}"
         if more > 1:
@@ -486,7 +487,7 @@ def rows_by_channel(channel: IntArray) -> dict[int, IntArray]:
     if not len(channel):
         return {}
     # 16 bits, if enough, sort much faster.
-    fit = channel.view(np.uint64).max() < 1 << 16  # an id below 0 is a huge one
+    fit = channel.view(np.uint64).max() <= np.iinfo(np.uint16).max  # an id below 0 is a huge one
     order = np.argsort(channel.astype(np.uint16) if fit else channel, kind="stable")
     ordered = channel[order]
     firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]

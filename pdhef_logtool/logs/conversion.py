@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,11 @@ from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.table_columns import field_name, unique
 from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import LogError, OutputError
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import NS_PER_S, Loss
 
-_WINDOW_NS = 60 * 10**9
+_WINDOW_NS = 60 * NS_PER_S
 _PACKAGE = "recorded_tables"
 _DATA = re.compile(r"data\[(\d+)\]")
 
@@ -75,17 +76,8 @@ def _write_tables(writer: McapLogWriter, log: DriveLog) -> None:
         writer.add_topic(topic.name, _type_of(topic), definition="\n".join(lines))
     for start_ns, end_ns in windows(log.start_ns, log.end_ns, _WINDOW_NS, log.recording_span):
         read = log.read({topic: tuple(paths) for topic, paths in columns.items()}, start_ns, end_ns)
-        writer.write(
-            [
-                TopicBatch(
-                    topic,
-                    rows.log_time_ns,
-                    rows.publish_time_ns,
-                    {name: _stored(rows.fields[path]) for path, name in columns[topic].items()},
-                )
-                for topic, rows in read.items()
-            ]
-        )
+        renamed = {t: {name: _stored(read[t].fields[path]) for path, name in its.items()} for t, its in columns.items()}
+        writer.write([replace(rows, fields=renamed[topic]) for topic, rows in read.items()])
 
 
 def _stored(values: NDArray[Any]) -> NDArray[Any]:

@@ -36,15 +36,15 @@ from pdhef_logtool.logs.message_schema import (
     select,
     values_at,
 )
-from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, MIB, LimitError, ResourceLimits
 from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
 #: Value of a time column if the message has no time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
 #: Messages that are decoded singly at the same time.
-_BYTES_AT_ONCE = 4 << 20
+_BYTES_AT_ONCE = 4 * MIB
 _LAYOUTS_PER_CHANNEL = 8
 #: An array has as many columns as its longest value: at most this many cells, or columns if there are many values.
 _CELLS = 1 << 26
@@ -309,9 +309,9 @@ def _column(selection: Selection, parts: Sequence[NDArray[Any] | None], n: int) 
     if selection.shape != "time":
         return given[0].astype(np.float64)
     seconds, nanoseconds = given
-    is_time = np.abs(seconds * 1e9 + nanoseconds) < 2.0**63
+    is_time = np.abs(seconds * float(NS_PER_S) + nanoseconds) < -float(NO_TIME_NS)
     with np.errstate(invalid="ignore"):
-        total = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+        total = seconds.astype(np.int64) * NS_PER_S + nanoseconds.astype(np.int64)
     return np.where(is_time, total, NO_TIME_NS)
 
 

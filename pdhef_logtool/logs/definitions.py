@@ -13,15 +13,17 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+from pdhef_logtool.logs.resource_limits import MIB
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.storage.documents import read_text
 
 #: A workspace with more files is more than messages, and a longer text is no message.
 MOST_FILES = 50_000
-MOST_BYTES = 1 << 20
+MOST_BYTES = MIB
 #: A type name may come from a log, and becomes a path.
 _TYPE_NAME = re.compile(r"([A-Za-z]\w*)/(?:msg|srv|action)/([A-Za-z]\w*)", re.ASCII)
-_MESSAGE_SEPARATOR = "=" * 80
+#: Line between two definitions.
+MESSAGE_SEPARATOR = "=" * 80
 #: Environment variables with the packages of ROS 2 and ROS 1, and the default folders.
 _PREFIXES, _SOURCES = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"), "ROS_PACKAGE_PATH"
 _USUAL = (Path("/usr/local"), Path("/usr"))
@@ -177,7 +179,7 @@ def message_definition(type_name: str) -> str:
         store.register(with_contained_types(types, store.fielddefs, shipped_definition))
         generated = store.generate_msgdef(type_name, ros_version=2)[0]
         # Keep the comments of the shipped text: they contain the units.
-        _, separator, rest = generated.partition(_MESSAGE_SEPARATOR)
+        _, separator, rest = generated.partition(MESSAGE_SEPARATOR)
         return text.rstrip("\n") + "\n" + separator + rest
     if type_name not in store.fielddefs:
         raise KeyError(type_name)

@@ -22,7 +22,7 @@ from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
 from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
@@ -186,8 +186,8 @@ class _Matrices:
         values = self._numbers((element, contents))
         if min(shape, default=0) < 0 or math.prod(shape) != len(values):
             raise ValueError(f"{path} has {len(values)} values for the dimensions {shape}")
-        self._claimed += 8 * len(values)
-        self._file.limits.check_table(self._claimed, self._file.size, self._file.name)
+        self._claimed += NUMBER_BYTES * len(values)
+        self._file.check(self._claimed)
         values = values.astype(np.bool_ if flags & _MAT["logical"] else _NUMBERS[kind])
         return name, values.item() if len(values) == 1 else values.reshape(shape, order="F").squeeze()
 
@@ -233,8 +233,8 @@ def _hdf5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, 
                 if isinstance(item, h5py.Group):
                     yield name, dict(children(item, f"{place}/", depth + 1))
                     continue
-                size = 8 * math.prod(item.shape or ())
-                file.limits.check_table(claimed + size, file.size, file.name)
+                size = NUMBER_BYTES * math.prod(item.shape or ())
+                file.check(claimed + size)
                 claimed += size
                 texts = (str(item.attrs[n]) for n in ("unit", "units", "Unit", "Units") if n in item.attrs)
                 unit = next(texts, "").replace(_SLASH, " per ")

@@ -22,10 +22,10 @@ from mcap.stream_reader import StreamReader
 from pdhef_logtool.logs.byte_source import ByteSource, CutError
 from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC, Span
 from pdhef_logtool.logs.recording_span import SILENCE_NS, STEP_BACK_NS
-from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, KIB, ResourceLimits
 
 #: One request brings the summary of a drive of several minutes; a longer one takes a second request.
-TAIL_BYTES = 256 << 10
+TAIL_BYTES = 256 * KIB
 RECORD = struct.Struct("<BQ")  # opcode, size of the content
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
 INDEX_RECORD = struct.Struct("<BQHI")  # opcode, size, channel, size of its pairs

@@ -48,17 +48,17 @@ from pdhef_logtool.logs.container import (
 )
 from pdhef_logtool.logs.mcap_index import INDEX_PAIR, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import LimitError, Meter
+from pdhef_logtool.logs.resource_limits import KIB, MIB, LimitError, Meter
 from pdhef_logtool.records.signals import IntArray, Loss
 
 UintArray: TypeAlias = NDArray[np.uint64]
 
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, uncompressed CRC, length of the compression's name
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
-_CRC_BLOCK_BYTES = 4 << 20
+_CRC_BLOCK_BYTES = 4 * MIB
 _CHUNK_HEAD_BYTES = RECORD.size + _CHUNK.size + _U64.size  # without the name of the compression
 _LONGEST_NAME = 4  # of a compression
-_ATTACHMENT_HEAD_BYTES = 64 << 10  # at most, in front of its data
+_ATTACHMENT_HEAD_BYTES = 64 * KIB  # at most, in front of its data
 #: A plain number: comparing with a member of an enumeration takes longer than reading a record.
 _OP_MESSAGE = int(Opcode.MESSAGE)
 _DECLARATIONS = (Opcode.SCHEMA, Opcode.CHANNEL)

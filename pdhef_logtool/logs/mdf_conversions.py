@@ -21,7 +21,7 @@ from pdhef_logtool.records.signals import FloatArray
 #: Returns physical values [N] of raw numbers [N].
 Rule: TypeAlias = Callable[[NDArray[Any]], FloatArray]
 
-_LONGEST_FORMULA, _DEEPEST_FORMULA = 500, 40
+_LONGEST_FORMULA, _DEEPEST_FORMULA, _SHOWN_CHARACTERS = 500, 40, 40
 _OPERATORS: dict[type[ast.AST], np.ufunc] = {
     ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power,
     ast.USub: np.negative, ast.UAdd: np.positive,
@@ -31,36 +31,38 @@ _FUNCTIONS: dict[str, np.ufunc] = {name: getattr(np, name) for name in _NAMES.sp
     "ln": np.log, "pow": np.power, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2,
 }  # fmt: skip
 
-#: Conversions that are formulas of their parameters, by version and type.
-_FORMULAS: dict[int, dict[int, str]] = {v: numbered(f) for v, f in numbered(CONSTANTS["mdf"]["formulas"]).items()}
+#: Conversions that are formulas of their parameters, and names of the others, by version and type.
+_FORMULAS, _OTHERS = (
+    {version: numbered(kinds) for version, kinds in CONSTANTS["mdf"][name].items()} for name in ("formulas", "tables")
+)
 
 
 def conversion_rule(block: Any, version: int) -> Rule:
     """Return the rule of a conversion block of MDF 3 or 4; ValueError if it is not supported."""
     if block is None:
         return _floats
-    kind = (4 if version >= 4 else 3), block.conversion_type
+    number, type_ = str(version), block.conversion_type
     try:
-        if formula := _FORMULAS[kind[0]].get(kind[1]):
+        if formula := _FORMULAS[number].get(type_):
             return formula_rule(formula.format(block))
-        match kind:
-            case (4, 4 | 5) | (3, 1 | 2):
-                return _table(block, interpolates=kind[1] in (1, 4))
-            case (4, 6):
+        match kind := _OTHERS[number].get(type_):
+            case "interpolated" | "nearest":
+                return _table(block, interpolates=kind == "interpolated")
+            case "formulas":
                 values = [formula_rule(str(value)) for value in _column(block, "phys")]
                 return _pieces(block, values, formula_rule(str(block.default)))
-            case (4, 7 | 8):
+            case "texts":
                 blocks = block.referenced_blocks.items()
-                rules = {key: None if isinstance(b, bytes | None) else conversion_rule(b, 4) for key, b in blocks}
+                rules = {key: None if isinstance(b, bytes | None) else conversion_rule(b, version) for key, b in blocks}
                 default = rules.pop("default_addr", None)
                 return _pieces(block, [*rules.values()], default)
-            case (3, 12):  # the text of all other numbers may contain a formula of {X}
+            case "ranges":  # the text of all other numbers may contain a formula of {X}
                 text = (block.referenced_blocks.get("default_addr") or b"").decode("latin-1")
                 default = formula_rule(text.replace("{X}", "x").strip('\0 "')) if "{X}" in text else None
                 return _pieces(block, [None] * len(_column(block, "lower")), default)
     except AttributeError:  # of a block that asammdf has not read to its end
         raise ValueError("its conversion is incomplete") from None
-    raise ValueError(f"its conversion is of type {kind[1]}, which is not supported")
+    raise ValueError(f"its conversion is of type {type_}, which is not supported")
 
 
 def formula_rule(text: str) -> Rule:
@@ -71,7 +73,7 @@ def formula_rule(text: str) -> Rule:
     ValueError : the formula contains anything else.
     """
     text = text.partition("\0")[0].strip()
-    shown = text if len(text) <= 40 else f"{text[:40]}..."
+    shown = text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}..."
     if len(text) > _LONGEST_FORMULA:
         raise ValueError(f"its formula {shown!r} has more than {_LONGEST_FORMULA} characters")
     try:

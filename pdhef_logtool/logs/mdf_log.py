@@ -20,18 +20,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.can_decoding import Frames
+from pdhef_logtool.logs.can_decoding import BYTE_BITS, EXTENDED_FLAG, Frames
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.mdf_conversions import conversion_rule
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, ascending_rows, placed
 from pdhef_logtool.logs.table_columns import field_name, unique
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Loss
 
 _FRAMES = "CAN_DataFrame"
 _MDF, _CAN = CONSTANTS["mdf"], CONSTANTS["can"]
@@ -39,6 +39,7 @@ _MDF, _CAN = CONSTANTS["mdf"], CONSTANTS["can"]
 _LENGTHS = np.array(_CAN["bytes_of_code"])
 _DATA_BLOCK = re.compile(rb"##(?:DT|SD|DV)\0{4}")
 _LONGEST_NAME = 40
+_SIZE = np.dtype("<u4")  # in front of data of variable length
 _VARIABLE, _VIRTUAL = _MDF["variable"], _MDF["virtual"]
 #: Types of masters by version.
 _MASTERS = numbered(_MDF["masters"])
@@ -49,7 +50,10 @@ _LOCAL, _WITH_OFFSETS = 1, 2
 _NO_TIMES = numbered(_MDF["no_times"])
 
 # Blocks that are surveyed before asammdf opens a file.
-_FIRST = 64
+#: The start: kind, first digit of the version, and flags of what is unfinished.
+_FIRST, _START = 64, struct.Struct("7sxc51x2s")
+#: Heads of blocks: kind, and in version 4 the number of links. Link, or length of a block, of version 4.
+_HEAD_3, _HEAD, _LINK = struct.Struct("<2s2x"), struct.Struct("<2x2s12xQ"), struct.Struct("<Q")
 #: Places of the links that are followed, by kind of block; empty: all links of a list of data.
 _FOLLOWED, _FOLLOWED_3 = (
     {kind.encode(): places for kind, places in _MDF[name].items()} for name in ("followed", "followed_3")
@@ -105,9 +109,9 @@ def open_mdf(file: TableFile) -> Tables:
 def is_unfinished(file: TableFile) -> bool:
     """Return whether the recorder did not complete lengths and links, and leave the stream at its start."""
     file.stream.seek(0)
-    head = file.stream.read(_FIRST).ljust(_FIRST)
+    kind, version, flags = _START.unpack(file.stream.read(_START.size).ljust(_START.size))
     file.stream.seek(0)
-    return head[8:9] == b"4" and (head[:7] == b"UnFinMF" or any(head[60:62]))
+    return version == b"4" and (kind == b"UnFinMF" or any(flags))
 
 
 def survey_blocks(file: TableFile) -> int:
@@ -122,31 +126,30 @@ def survey_blocks(file: TableFile) -> int:
     stream, limits, unfinished = file.stream, file.limits, is_unfinished(file)
     stream.seek(_FIRST)
     is_old = stream.read(2) == b"HD"
-    base, link, followed = (4, struct.Struct("<I"), _FOLLOWED_3) if is_old else (24, struct.Struct("<Q"), _FOLLOWED)
+    base, link, followed = (_HEAD_3, struct.Struct("<I"), _FOLLOWED_3) if is_old else (_HEAD, _LINK, _FOLLOWED)
     kinds: Counter[bytes] = Counter()
     seen: set[int] = set()
     unpacked = missing = 0
     pending: list[tuple[int, bytes, int]] = [(_FIRST, b"", 0)]
     while pending:
         address, parent, place = pending.pop()
-        if address > file.size - base:
+        if address > file.size - base.size:
             missing += 1
             continue
         stream.seek(address)
-        head = stream.read(base)
-        kind = head[:2] if is_old else head[2:4]
+        kind, *links_stated = base.unpack(stream.read(base.size))
         if _CHAINS.get((parent, place), kind) != kind:
             raise _damage(f"a block {_CHAINS[parent, place].decode()} at byte {address}", "another one", file)
         if kind == b"DZ":
-            unpacked += int.from_bytes(stream.read(16)[8:], "little")
+            unpacked += int.from_bytes(stream.read(2 * _LINK.size)[_LINK.size :], "little")
         if kind not in followed or ((parent, place) == (b"CN", 5) and kind not in _LISTS):
             continue
         if address in seen:
             raise _damage("links that lead to other blocks", f"a circle at byte {address}", file)
         seen.add(address)
         kinds[kind] += 1
-        count = int.from_bytes(head[16:24], "little") if kind in _LISTS else 1 + max(followed[kind])
-        limits.check("metadata_bytes", 8 * count, file.name)
+        count = sum(links_stated) if kind in _LISTS else 1 + max(followed[kind])
+        limits.check("metadata_bytes", _LINK.size * count, file.name)
         data = stream.read(count * link.size)
         links = [target for (target,) in link.iter_unpack(data[: len(data) // link.size * link.size])]
         missing += len(links) < count
@@ -155,7 +158,7 @@ def survey_blocks(file: TableFile) -> int:
         pending += [(links[i], kind, i) for i in followed[kind] or range(len(links)) if i < len(links) and links[i]]
     limits.check("channels", kinds[b"CG"], file.name)
     limits.check("schema_leaves", kinds[b"CN"] / max(1, kinds[b"CG"]), f"{file.name}, channels of a group")
-    limits.check_table(unpacked, file.size, file.name)
+    file.check(unpacked)
     return missing
 
 
@@ -169,11 +172,12 @@ def _repaired(file: TableFile) -> BytesIO | None:
     """Return a copy of a version 4 file with the length of its cut last data block corrected; None without a cut."""
     file.stream.seek(0)
     data = bytearray(file.stream.read())
-    starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= len(data)]
-    cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > len(data)]
+    blocks = [m.span() for m in _DATA_BLOCK.finditer(data) if m.end() + _LINK.size <= len(data)]
+    cut = [(start, place) for start, place in blocks if start + _LINK.unpack_from(data, place)[0] > len(data)]
     if not cut:
         return None
-    data[cut[-1] + 8 : cut[-1] + 16] = (len(data) - cut[-1]).to_bytes(8, "little")
+    start, place = cut[-1]
+    _LINK.pack_into(data, place, len(data) - start)
     return BytesIO(data)
 
 
@@ -194,7 +198,7 @@ def _start(header: Any) -> tuple[int, bool]:
         text = b" ".join((header.date, header.time)).decode("latin-1").strip(" \0")
         with suppress(ValueError):
             date = dt.datetime.strptime(f"{text} +0000", "%d:%m:%Y %H:%M:%S %z")
-            start, flags = round(date.timestamp()) * TIME_UNITS_NS["seconds"], _LOCAL
+            start, flags = round(date.timestamp()) * NS_PER_S, _LOCAL
     return (start, flags == _LOCAL) if 0 < start < _MDF["last_date_ns"] else (0, False)
 
 
@@ -239,8 +243,8 @@ class _Group:
         group, file = self._block, self._file
         if not self._channels or not group.cycles_nr:
             return
-        row_bytes = group.samples_byte_nr + getattr(group, "invalidation_bytes_nr", 0) + 8
-        file.limits.check_table(group.cycles_nr * row_bytes, file.size, f"{file.name}, {name}")
+        row_bytes = group.samples_byte_nr + getattr(group, "invalidation_bytes_nr", 0) + NUMBER_BYTES
+        file.check(group.cycles_nr * row_bytes, f"{file.name}, {name}")
         self._check_layout()
         stamps, rows = self._stamps(name, start_ns, losses)
         if self._contains_frames:
@@ -275,14 +279,15 @@ class _Group:
     def _check_layout(self) -> None:
         """Raise SpanDamageError for a channel outside of its record: asammdf would read and write memory of others."""
         group = self._block
+        invalidation_bits = BYTE_BITS * getattr(group, "invalidation_bytes_nr", 0)
         for i, channel in enumerate(self._channels):
             end, last_bit = channel.bit_count, -1
             if self._version == 3:
-                end += channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0)
+                end += channel.start_offset + BYTE_BITS * getattr(channel, "additional_byte_offset", 0)
             else:
-                end += 8 * channel.byte_offset + channel.bit_offset if not self._is(i, _VIRTUAL) else -end
+                end += BYTE_BITS * channel.byte_offset + channel.bit_offset if not self._is(i, _VIRTUAL) else -end
                 last_bit = channel.pos_invalidation_bit if channel.flags & _SOME_INVALID else -1
-            if end > 8 * group.samples_byte_nr or last_bit >= 8 * getattr(group, "invalidation_bytes_nr", 0):
+            if end > BYTE_BITS * group.samples_byte_nr or last_bit >= invalidation_bits:
                 raise SpanDamageError(f"channel {channel.name} is outside of its record")
 
     def _seconds(self) -> FloatArray:
@@ -306,7 +311,7 @@ class _Group:
         if missing := self._block.cycles_nr - len(seconds):
             losses.append(Loss("truncated", f"the file ends after {len(seconds)} rows", name, count=missing))
         finite = np.abs(seconds) < _MDF["longest_s"]
-        stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + start_ns
+        stamps = np.round(np.where(finite, seconds, 0.0) * NS_PER_S).astype(np.int64) + start_ns
         stamps = placed(np.where(finite, stamps, NO_TIME))
         # Frames of several buses are buffered before they are written; rows of channels are in order.
         order = np.argsort(stamps, kind="stable") if self._contains_frames else np.arange(len(stamps))
@@ -361,7 +366,8 @@ class _Group:
         length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
         if np.isin(length, _CAN["only_codes"]).any() or ("DLC" in parts and "DataLength" not in parts):
             length = _LENGTHS[length.clip(0, len(_LENGTHS) - 1)]
-        extended = (parts["ID"] >> 31 & 1) | (identifier > _CAN["base_id_bits"]) | (parts.get("IDE", np.zeros(1)) > 0)
+        is_flagged = ((parts["ID"] & EXTENDED_FLAG) > 0) | (parts.get("IDE", np.zeros(1)) > 0)
+        extended = is_flagged | (identifier > _CAN["base_id_bits"])
         frames = {"id": identifier, "length": length.clip(0, data.shape[1]), "is_extended": extended}
         return Frames(stamps, frames | ({"bus": parts["BusChannel"]} if "BusChannel" in parts else {}), data)
 
@@ -375,9 +381,10 @@ class _Group:
             return np.asarray(raw, np.uint8).reshape(len(raw), -1)
         stored = np.frombuffer(self._source._mdf._load_signal_data(self._group, index), np.uint8)
         begins = raw.astype(np.int64)
-        if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - 4:
+        if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - _SIZE.itemsize:
             raise SpanDamageError("data of a frame are missing")
-        frames = np.lib.stride_tricks.sliding_window_view(np.pad(stored, (0, _LENGTHS[-1])), 4 + _LENGTHS[-1])[begins]
-        lengths = frames[:, :4].copy().view("<u4")
-        data = frames[:, 4 : 4 + min(lengths.max(initial=0), _LENGTHS[-1])]
+        most, head = _LENGTHS[-1], _SIZE.itemsize
+        frames = np.lib.stride_tricks.sliding_window_view(np.pad(stored, (0, most)), head + most)[begins]
+        lengths = frames[:, :head].copy().view(_SIZE)
+        data = frames[:, head : head + min(lengths.max(initial=0), most)]
         return np.where(np.arange(data.shape[1]) < lengths, data, np.uint8(0))

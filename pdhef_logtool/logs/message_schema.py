@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.logs.constants import CONSTANTS
-from pdhef_logtool.logs.definitions import SHIPPED, Definitions, referenced, with_contained_types
+from pdhef_logtool.logs.definitions import MESSAGE_SEPARATOR, SHIPPED, Definitions, referenced, with_contained_types
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
@@ -254,7 +254,7 @@ def ros_schema(
     with parsing(what):
         limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
         if has_text:
-            text = _SEPARATOR.sub("=" * 80, text)
+            text = _SEPARATOR.sub(MESSAGE_SEPARATOR, text)
             types = _idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
         if not has_text or referenced(types) - set(types):  # a distribution's types take long to load
             base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)

@@ -216,11 +216,7 @@ def _open_folder(file: LogFile) -> DriveLog:
     if len(logs) != 1:
         got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
         raise LogError(expected=what_is_a_log(), got=got, where=str(path), remedy=_ONE_RECORDING if logs else _REMEDY)
-    opened = _open_file(replace(file, path=logs[0], place=logs[0]))
-    if isinstance(opened, DriveLog):
-        return opened
-    kind = "rosbag2-mcap" if opened.kind == "mcap" else opened.kind
-    return ColumnarLog(path, kind, [opened], distro=opened.distro)
+    return _opened(replace(file, path=logs[0], place=logs[0]), EVERYTHING)
 
 
 def _read_metadata(path: Path, limits: ResourceLimits) -> Mapping[str, Any]:

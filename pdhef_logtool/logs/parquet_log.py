@@ -5,22 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pyarrow import types as of
 
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_cells import read_cells
 from pdhef_logtool.logs.table_clocks import unwrapped
 from pdhef_logtool.logs.table_columns import Sheet, read_head, tables_of
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import NS_PER_S, Loss
 
 
 def open_parquet(file: TableFile) -> Tables:
     """Read a Parquet file; a column that cannot be read is a loss, in its row group."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     losses: list[Loss] = []
     schema = pq.read_schema(file.stream)
     leaves = dict(_leaves(schema, ""))
@@ -51,8 +53,6 @@ def open_parquet(file: TableFile) -> Tables:
 
 def _leaves(fields: Any, prefix: str) -> Iterator[tuple[str, Any]]:
     """Yield the paths of columns, inside of structs too, and their fields."""
-    import pyarrow as pa
-
     for field in fields:
         if pa.types.is_struct(field.type):
             yield from _leaves(field.type, f"{prefix}{field.name}.")
@@ -62,8 +62,6 @@ def _leaves(fields: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 def _kind(type_: Any) -> str:
     """Return how a column of a type is read; empty if it cannot contain numbers or times."""
-    import pyarrow.types as of
-
     if of.is_dictionary(type_):
         type_ = type_.value_type
     kinds = (
@@ -82,8 +80,6 @@ def _unit_of(metadata: Mapping[bytes, bytes] | None) -> str:
 
 def _groups(source: Any, paths: Sequence[str], file: TableFile, losses: list[Loss]) -> list[dict[str, Any]]:
     """Return the columns of row groups by path, null where they cannot be read; no group exceeds the limits."""
-    import pyarrow as pa
-
     parts: list[dict[str, Any]] = []
     types = {path: field.type for path, field in _leaves(source.schema_arrow, "")}
     claimed = 0
@@ -93,8 +89,8 @@ def _groups(source: Any, paths: Sequence[str], file: TableFile, losses: list[Los
         part: dict[str, Any] = {}
         errors: dict[str, str] = {}
         try:
-            claimed += max(8 * rows * max(1, len(paths)), group.total_byte_size)
-            file.limits.check_table(claimed, file.size, where)
+            claimed += max(NUMBER_BYTES * rows * max(1, len(paths)), group.total_byte_size)
+            file.check(claimed, where)
         except LogError as error:
             losses.append(Loss("bad-rows", str(error), where, count=rows))
             continue
@@ -116,8 +112,6 @@ def _groups(source: Any, paths: Sequence[str], file: TableFile, losses: list[Los
 
 def _column_of_group(source: Any, number: int, path: str, rows: int) -> Any:
     """Return a column of a row group, out of the structs around it; ValueError if it has another length."""
-    import pyarrow as pa
-
     table = source.read_row_group(number, columns=[path], use_threads=False)
     while pa.types.is_struct(table.schema.types[0]):
         table = table.flatten()
@@ -128,9 +122,6 @@ def _column_of_group(source: Any, number: int, path: str, rows: int) -> Any:
 
 def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Loss]) -> Any:
     """Return a column as an array [N] with NaN (NaT) for null, or as texts."""
-    import polars as pl
-    import pyarrow as pa
-
     if kind == "text":
         return _texts(column, name, file, losses)
     if pa.types.is_dictionary(column.type):
@@ -141,7 +132,7 @@ def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Los
     if kind == "duration":
         is_of_day = series.dtype == pl.Time
         nanoseconds = series if is_of_day else series.cast(pl.Duration("ns"))
-        values = nanoseconds.cast(pl.Int64).cast(pl.Float64).to_numpy() / 1e9
+        values = nanoseconds.cast(pl.Int64).cast(pl.Float64).to_numpy() / NS_PER_S
         return unwrapped(values) if is_of_day else values
     if series.dtype.is_float() or (series.dtype.is_integer() and not series.null_count()):
         return series.to_numpy()
@@ -150,14 +141,10 @@ def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Los
 
 def _texts(column: Any, name: str, file: TableFile, losses: list[Loss]) -> NDArray[Any] | Any:
     """Return texts as numbers if most of them are numbers; a text that repeats counts each time for the limits."""
-    import polars as pl
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
     column.validate(full=True)  # texts that are not UTF-8 would end the process
     dictionaries = [chunk for chunk in column.chunks if pa.types.is_dictionary(chunk.type)]
     sizes = (pc.sum(pc.take(pc.binary_length(c.dictionary), c.indices)).as_py() or 0 for c in dictionaries)
-    file.limits.check_table(sum(sizes), file.size, f"{file.name}, {name}")
+    file.check(sum(sizes), f"{file.name}, {name}")
     texts = pl.Series(pl.from_arrow(column.cast(pa.large_string())))
     cells = read_cells(texts)
     if cells.is_text:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.resource_limits import RAISE_LIMIT, LimitError
+from pdhef_logtool.logs.resource_limits import MIB, RAISE_LIMIT, LimitError
 from pdhef_logtool.logs.table_file import LogFile, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError, PdhefError, UsageError, WorkerError
@@ -91,7 +91,7 @@ class _Session:
 
     def __init__(self, path: Path, file: TableFile, reader: str, libraries: Sequence[str]) -> None:
         self._path, self._file, self._reader, self._libraries = path, file, reader, libraries
-        self._seconds = file.limits.seconds + file.limits.seconds_per_mib * file.size / 2**20
+        self._seconds = file.limits.seconds + file.limits.seconds_per_mib * file.size / MIB
         most = 2 * (file.limits.table_bytes + file.limits.table_ratio * file.size)
         self._bytes = min(most, psutil.virtual_memory().available)
         self._child: Child | None = None
@@ -198,7 +198,7 @@ def serve_tables(connection: Connection, descriptor: int) -> None:
                     number, path, start, stop = arguments
                     head, arrays = {}, [np.asarray(tables.tables[number].load(path, slice(start, stop)))]
             except MemoryError:
-                head, arrays = _failure(_over("memory", f"{more_bytes / 1e6:.0f} MB", file.name)), []
+                head, arrays = _failure(_over("memory", f"{more_bytes / MIB:.0f} MiB", file.name)), []
             except Exception as error:  # noqa: BLE001  any error of a library
                 head, arrays = _failure(error), []
             _reply(connection, head, arrays)

@@ -13,7 +13,7 @@ from pathlib import Path
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.formats import HEAD_BYTES, recognised_format
 from pdhef_logtool.logs.reader_process import log_of_tables
-from pdhef_logtool.logs.resource_limits import Meter
+from pdhef_logtool.logs.resource_limits import KIB, Meter
 from pdhef_logtool.logs.table_columns import field_name, unique
 from pdhef_logtool.logs.table_file import LogFile, Tables, TableSettings
 from pdhef_logtool.logs.table_log import Table, TableLog
@@ -70,7 +70,7 @@ def _may_be_recording(paths: Sequence[Path]) -> bool:
     titles = set()
     for path in paths:
         with path.open("rb") as file:
-            titles.add(file.readline(1 << 16).strip())
+            titles.add(file.readline(64 * KIB).strip())
     return len(titles) > 1
 
 

@@ -24,20 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import Container
-from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, IntArray, Loss
 
 #: A longer silence ends a stretch.
-SILENCE_NS = 600_000_000_000
+SILENCE_NS = 600 * NS_PER_S
 #: A stretch with at most this many messages is an outlier: too short for any estimate.
 OUTLIER_MESSAGES = 3
 #: No drive continues in the same log after a longer pause; clocks that are set jump by months and years.
-EPOCH_NS = 86_400_000_000_000
+EPOCH_NS = 86_400 * NS_PER_S
 #: Recorders with several threads write up to a second out of order; a clock that is set back falls further...
-STEP_BACK_NS = 1_000_000_000
+STEP_BACK_NS = NS_PER_S
 #: ... for at least this many messages, behind the median of as many before; single wrong times are no step.
 STEP_BACK_MESSAGES = 5
 #: Left out beside times that were recorded twice: the true duration of the step is unknown.
-BREAK_NS = 1_000_000_000
+BREAK_NS = NS_PER_S
 #: Messages left out are a note below this share of a log's messages, a loss above it.
 NOTED_SHARE = 0.01
 
@@ -285,6 +285,6 @@ def _loss(reason: str, where: str, start_ns: IntArray, end_ns: IntArray, count: 
 def shown_time(ns: int) -> str:
     """Return any time of the log's clock in UTC to the second."""
     try:
-        return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=ns // 10**9)).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=ns // NS_PER_S)).strftime("%Y-%m-%d %H:%M:%S UTC")
     except (OverflowError, ValueError):
         return f"{ns} ns"

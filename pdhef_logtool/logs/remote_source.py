@@ -20,21 +20,23 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iter
 from concurrent.futures import Future
 from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import cached_property
+from http import HTTPStatus
 from io import DEFAULT_BUFFER_SIZE
 from pathlib import Path
 from threading import Lock
-from typing import Any, BinaryIO
+from typing import Any
 
 from isal.isal_zlib import crc32
 
 from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, guarded_client
 from pdhef_logtool.logs.remote_place import RemotePlace
+from pdhef_logtool.logs.resource_limits import KIB, MIB
 from pdhef_logtool.records.extras import required
-from pdhef_logtool.storage.files import scratch_folder
+from pdhef_logtool.storage.files import scratch_folder, take_lock
 from pdhef_logtool.storage.object_store import s3_system, words_of
 
-BLOCK_BYTES, MOST_RANGE_BYTES = 64 << 10, 8 << 20
+BLOCK_BYTES, MOST_RANGE_BYTES = 64 * KIB, 8 * MIB
 AT_ONCE = 4
 #: Waits before a request is repeated, and timeouts. S3 requests are repeated by its library.
 WAITS_S = (0.5, 1.0, 2.0, 4.0)
@@ -43,7 +45,7 @@ _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+)")
 
 
 #: Size of all copies together; least recently used ones are removed.
-CACHE_BYTES = 4 << 30
+CACHE_BYTES = 4096 * MIB
 
 
 class RemoteCopy:
@@ -51,7 +53,8 @@ class RemoteCopy:
 
     Parameters
     ----------
-    name : of the object. identity : of its version; empty, or without a writable cache folder: the copy is temporary.
+    name : of the object.
+    identity : of its version; empty, or without a writable cache folder with locks: the copy is temporary.
 
     Attributes
     ----------
@@ -72,7 +75,7 @@ class RemoteCopy:
         self.path, index = folder / "object" / (name.replace("/", "_")[-80:] or "log"), folder / "index"
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._index = stack.enter_context(index.open("a+b", buffering=0))
-        if not (_lock(self._index, exclusive=False) and index.exists()):
+        if cached is not None and not (take_lock(self._index.fileno(), exclusive=False) and index.exists()):
             raise FileNotFoundError  # another process is removing the copy
         os.utime(index)
         self.path.touch()
@@ -111,18 +114,6 @@ def _cache_folder() -> Path:
     return Path(os.environ.get("PDHEF_CACHE_DIR") or Path(caches, "pdhef")) / "remote"
 
 
-def _lock(file: BinaryIO, *, exclusive: bool) -> bool:
-    """Lock a file until it is closed; False if another process has locked it."""
-    try:
-        import fcntl
-    except ImportError:
-        return True  # such systems do not remove files that are open
-    with suppress(BlockingIOError):
-        fcntl.flock(file, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-        return True
-    return False
-
-
 def _evict() -> None:
     """Remove the least recently used copies that are not in use, until the others fit in CACHE_BYTES."""
     total = 0
@@ -131,7 +122,7 @@ def _evict() -> None:
             files = [path.stat() for path in (index.parent / "object").iterdir()]
             total += sum(getattr(file, "st_blocks", file.st_size >> 9) << 9 for file in files)
             with index.open("rb") as file:
-                if total > CACHE_BYTES and _lock(file, exclusive=True):
+                if total > CACHE_BYTES and take_lock(file.fileno()):
                     shutil.rmtree(index.parent, ignore_errors=True)
 
 
@@ -252,19 +243,21 @@ class RemoteSource(ByteSource):
             async with response["Body"] as body:
                 head = {"Content-Length": response["ContentLength"], "ETag": response["ETag"]}
                 head["Content-Range"] = response.get("ContentRange", "")
-                yield *self._compared(head), body.iter_chunks(1 << 20)
+                yield *self._compared(head), body.iter_chunks(MIB)
             return
         headers = {"Range": part, "Accept-Encoding": "identity"}
         session = await self._system.set_session()
         async with session.get(self._system.encode_url(place.url), headers=headers) as response:
-            if response.status == 416 and response.headers.get("Content-Range") == "bytes */0":
+            is_no_range = response.status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE
+            if is_no_range and response.headers.get("Content-Range") == "bytes */0":
                 async with session.get(self._system.encode_url(place.url)) as empty:
-                    yield *self._compared(empty.headers), empty.content.iter_chunked(1 << 20)
+                    yield *self._compared(empty.headers), empty.content.iter_chunked(MIB)
                 return
-            if response.status not in (200, 206):
-                kind = ConnectionError if response.status >= 500 else _ERRORS.get(response.status, OSError)
+            if response.status not in (HTTPStatus.OK, HTTPStatus.PARTIAL_CONTENT):
+                is_of_server = response.status >= HTTPStatus.INTERNAL_SERVER_ERROR
+                kind = ConnectionError if is_of_server else _ERRORS.get(response.status, OSError)
                 raise kind(f"status {response.status}")
-            yield *self._compared(response.headers), response.content.iter_chunked(1 << 20)
+            yield *self._compared(response.headers), response.content.iter_chunked(MIB)
 
     def _compared(self, head: Mapping[str, Any]) -> tuple[int | None, int]:
         """Return size and offset of an answer; raises ChangedError if the object is not the one that was opened."""
@@ -345,8 +338,16 @@ def _words_of(error: Exception) -> tuple[str, str, bool]:
 
 
 #: Errors by status. Timeouts, too many requests and 5xx are temporary, as a lost connection is.
-_ERRORS: dict[int, type[OSError]] = dict.fromkeys((408, 425, 429), ConnectionError)
-_ERRORS |= dict.fromkeys((401, 403, 407), PermissionError) | dict.fromkeys((404, 410), FileNotFoundError)
+_ERRORS: Mapping[int, type[OSError]] = {
+    HTTPStatus.REQUEST_TIMEOUT: ConnectionError,
+    HTTPStatus.TOO_EARLY: ConnectionError,
+    HTTPStatus.TOO_MANY_REQUESTS: ConnectionError,
+    HTTPStatus.UNAUTHORIZED: PermissionError,
+    HTTPStatus.FORBIDDEN: PermissionError,
+    HTTPStatus.PROXY_AUTHENTICATION_REQUIRED: PermissionError,
+    HTTPStatus.NOT_FOUND: FileNotFoundError,
+    HTTPStatus.GONE: FileNotFoundError,
+}
 
 
 def _file_system(place: RemotePlace) -> Any:

@@ -15,9 +15,9 @@ from pdhef_logtool.records.errors import LogError
 
 #: Remedy of an exceeded limit.
 RAISE_LIMIT = "if the recording is sound, raise the limit with --set budget=FACTOR"
-_MIB = 1 << 20
-_MESSAGES_A_CHECK = 1 << 16
-_FEW_MESSAGES = 1 << 16
+#: Bytes.
+KIB, MIB = 1 << 10, 1 << 20
+_MESSAGES_A_CHECK = _FEW_MESSAGES = 1 << 16
 
 
 class LimitError(LogError):
@@ -46,17 +46,17 @@ class ResourceLimits:
     seconds_per_mib : a further part of it, for each MiB read.
     """
 
-    chunk_bytes: int = 256 << 20
+    chunk_bytes: int = 256 * MIB
     chunk_ratio: int = 2000
     chunk_messages: int = 1_000_000
     messages_per_byte: float = 4.0
     channels: int = 4096
-    metadata_bytes: int = 64 << 20
-    schema_bytes: int = 4 << 20
+    metadata_bytes: int = 64 * MIB
+    schema_bytes: int = 4 * MIB
     schema_leaves: int = 20_000
     schema_depth: int = 32
     array_width: int = 65_536
-    table_bytes: int = 256 << 20
+    table_bytes: int = 256 * MIB
     table_ratio: int = 32
     seconds: float = 5.0
     seconds_per_mib: float = 20.0
@@ -80,7 +80,7 @@ class ResourceLimits:
     def check_unpacked(self, size: int, stored: int, what: str) -> None:
         """Raise :class:`LimitError` if ``stored`` bytes may not become, or claim to become, ``size`` bytes."""
         self.check("chunk_bytes", size, what)
-        if size > _MIB:
+        if size > MIB:
             self.check("chunk_ratio", size / max(stored, 1), what)
 
     def check_table(self, size: int, stored: int, what: str) -> None:
@@ -115,7 +115,7 @@ class Meter:
     @property
     def allowed_s(self) -> float:
         """Time limit for the bytes read so far, in seconds."""
-        return self.limits.seconds + self.limits.seconds_per_mib * self._bytes / _MIB
+        return self.limits.seconds + self.limits.seconds_per_mib * self._bytes / MIB
 
     def check(self) -> None:
         """Raise :class:`LimitError` if reading has taken too long."""

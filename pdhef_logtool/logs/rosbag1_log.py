@@ -14,19 +14,19 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from rosbags.rosbag1.reader import Header, ReaderError
+from rosbags.rosbag1.reader import Header, ReaderError, RecordType
 
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import Block, ChannelRecord, FileContainer, Span, SpanDamageError, block_from_lists
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import Meter
+from pdhef_logtool.logs.resource_limits import MIB, Meter
 from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
-_OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
 _U32 = struct.Struct("<I")
-_ZERO_BLOCK_BYTES = 1 << 20
-_LEAST_MESSAGE_BYTES = 8 + 3 * 4 + len(b"op=") + 1 + len(b"conn=") + 4 + len(b"time=") + 8
+_LENGTHS_BYTES = 2 * _U32.size  # of the header and the data of a record
+#: Bytes of a message record without data: five lengths, an opcode, a connection and a time with their names.
+_LEAST_MESSAGE_BYTES = struct.calcsize("<5IBIQ") + len(b"op=conn=time=")
 
 
 @dataclass(slots=True)
@@ -82,21 +82,21 @@ class Rosbag1Container(FileContainer):
     def _take(self, fields: Header, offset: int, start: int, end: int) -> None:
         """Handle one complete record."""
         op = fields.get_uint8("op")
-        if op == _OP_CHUNK:
+        if op == RecordType.CHUNK:
             compression, size = fields.get_string("compression"), fields.get_uint32("size")
             self._found.append(_Chunk(offset, start, end, compression, size))
             return
-        if op == _OP_BAG_HEADER:
+        if op == RecordType.BAGHEADER:
             self._header = fields.get_uint64("index_pos"), fields.get_uint32("chunk_count")
             return
         self.meter.limits.check("metadata_bytes", end - start, f"a record of kind {op}")
-        if op == _OP_CONNECTION:
+        if op == RecordType.CONNECTION:
             self._add_connection(fields, self.source.read(start, end - start))
-        elif op == _OP_CHUNK_INFO:
+        elif op == RecordType.CHUNK_INFO:
             pairs = np.frombuffer(self.source.read(start, end - start), dtype="<u4")
             counts = Counter(dict(zip(pairs[::2].tolist(), pairs[1::2].tolist(), strict=True)))
             self._infos[fields.get_uint64("chunk_pos")] = counts
-        elif op == _OP_INDEX and self._found:
+        elif op == RecordType.IDXDATA and self._found:
             self._found[-1].indexes.append(_index(fields, self.source.read(start, end - start)))
         else:
             raise SpanDamageError(f"no record of kind {op} is allowed here")
@@ -129,10 +129,7 @@ class Rosbag1Container(FileContainer):
             self.add_content(chunk)
 
     def _is_zero(self, start: int, end: int) -> bool:
-        return all(
-            not any(self.source.read(offset, min(_ZERO_BLOCK_BYTES, end - offset)))
-            for offset in range(start, end, _ZERO_BLOCK_BYTES)
-        )
+        return all(not any(self.source.read(offset, min(MIB, end - offset))) for offset in range(start, end, MIB))
 
     def _add_connection(self, fields: Header, payload: bytes) -> None:
         inner = Header.read(BytesIO(_U32.pack(len(payload)) + payload))
@@ -168,13 +165,13 @@ class Rosbag1Container(FileContainer):
             fields, begin, offset = record
             try:
                 op = fields.get_uint8("op")
-                if op == _OP_MESSAGE:
+                if op == RecordType.MSGDATA:
                     self.meter.check_scan(len(stamps))
                     channels.append(fields.get_uint32("conn"))
                     stamps.append(fields.get_time("time"))
                     offsets.append(begin)
                     lengths.append(offset - begin)
-                elif op != _OP_CONNECTION:
+                elif op != RecordType.CONNECTION:
                     raise SpanDamageError(f"it contains a record of kind {op}, which no chunk may")
                 elif declare:
                     self._add_connection(fields, content[begin:offset])
@@ -198,14 +195,14 @@ def _record_at(read: Callable[[int, int], bytes], offset: int, size: int, most: 
     ----------
     read : returns bytes by offset and count. size : of the file or chunk. most : bytes of a header.
     """
-    if offset + 8 > size:
+    if offset + _LENGTHS_BYTES > size:
         return None
-    (header,) = _U32.unpack(read(offset, 4))
-    if header == 0 or offset + 8 + header > size or header > most:
+    (header,) = _U32.unpack(read(offset, _U32.size))
+    start = offset + _LENGTHS_BYTES + header
+    if header == 0 or start > size or header > most:
         return None
-    text = read(offset, header + 8)
-    start = offset + len(text)
-    end = start + int.from_bytes(text[-4:], "little")
+    text = read(offset, start - offset)
+    end = start + int.from_bytes(text[-_U32.size :], "little")
     if end > size:
         return None
     try:

@@ -25,11 +25,11 @@ from pdhef_logtool.logs.container import (
     rows_by_channel,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import LimitError, Meter
+from pdhef_logtool.logs.resource_limits import MIB, LimitError, Meter
 from pdhef_logtool.storage.files import scratch_folder
 
 _PAGE_ROWS = 8192
-_PAGE_BYTES = 4 << 20
+_PAGE_BYTES = 4 * MIB
 _STEPS_A_CHECK = 100_000  # instructions of SQLite between checks of the time
 
 
@@ -57,7 +57,7 @@ class SqliteContainer(Container):
         self.on_close(self._db.close)
         try:
             self._db.text_factory = lambda stored: stored.decode("utf-8", errors="replace")  # also of a damaged one
-            self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.limits.chunk_bytes, 2**31 - 1))
+            self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.limits.chunk_bytes, np.iinfo(np.int32).max))
             self._db.set_progress_handler(self._out_of_time, _STEPS_A_CHECK)
             for pragma in ("trusted_schema = OFF", "mmap_size = 0", "cell_size_check = ON"):
                 self._db.execute(f"PRAGMA {pragma}")

@@ -5,14 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import polars as pl
+from polars import Series
 
 from pdhef_logtool.records.signals import FloatArray, Loss
-
-if TYPE_CHECKING:
-    from polars import Series
 
 #: Spellings of a missing value.
 EMPTY = re.compile(r"(?i)\s*([-+]?(nan|1\.#(qnan|snan|ind))(\(\w*\))?0*|#?n/?a|#n/a!|<na>|nat|null|none|-*)\s*")
@@ -85,8 +83,6 @@ def read_cells(texts: Series, decimal: str = "") -> Cells:
 
 def _cleaned(texts: Series) -> Series:
     """Return texts with hexadecimal numbers, booleans, minus signs and groups of digits in plain spelling."""
-    import polars as pl
-
     texts = texts.str.to_lowercase().str.replace_all("[−–]", "-").replace(_BOOLEANS)
     hexadecimal = texts.str.extract("^0x([0-9a-f]+)$").str.to_integer(base=16, strict=False).cast(pl.String)
     spaced = pl.when(texts.str.contains(_SPACED)).then(texts.str.replace_all(r"[\s'’]", ""))
@@ -95,8 +91,6 @@ def _cleaned(texts: Series) -> Series:
 
 def _numbers(texts: Series, decimal: str) -> FloatArray:
     """Return the finite numbers [N] of texts with this decimal mark, NaN where a text has another spelling."""
-    import polars as pl
-
     group = ",.".replace(decimal, "")
     spelling = rf"^[-+]?(\d+|[1-9]\d{{0,2}}([{group}]\d{{3}})+)?([{decimal}]\d*)?([eE][-+]?\d+)?$"
     plain = texts.str.replace_all(group, "", literal=True).str.replace(decimal, ".", literal=True)

@@ -30,7 +30,8 @@ _CLOCKS, _GPS = CONSTANTS["clocks"], CONSTANTS["gps"]
 _UNITS: dict[int, list[str]] = {ns: spellings.split() for ns, spellings in numbered(_CLOCKS["units"]).items()}
 TIME_UNITS_NS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
 _DAY_NS, _HOUR_NS, _MINUTE_NS, _SECONDS = (TIME_UNITS_NS[name] for name in ("days", "hours", "minutes", "seconds"))
-_DAY_S = _DAY_NS / _SECONDS
+_DAY_S, _HOUR_S, _MINUTE_S = (ns / _SECONDS for ns in (_DAY_NS, _HOUR_NS, _MINUTE_NS))
+_DAY_H, _HALF_DAY_H, _HOUR_MIN = 24, 12, 60
 #: Units of columns with published names; the first of each explains no other column.
 _NAMED_UNITS: dict[str, list[str]] = {name: units.split() for name, units in _CLOCKS["columns"].items()}
 _SUBUNITS = tuple(
@@ -119,13 +120,19 @@ def number_clock(
     finite = np.isfinite(values)
     if (of_day := seconds_of_day(values[finite])) is not None:
         stamps = np.full(len(values), NO_TIME, np.int64)
-        stamps[finite] = np.round(of_day * 1e6).astype(np.int64) * 1000
+        stamps[finite] = to_ns(of_day)
         return Clock(placed(stamps))
     stated = TIME_UNITS_NS.get(re.sub(r"[\s\[\](){}.]", "", unit).lower(), 0)
     factor, epoch, note = _reading(values[finite], stated, others, rate_hz)
     stamps = placed(_scaled(values, factor, epoch, finite))
     clock = Clock(stamps, (f"{name}: {note}",) if note else (), bool(stated or epoch or rate_hz) or _is_dated(stamps))
     return clock if epoch else _of_gps(clock, name, others)
+
+
+def to_ns(seconds: Any) -> Any:
+    """Return seconds, a number or [N], as whole microseconds in ns: a double of a date has no more digits."""
+    us = TIME_UNITS_NS["microseconds"]
+    return np.round(np.asarray(seconds) * (_SECONDS // us)).astype(np.int64) * us
 
 
 def seconds_of_day(values: FloatArray) -> FloatArray | None:
@@ -137,15 +144,15 @@ def seconds_of_day(values: FloatArray) -> FloatArray | None:
     if not is_time.all():
         return None
     jumps = np.diff(values) - np.diff(of_day)
-    return of_day if (jumps > 39.0).any() and np.diff(of_day).max() < _MINUTE_NS / _SECONDS else None
+    return of_day if (jumps > 39.0).any() and np.diff(of_day).max() < _MINUTE_S else None
 
 
 def of_digits(values: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the seconds since midnight of ``hhmmss.sss`` [N], going on behind midnight, and where they are a time."""
     hours, rest = np.divmod(values, 1e4)
     minutes, seconds = np.divmod(rest, 1e2)
-    is_time = (values >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
-    return unwrapped(3600.0 * hours + 60.0 * minutes + seconds), is_time
+    is_time = (values >= 0.0) & (hours < _DAY_H) & (minutes < _HOUR_MIN) & (seconds < _MINUTE_S)
+    return unwrapped(_HOUR_S * hours + _MINUTE_S * minutes + seconds), is_time
 
 
 def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz: float | None) -> tuple[int, int, str]:
@@ -340,8 +347,8 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
         hour, minute, second = (np.where(short, *pair) for pair in ((minute, hour), (second, minute), (0, second)))
     hour, minute, second = (np.maximum(part, 0) for part in (hour, minute, second))
     half = parts["half"].str.to_lowercase().fill_null("").to_numpy()
-    hour = np.where(half == "", hour, hour % 12 + 12 * (half == "p"))
-    has_time = (second <= 60) & ((minute < 60) | short & ~is_dated) & ((hour < 24) | ~is_dated)
+    hour = np.where(half == "", hour, hour_of_day(hour, half == "p"))
+    has_time = (second <= _MINUTE_S) & ((minute < _HOUR_MIN) | short & ~is_dated) & ((hour < _DAY_H) | ~is_dated)
     fraction = parts["fraction"].fill_null("").str.pad_end(9, "0").cast(int).to_numpy()
     of_day = hour * _HOUR_NS + minute * _MINUTE_NS + second * _SECONDS + fraction
     if not is_dated.any():
@@ -359,6 +366,11 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
 
 _WORDS = frozenset({"mark", "half", "sign", "fraction"})
 _MONTHS = [names.replace(" ", "|") for names in CONSTANTS["asc"]["months"]]
+
+
+def hour_of_day(hour: Any, is_afternoon: Any) -> Any:
+    """Return hours from 0 to 23 of hours of a clock with twelve, numbers or [N]."""
+    return hour % _HALF_DAY_H + _HALF_DAY_H * is_afternoon
 
 
 def _numbered_months(texts: Series) -> Series:
@@ -392,7 +404,7 @@ def _days(a: IntArray, b: IntArray, c: IntArray, mark: NDArray[Any]) -> tuple[In
 def _civil(year: IntArray, month: IntArray, day: IntArray) -> tuple[IntArray, BoolArray]:
     """Return days since 1970 [N], and whether these are days of the calendar from 1900 to 2261."""
     first, last = _CLOCKS["years"]
-    is_day = (year >= first) & (year <= last) & (month >= 1) & (month <= 12) & (day >= 1)
+    is_day = (year >= first) & (year <= last) & (month >= 1) & (month <= len(_MONTHS)) & (day >= 1)
     years = np.where(is_day, year - 1970, 0).astype("datetime64[Y]")
     months = years.astype("datetime64[M]") + np.where(is_day, month - 1, 0)
     days = months.astype("datetime64[D]") + np.where(is_day, day - 1, 0)

@@ -20,7 +20,7 @@ from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, Clock
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.geometry import DEGREE_M
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from polars import Series
@@ -194,7 +194,7 @@ def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
     corners = rows[:: max(1, len(rows) // _MOTION["steps"])]
     north, east = np.diff(latitude[corners]), np.diff(longitude[corners]) * np.cos(np.radians(latitude[corners[1:]]))
     path_m = DEGREE_M * float(np.hypot(north, east).sum())
-    length = float(np.nansum(np.abs(speed[rows[1:]]) * np.diff(clock.stamps_ns[rows]) * 1e-9))
+    length = float(np.nansum(np.abs(speed[rows[1:]]) * np.diff(clock.stamps_ns[rows]) * S_PER_NS))
     if not (_MOTION["shortest_path_m"] < path_m < _MOTION["longest_path_m"] and length > 0.0):
         return clock
     decades = math.ceil(math.log10(path_m / length) - _MOTION["noise_decades"])

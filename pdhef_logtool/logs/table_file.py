@@ -38,6 +38,8 @@ class TableSettings:
 
 
 NO_SETTINGS = TableSettings()
+#: Of a number in a column.
+NUMBER_BYTES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,10 @@ class TableFile:
     name: str
     limits: ResourceLimits
     settings: TableSettings = NO_SETTINGS
+
+    def check(self, size: int, where: str = "") -> None:
+        """Raise LimitError if the file may not become, or claim to become, tables of ``size`` bytes."""
+        self.limits.check_table(size, self.size, where or self.name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

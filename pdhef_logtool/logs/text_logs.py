@@ -20,28 +20,26 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import polars as pl
+from polars import Series
 
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.mat_log import tables_of_variables
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
-from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, of_digits, placed, whole_days
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, of_digits, placed, to_ns, whole_days
 from pdhef_logtool.logs.table_columns import Sheet, by_times, field_name, is_unit, read_head, tables_of
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
+from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
-if TYPE_CHECKING:
-    from polars import Series
-
-    from pdhef_logtool.logs.table_log import Table
-
 #: Lines at the start of a CSV file in which its header must be; cells below it that show the decimal mark; lines that
-#: show numbers with names; cells that are in memory as texts at the same time.
+#: show the structure of the rows; cells that are in memory as texts at the same time.
 #: Least share of values in rows of long forms.
-_HEAD_LINES, _CELLS_OF_HEAD, _PAIRED, _CELLS_AT_ONCE, _LEAST_VALUES = 200, 10_000, 20, 1 << 23, 0.3
+_HEAD_LINES, _CELLS_OF_HEAD, _SAMPLE_LINES, _CELLS_AT_ONCE, _LEAST_VALUES = 200, 10_000, 20, 1 << 23, 0.3
 _CELL_END, _SPACES = "\x1f", r"\s{2,}"
 codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
 
@@ -54,8 +52,6 @@ _MOST_ELEMENTS, _LARGEST, _DEEPEST = (CONSTANTS["json"][name] for name in ("elem
 
 def open_csv(file: TableFile) -> Tables:
     """Read a CSV file; raises LogError if the file has no header or no column of times."""
-    import polars as pl
-
     losses: list[Loss] = []
     with _text(file) as text:
         lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
@@ -92,7 +88,7 @@ def _records_of_lines(lines: Sequence[str], text: io.TextIOWrapper, file: TableF
     if lines and lines[0].startswith("{"):
         return open_json_lines(file)
     text.seek(0)
-    is_log = bool(lines) and all(map(_record_of_pairs, lines[-_PAIRED:]))
+    is_log = bool(lines) and all(map(_record_of_pairs, lines[-_SAMPLE_LINES:]))
     return _tables_of_records(map(_record_of_pairs, text), file, "csv", "csv") if is_log else None
 
 
@@ -208,7 +204,7 @@ def _separator(lines: Sequence[str]) -> str:
     Several spaces are the delimiter if one of them is in a title.
     """
     every = [re.sub(r'"[^"]*"', "", line) for line in lines]
-    lines = every[-20:]
+    lines = every[-_SAMPLE_LINES:]
     if all(re.match(r"[$#%][A-Z\d]{3,},", line) for line in lines):  # sentences of a receiver
         return ","
     counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",", ":")}
@@ -216,13 +212,15 @@ def _separator(lines: Sequence[str]) -> str:
     frequent = max([*counts][:-1], key=lambda s: sum(counts[s]))
     widths = [len(re.split(_SPACES, line.strip())) for line in every]
     titles = (line for line, n in zip(every, widths, strict=True) if n == widths[-1] > 1)
-    is_aligned = len({*widths[-20:]}) == 1 and any(re.search(r"[a-z.] [a-z(]", t, re.IGNORECASE) for t in titles)
+    is_aligned = len({*widths[-_SAMPLE_LINES:]}) == 1 and any(
+        re.search(r"[a-z.] [a-z(]", t, re.IGNORECASE) for t in titles
+    )
     return regular or (frequent if any(counts[frequent]) else _SPACES if is_aligned else " ")
 
 
 def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], Sequence[str], int]:
     """Return titles, units and the number of the first row of values."""
-    lengths = Counter(len(row) for row in rows[-20:])
+    lengths = Counter(len(row) for row in rows[-_SAMPLE_LINES:])
     width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
     rows = [_uncommented(row, width) for row in rows]
     header = max((i for i, row in enumerate(rows) if row and PATTERNS["end_of_header"].fullmatch(row[0])), default=-1)
@@ -275,7 +273,7 @@ def _filled(titles: Sequence[str], others: Sequence[Sequence[str]]) -> list[str]
 
 def _data_rows(rows: Sequence[Sequence[str]], width: int) -> list[int]:
     """Return the rows without a label: below a text in a first column of numbers is a sample rate, or a block size."""
-    starts = [row[0].strip() for row in rows[-20:] if len(row) == width]
+    starts = [row[0].strip() for row in rows[-_SAMPLE_LINES:] if len(row) == width]
     has_labels = _share(starts, _is_value) >= 0.9 or not any(starts)
     return [i for i, row in enumerate(rows) if row and not (has_labels and row[0].strip() and not _is_value(row[0]))]
 
@@ -336,8 +334,6 @@ def _columns(
 
     ``decimal`` is the decimal mark of columns that do not show theirs.
     """
-    import polars as pl
-
     lines, data = _fitting(rows, len(names), file, losses)
     columns = {}
     step = max(1, _CELLS_AT_ONCE // len(lines))
@@ -412,7 +408,7 @@ def _fitting(
             losses.append(Loss(kind, what, place, count=len(numbers), severity=severity))
     if not lines:
         raise LogError(expected=f"rows of {width} cells", got="none", where=file.name)
-    file.limits.check_table(8 * width * len(lines), file.size, file.name)
+    file.check(NUMBER_BYTES * width * len(lines))
     return lines, data.getvalue()
 
 
@@ -460,7 +456,7 @@ def _vbo_stamps(columns: Mapping[str, Any], created: Iterable[tuple[str, str, st
     clock: FloatArray = columns["time"]
     finite = np.isfinite(clock) & (clock >= 0.0) & (clock < 240_000.0)
     stamps = np.full(len(clock), NO_TIME, np.int64)
-    stamps[finite] = np.round(of_digits(clock[finite])[0] * 1e6).astype(np.int64) * 1000
+    stamps[finite] = to_ns(of_digits(clock[finite])[0])
     with suppress(ValueError):
         for day, month, year in created:
             return np.where(finite, stamps + whole_days(dt.date(int(year), int(month), int(day))), NO_TIME)
@@ -591,7 +587,7 @@ def _tables_of_records(records: Iterable[Any], file: TableFile, kind: str, name:
     if wrong:
         place = f"{file.name}, from line {wrong[0]} on"
         losses.append(Loss("bad-row", "line without an object", place, count=len(wrong)))
-    file.limits.check_table(8 * len(rows) * len(paths), file.size, file.name)
+    file.check(NUMBER_BYTES * len(rows) * len(paths))
     fields, units = read_head([*paths])
     cells = ([row.get(path) for row in rows] for path in paths)
     columns = {f: _json_column(f, its, lines, file, losses) for f, its in zip(fields, cells, strict=True)}
@@ -620,8 +616,6 @@ def _name_of(value: Any) -> str:
 
 def _json_column(name: str, values: Sequence[Any], lines: Sequence[int], file: TableFile, losses: list[Loss]) -> Any:
     """Return numbers [N] with NaN where a line has none, or texts [N]."""
-    import polars as pl
-
     if any(isinstance(value, str) for value in values):
         series = pl.Series([None if value is None else str(value) for value in values], dtype=pl.String)
         cells = read_cells(series, ".")

@@ -10,7 +10,6 @@ import contextlib
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Sized
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -33,12 +32,13 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, Block, ChannelRecord, items_at_bytes, rows_by_channel
 from pdhef_logtool.logs.definitions import message_definition
-from pdhef_logtool.logs.mcap_index import INDEX_RECORD, RECORD
+from pdhef_logtool.logs.drive_log import Columns
+from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
+from pdhef_logtool.logs.resource_limits import MIB
 from pdhef_logtool.logs.wire_layout import CdrEncoder
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import IntArray
@@ -46,27 +46,10 @@ from pdhef_logtool.records.version import LIBRARY
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 #: Of message records, as far as they come together; in a chunk.
-CHUNK_BYTES = 1 << 20
+CHUNK_BYTES = MIB
 #: Of zstd.
 _LEVEL = 6
-_LARGEST_ID = 0xFFFF
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TopicBatch:
-    """Messages of one topic as columns.
-
-    Attributes
-    ----------
-    log_time_ns, publish_time_ns : int64 [N]; log times ascend.
-    fields : by dotted path, [N] or [N, k]; a time path such as ``header.stamp`` takes int64 nanoseconds, a
-        quaternion struct the columns w, x, y, z.
-    """
-
-    topic: str
-    log_time_ns: IntArray
-    publish_time_ns: IntArray
-    fields: Mapping[str, NDArray[Any]]
+_LARGEST_ID = np.iinfo(np.uint16).max
 
 
 class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
@@ -117,7 +100,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         constants: Mapping[str, str | float | Sequence[float]] | None = None,
         definition: str | None = None,
     ) -> None:
-        """Add a ROS 2 CDR topic for :class:`TopicBatch`.
+        """Add a ROS 2 CDR topic for :class:`~.drive_log.Columns`.
 
         Parameters
         ----------
@@ -165,10 +148,10 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
 
     def _next_id(self, taken: Sized) -> int:
         if len(taken) >= _LARGEST_ID:
-            raise OutputError(expected="at most 65535 channels", got="more", where=self._path)
+            raise OutputError(expected=f"at most {_LARGEST_ID} channels", got="more", where=self._path)
         return len(taken) + 1
 
-    def write(self, batches: Sequence[TopicBatch], raws: Iterable[Block] = ()) -> None:
+    def write(self, batches: Sequence[Columns], raws: Iterable[Block] = ()) -> None:
         """Write batches and raw messages on channels of :meth:`add_channel`, which ascend in log time.
 
         Both are merged by log time, of equal times raw messages first. Raw messages are consumed as they come.
@@ -206,7 +189,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             self._emit_chunk(content, block.channel[rows], block.log_time_ns[rows], start[rows] - start[first])
             first = last
 
-    def _encode(self, batch: TopicBatch) -> Block:
+    def _encode(self, batch: Columns) -> Block:
         """Return the messages of a batch."""
         channel, encoder = self._encoders[batch.topic]
         n = len(batch.log_time_ns)
@@ -235,7 +218,8 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         for id_, rows in rows_by_channel(channel).items():
             offsets[id_] = index_at + len(index)
             data = pairs[rows].tobytes()
-            index += INDEX_RECORD.pack(Opcode.MESSAGE_INDEX, 6 + len(data), id_, len(data)) + data
+            length = INDEX_RECORD.size - RECORD.size + len(data)
+            index += INDEX_RECORD.pack(Opcode.MESSAGE_INDEX, length, id_, len(data)) + data
             self._counts[id_] += len(rows)
         self._emit(bytes(index))
         self._chunk_indexes.append(
@@ -296,7 +280,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         )
         indexes = *self._chunk_indexes, *self._attachment_indexes, *self._metadata_indexes
         summary = _bytes_of(*self._schemas.values(), *self._channels, statistics, *indexes)
-        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0)
+        head = struct.pack("<BQQQ", Opcode.FOOTER, FOOTER.size - RECORD.size, start, 0)
         self._emit(summary)
         self._emit_record(Footer(summary_start=start, summary_offset_start=0, summary_crc=crc32(head, crc32(summary))))
         self._emit(MCAP_MAGIC)

@@ -43,7 +43,8 @@ COUNTING, NOT_VALUES = _WORDS["counting"], _WORDS["not_values"]
 KNOWN = _WORDS["lexicon"] | _SYNONYMS.keys()
 _WHOLE, _BARE = KNOWN | _WORDS["whole"], _WORDS["bare"] | _UNIT_WORDS
 _CORNERS: dict[str, str] = VOCABULARY["corners"]
-_GERMAN: dict[str, str] = VOCABULARY["german_corners"]
+#: Words for a wheel, and the wheels that are abbreviated so beside them.
+_BESIDE = tuple((frozenset(words.split()), corners) for words, corners in VOCABULARY["wheels_beside"].items())
 _AXES: dict[str, str] = {word: axis for axis, words in VOCABULARY["axes"].items() for word in words.split()}
 _PATTERNS = {name: re.compile("|".join(either)) for name, either in VOCABULARY["patterns"].items()}
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
@@ -111,9 +112,9 @@ class Meaning:
 
 def is_command(*names: str) -> bool:
     """Return whether the name of a topic, type or field describes a command, not a measurement."""
-    words = [set(words_of(n)) for n in names]
-    # The reference of a stability controller is the speed of the vehicle.
-    return any(_WORDS["commands"] & w and not {"v", "vehicle", "ref"} <= w for w in words)
+    # The reference of a stability controller is the vehicle's speed; its other quantities are those of its sensors.
+    measured = ({"v", "vehicle", "ref"}, {"stability", "control"})
+    return any(_WORDS["commands"] & w and not any(m <= w for m in measured) for w in map(set, map(words_of, names)))
 
 
 def plain_unit(text: str) -> str:
@@ -301,8 +302,8 @@ def corner_of(words: tuple[str, ...], leaf_words: tuple[str, ...] = ()) -> str:
         for word in group:
             if word in _CORNERS:
                 return _CORNERS[word]
-            if word in _GERMAN and {"wheel", "whl", "rad"} & set(words):
-                return _GERMAN[word]
+            if corner := next((its[word] for beside, its in _BESIDE if word in its and beside & set(words)), ""):
+                return corner
         ends = {"front": "f", "rear": "r", "back": "r"}, {"left": "l", "right": "r"}
         if "axle" in group:
             ends[0].update({"1": "f", "2": "r"})

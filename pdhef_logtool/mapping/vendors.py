@@ -143,8 +143,8 @@ class Vendors:
     receivers: tuple[VendorType, ...] = ()
 
     def typed(self, topic: TopicInfo, fields: Iterable[FieldInfo]) -> TopicInfo:
-        """Return an untyped topic with the type name of the export that its fields match, if any."""
-        if topic.encoding != "json" or plain_type(topic.type_name) in self.types:
+        """Return an untyped topic, JSON or a table, with the type name of the export that its fields match, if any."""
+        if (topic.type_name and topic.encoding != "json") or plain_type(topic.type_name) in self.types:
             return topic
         there = {f.path for f in fields}
         names = (name for name, kind in self.types.items() if kind.has and kind.has <= there)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.sensor_changes import samples_and_sums
+from pdhef_logtool.drive.sensor_changes import part_means
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.model.equations import AY, FRICTION, SPEED, STEER, YAW_RATE
 from pdhef_logtool.records.interpolation import Bracket
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Signals
 
 #: Step of the grid. The model is valid to 4 Hz; the integration is exact for tyre lags (12 ms at 40 m/s).
 STEP_S = 0.02
@@ -78,15 +78,14 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
         return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2))
     signals, _ = believable(signals, vehicle.sensors, None)
     start_ns = int(signals.stamps_ns[0])
-    cell = (signals.stamps_ns - start_ns) // round(STEP_S * 1e9)
+    cell = (signals.stamps_ns - start_ns) // round(STEP_S * NS_PER_S)
     cells, place = np.unique(cell, return_inverse=True)
     means = np.full((_COLUMNS, cells.size), np.nan)
     # In the order of the columns.
     sources = (signals.steer_rad, signals.speed_m_s, signals.yaw_rate_rad_s, signals.ay_m_s2, signals.friction)
     for row, values in enumerate(sources):
-        count, total = samples_and_sums(values, place, cells.size)
-        means[row] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    ends_ns = start_ns + (cells + 1) * round(STEP_S * 1e9)
+        means[row] = part_means(values, place, cells.size)
+    ends_ns = start_ns + (cells + 1) * round(STEP_S * NS_PER_S)
     # A pause, however long, is a gap: it takes no more room than that.
     cells = np.concatenate([[0], np.cumsum(np.minimum(np.diff(cells), _PAUSE_CELLS))])
     columns = np.full((_COLUMNS, int(cells[-1]) + 1), np.nan)

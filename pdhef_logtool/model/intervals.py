@@ -9,9 +9,10 @@ where v_y,i is the lateral velocity of the physics filter on the vehicle one 1-s
 posterior, or of the prior without a fit to the log. s_l is the uncertainty of the distance from the rear axle to the
 centre of gravity if no file contains it: the lateral velocity is determined at the rear axle. On a vehicle of the
 drive's posterior, s_car is the model error of a single track, which is nearly constant within a drive, and χ ≥ 1 is the
-RMS error of the fit over the assumed one (Birge 1932). c is the lateral kinematic consistency, as far as it correlates
-with the driving: of the whole drive if the vehicle was fitted to it, otherwise as available online
-(:func:`running_consistency`). The variance of v_y is the same sum as a velocity. Estimates are unchanged.
+RMS error of the fit over the assumed one (Birge 1932); otherwise χ s_car is the rear slip angle on a crossfall. c is
+the lateral kinematic consistency, as far as it correlates with the driving: of the whole drive if the vehicle was
+fitted to it, otherwise as available online (:func:`running_consistency`). The variance of v_y is the same sum as a
+velocity. Estimates are unchanged.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ from pdhef_logtool.estimators.vehicle_model import VY
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car, physics_filter
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
-from pdhef_logtool.model.priors import prior_variations
+from pdhef_logtool.model.priors import coefficients, prior_variations
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
-from pdhef_logtool.records.signals import SIGNAL_COLUMNS, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import S_PER_NS, SIGNAL_COLUMNS, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, release
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
@@ -49,8 +50,9 @@ DRIVE_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
 #: cars, each identified on one drive and evaluated on drives of other manoeuvres.
 OWN_SHARE = 0.5
 #: Standard deviations of the parameters of an identified car over those of a vehicle file: 8 % of the stiffness of an
-#: axle, which changes of the load cause.
-IDENTIFIED_SHARE = 0.16
+#: axle, which changes of the load cause. 1-sigma of the crossfall of a road (usually 2 to 2.5 %), whose effect on a_y
+#: equals that of a bias.
+IDENTIFIED_SHARE, CROSSFALL_STD_RAD = 0.16, 0.02
 #: Smallest χ of parameters from earlier drives: later driving may fit less.
 EARLIER_ERROR_SCALE = 2.0
 #: Longest step of the filters whose differences count: parameters act slowly.
@@ -172,12 +174,13 @@ def _of_file(car: Car, share: float, *, use_speed: bool) -> Interval:
     vehicles = (physics.vehicle, *prior_variations(physics.vehicle, share=share))
     bare = physics.vehicle.physics.model_copy(update=dict.fromkeys(CURES, False))
     filters = tuple(replace(physics, vehicle=v.model_copy(update={"physics": bare})) for v in vehicles)
-    return Interval(filters, car.vehicle)
+    car_std_rad = CROSSFALL_STD_RAD / coefficients(physics.vehicle)[1]
+    return Interval(filters, car.vehicle, car_std_rad=car_std_rad / OWN_SHARE)
 
 
 def _in_blocks(signals: Signals) -> tuple[Signals, int, IntArray]:
     """Return means over blocks of samples, their number of samples, and by stamp [N] the last complete block, or -1."""
-    period_s = float(np.median(np.diff(signals.stamps_ns))) * 1e-9 if len(signals) > 1 else SLOW_STEP_S
+    period_s = float(np.median(np.diff(signals.stamps_ns))) * S_PER_NS if len(signals) > 1 else SLOW_STEP_S
     number = max(1, int(SLOW_STEP_S / period_s))
     count = len(signals) // number
 

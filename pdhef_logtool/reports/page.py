@@ -75,10 +75,9 @@ def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
 def _environment() -> Environment:
     made = environment(_HERE / "templates")
     made.finalize = _printed
-    of_results = result_of, assumptions_of, failed_checks, shown
+    of_results = result_of, assumptions_of, failed_checks, joint_notes, shown
     of_numbers = number, duration, degrees, percent, stamp
     made.filters |= {function.__name__: function for function in (*of_results, *of_numbers)} | {
-        "joint_notes": lambda plan: joint_notes({str(r["id"]): r.get("notes") or () for r in plan["requirements"]}),
         "reason": _reason,
         "change": partial(percent, sign="+"),
         "seconds": lambda value_s: DASH if value_s is None else f"{value_s:.3f} s",

@@ -214,7 +214,7 @@ class Comparison:
     @property
     def exit_code(self) -> int:
         """4 where the gate is closed, 3 for drives without partner and no gate, else 0."""
-        if self.failures or (self.requirements is not None and self.requirements.closes_gate):
+        if self.failures or (self.requirements is not None and self.requirements.closing):
             return EXIT_GATE
         return EXIT_PARTIAL if self.unpaired and not self.gated and not self.allow_unpaired else EXIT_OK
 

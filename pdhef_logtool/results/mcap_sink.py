@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from pdhef_logtool.evaluation.dead_reckoned import pose_known
 from pdhef_logtool.logs.container import Block, ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.definitions import message_definition
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray
@@ -171,7 +171,7 @@ class AnnotatedMcap(AbstractContextManager["AnnotatedMcap"]):
 
     def _batches(
         self, track: StateTrack, rows: Sequence[IntArray], piece: tuple[int, int], truth: StateTrack | None
-    ) -> list[TopicBatch]:
+    ) -> list[Columns]:
         """Return the messages of a track in a piece of the drive."""
         first, last = np.searchsorted(track.stamps_ns, piece).tolist()
         part = track.rows(first, last)
@@ -179,7 +179,7 @@ class AnnotatedMcap(AbstractContextManager["AnnotatedMcap"]):
         drawn = {n: rounded(n, c[plotted]) for n, c in plotted_fields(part, truth, self.min_speed_m_s).items()}
         of_topics = (stated, _state_fields(part, stated)), (posed, _odometry_fields(part, posed)), (plotted, drawn)
         return [
-            TopicBatch(topic_of(track.name, what), stamps_ns, stamps_ns, {"header.stamp": stamps_ns, **fields})
+            Columns(topic_of(track.name, what), stamps_ns, stamps_ns, {"header.stamp": stamps_ns, **fields})
             for what, (use, fields) in zip(("state", "odometry", "plot"), of_topics, strict=True)
             for stamps_ns in [part.stamps_ns[use]]
         ]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.sensors import NOT_INDEPENDENT, SENSORS
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
-from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, JudgedDrive, RequirementVerdict, gates, judge
+from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, JudgedDrive, RequirementVerdict, judge
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
@@ -41,9 +41,10 @@ class PlanVerdicts:
     strict: bool = False
 
     @property
-    def closes_gate(self) -> bool:
-        """Whether the command fails; the default plan never decides that."""
-        return bool(self.plan.file) and gates(self.verdicts, strict=self.strict)
+    def closing(self) -> list[RequirementVerdict]:
+        """The verdicts that fail the command; none of the default plan do."""
+        outcomes = ("FAIL", "INCONCLUSIVE") if self.strict else ("FAIL",)
+        return [v for v in self.verdicts if self.plan.file and v.outcome in outcomes]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plan and verdicts as JSON-able values."""

@@ -18,6 +18,7 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, all_specs
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.records.signals import NS_PER_S
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.results import opened_run
 from pdhef_logtool.results.no_position import topics_with_position, without_pose
@@ -125,7 +126,7 @@ class DriveOutputs:
         """Return the first stamp from which the rows of each causal estimator depend on past samples only."""
         drive = self._run.drive
         after_s = drive.plan.decided_s if drive.causal_from_s is None else drive.causal_from_s
-        first_ns = drive.plan.start_ns + round(after_s * 1e9)
+        first_ns = drive.plan.start_ns + round(after_s * NS_PER_S)
         return {e.name: first_ns for e in self._run.estimators if e.causal and not drive.not_causal}
 
     def _write_layouts(self, colours: dict[str, int]) -> None:
@@ -226,11 +227,10 @@ def check_places(
     cars: Sequence[Path | None] = (),
 ) -> None:
     """Refuse to write over an input; raises UsageError."""
+    files, folders = [*filter(None, [junit])], list[Path]()
+    if output is not None:
+        folders = [output / log_place(i.stem) for i in inputs]
+        files += [output / name for name in (opened_run.METRICS_FILE, RUN_FILE, opened_run.PAGE_FILE)]
+        files += [folder / name for folder in folders for name in LOG_FILES]
     can = () if mapping is None else mapping.dbc
-    files = (
-        [] if output is None else [output / name for name in (opened_run.METRICS_FILE, RUN_FILE, opened_run.PAGE_FILE)]
-    )
-    folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
-    files += [folder / name for folder in folders for name in LOG_FILES]
-    read = [*(i.local for i in inputs), *config.files, *cars, *can]
-    check_no_input(read, files if junit is None else [*files, junit], folders)
+    check_no_input([*(i.local for i in inputs), *config.files, *cars, *can], files, folders)

@@ -20,7 +20,7 @@ from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.plug_ins import package_of
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
-from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Manoeuvre, find_manoeuvres
+from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, find_manoeuvres
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
 from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segment_masks
 from pdhef_logtool.model.drive_model import DriveModel
@@ -241,7 +241,9 @@ def evaluate(
     tracks, slow, calibrated = estimated.tracks, vehicle.low_speed_blend_m_s, model.calibrated(signals)
     dependent = drive.plan.dependent if dependent is None else dependent
     scored = EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent)
-    events = _events(signals, masks, manoeuvres, [*tracks.values()])
+    # The whole drive and ``linear`` are no events.
+    spans = (s for s in find_intervals(signals, masks) if s.name not in ("all", "linear", *MANOEUVRES))
+    events = in_order([*spans, *manoeuvres, *divergences(tracks.values())])
     moves = bool(moving.any())
     silent = {
         name: why_silent(signals, moving)
@@ -257,20 +259,6 @@ def why_silent(signals: Signals, moving: BoolArray) -> str:
     if lost := [name for name in read if not np.isfinite(getattr(signals, name)[moving]).any()]:
         return f"no samples of {', '.join(lost)} while it does"
     return "its signals are there, but the estimator marks none as valid"
-
-
-def _events(
-    stamped: Signals | StateTrack,
-    masks: Mapping[str, BoolArray],
-    manoeuvres: Sequence[Manoeuvre],
-    tracks: Sequence[StateTrack],
-) -> list[Event]:
-    """Return segments, manoeuvres with their peaks, and intervals in which an estimator reports divergence, in order.
-
-    The whole drive and ``linear`` are no events.
-    """
-    spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
-    return in_order([*spans, *manoeuvres, *divergences(tracks)])
 
 
 def divergences(tracks: Iterable[StateTrack]) -> Iterator[Event]:

@@ -16,7 +16,7 @@ from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import drive_intervals
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import S_PER_NS, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.estimating import Estimated, choose, estimate_drive, evaluate
@@ -72,7 +72,8 @@ class Estimates:
 
         axes = plt.subplots()[1]
         for name, track in self.tracks.items():
-            axes.plot((track.stamps_ns - self.drive.plan.start_ns) * 1e-9, np.degrees(track.sideslip_rad), label=name)
+            seconds = (track.stamps_ns - self.drive.plan.start_ns) * S_PER_NS
+            axes.plot(seconds, np.degrees(track.sideslip_rad), label=name)
         axes.set(xlabel="time, s", ylabel="sideslip, °")
         axes.legend()
         return axes

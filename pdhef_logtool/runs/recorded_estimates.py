@@ -42,6 +42,7 @@ from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     ESTIMATE_UNITS,
+    NS_PER_S,
     TRUTH_UNITS,
     WHEELS,
     BoolArray,
@@ -263,16 +264,11 @@ def _reference(drive: Drive, model: DriveModel, config: RunConfig) -> DriveRefer
 def _drive_at(drive: Drive, truth: TruthTrack | None, stamps_ns: IntArray) -> WholeDrive:
     """Return the drive at stamps [N]: its sensors are interpolated between samples, never across gaps."""
     plan, recorded = drive.plan, drive.recorded()
-
-    def column(name: str) -> FloatArray:
-        values: FloatArray = getattr(recorded.signals, name)
-        is_finite = np.isfinite(values)
-        stamps = recorded.signals.stamps_ns[is_finite]
-        return Bracket(stamps, stamps_ns, gap_ns(stamps)).linear(values[is_finite])
-
-    columns: dict[str, Any] = {name: column(name) for name in ALIGNED_SIGNALS}
+    read, columns = recorded.signals, dict[str, Any]()
+    for name in ALIGNED_SIGNALS:
+        columns[name] = _interpolated(read.stamps_ns, getattr(read, name), stamps_ns)
     wheels = np.full((len(stamps_ns), len(WHEELS)), np.nan)
-    signals = Signals(stamps_ns, stamps_ns, wheel_speed_m_s=wheels, available=recorded.signals.available, **columns)
+    signals = Signals(stamps_ns, stamps_ns, wheel_speed_m_s=wheels, available=read.available, **columns)
     latency_s, standstill_m_s = plan.truth_latency_s, plan.vehicle.standstill_m_s
     true = None if truth is None else truth_at(truth, stamps_ns, latency_s, standstill_m_s=standstill_m_s)
     return WholeDrive(drive.name, plan, drive.friction.fill(signals), true, drive.log.start_ns, recorded.changes)
@@ -360,7 +356,7 @@ def read_estimate(
             continue
         topic = columns[s.read_topic]
         stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
-        stamps = stamps - np.int64(round(s.latency_s * 1e9))
+        stamps = stamps - np.int64(round(s.latency_s * NS_PER_S))
         kept = _in_order(stamps, topic.log_time_ns, usable)
         values, low, high = si_values(topic, s)[kept], s.valid_min, s.valid_max
         use = np.isfinite(values) & (low is None or values >= low) & (high is None or values <= high)
@@ -411,7 +407,11 @@ def _track(
     columns: dict[str, FloatArray] = {}
     for quantity, channel in channels.items():
         same = np.array_equal(channel.stamps_ns, stamps_ns)
-        columns[quantity] = channel.values if same else _interpolated(channel, stamps_ns)
+        if same:
+            columns[quantity] = channel.values
+        else:
+            is_angle = quantity == "sideslip_rad"
+            columns[quantity] = _interpolated(channel.stamps_ns, channel.values, stamps_ns, is_angle=is_angle)
         if not same and quantity in BASE_ORDER:
             notes.append(f"{quantity} has other stamps than the estimate and is interpolated to them")
     if "sideslip_rad" in columns:
@@ -431,12 +431,10 @@ def _track(
     return make_track(name, stamps_ns, covariance=covariance, **state, **flags), tuple(notes)
 
 
-def _interpolated(channel: Channel, stamps_ns: IntArray) -> FloatArray:
-    finite = channel.take(np.isfinite(channel.values))
-    bracket = Bracket(finite.stamps_ns, stamps_ns, gap_ns(finite.stamps_ns))
-    return bracket.angle(finite.values) if channel.name == "sideslip_rad" else bracket.linear(finite.values)
-
-
-def gap_ns(stamps_ns: IntArray) -> int:
-    """Return the longest step of stamps [N] that is interpolated across."""
-    return round(GAP_PERIODS * float(np.median(np.diff(stamps_ns)))) if stamps_ns.shape[0] > 1 else 0
+def _interpolated(stamps_ns: IntArray, values: FloatArray, at_ns: IntArray, *, is_angle: bool = False) -> FloatArray:
+    """Return values [N] at other stamps [M], between finite samples that are not too far apart."""
+    is_finite = np.isfinite(values)
+    stamps = stamps_ns[is_finite]
+    gap_ns = round(GAP_PERIODS * float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0
+    bracket = Bracket(stamps, at_ns, gap_ns)
+    return bracket.angle(values[is_finite]) if is_angle else bracket.linear(values[is_finite])

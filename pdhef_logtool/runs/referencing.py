@@ -13,7 +13,7 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.priors import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 
@@ -102,9 +102,9 @@ def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[S
     from pdhef_logtool.estimators.reference.drive import refer
 
     signals = drive.whole().signals
-    starts_ns = np.arange(signals.stamps_ns[0], signals.stamps_ns[-1] + 1, round(SPAN_S * 1e9))
+    starts_ns = np.arange(signals.stamps_ns[0], signals.stamps_ns[-1] + 1, round(SPAN_S * NS_PER_S))
     edges = [*np.searchsorted(signals.stamps_ns, starts_ns).tolist(), len(signals)]
-    margin_ns = round(MARGIN_S * 1e9)
+    margin_ns = round(MARGIN_S * NS_PER_S)
     for number, end in enumerate(edges[1:]):
         before_ns = int(signals.stamps_ns[edges[number] - 1]) - 2 * margin_ns if number else None
         lead = 0 if before_ns is None else int(np.searchsorted(signals.stamps_ns, before_ns))
@@ -171,7 +171,7 @@ def _blocks(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> F
     used &= np.isfinite(truth.sideslip_rad) & np.isfinite(reference.sideslip_std_rad)
     same = (np.diff(truth.vy_m_s, prepend=np.nan) == 0.0).astype(np.float64)
     columns = wrap_angle(truth.sideslip_rad - reference.sideslip_rad), reference.sideslip_std_rad, same
-    number = (reference.stamps_ns[used] - reference.stamps_ns[0]) // round(BLOCK_S * 1e9)
+    number = (reference.stamps_ns[used] - reference.stamps_ns[0]) // round(BLOCK_S * NS_PER_S)
     ids, inverse, counts = np.unique(number, return_inverse=True, return_counts=True)
     sums = np.zeros((len(ids), 3))
     np.add.at(sums, inverse, np.stack([c[used] for c in columns], axis=1))

@@ -30,7 +30,7 @@ from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.processes import release_memory
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import S_PER_NS, Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.run_report import LogOutcome, build_report, estimator_entry, run_versions
@@ -258,7 +258,7 @@ def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Se
             "sha256": drive.sha256,
             "start_ns": plan.start_ns,
             "end_ns": plan.end_ns,
-            "duration_s": (plan.end_ns - plan.start_ns) * 1e-9,
+            "duration_s": (plan.end_ns - plan.start_ns) * S_PER_NS,
         },
         "mapping": {"missing": drive.chosen.missing},
         "vehicle": {

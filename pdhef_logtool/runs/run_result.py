@@ -85,13 +85,10 @@ class RunResult:
         """0: success, 4: a requirement failed, 3: input was lost, a check or some logs failed, 1: all logs failed."""
         if all(r.outcome.failed is not None for r in self.results):
             return EXIT_FAILURE
-        if self.requirements is not None and self.requirements.closes_gate:
+        if self.requirements is not None and self.requirements.closing:
             return EXIT_GATE
-        return (
-            EXIT_OK
-            if all(r.outcome.outcome == "ok" and not r.outcome.failed_checks for r in self.results)
-            else EXIT_PARTIAL
-        )
+        is_whole = all(r.outcome.outcome == "ok" and not r.outcome.failed_checks for r in self.results)
+        return EXIT_OK if is_whole else EXIT_PARTIAL
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document; of many logs without their reports."""

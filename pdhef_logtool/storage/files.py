@@ -95,6 +95,19 @@ def open_new(path: Path, mode: Literal["wb", "ab"] = "wb") -> IO[bytes]:
     return path.open(mode)
 
 
+def take_lock(descriptor: int, *, exclusive: bool = True) -> bool:
+    """Lock a file until it is closed; False if another process has it. Raises OSError if the system has no locks."""
+    try:
+        import fcntl
+    except ImportError:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS)) from None
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
 def write_bytes(target: Path, data: bytes) -> None:
     """Write a whole file through a temporary name; raises OutputError when it cannot be written."""
     with PendingFile(target) as pending, writing(target), open_new(pending.path) as file:

@@ -19,7 +19,16 @@ from typing import Self
 
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.records.processes import is_alive, process_name
-from pdhef_logtool.storage.files import OF_WRITING, WINDOWS, cannot_write, open_new, sweep_files, sync, writing
+from pdhef_logtool.storage.files import (
+    OF_WRITING,
+    WINDOWS,
+    cannot_write,
+    open_new,
+    sweep_files,
+    sync,
+    take_lock,
+    writing,
+)
 
 #: The hidden folder beside outputs in which changes are prepared: ``.pdhef/NAME/{new,old}``.
 WORK = ".pdhef"
@@ -156,7 +165,7 @@ class FolderLock:
                 return
             descriptor = os.open(folder, os.O_RDONLY)
             self._descriptors.append(descriptor)
-            _locked(descriptor)
+            take_lock(descriptor)
 
     def release(self) -> None:
         """Release the lock, if any."""
@@ -172,7 +181,7 @@ class FolderLock:
             return self._try_file()
         descriptor = os.open(self.path, os.O_RDONLY)
         try:
-            if not _locked(descriptor):
+            if not take_lock(descriptor):
                 os.close(descriptor)
                 return False
             if not os.path.samestat(os.fstat(descriptor), self.path.stat()):
@@ -320,19 +329,6 @@ def _identity(path: Path) -> tuple[int, int] | None:
 def _lineage(path: Path) -> Iterator[Path]:
     real = Path(os.path.realpath(path))
     yield from (real, *real.parents)
-
-
-def _locked(descriptor: int) -> bool:
-    """Take the kernel's lock; False if another process has it. Raises OSError if the file system has no locks."""
-    try:
-        import fcntl
-    except ImportError:
-        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS)) from None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _holder(file: Path) -> str | None:

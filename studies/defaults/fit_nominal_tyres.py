@@ -14,12 +14,13 @@ other.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from pdhef_logtool.car.vehicle import AxleTyre
+from pdhef_logtool.car.vehicle import AxleTyre, VehicleParameters
 from pdhef_logtool.records.signals import FloatArray
 from studies.pages import options
 from truthsim.manoeuvres import GRAVITY_M_S2, MANOEUVRES, Request
@@ -41,12 +42,18 @@ SCALE = 2.5
 LINEAR_A_Y_M_S2 = 4.0
 
 
-def axle_curves(motion: Motion, car: Vehicle = CAR) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return slip angle (rad) and lateral force (N) of both axles over a motion."""
+#: Columns of :func:`axle_curves`.
+MOTION = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "steer_rad", "ay_m_s2", "yaw_acceleration_rad_s2")
+
+
+def axle_curves(
+    motion: Iterable[FloatArray], car: Vehicle | VehicleParameters = CAR
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return slip angle (rad) and lateral force (N) of both axles over a motion: the columns [N] of :data:`MOTION`."""
     lf, lr = car.cg_to_front_axle_m, car.cg_to_rear_axle_m
-    v_x, v_y, r, steer = (motion.column(k) for k in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "steer_rad"))
-    force = car.mass_kg * motion.column("ay_m_s2")
-    front = (lr * force + car.yaw_inertia_kg_m2 * motion.column("yaw_acceleration_rad_s2")) / (lf + lr)
+    v_x, v_y, r, steer, a_y, yaw_acceleration = motion
+    force = car.mass_kg * a_y
+    front = (lr * force + car.yaw_inertia_kg_m2 * yaw_acceleration) / (lf + lr)
     return {
         "front": (steer - np.arctan2(v_y + lf * r, v_x), front / np.cos(steer)),
         "rear": (-np.arctan2(v_y - lr * r, v_x), force - front),
@@ -77,7 +84,7 @@ def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleTyre:
 
 def fit_axles(motions: dict[float, Motion]) -> dict[str, AxleTyre]:
     """Fit both axles to one motion a friction."""
-    curves = {friction: axle_curves(motion) for friction, motion in motions.items()}
+    curves = {friction: axle_curves(map(motion.column, MOTION)) for friction, motion in motions.items()}
     return {
         axle: fit_axle(
             np.concatenate([curve[axle][0] / friction for friction, curve in curves.items()]),

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -49,6 +49,7 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
+from studies.defaults.fit_nominal_tyres import axle_curves, magic_formula
 from studies.pages import options
 from truthsim.suite import write_suite
 
@@ -102,16 +103,6 @@ class FitDrive:
     truth: StateTrack
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AxleSamples:
-    """Slip angle [N] in rad and lateral force [N] in N of both axles, from ground truth."""
-
-    front_slip_rad: FloatArray
-    front_force_n: FloatArray
-    rear_slip_rad: FloatArray
-    rear_force_n: FloatArray
-
-
 @dataclass(frozen=True, slots=True)
 class AxleCurve:
     """Magic formula of one axle with E = 0: stiffness N/rad, peak N, shape C."""
@@ -123,7 +114,7 @@ class AxleCurve:
     def force_n(self, slip_rad: FloatArray) -> FloatArray:
         """Return D sin(C atan(B α)) with B = stiffness/(C D)."""
         b = self.stiffness_n_per_rad / (self.shape * self.peak_n)
-        return self.peak_n * np.sin(self.shape * np.arctan(b * slip_rad))
+        return magic_formula(slip_rad, b, self.shape, self.peak_n, 0.0)
 
 
 def usable_stamps(signals: Signals, truth: StateTrack, vehicle: VehicleParameters) -> BoolArray:
@@ -140,35 +131,25 @@ def period_s(drive: FitDrive) -> float:
     return float(np.median(np.diff(drive.signals.stamps_ns))) * 1e-9
 
 
-def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> AxleSamples:
-    """Return slip angles and forces of all usable stamps of all drives, smoothed to ``SMOOTHING_HZ``.
+def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return slip angles (rad) and forces (N) [N] of each axle at all usable stamps, smoothed to ``SMOOTHING_HZ``.
 
     At known friction they are those at the vehicle file's, for tyres that keep their stiffness: one curve of force over
     friction by slip over friction.
     """
-    columns: list[tuple[FloatArray, ...]] = []
-    lf, lr = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
+    columns: dict[str, list[FloatArray]] = {"front": [], "rear": []}
     for drive in drives:
-        use = usable_stamps(drive.signals, drive.truth, vehicle)
-        stamps = drive.signals.stamps_ns
-
-        def smoothed(values: FloatArray, use: BoolArray = use, stamps: FloatArray = stamps) -> FloatArray:  # type: ignore[assignment]
-            return smooth(stamps, np.where(use, values, np.nan), SMOOTHING_HZ)  # type: ignore[arg-type]
-
-        truth = drive.truth
-        vx, vy, r = smoothed(truth.vx_m_s), smoothed(truth.vy_m_s), smoothed(truth.yaw_rate_rad_s)
-        ay, steer = smoothed(truth.ay_m_s2), smoothed(drive.signals.steer_rad)
-        r_dot = np.gradient(r, stamps * 1e-9 - stamps[0] * 1e-9)
-        total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
-        front = (lr * total + moment) / (lf + lr) / np.cos(steer)
-        rear = (lf * total - moment) / (lf + lr)
-        friction = drive.signals.friction
-        grip = np.where(np.isfinite(friction), friction / vehicle.assumed_friction, 1.0)
-        slips = (steer - np.arctan((vy + lf * r) / vx), -np.arctan((vy - lr * r) / vx))
-        columns.append((slips[0] / grip, front / grip, slips[1] / grip, rear / grip))
-    joined = [np.concatenate(c) for c in zip(*columns, strict=True)]
-    good = np.isfinite(np.sum(joined, axis=0))
-    return AxleSamples(*(c[good] for c in joined))
+        signals, truth, stamps = drive.signals, drive.truth, drive.signals.stamps_ns
+        use = usable_stamps(signals, truth, vehicle)
+        raw = (truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s, signals.steer_rad, truth.ay_m_s2)
+        motion = [smooth(stamps, np.where(use, values, np.nan), SMOOTHING_HZ) for values in raw]
+        yaw_acceleration = np.gradient(motion[2], stamps * 1e-9 - stamps[0] * 1e-9)
+        grip = np.where(np.isfinite(signals.friction), signals.friction / vehicle.assumed_friction, 1.0)
+        curves = np.stack([*axle_curves([*motion, yaw_acceleration], vehicle).values()]) / grip
+        good = np.isfinite(curves).all(axis=(0, 1))
+        for axle, curve in zip(columns, curves, strict=True):
+            columns[axle].append(curve[:, good])
+    return {axle: tuple(np.concatenate(parts, axis=1)) for axle, parts in columns.items()}
 
 
 def fit_axle(
@@ -213,13 +194,13 @@ class Prior:
         return value if self.low is None else max(value, self.low)
 
 
-def make_priors(start: VehicleParameters, samples: AxleSamples, usable_s: float) -> tuple[Prior, ...]:
+def make_priors(
+    start: VehicleParameters, samples: Mapping[str, tuple[FloatArray, FloatArray]], usable_s: float
+) -> tuple[Prior, ...]:
     """Return the priors of docs/method.md#identification about a vehicle file."""
     mu, priors = start.assumed_friction, []
-    for axle, front, slip, force in (
-        ("front", True, samples.front_slip_rad, samples.front_force_n),
-        ("rear", False, samples.rear_slip_rad, samples.rear_force_n),
-    ):
+    for axle, (slip, force) in samples.items():
+        front = axle == "front"
         peak = max(start.magic_formula(front, mu)[2], float(np.percentile(np.abs(force), 99.5)))
         file_curve = AxleCurve(start.cornering_stiffness_n_per_rad(front, mu), peak, SHAPE)
         curve = fit_axle(slip, force, prior=file_curve, mass_kg=start.mass_kg, independent=usable_s / CORRELATION_S)
@@ -364,10 +345,6 @@ def fit_cost(errors: Sequence[DriveError], theta: FloatArray) -> float:
     return fit + float(theta @ theta) + _nis_residual(errors) ** 2
 
 
-def _scale(drive: DriveError) -> float:
-    return math.sqrt(_robust_square(drive) + FLOOR_RAD**2)
-
-
 def _robust_square(drive: DriveError) -> float:
     """Return the mean square of errors cut at :data:`ROBUST` times their RMS."""
     limit = ROBUST * drive.rms
@@ -388,7 +365,7 @@ def scaled_errors(there: Sequence[DriveError], here: Sequence[DriveError]) -> Fl
     """Return the errors and the term of the NIS as residuals, with the scales of the errors ``here`` a place."""
     parts = []
     for d, now in zip(there, here, strict=True):
-        s = _scale(now)
+        s = math.sqrt(_robust_square(now) + FLOOR_RAD**2)
         weight = math.sqrt(now.seconds / CORRELATION_S / max(now.counted, 1))
         parts.append(weight * np.clip(d.error, -ROBUST * s, ROBUST * s) / s)
     return np.concatenate([*parts, [_nis_residual(there)]])

@@ -137,6 +137,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.list:
         print("\n".join(f"{r.gate}/{r.name}" for r in rows))
         return 0
+    for row in rows:
+        if absent := [str(file) for file in row.needs if not file.exists()]:
+            print(f"{row.gate}/{row.name}: skipped, because {', '.join(absent)} is absent", file=sys.stderr)
+    rows = [r for r in rows if all(file.exists() for file in r.needs)]
     frozen, begin, tool = read(FILE), time.monotonic(), Tool(given.tree.resolve(), given.work.resolve())
     if given.freeze:
         done = {key[:2] for key, value in frozen.items() if value.commit == given.freeze}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import subprocess
 import threading
 from collections import Counter
@@ -20,7 +19,7 @@ from studies.conditions import row_inputs, row_logs
 from studies.gates.tool import Tool, commands_and_options, coverage_percent, reports, sideslip_rmse_deg
 from studies.mapping_mistakes import VERDICTS, outcomes
 from studies.pages import DRIVES, ROOT, SAMPLE_VEHICLE, read_json, read_toml, write_toml
-from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
+from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, needed_files, vehicle_table
 from studies.torture.seeds import FORMATS, RECORDINGS
 from truthsim.conditions import ROWS
 from truthsim.drive import simulate_drive
@@ -45,12 +44,16 @@ Figures = dict[str, Figure]
 
 @dataclass(frozen=True, slots=True)
 class GateRow:
-    """One row: ``measure`` returns its figures by name; ``quick``: whether the quick gates contain it."""
+    """One row: ``measure`` returns its figures by name.
+
+    ``quick``: whether the quick gates contain it. ``needs``: files outside the repository, without which it is skipped.
+    """
 
     gate: str
     name: str
     measure: Callable[[Tool], Figures]
     quick: bool = False
+    needs: tuple[Path, ...] = ()
 
 
 def rmse_figures(run: Path, absolute_deg: float, coverage_of: str | None = None) -> Figures:
@@ -203,7 +206,7 @@ def strangers(only: Sequence[str], tool: Tool) -> Figures:
 def fuzz(name: str, count: int, tool: Tool) -> Figures:
     """Count how commands end on mutants of a format."""
     work = tool.work / f"fuzz-{name}-{count}"
-    given = ("--work", work, "--jobs", "1", "--format", name, "--count", str(count), "--out", work / "none.md")
+    given = ("--work", work, "--jobs", "1", "--format", name, "--count", str(count), "--out", work)
     judged = written(work / "formats.json", tool.python("studies.torture", "formats", *given))[name]
     figures = {f"{name}: problems": Figure(float(len(judged["problems"])), "count", 0.0)}
     for end in ("exit 0", "exit 1", "exit 3"):
@@ -264,22 +267,6 @@ def keys(document: dict[str, Any], depth: int) -> Iterator[str]:
             yield from (f"{name}.{key}" for key in keys(inner, depth - 1))
 
 
-# ------------------------------------------------------------------------------------------------ speed
-
-
-def speed(benchmark: str, tool: Tool) -> Figures:
-    """Return how many times as long each peer takes, as the benchmarks measure it in one run."""
-    done = tool.python("benchmarks.performance", benchmark)
-    if done.returncode:
-        raise RuntimeError(done.stderr[-2000:])
-    figures: Figures = {}
-    lines = [line for line in done.stdout.splitlines() if line.startswith("| ")][2:]
-    for i, line in enumerate(lines):
-        for peer, ratio in re.findall(r"([\w.+-][\w .+-]*?) ([\d.]+) x", line.split("|")[-2]):
-            figures[f"{i + 1} {peer}"] = Figure(float(ratio), "times", 0.35)
-    return figures
-
-
 # ------------------------------------------------------------------------------------------------ all
 
 #: Formats of which a few mutants are quick.
@@ -287,26 +274,20 @@ _FEW_FORMATS = ("csv", "blf", *RECORDINGS)
 
 
 def all_rows() -> Iterator[GateRow]:
-    """Yield all rows in the order of the file; the fuzz tests, which take longest, are last.
-
-    Rows of recorded drives need ``../shared`` beside the repository.
-    """
+    """Yield all rows in the order of the file; the fuzz tests, which take longest, are last."""
     for name, measure in {"exit codes": exit_codes, "options": options, "files and keys": files_and_keys}.items():
         yield GateRow("contract", name, measure, quick=True)
     for name in _TABLES["reference_drives"]:
         yield GateRow("reference", name, partial(reference, name), quick=name == "double lane change")
-    recorded_drives = [d for d in PEER_DRIVES if (DRIVES / d.log).exists()]
-    for d in recorded_drives:
-        yield GateRow("recorded drives", d.log, partial(recorded, d, False), quick=d.log in QUICK_DRIVES)
-    for d in recorded_drives:
+    for d in PEER_DRIVES:
+        needs, is_quick = needed_files(d), d.log in QUICK_DRIVES
+        yield GateRow("recorded drives", d.log, partial(recorded, d, False), is_quick, needs)
         if d.log.startswith("v40_"):
-            yield GateRow("recorded drives", f"{d.log}, GNSS velocity", partial(recorded, d, True))
+            yield GateRow("recorded drives", f"{d.log}, GNSS velocity", partial(recorded, d, True), needs=needs)
     for row in ROWS:
         yield GateRow("conditions", row.name, partial(condition, row.name, 10))
     for name in ("in-domain", "gyro-stuck"):
         yield GateRow("conditions", f"{name}, 2 drives", partial(condition, name, 2), quick=True)
-    for name in ("reading", "reading_mdf"):
-        yield GateRow("speed", name, partial(speed, name))
     yield GateRow("third-party logs", "all", partial(strangers, ()))
     yield GateRow("third-party logs", "7 layouts", partial(strangers, _TABLES["few_layouts"]), quick=True)
     yield GateRow("plus-minus", "20 cars", partial(plus_minus, range(20)))

@@ -77,17 +77,21 @@ class Tool:
         return read_toml(file)
 
 
+def metrics(run: Path, **of: str) -> pl.DataFrame:
+    """Return the metrics over whole logs of a run, those with the given columns alone."""
+    return pl.read_parquet(run / "metrics.parquet").filter(segment="all", **of)
+
+
 def sideslip_rmse_deg(run: Path) -> dict[str, float]:
     """Return the sideslip RMSE over all samples of all logs of a run by estimator, in degrees."""
-    rows = pl.read_parquet(run / "metrics.parquet").filter(signal="sideslip_rad", segment="all", metric="rmse")
+    rows = metrics(run, signal="sideslip_rad", metric="rmse")
     pooled = rows.group_by("estimator").agg((pl.col("value") ** 2 * pl.col("n")).sum() / pl.col("n").sum())
     return {name: float(np.degrees(np.sqrt(square))) for name, square in pooled.sort("estimator").iter_rows()}
 
 
 def coverage_percent(run: Path, estimator: str) -> float:
     """Return the share of samples within the 95 % interval of sideslip over all logs of a run."""
-    of = {"signal": "sideslip_rad", "segment": "all", "metric": "coverage95", "estimator": estimator}
-    rows = pl.read_parquet(run / "metrics.parquet").filter(**of)
+    rows = metrics(run, signal="sideslip_rad", metric="coverage95", estimator=estimator)
     return 100.0 * float(np.average(rows["value"], weights=rows["n"])) if len(rows) else float("nan")
 
 

@@ -15,7 +15,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -103,22 +103,16 @@ def cases_of(drives: Iterable[Drive], car: Car) -> list[Case]:
     return [Case(d, on_the_road(car, d.friction), use) for d in drives for use in SENSOR_SETS.values()]
 
 
-class Goal:
-    """Geometric mean of the sideslip RMSE in degrees over cases; each point is computed once."""
-
-    def __init__(self, cases: Sequence[Case]) -> None:
-        self._cases = cases
-        self._values: dict[Constants, float] = {}
-
-    def __call__(self, point: Constants) -> float:
-        """Return the mean at a point."""
-        if point not in self._values:
-            logs = [np.log(case.rmse_deg(point)) for case in self._cases]
-            self._values[point] = float(np.exp(np.mean(logs)))
-        return self._values[point]
+#: Geometric mean of the sideslip RMSE in degrees over some cases.
+Goal = Callable[[Constants], float]
 
 
-def choose(goal: Callable[[Constants], float], start: Constants = START) -> Constants:
+def goal_of(cases: Sequence[Case]) -> Goal:
+    """Return the goal of cases, which computes each point once."""
+    return cache(lambda point: float(np.exp(np.mean([np.log(case.rmse_deg(point)) for case in cases]))))
+
+
+def choose(goal: Goal, start: Constants = START) -> Constants:
     """Return the result of the cyclic search."""
     while True:
         point = start
@@ -146,14 +140,14 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, default=FILE)
     arguments = parser.parse_args()
     car = Car.load("saloon")
-    training = Goal(cases_of(training_drives(), car))
+    training = goal_of(cases_of(training_drives(), car))
     chosen = choose(training)
     seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + NOISE_SEEDS)
     goals = {"training drives": training}
     for scenario in SCENARIO_PAIR:
         cases = cases_of((simulate_drive(scenario.manoeuvre, seed=seed) for seed in seeds), car)
         for title, use_speed in SENSOR_SETS.items():
-            goals[f"{scenario.name}, {title}"] = Goal([c for c in cases if c.use_speed == use_speed])
+            goals[f"{scenario.name}, {title}"] = goal_of([c for c in cases if c.use_speed == use_speed])
     document = {
         "made_by": "python -m studies.paper.constants",
         "training_drives": COUNT,

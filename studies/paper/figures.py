@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.estimators.table import SPECS
-from pdhef_logtool.records.geometry import dead_reckon, wrap_angle
+from pdhef_logtool.records.geometry import DEGREES, GRAVITY_M_S2, dead_reckon, wrap_angle
 from pdhef_logtool.records.signals import FloatArray
-from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B, Experiment, spread, time_s, valid
+from studies.paper.experiment import BURST, BURST_S, SCENARIO_PAIR, A, B, Experiment, spread, time_s, valid
 from studies.paper.probes import RESIDUAL_ROWS, ResidualFit, TrustCurve
-from studies.paper.results import Results
-from studies.paper.schemes import DRAWN, PUBLISHED
+from studies.paper.results import ADAPTIVE, Results
+from studies.paper.schemes import DRAWN, PAPER, PUBLISHED
 from studies.pictures import STYLE, save, subplots
 
 COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
@@ -24,7 +23,7 @@ BARS = ("phy-ukf", "phy-ukf:tuned", "physics", "pure-lstm", "pd-hef-paper", "pd-
 
 #: Signal, factor to the unit drawn, label.
 SIGNALS = {
-    "sideslip": ("sideslip_rad", math.degrees(1.0), "sideslip, deg"),
+    "sideslip": ("sideslip_rad", DEGREES, "sideslip, deg"),
     "yaw_rate": ("yaw_rate_rad_s", 1.0, "yaw rate, rad/s"),
     "ay": ("ay_m_s2", 1.0 / GRAVITY_M_S2, "lateral acceleration, g"),
 }
@@ -56,7 +55,7 @@ def convergence(folder: Path, losses: Mapping[str, Sequence[float]]) -> None:
 
 def step_time_bars(folder: Path, times: Mapping[str, Mapping[str, float]]) -> None:
     """Figure 23: processor time of a step; the paper's values as dots, and the controller's cycle dotted."""
-    names = [n for n in BARS if n in times][::-1]
+    names = BARS[::-1]
     fig, axes = subplots(1, 1, 7.4, 3.0, _STYLE)
     axes[0, 0].barh(names, [times[n]["median_us"] for n in names], color=[COLOURS[n] for n in names], height=0.72)
     theirs = {"phy-ukf": PUBLISHED["step_ms"]["phy-ukf"], "pd-hef-paper": PUBLISHED["step_ms"]["pd-hef"]}
@@ -116,62 +115,60 @@ _TRUTH = {"color": COLOURS["truth"], "linewidth": 3.0, "label": "truth"}
 _ERROR = {"xlabel": "time, s", "ylim": (0.0, None)}
 
 
-def history(
-    folder: Path, name: str, experiment: Experiment, scenario: str, signal: str, schemes: Sequence[str]
-) -> None:
+def history(folder: Path, name: str, experiment: Experiment, scenario: str, signal: str) -> None:
     """Figures 12 to 14 and 16 to 18: a state over time, and the absolute error below it."""
     column, factor, label = SIGNALS[signal]
     truth = experiment.truth(scenario)
     at_s, real = time_s(truth), truth[column].to_numpy()
     states: list[Curve] = [(at_s, factor * real, _TRUTH)]
     errors: list[Curve] = []
-    for scheme in schemes:
-        if (track := experiment.track(scenario, scheme)) is not None:
-            value = valid(track, column)
-            error = wrap_angle(value - real) if signal == "sideslip" else value - real
-            states.append((at_s, factor * value, _style(scheme)))
-            errors.append((at_s, factor * np.abs(error), _thin(scheme)))
+    for scheme in DRAWN:
+        value = valid(experiment.track(scenario, scheme), column)
+        error = wrap_angle(value - real) if signal == "sideslip" else value - real
+        states.append((at_s, factor * value, _style(scheme)))
+        errors.append((at_s, factor * np.abs(error), _thin(scheme)))
     below = {"ylabel": f"absolute error, {label.rsplit(', ', 1)[1]}", **_ERROR}
     panels(folder / f"{name}.png", 4.4, [(states, {"ylabel": label}), (errors, below)], sharex=True)
 
 
-def position(folder: Path, name: str, experiment: Experiment, scenario: str, schemes: Sequence[str]) -> None:
+def position(folder: Path, name: str, experiment: Experiment, scenario: str) -> None:
     """Figures 11 and 15: dead-reckoned trajectory beside the true one, and the distance between them over time."""
     truth, columns = experiment.truth(scenario), ("x_m", "y_m", "yaw_rad")
     poses = truth.select(columns).to_numpy()
     paths: list[Curve] = [(poses[:, 0], poses[:, 1], _TRUTH)]
     distances: list[Curve] = []
-    for scheme in schemes:
-        if (track := experiment.track(scenario, scheme)) is not None:
-            motion = [valid(track, c) for c in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")]
-            first = int(np.flatnonzero(np.isfinite(motion[0] + motion[1] + poses[:, 0]))[0])
-            start = (float(poses[first, 0]), float(poses[first, 1]), float(poses[first, 2]))
-            stamps = track["stamp_ns"].to_numpy()[first:]
-            vx, vy, rate = (values[first:] for values in motion)
-            x, y, _ = dead_reckon(stamps, vx, vy, rate, start)
-            paths.append((x, y, _style(scheme)))
-            away = np.hypot(x - poses[first:, 0], y - poses[first:, 1])
-            distances.append((time_s(truth)[first:], away, _thin(scheme)))
+    for scheme in DRAWN:
+        track = experiment.track(scenario, scheme)
+        motion = np.stack([valid(track, c) for c in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")])
+        first = int(np.flatnonzero(np.isfinite(motion[0] + motion[1] + poses[:, 0]))[0])
+        stamps, start = track["stamp_ns"].to_numpy()[first:], tuple(poses[first].tolist())
+        vx, vy, rate = motion[:, first:]
+        x, y, _ = dead_reckon(stamps, vx, vy, rate, start)
+        paths.append((x, y, _style(scheme)))
+        away = np.hypot(x - poses[first:, 0], y - poses[first:, 1])
+        distances.append((time_s(truth)[first:], away, _thin(scheme)))
     above = {"xlabel": "x, m", "ylabel": "y, m (axes not equal)"}
     below = {"ylabel": "distance to ground truth, m", **_ERROR}
     panels(folder / f"{name}.png", 4.6, [(paths, above), (distances, below)])
 
 
-def noise_adaptation(folder: Path, experiment: Experiment, adaptive: Sequence[str], compared: Sequence[str]) -> None:
+#: Schemes of Figure 20.
+COMPARED = ("phy-ukf", "pd-hef:fixed-r", "pd-hef-paper", "pd-hef")
+
+
+def noise_adaptation(folder: Path, experiment: Experiment) -> None:
     """Figure 20: yaw rate in the burst, the factor on R, and the sideslip error."""
     truth = experiment.truth(BURST.name)
-    tracks = {
-        n: track for n in ("zero:no-lateral", *compared) if (track := experiment.track(BURST.name, n)) is not None
-    }
+    tracks = {name: experiment.track(BURST.name, name) for name in ("zero:no-lateral", *COMPARED)}
     at_s, real = time_s(truth), truth["sideslip_rad"].to_numpy()
     measured = {"color": "#56B4E9", "linewidth": 0.7, "label": "measured"}
     rates: list[Curve] = [
         (at_s, tracks["zero:no-lateral"]["yaw_rate_rad_s"].to_numpy(), measured),
         (at_s, truth["yaw_rate_rad_s"].to_numpy(), {"color": "#000000", "linewidth": 1.6, "label": "truth"}),
     ]
-    scales: list[Curve] = [(at_s, valid(tracks[n], "r_scale"), _style(n)) for n in adaptive]
+    scales: list[Curve] = [(at_s, valid(tracks[n], "r_scale"), _style(n)) for n in ADAPTIVE]
     errors: list[Curve] = [
-        (at_s, np.degrees(np.abs(wrap_angle(valid(tracks[n], "sideslip_rad") - real))), _thin(n)) for n in compared
+        (at_s, np.degrees(np.abs(wrap_angle(valid(tracks[n], "sideslip_rad") - real))), _thin(n)) for n in COMPARED
     ]
     stack: list[tuple[list[Curve], dict[str, Any]]] = [
         (rates, {"ylabel": "yaw rate, rad/s"}),
@@ -181,15 +178,14 @@ def noise_adaptation(folder: Path, experiment: Experiment, adaptive: Sequence[st
     panels(folder / "figure20_noise_adaptation.png", 5.8, stack, BURST_S, sharex=True)
 
 
-def trust(folder: Path, curves: Mapping[str, Mapping[str, TrustCurve]]) -> None:
-    """Figure 21: β over |a_y|, a column each scenario, schemes one over the other; the paper's end points dashed."""
+def trust(folder: Path, curves: Mapping[str, TrustCurve]) -> None:
+    """Figure 21: β of the paper's filter over |a_y|, a column each scenario; the paper's end points dashed."""
     fig, axes = subplots(1, len(curves), 7.4, 3.3, _STYLE, sharey=True)
-    for ax, (scenario, by_scheme) in zip(axes[0], curves.items(), strict=True):
-        for scheme, curve in by_scheme.items():
-            colour = COLOURS[scheme]
-            ax.plot(curve.ay_g, curve.trust, ".", markersize=2.0, alpha=0.35, color=colour)
-            ax.fill_between(curve.centre_g, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
-            ax.plot(curve.centre_g, curve.median, "o-", markersize=4, color=colour, label=f"{scheme}, median of a bin")
+    colour = COLOURS[PAPER]
+    for ax, (scenario, curve) in zip(axes[0], curves.items(), strict=True):
+        ax.plot(curve.ay_g, curve.trust, ".", markersize=2.0, alpha=0.35, color=colour)
+        ax.fill_between(curve.centre_g, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
+        ax.plot(curve.centre_g, curve.median, "o-", markersize=4, color=colour, label=f"{PAPER}, median of a bin")
         for level in PUBLISHED["residual_gain"]:
             ax.axhline(level, color=COLOURS["truth"], linestyle="--", linewidth=1.0)
         ax.set(xlabel="true |lateral acceleration|, g", ylim=(0.0, 1.0), title=f"scenario {scenario}")
@@ -207,27 +203,24 @@ BAR_FIGURES = {
 }
 
 
-def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenarios: Sequence[str]) -> None:
+def rmse_bars(folder: Path, experiment: Experiment) -> None:
     """Figure 22: median RMSE with smallest and largest over the seeds; the paper's value of its PD-HEF as a line."""
-    names = [n for n in BARS if n in ran][::-1]
-    height = 0.6 + len(scenarios) * (0.7 + 0.26 * len(names))
-    fig, axes = subplots(len(scenarios), len(BAR_FIGURES), 9.4, height, _STYLE, sharey=True)
-    for i, scenario in enumerate(scenarios):
+    names, rows = BARS[::-1], len(SCENARIO_PAIR)
+    fig, axes = subplots(rows, len(BAR_FIGURES), 9.4, 0.6 + rows * (0.7 + 0.26 * len(names)), _STYLE, sharey=True)
+    for i, scenario in enumerate(s.name for s in SCENARIO_PAIR):
         for j, (figure, label) in enumerate(BAR_FIGURES.items()):
             ax = axes[i, j]
-            spreads = [(k, n, spread(experiment.metrics, scenario, n, figure)) for k, n in enumerate(names)]
-            for k, name, s in spreads:
-                if s is None:
-                    continue
-                ax.barh(k, s["median"], color=COLOURS[name], height=0.72)
-                ax.plot([s["low"], s["high"]], [k, k], color="#222222", linewidth=1.1)
+            for k, name in enumerate(names):
+                if s := spread(experiment.metrics, scenario, name, figure):
+                    ax.barh(k, s["median"], color=COLOURS[name], height=0.72)
+                    ax.plot([s["low"], s["high"]], [k, k], color="#222222", linewidth=1.1)
             theirs = PUBLISHED["rmse"][scenario].get(figure)
             if theirs is not None:
                 ax.axvline(theirs, color="#222222", linestyle=":", linewidth=1.4)
             ax.set_yticks(range(len(names)), names)
             ax.grid(axis="y", visible=False)
             ax.set_xlim(left=0.0)
-            if i == len(scenarios) - 1:
+            if i == rows - 1:
                 ax.set_xlabel(f"RMSE of {label}" if j < 3 else f"RMSE, {label}")
         axes[i, 0].set_title(f"scenario {scenario}", loc="left")
     save(fig, folder / "figure22_rmse.png")
@@ -235,17 +228,14 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
 
 def draw(r: Results, folder: Path) -> None:
     """Write the PNGs of Figures 9 to 23 into a folder, under the names that the page uses."""
-    schemes = [n for n in DRAWN if n in r.experiment.ran]
     residuals(folder, "figure10_residual_fit", r.fits[A.name], "scenario A")
     residuals(folder, "figure19_residual_verification", r.fits[B.name], "scenario B")
     for scenario, letter, first in ((A.name, "a", 11), (B.name, "b", 15)):
-        position(folder, f"figure{first}_position_{letter}", r.experiment, scenario, schemes)
+        position(folder, f"figure{first}_position_{letter}", r.experiment, scenario)
         for i, signal in enumerate(SIGNALS, start=1):
-            history(folder, f"figure{first + i}_{signal}_{letter}", r.experiment, scenario, signal, schemes)
-    compared = [n for n in ("phy-ukf", "pd-hef:fixed-r", "pd-hef-paper", "pd-hef") if n in r.experiment.ran]
-    noise_adaptation(folder, r.experiment, list(r.inflations), compared)
-    if any(r.curves.values()):
-        trust(folder, {s: c for s, c in r.curves.items() if c})
-    rmse_bars(folder, r.experiment, r.experiment.ran, (A.name, B.name))
+            history(folder, f"figure{first + i}_{signal}_{letter}", r.experiment, scenario, signal)
+    noise_adaptation(folder, r.experiment)
+    trust(folder, r.curves)
+    rmse_bars(folder, r.experiment)
     convergence(folder, r.losses)
     step_time_bars(folder, r.times)

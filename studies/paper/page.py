@@ -57,17 +57,13 @@ def gain_text(gain: Mapping[str, Any]) -> str:
     return f"{text} · {significance}"
 
 
-def _schemes(d: Document) -> list[str]:
-    return [scheme for scheme in SCHEMES if any(scheme in by_scheme for by_scheme in d["summary"].values())]
-
-
 def _errors(d: Document) -> str:
     """Return the table of the sideslip errors."""
     rows = []
-    for scheme in _schemes(d):
+    for scheme in SCHEMES:
         cells = [f"`{scheme}`"]
         for by_scheme in d["summary"].values():
-            figures = by_scheme.get(scheme, {})
+            figures = by_scheme[scheme]
             share = f" · {percent(figures['sideslip_relative']['median'])}" if "sideslip_relative" in figures else ""
             cells.append(ranged(figures["sideslip_deg"]) + share if "sideslip_deg" in figures else "–")
         rows.append(cells)

@@ -14,10 +14,11 @@ from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.network.residuals import residual_rows
+from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.runs.estimating import estimate_drive
-from studies.paper.experiment import GRAVITY_M_S2, Experiment, time_s, valid
+from studies.paper.experiment import Experiment, time_s, valid
 
 #: Rows of the residual, with their units.
 RESIDUAL_ROWS = (("v_y", "m/s²"), ("yaw rate", "rad/s²"))
@@ -74,17 +75,12 @@ class TrustCurve:
     high: FloatArray
 
 
-def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> TrustCurve | None:
-    """Return β of a scheme over the true |a_y|; None where the scheme did not run or has a constant gain."""
-    track = experiment.track(scenario, scheme)
-    if track is None:
-        return None
+def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 12) -> TrustCurve:
+    """Return β of a scheme over the true |a_y|."""
     ay = np.abs(experiment.truth(scenario)["ay_m_s2"].to_numpy()) / GRAVITY_M_S2
-    trust = valid(track, "network_trust")
+    trust = valid(experiment.track(scenario, scheme), "network_trust")
     use = np.isfinite(trust) & np.isfinite(ay)
     ay, trust = ay[use], trust[use]
-    if not ay.size or np.ptp(trust) < 1e-9:
-        return None
     edges = np.linspace(0.0, ay.max(), bins + 1)
     place = np.clip(np.digitize(ay, edges) - 1, 0, bins - 1)
     filled = [i for i in range(bins) if np.count_nonzero(place == i) >= 5]
@@ -93,19 +89,13 @@ def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 
     return TrustCurve(ay, trust, centre, points[:, 1], points[:, 0], points[:, 2])
 
 
-def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float]) -> dict[str, float] | None:
-    """Return the factor on R: median before the burst, without its first half second, and largest within.
-
-    None if the scheme did not run or its R is constant.
-    """
-    if (track := experiment.track("A-burst", scheme)) is None:
-        return None
+def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float]) -> dict[str, float]:
+    """Return the factor on R: median before the burst, without its first half second, and largest within."""
+    track = experiment.track("A-burst", scheme)
     scale, at_s = valid(track, "r_scale"), time_s(track)
     before, within = (
         scale[(at_s > low) & (at_s < high) & np.isfinite(scale)] for low, high in ((0.5, burst_s[0]), burst_s)
     )
-    if not before.size or not within.size or np.nanmax(scale) - np.nanmin(scale) < 1e-9:
-        return None
     return {"before": float(np.median(before)), "within": float(within.max())}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from typing import Any
 
 import polars as pl
@@ -28,11 +29,11 @@ from studies.paper.experiment import (
     spread,
 )  # fmt: skip
 from studies.paper.probes import ResidualFit, TrustCurve, inflation, residual_fit, step_times, trust_curve
-from studies.paper.schemes import ESP, PAIRS
+from studies.paper.schemes import ESP, HYBRID, PAIRS, PAPER, SCHEMES
 
 SCENARIOS = (A, B, BURST)
-#: Schemes with a variable gain or factor on R.
-ADAPTIVE = ("pd-hef-paper", "pd-hef")
+#: Schemes with a variable factor on R; that of the paper also has a variable gain.
+ADAPTIVE = (PAPER, HYBRID)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,14 +42,14 @@ class Results:
 
     Attributes
     ----------
-    fits : of the paper's network by scenario. curves : β over |a_y| by scenario and scheme.
+    fits : of the paper's network by scenario. curves : its β over |a_y| by scenario.
     inflations, times : of R, and processor times, by scheme.
     """
 
     experiment: Experiment
     car: Car
     fits: Mapping[str, ResidualFit]
-    curves: Mapping[str, Mapping[str, TrustCurve]]
+    curves: Mapping[str, TrustCurve]
     inflations: Mapping[str, dict[str, float]]
     times: Mapping[str, dict[str, float]]
 
@@ -64,9 +65,9 @@ def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> Results:
     experiment = run_experiment(tool, scenarios=SCENARIOS, noise_seeds=noise_seeds)
     drives = {s.name: read_log(experiment.logs[s.name], on_the_road(car, s.friction)) for s in (A, B)}
     fits = {name: residual_fit(whole, car) for name, whole in drives.items()}
-    curves = {s.name: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s.name, n)) is not None} for s in (A, B)}
-    inflations = {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None}
-    names = [n for n in experiment.ran if not n.endswith(ESP)]
+    curves = {s.name: trust_curve(experiment, s.name, PAPER) for s in (A, B)}
+    inflations = {name: inflation(experiment, name, BURST_S) for name in ADAPTIVE}
+    names = [n for n in SCHEMES if not n.endswith(ESP)]
     times = step_times(drives[B.name], on_the_road(car, B.friction), names)
     return Results(experiment, car, fits, curves, inflations, times)
 
@@ -88,15 +89,13 @@ def document(r: Results) -> dict[str, Any]:
     summary = {
         scenario: {
             scheme: {f: of for f in FIGURES if (of := spread(metrics, scenario, scheme, f)) is not None}
-            for scheme in r.experiment.ran
+            for scheme in SCHEMES
         }
         for scenario in scenarios
     }
     gains = [
-        {"scenario": scenario, "scheme": s, "baseline": b, **gain}
-        for scenario in scenarios
-        for s, b in PAIRS
-        if (gain := improvement(metrics, scenario, s, b)) is not None
+        {"scenario": scenario, "scheme": s, "baseline": b, **improvement(metrics, scenario, s, b)}
+        for scenario, (s, b) in product(scenarios, PAIRS)
     ]
     residuals = {
         scenario: {
@@ -106,11 +105,8 @@ def document(r: Results) -> dict[str, Any]:
         for scenario, fit in r.fits.items()
     }
     trust = {
-        scenario: {
-            scheme: {"centre_g": c.centre_g.tolist(), "median": c.median.tolist(), "mean": float(c.trust.mean())}
-            for scheme, c in curves.items()
-        }
-        for scenario, curves in r.curves.items()
+        scenario: {PAPER: {"centre_g": c.centre_g.tolist(), "median": c.median.tolist(), "mean": float(c.trust.mean())}}
+        for scenario, c in r.curves.items()
     }
     plain: dict[str, Any] = _plain(
         {

@@ -54,6 +54,12 @@ def peer_drive(log: str) -> PeerDrive:
     return next(drive for drive in PEER_DRIVES if drive.log == log)
 
 
+def needed_files(drive: PeerDrive) -> tuple[Path, ...]:
+    """Return the files outside the repository that a drive needs: its log, and mapping and vehicle beside it."""
+    beside = () if drive.files else (".signals.toml", ".vehicle.toml")
+    return tuple(DRIVES / f"{drive.log}{end}" for end in ("", *beside))
+
+
 def mapping_table(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = False) -> dict[str, Any]:
     """Return the mapping file of a drive as a document; ``receiver``: the GNSS velocity of a V40 replaces its speed."""
     if drive.log.startswith("v40_"):

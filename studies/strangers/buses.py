@@ -75,7 +75,8 @@ def _mdf(frames: Sequence[_Frame], path: Path) -> None:
 
 def _mcap(frames: Sequence[_Frame], databases: dict[str, str], path: Path) -> Path:
     """Write a topic of frames for each bus, and the DBC files as attachments."""
-    from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+    from pdhef_logtool.logs.drive_log import Columns
+    from pdhef_logtool.logs.writer import McapLogWriter
     from studies.strangers.containers import definition
 
     path = path.with_suffix(".mcap")
@@ -90,7 +91,7 @@ def _mcap(frames: Sequence[_Frame], databases: dict[str, str], path: Path) -> Pa
             writer.add_topic(
                 topic, "can_msgs/msg/Frame", constants={"dlc": 8.0}, definition=definition("can_msgs/msg/Frame")
             )
-            batches.append(TopicBatch(topic, stamps, stamps, fields))
+            batches.append(Columns(topic, stamps, stamps, fields))
             writer.attachment(Attachment(int(stamps[0]), int(stamps[0]), f"{name}.dbc", "text/plain", text.encode()))
         writer.write(batches)
     return path

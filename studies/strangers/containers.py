@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.drive_log import Columns
+from pdhef_logtool.logs.writer import McapLogWriter
 from studies.mcap_logs import Message, messages, write_log
 from studies.strangers import buses, tables
 from studies.strangers.cars import Topic as Topic
@@ -92,7 +93,7 @@ def _mcap(topics: Sequence[Topic], path: Path) -> Path:
                 text = definition(topic.type_name)
                 writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
         raws = [message for topic in joints for message in _joints(writer, topic)]
-        batches = [TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints]
+        batches = [Columns(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints]
         writer.write(batches, [block_of(raws)])
     return path
 
@@ -125,8 +126,8 @@ def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tu
         scratch.unlink()
 
 
-def _copied(topics: Sequence[Topic], path: Path, writer: Any, *, ros1: bool) -> Path:
-    """Write the messages of topics with a writer of rosbags."""
+def copied(topics: Sequence[Topic], path: Path, writer: Any, *, ros1: bool) -> Path:
+    """Write the messages of topics with a writer of rosbags; return the path."""
     store = _store(ros1)
 
     def described(name: str) -> dict[str, str]:
@@ -144,7 +145,7 @@ def _rosbag1(topics: Sequence[Topic], path: Path) -> Path:
     from rosbags.rosbag1 import Writer
 
     path = path.with_suffix(".bag")
-    return _copied(topics, path, Writer(path), ros1=True)
+    return copied(topics, path, Writer(path), ros1=True)
 
 
 def _mcap_ros1(topics: Sequence[Topic], path: Path) -> Path:
@@ -160,7 +161,7 @@ def _rosbag2(topics: Sequence[Topic], path: Path, plugin: str = "SQLITE3") -> Pa
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     shutil.rmtree(path, ignore_errors=True)
-    return _copied(topics, path, Writer(path, version=9, storage_plugin=StoragePlugin[plugin]), ros1=False)
+    return copied(topics, path, Writer(path, version=9, storage_plugin=StoragePlugin[plugin]), ros1=False)
 
 
 def _rosbag2_bare(topics: Sequence[Topic], path: Path) -> Path:

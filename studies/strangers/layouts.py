@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
 from studies.strangers import recordings
 from studies.strangers.cars import Car, Series, drive
 from studies.strangers.containers import Topic
-from studies.strangers.recordings import DEG, DOWN, G_M_S2, KMH, SCORING, Recording, answers, message
+from studies.strangers.recordings import DEG, DOWN, KMH, SCORING, Recording, answers, message
 from truthsim.recording import quaternion
 
 #: Patterns of messages that name a cause.
@@ -29,7 +30,7 @@ def rotation(axis: tuple[float, float, float], angle_rad: float) -> FloatArray:
 _NUMPY = ("clip", "cos", "cumsum", "diag", "floor", "gradient", "maximum", "pi", "rint", "sin", "sqrt", "stack", "tan")
 #: Names of expressions beside the columns of the car. ``shift`` is a command ahead of its measurement.
 _NAMES = {
-    "DEG": DEG, "DOWN": DOWN, "FORWARD": np.diag([1.0, 0.0]), "G": G_M_S2, "KMH": KMH, "RPM": 2.0 * np.pi / 60.0,
+    "DEG": DEG, "DOWN": DOWN, "FORWARD": np.diag([1.0, 0.0]), "G": GRAVITY_M_S2, "KMH": KMH, "RPM": 2.0 * np.pi / 60.0,
     "quaternion": quaternion, "rng": np.random.default_rng, "shift": np.roll,
     **{name: getattr(np, name) for name in _NUMPY},
 }  # fmt: skip

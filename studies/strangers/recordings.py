@@ -16,7 +16,6 @@ from studies.strangers.cars import Car, Series
 from studies.strangers.containers import Topic
 from truthsim.recording import quaternion
 
-G_M_S2 = 9.80665
 DEG = np.pi / 180.0
 KMH = 1.0 / 3.6
 #: Turns forward, left, up into forward, right, down and back.

@@ -84,7 +84,7 @@ def look(path: Path) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
     suspects = frozenset(name for w in warnings for name in (w["suspects"] or w["signals"]))
     try:
         with read_drive(path, Car.load("saloon"), options=ReadOptions(msgs=msgs), require_sensors=False) as drive:
-            more = [asdict(check) for check in getattr(drive, "checks", ())]
+            more = [asdict(check) for check in drive.checks]
             checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
     except PdhefError as error:
         refused_run = str(error)

@@ -1,7 +1,7 @@
 """Fuzz and fault-injection tests, counted: ``docs/reliability.md``.
 
     python -m studies.torture [PART ...] [--work out/torture] [--seed 1] [--logs 200000] [--drives 24] [--kills 20]
-                              [--count 500] [--format blf ...] [--hours 10] [--jobs 2] [--out docs/reliability.md]
+                              [--count 500] [--format blf ...] [--hours 10] [--jobs 2] [--out docs]
 
 Parts: bombs, shared, mutations, formats, crashes, hours; all without one.
 
@@ -23,7 +23,7 @@ from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
 from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
-from studies.pages import DOCS, ROOT, fill, options, read_json, table, write, write_json
+from studies.pages import DOCS, ROOT, options, read_json, table, update, write_json
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
 from studies.torture.mutants import HANG_S, format_judge, log_judge
@@ -152,7 +152,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=500, help="mutants of each table and CAN format")
     parser.add_argument("--format", action="append", choices=FORMATS, help="a table or CAN format; may be given again")
     parser.add_argument("parts", nargs="*", help="parts; all without one")
-    parser.add_argument("--out", type=Path, default=DOCS / "reliability.md")
+    parser.add_argument("--out", type=Path, default=DOCS, help="folder of the page")
     given = parser.parse_args()
     parts: list[str] = given.parts
     work: Path = given.work
@@ -179,12 +179,11 @@ def main() -> int:
             write_json(kept, (read_json(kept) if again and kept.is_file() else {}) | do() if again else do())
         if kept.is_file():
             results[name] = read_json(kept)
-    if given.out.is_file():
-        counts = f"--logs {given.logs} --count {given.count}"
-        counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"
-        tables = {name: (_list if isinstance(r, list) else _mutations)(r) for name, r in results.items() if r}
-        asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
-        write(given.out, fill(given.out.read_text(), tables | asked, str(given.out)))
+    counts = f"--logs {given.logs} --count {given.count}"
+    counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"
+    tables = {name: (_list if isinstance(r, list) else _mutations)(r) for name, r in results.items() if r}
+    asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
+    update(given.out, "reliability.md", tables | asked)
     rows = [r for part in results.values() for r in (part if isinstance(part, list) else part.values())]
     return int(any(r.get("problem") or r.get("problems") for r in rows))
 

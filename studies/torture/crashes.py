@@ -11,13 +11,11 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from itertools import groupby
 from pathlib import Path
 from typing import TypeAlias
@@ -25,7 +23,7 @@ from typing import TypeAlias
 import pyarrow.parquet as pq
 
 from studies.pages import ROOT
-from studies.torture.workers import Process, Verdict, judge, measured, start
+from studies.torture.workers import Ended, Process, Verdict, judge, measured, start
 from truthsim.suite import write_suite
 
 #: A change of a file.
@@ -50,11 +48,6 @@ _OF_DRIVES = (
     "tables/parts/*",
 )
 _OF_RUN = ("run.json", "report.json", "report.html", "metrics.parquet", "tables/[!p]*.parquet")
-#: Tests of a fleet on Ray: file and part of the name.
-_RAY = {
-    "a Ray node is lost": ("tests/runs/test_fleet_runs.py", "one_of_which_goes"),
-    "a Ray cluster is lost": ("tests/workers/test_supervisor.py", "is_lost"),
-}
 
 
 def _run(logs: Path | str, output: Path, *more: str) -> Process:
@@ -128,15 +121,20 @@ def compared(calm: Path, folder: Path, codes: Iterable[int], wrong: Iterable[str
 
 
 def kills(fleet: Fleet, count: int, seed: int, folder: Path) -> Verdict:
-    """Kill runs that continue one output; if a run ends before its kill, the next one starts with an empty folder."""
+    """Kill runs that continue one output at random times, every second one while it writes.
+
+    If a run ends before its kill, the next one starts with an empty folder.
+    """
     output, codes, wrong = folder / "out", list[int](), list[str]()
     files = {p.name for p in next((fleet.calm / "logs").iterdir()).iterdir()}
-    lasts_s, writes_s = fleet.lasts_s / 2.0, fleet.lasts_s / 4.0
-    call = [str(fleet.logs), *_RUN, "--resume"]
-    for killed in kill_many(call, output, count=count, lasts_s=lasts_s, writes_s=writes_s, seed=seed):
-        codes.append(killed.exit_code or 0)
+    call, draw = [str(fleet.logs), *_RUN, "--resume"], random.Random(seed)
+    for i in range(count):
+        writing = i % 2 == 0
+        after_s = draw.uniform(0.0, fleet.lasts_s / (4.0 if writing else 2.0))
+        number = draw.choice((signal.SIGKILL, signal.SIGINT))
+        codes.append(kill_run(call, output, after_s=after_s, number=number, writing=writing).code)
         wrong += faults(output, files)
-        if killed.exit_code is None:
+        if codes[-1] == 0:
             wrong.append(compared(fleet.calm, output, ()).problem)
             shutil.rmtree(output)
     return fleet.finish(output, sorted(codes), wrong)
@@ -237,16 +235,6 @@ def cut(path: Path) -> None:
     os.truncate(path, path.stat().st_size // 2)
 
 
-def lost_on_ray(file: str, name: str, _: Path) -> Verdict:
-    """Run a test of a fleet on Ray."""
-    if find_spec("ray") is None:
-        return Verdict("skipped: Ray is not installed")
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "fleet", file, "-k", name]
-    environment = os.environ | {"PDHEF_FLEET": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    return Verdict(f"pytest {done.returncode}", done.stdout[-800:] if done.returncode else "")
-
-
 def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Callable[[Path], Verdict]]:
     """Simulate the drives, run them undisturbed, and return the cases by their planted fault."""
     folders = {"fleet": (drives, DRIVE_S), "few": (FEW, DRIVE_S), "taught": (2, TAUGHT_S), "other": (1, DRIVE_S)}
@@ -277,7 +265,6 @@ def crash_cases(work: Path, drives: int, count: int, seed: int) -> dict[str, Cal
             for what, patterns in kinds.items()
             for how, deed in harm.items()
         },
-        **{name: partial(lost_on_ray, *test) for name, test in _RAY.items()},
     }
 
 
@@ -293,18 +280,10 @@ WHOLE = ("estimates.parquet", "metrics.parquet", "recording.rrd", "report.json")
 LONGEST_END_S = 120.0
 
 
-@dataclass(frozen=True)
-class Killed:
-    """How a command ended: exit code (None if it was done before the signal), and its stderr."""
-
-    exit_code: int | None
-    said: str
-
-
 def kill_run(
     arguments: Sequence[str], output: Path, *, after_s: float, number: int = signal.SIGKILL, writing: bool = False
-) -> Killed:
-    """Start ``pdhef run ARGUMENTS -o OUTPUT`` and send it a signal; return when it has ended.
+) -> Ended:
+    """Start ``pdhef run ARGUMENTS -o OUTPUT``, send it a signal unless it has ended, and return its end.
 
     Parameters
     ----------
@@ -321,18 +300,15 @@ def kill_run(
     with start(*words, stdout=quiet, stderr=told, preexec_fn=_notice_interrupts) as process:
         while writing and process.poll() is None and _prepared(output) <= before:
             time.sleep(0.002)
-        try:
+        with suppress(subprocess.TimeoutExpired):
             process.wait(after_s)
-            done = True
-        except subprocess.TimeoutExpired:
-            done = False
-            process.send_signal(number)
+        process.send_signal(number)
         try:
             said = process.communicate(timeout=LONGEST_END_S)[1].decode()
         except subprocess.TimeoutExpired:
             process.kill()
             raise
-    return Killed(None if done else process.returncode, said)
+    return Ended(process.returncode, "", said)
 
 
 def _notice_interrupts() -> None:
@@ -349,28 +325,6 @@ def _prepared(output: Path) -> set[int]:
     return prepared
 
 
-def kill_many(
-    arguments: Sequence[str],
-    output: Path,
-    *,
-    count: int,
-    lasts_s: float,
-    writes_s: float,
-    seed: int,
-    signals: Sequence[int] = (signal.SIGKILL, signal.SIGINT),
-) -> Iterator[Killed]:
-    """Kill ``count`` runs into one folder one after the other, at times drawn from ``seed``; yield how each ended.
-
-    Every second one is killed within ``writes_s`` of its beginning to write, the others within ``lasts_s`` of their
-    start.
-    """
-    draw = random.Random(seed)
-    for i in range(count):
-        writing = i % 2 == 0
-        after_s = draw.uniform(0.0, writes_s if writing else lasts_s)
-        yield kill_run(arguments, output, after_s=after_s, number=draw.choice(signals), writing=writing)
-
-
 def faults(output: Path, files: Collection[str] = WHOLE) -> list[str]:
     """Return the problems of incomplete files under final names, and of drives without all ``files``."""
     problems = []
@@ -380,7 +334,7 @@ def faults(output: Path, files: Collection[str] = WHOLE) -> list[str]:
                 json.loads(path.read_text(encoding="utf-8"))
             elif path.suffix == ".parquet":
                 pq.ParquetFile(path).read()
-            elif any(end not in path.read_bytes()[-64:] for suffix, end in ENDS.items() if suffix == path.suffix):
+            elif ENDS.get(path.suffix, b"") not in path.read_bytes()[-64:]:
                 problems.append(f"{path.name}: cut")
         except (OSError, ValueError) as error:
             problems.append(f"{path.name}: {error}")

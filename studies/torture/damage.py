@@ -18,7 +18,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -59,16 +59,6 @@ SCHEMAS = (
     b"\x0a\xff\xff\xff\xff\x0f",
     b"\x0a\x02\x0a\x00",
 )
-
-
-def mutant(name: str, content: bytes, seed: int, number: int) -> tuple[str, bytes]:
-    """Return the kind of the damage and the damaged file, the same for the same numbers."""
-    rng = random.Random(f"{seed} {name} {number}")
-    if rng.random() < 0.35:
-        return "bytes", damage_bytes(content, rng)
-    apart = {".mcap": damage_mcap, ".bag": damage_bag, ".db3": damage_database}[PurePath(name).suffix]
-    changed = apart(content, rng)
-    return ("records", changed) if rng.random() < 0.8 else ("records and bytes", damage_bytes(changed, rng))
 
 
 # ------------------------------------------------------------------------------------------------ bytes
@@ -622,12 +612,15 @@ _DAMAGE: dict[str, Callable[..., bytes]] = {
 }  # fmt: skip
 
 
-def table_mutant(name: str, seeds: Sequence[bytes], seed: int, number: int, canary: Path) -> bytes:
-    """Return the damaged file of a format, the same for the same numbers."""
+def mutant(name: str, seeds: Sequence[bytes], seed: int, number: int, canary: Path) -> tuple[str, bytes]:
+    """Return the kind of the damage and the damaged file of a format, the same for the same numbers.
+
+    ``canary``: a file, and with ``.h5`` an HDF5 file, that damaged files refer to.
+    """
     rng = random.Random(f"{seed} {name} {number}")
     content = seeds[number % len(seeds)]
     if rng.random() < 0.2:
-        return damage_bytes(content, rng)
+        return "bytes", damage_bytes(content, rng)
     damage = partial(damage_hdf5, canary=canary) if name == "mat73" else _DAMAGE.get(name, damage_text)
     changed = damage(content, rng)
-    return damage_bytes(changed, rng) if rng.random() < 0.1 else changed
+    return "structure", damage_bytes(changed, rng) if rng.random() < 0.1 else changed

@@ -1,12 +1,13 @@
-"""Small sound files of every container, encoding and format, to be damaged: seconds of one simulated drive each."""
+"""Small intact files of every container, encoding and format, to be damaged: seconds of one drive each.
+
+They are written by :mod:`studies.strangers.containers`.
+"""
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,160 +15,94 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from pdhef_logtool.logs.definitions import message_definition
-from studies import mcap_logs
-from studies.strangers.containers import Topic, write
+from studies.mcap_logs import Message, messages, write_log
+from studies.strangers.cars import Series
+from studies.strangers.containers import Topic, copied, write
+from studies.strangers.recordings import imu, message, steering, velocity
 
 START_NS = 1_767_225_600_000_000_000
-_RATE_HZ = 50
-_SECONDS = 1.2
-#: Types that carry their definition; the sequence and the text make messages of unequal sizes.
-_OWN = {
-    "ackermann_msgs/msg/AckermannDrive": "float32 steering_angle\nfloat64[4] wheels\nuint8[] spare\nstring note\n",
-    "autoware_vehicle_msgs/msg/VelocityReport": "std_msgs/Header header\nfloat32 longitudinal_velocity\n",
-}
+_STAMPS = START_NS + np.arange(150) * 20_000_000
+_RATE = 0.3 * np.sin(np.arange(150) * 0.06)
+_SPEED = 15.0 + np.arange(150) * 0.02
+#: Topics of tables and CAN logs.
+TOPICS = (
+    Topic("/imu", "bus", _STAMPS, _STAMPS, {"accel_y [m/s^2]": _SPEED * _RATE, "yaw_rate [rad/s]": _RATE}),
+    Topic("/car", "bus", _STAMPS, _STAMPS, {"speed [m/s]": _SPEED, "steering_angle [rad]": 0.2 * _RATE}),
+)
+#: Stamps, yaw rate and speed of the recordings.
+_FEW_NS, _R, _V = _STAMPS[:60], _RATE[:60], _SPEED[:60]
+_CHUNK_BYTES = 12_000
 
 
-_SCHEMA = Path(__file__).with_name("state.schema.json").read_bytes().strip()
+def _ros_topics() -> tuple[Topic, ...]:
+    """Return a car that turns: IMU, odometry as ground truth, steering and speed with types of their own."""
+
+    def series(values: Any) -> Series:
+        return Series(_FEW_NS, _FEW_NS, values)
+
+    zero = 0.0 * _V
+    force, rate = np.stack([zero + 0.1, _V * _R, zero + 9.81], axis=1), np.stack([zero, zero, _R], axis=1)
+    motion = {"twist.twist.linear.x": _V, "twist.twist.linear.y": zero + 0.1, "twist.twist.angular.z": _R}
+    motion |= {"pose.pose.position.x": np.cumsum(_V) * 0.02}
+    frames: dict[str, str | float | Sequence[float]]
+    frames = {"header.frame_id": "base", "child_frame_id": "base", "pose.pose.orientation.w": 1.0}
+    return (
+        imu(series(force), series(rate), frame="base"),
+        message("/rtk/odometry", "nav_msgs/msg/Odometry", series(_V), motion, constants=frames),
+        steering(series(0.2 * _R), "/vehicle/steering"),
+        velocity(series(_V), "/vehicle/speed"),
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message: topic, ROS 2 type, time, payload as CDR and as plain values."""
-
-    topic: str
-    type_name: str
-    time_ns: int
-    cdr: bytes
-    values: dict[str, Any]
+def _texts() -> Iterator[Message]:
+    """Yield messages of unequal sizes: texts of 0 to 4 characters."""
+    for i, stamp in enumerate(_FEW_NS.tolist()):
+        text = b"a" * (i % 5) + b"\0"
+        data = b"\0\1\0\0" + len(text).to_bytes(4, "little") + text
+        yield Message(stamp, stamp, "/note", data, "cdr", ("std_msgs/msg/String", "ros2msg", b"string data\n"))
 
 
-def messages() -> Iterator[Message]:
-    """Yield a car that turns: IMU, odometry as ground truth, and an unknown type."""
-    store = _store("LATEST")
-    # Zeros, and texts of length 1: of frame_id, and of child_frame_id behind it.
-    texts = b"\0\1\0\0" + bytes(8) + b"\1" + bytes(7)
-    imu = store.deserialize_cdr(texts.ljust(316, b"\0"), "sensor_msgs/msg/Imu")
-    odometry = store.deserialize_cdr((texts + b"\1").ljust(708, b"\0"), "nav_msgs/msg/Odometry")
-    imu.orientation.w = odometry.pose.pose.orientation.w = 1.0
-    odometry.child_frame_id, odometry.header = "base", imu.header
-    imu.header.frame_id = "base"
-    steering_type, speed_type = _OWN
-    for i in range(int(_RATE_HZ * _SECONDS)):
-        stamp_ns, t = START_NS + i * 1_000_000_000 // _RATE_HZ, i / _RATE_HZ
-        seconds, nanoseconds = divmod(stamp_ns, 10**9)
-        rate, speed = 0.3 * np.sin(3.0 * t), 15.0
-        imu.header.stamp.sec, imu.header.stamp.nanosec = seconds, nanoseconds
-        acceleration, twist = imu.linear_acceleration, odometry.twist.twist
-        acceleration.x, acceleration.y, acceleration.z = 0.1, speed * rate, 9.81
-        twist.linear.x, twist.linear.y = speed, 0.1
-        imu.angular_velocity.z = twist.angular.z = rate
-        odometry.pose.pose.position.x = speed * t
-        spare = np.arange(i % 5, dtype=np.uint8)
-        angle = store.types[steering_type](0.02 * np.sin(3.0 * t), np.full(4, speed), spare, "ok")
-        stamp = {"sec": seconds, "nsec": nanoseconds}
-        plain = {"stamp": stamp, "speed": speed, "rate": rate, "wheels": [speed] * 4}
-        for topic, name, message in (
-            ("/imu/data", "sensor_msgs/msg/Imu", imu),
-            ("/rtk/odometry", "nav_msgs/msg/Odometry", odometry),
-            ("/vehicle/steering", steering_type, angle),
-            ("/vehicle/speed", speed_type, store.types[speed_type](imu.header, speed)),
-        ):
-            yield Message(topic, name, stamp_ns, bytes(store.serialize_cdr(message, name)), plain)
-
-
-def _store(release: str) -> Any:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores[release])
-    for name, text in _OWN.items():
-        store.register(get_types_from_msg(text, name))
-    return store
-
-
-def _definition(name: str) -> bytes:
-    if name not in _OWN:
-        return message_definition(name).encode()
-    text: str = _store("LATEST").generate_msgdef(name, ros_version=2)[0]
-    return text.encode()
-
-
-def _mcap(encoding: str, path: Path, **options: Any) -> None:
-    def encoded() -> Iterator[mcap_logs.Message]:
-        for m in messages():
-            payload, schema = m.cdr, (m.type_name, "ros2msg", _definition(m.type_name))
-            if encoding == "json":
-                payload, schema = json.dumps(m.values).encode(), ("State", "jsonschema", _SCHEMA)
-            elif encoding == "protobuf":
-                payload, schema = _protobuf(m.values), ("car.State", "protobuf", _descriptors())
-            yield mcap_logs.Message(m.time_ns, m.time_ns, m.topic, payload, encoding, schema)
+def _mcap(container: str, path: Path, **options: Any) -> None:
+    """Write a log with a metadata record and an attachment; ``options`` of ``mcap.writer.Writer``."""
 
     def notes(writer: Writer) -> None:
         writer.add_metadata("drive", {"driver": "nobody", "tyres": "summer"})
         writer.add_attachment(START_NS, START_NS, "note.txt", "text/plain", b"a note")
 
-    mcap_logs.write_log(path, encoded(), "ros2" if encoding == "cdr" else "", notes, chunk_size=12_000, **options)
-
-
-def _descriptors() -> bytes:
-    from google.protobuf import descriptor_pb2, text_format
-
-    text = Path(__file__).with_name("state.txtpb").read_text(encoding="utf-8")
-    return bytes(text_format.Parse(text, descriptor_pb2.FileDescriptorSet()).SerializeToString())
-
-
-def _protobuf(values: dict[str, Any]) -> bytes:
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-
-    pool = descriptor_pool.DescriptorPool()
-    for file in descriptor_pb2.FileDescriptorSet.FromString(_descriptors()).file:
-        pool.Add(file)
-    message = message_factory.GetMessageClass(pool.FindMessageTypeByName("car.State"))()
-    message.speed, message.rate = values["speed"], values["rate"]
-    for wheel in values["wheels"]:
-        message.wheels.add(speed=wheel)
-    return bytes(message.SerializeToString())
-
-
-def _copied(writer: Any, store: Any, *, ros1: bool) -> None:
-    """Write all messages with a writer of rosbags."""
-    newest, connections = _store("LATEST"), dict[str, Any]()
-    with writer:
-        for m in messages():
-            if m.topic not in connections:
-                connections[m.topic] = writer.add_connection(m.topic, m.type_name, typestore=store)
-            data = newest.cdr_to_ros1(m.cdr, m.type_name) if ros1 else m.cdr
-            writer.write(connections[m.topic], m.time_ns, data)
+    topics, texts = _ros_topics(), list(_texts())
+    if container != "mcap":
+        state = {"stamp.sec": _FEW_NS / 1e9, "speed": _V, "rate": _R, "wheels": np.stack([_V] * 4, axis=1)}
+        topics, texts = (Topic("/vehicle/state", "car.State", _FEW_NS, _FEW_NS, state),), []
+    with tempfile.TemporaryDirectory() as folder:
+        written = sorted([*messages(write(topics, Path(folder) / "log", container)), *texts], key=lambda m: m[0])
+    write_log(path, written, "ros2" if texts else "", notes, chunk_size=_CHUNK_BYTES, **options)
 
 
 def _bag(compression: str, path: Path) -> None:
     from rosbags.rosbag1 import Writer
 
     writer = Writer(path)
-    writer.chunk_threshold = 12_000
+    writer.chunk_threshold = _CHUNK_BYTES
     if compression:
         writer.set_compression(writer.CompressionFormat[compression])
-    _copied(writer, _store("ROS1_NOETIC"), ros1=True)
+    copied(_ros_topics(), path, writer, ros1=True)
 
 
 def _database(path: Path) -> None:
-    from rosbags.rosbag2 import StoragePlugin, Writer
-
     with tempfile.TemporaryDirectory() as folder:
-        writer = Writer(Path(folder) / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3)
-        _copied(writer, _store("LATEST"), ros1=False)
-        shutil.copyfile(Path(folder) / "bag" / "bag.db3", path)
+        (database,) = write(_ros_topics(), Path(folder) / "bag", "rosbag2").glob("*.db3")
+        shutil.copyfile(database, path)
 
 
 #: Writer of each seed, by file name.
 SEEDS: dict[str, Callable[[Path], None]] = {
-    "zstd.mcap": partial(_mcap, "cdr"),
-    "lz4.mcap": partial(_mcap, "cdr", compression=CompressionType.LZ4),
-    "plain.mcap": partial(_mcap, "cdr", compression=CompressionType.NONE),
-    "unchunked.mcap": partial(_mcap, "cdr", compression=CompressionType.NONE, use_chunking=False),
-    "noindex.mcap": partial(_mcap, "cdr", index_types=IndexType.NONE),
-    "json.mcap": partial(_mcap, "json"),
-    "protobuf.mcap": partial(_mcap, "protobuf"),
+    "zstd.mcap": partial(_mcap, "mcap"),
+    "lz4.mcap": partial(_mcap, "mcap", compression=CompressionType.LZ4),
+    "plain.mcap": partial(_mcap, "mcap", compression=CompressionType.NONE),
+    "unchunked.mcap": partial(_mcap, "mcap", compression=CompressionType.NONE, use_chunking=False),
+    "noindex.mcap": partial(_mcap, "mcap", index_types=IndexType.NONE),
+    "json.mcap": partial(_mcap, "mcap-json"),
+    "protobuf.mcap": partial(_mcap, "mcap-protobuf"),
     "plain.bag": partial(_bag, ""),
     "bz2.bag": partial(_bag, "BZ2"),
     "lz4.bag": partial(_bag, "LZ4"),
@@ -184,15 +119,6 @@ def write_seeds(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in SEEDS}
 
 
-# ------------------------------------------------------------------------------------------------ tables
-
-_STAMPS = START_NS + np.arange(150) * 20_000_000
-_RATE = 0.3 * np.sin(np.arange(150) * 0.06)
-_SPEED = 15.0 + np.arange(150) * 0.02
-TOPICS = (
-    Topic("/imu", "bus", _STAMPS, _STAMPS, {"accel_y [m/s^2]": _SPEED * _RATE, "yaw_rate [rad/s]": _RATE}),
-    Topic("/car", "bus", _STAMPS, _STAMPS, {"speed [m/s]": _SPEED, "steering_angle [rad]": 0.2 * _RATE}),
-)
 RECORDINGS = ("mcap", "bag", "db3")
 #: Suffix and layouts of each format; a number after a version of MDF is its compression.
 FORMATS: dict[str, tuple[str, tuple[str, ...]]] = {

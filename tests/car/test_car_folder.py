@@ -15,15 +15,7 @@ from made_models import random_network
 from pdhef_logtool.car import store
 from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, SHIPPED_CARS, VEHICLE_FILE, Car
 from pdhef_logtool.car.names import MODEL_FILE
-from pdhef_logtool.car.parts import (
-    FilterNoise,
-    Fit,
-    FittedPhysics,
-    LearntOn,
-    Record,
-    car_folder,
-    physics_sha256,
-)
+from pdhef_logtool.car.parts import FilterNoise, Fit, FittedPhysics, LearntOn, Record, car_folder, physics_sha256
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
@@ -350,10 +342,7 @@ def _gain(car: Car, name: str = "pd-hef") -> tuple[float, str]:
 def test_a_network_acts_on_the_physics_that_it_was_trained_with():
     own, foreign = replace(SEDAN, network=OWN), replace(SEDAN, network=FOREIGN)
     assert _gain(own) == (1.0, "residual gain 1: within its region of validity")
-    assert _gain(foreign) == (
-        0.0,
-        "residual gain 0: the network was not trained with the physics of this car",
-    )
+    assert _gain(foreign) == (0.0, "residual gain 0: the network was not trained with the physics of this car")
     assert (own.has_evidence, foreign.has_evidence, SEDAN.has_evidence) == (True, False, False)
     assert "no network" in _gain(SEDAN)[1]
     assert _gain(own.with_noise("physics", FilterNoise(q_std=(1.0, 1.0, 1.0))))[0] == 1.0

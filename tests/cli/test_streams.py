@@ -1,5 +1,6 @@
 """Processes: what a command imports, readers that go, terminals that are full, closed streams and requests to end."""
 
+import json
 import os
 import signal
 import subprocess
@@ -100,7 +101,7 @@ ROOT = Path(__file__).parents[2]
 _CODE = """
 import sys
 def loaded(*heavy):
-    print("loaded:", *(name for name in heavy if name in sys.modules))
+    print("ended:", *(name for name in heavy if name in sys.modules))
 import pdhef_logtool
 loaded("numpy", "pydantic")
 import pdhef_logtool.cli.inspecting, pdhef_logtool.runs.config, pdhef_logtool.runs.inspection, truthsim.manoeuvres
@@ -115,75 +116,46 @@ loaded("torch", "rerun", "scipy.linalg", "scipy.special", "scipy.ndimage", "matp
 """
 
 
-@pytest.mark.slow
-def test_the_package_an_inspection_and_a_light_run_load_no_large_library_that_they_do_not_need(tmp_path):
-    words = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "-o", str(tmp_path / "out"), "--end", "2")
+def ended_of(script: str, *arguments: str) -> list[str]:
+    """Run a script in a separate process; return its lines that begin with ``ended:``, without that."""
     done = subprocess.run(
-        [sys.executable, "-c", _CODE, *words, "--keep", "metrics", "--no-report"],
+        [sys.executable, "-c", script, *arguments],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=True,
     )
-    assert [line.strip() for line in done.stdout.splitlines() if line.startswith("loaded:")] == ["loaded:"] * 3
+    return [line.removeprefix("ended:").strip() for line in done.stdout.splitlines() if line.startswith("ended:")]
 
 
-#: Read by every Python process that starts, workers too: as if PyTorch were not installed.
-_BLOCKED = """
-import sys
-from importlib.machinery import PathFinder
+@pytest.mark.slow
+def test_the_package_an_inspection_and_a_light_run_load_no_large_library_that_they_do_not_need(tmp_path):
+    words = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "-o", str(tmp_path / "out"), "--end", "2")
+    assert ended_of(_CODE, *words, "--keep", "metrics", "--no-report") == [""] * 3
 
-class WithoutTorch(PathFinder):
-    @classmethod
-    def find_spec(cls, name, path=None, target=None):
-        return None if name.partition(".")[0] == "torch" else super().find_spec(name, path, target)
 
-sys.meta_path[sys.meta_path.index(PathFinder)] = WithoutTorch
-"""
 _COMMANDS = """
-import contextlib, io, sys
-from pdhef_logtool.cli.app import main
-for line in sys.stdin.read().splitlines():
-    sys.argv, said = ["pdhef", *line.split("|")], io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            main()
-        code = 0
-    except SystemExit as ended:
-        code = ended.code or 0
-    print("ended:", line.split("|")[0], code, " ".join(said.getvalue().split()), flush=True)
+import json, sys
+sys.modules["torch"] = None  # as if it were not installed
+from tests.command_line import called
+for words in json.loads(sys.argv[1]):
+    done = called(*words)
+    print("ended:", words[0], done.returncode, *done.stderr.split())
 """
-
-
-def ended_without_torch(folder: Path, *commands: tuple[object, ...]) -> list[str]:
-    """Run commands in a separate process; return their names, exit codes and lines on stderr."""
-    (folder / "sitecustomize.py").write_text(_BLOCKED)
-    done = subprocess.run(
-        [sys.executable, "-c", _COMMANDS],
-        input="\n".join("|".join(map(str, words)) for words in commands),
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return [line.removeprefix("ended: ") for line in done.stdout.splitlines() if line.startswith("ended: ")]
 
 
 @pytest.mark.slow
 def test_what_trains_no_network_works_without_it_and_what_trains_one_ends_with_one_line(tmp_path):
-    drive = ("sample_logs/dlc.mcap", "--car", "saloon", "--set", "end=3")
-    trained = ("train", tmp_path, "-o", tmp_path / "network")
-    ran, extracted, *refused = ended_without_torch(
-        tmp_path,
-        ("run", *drive, "-e", "pd-hef,physics", "--annotate", "none", "-o", tmp_path / "out"),
-        ("extract", *drive, "-o", tmp_path / "residuals"),
-        trained,
+    out, drive = str(tmp_path), ("sample_logs/dlc.mcap", "--car", "saloon", "--set", "end=3")
+    commands = (
+        ("run", *drive, "-e", "pd-hef,physics", "--annotate", "none", "-o", f"{out}/out"),
+        ("extract", *drive, "-o", f"{out}/residuals"),
+        ("train", out, "-o", f"{out}/network"),
     )
+    ran, extracted, refused = ended_of(_COMMANDS, json.dumps(commands))
     assert ran.startswith("run 0") and extracted.startswith("extract 0")
     assert (tmp_path / "out/logs/dlc/report.html").is_file()
-    remedy = "got an installation without it; pip install 'pdhef-logtool[train]'"
-    for line in refused:
-        assert line.startswith("train 2 ") and remedy in line, line
+    assert refused.startswith("train 2 ")
+    assert "got an installation without it; pip install 'pdhef-logtool[train]'" in refused
     assert not (tmp_path / "network").exists()

@@ -390,11 +390,6 @@ def test_no_number_warns(name):
     """Values of any magnitude and runs of NaN cause no warning; readers drop infinite values."""
     channels = drive(5)
     values, i = channels[name].values, np.arange(len(channels[name]))
-    for wrong in (
-        1e200 * values,
-        1e-200 * values,
-        np.where(i // 200 % 2 == 0, np.nan, values),
-        np.nan * values,
-    ):
+    for wrong in (1e200 * values, 1e-200 * values, np.where(i // 200 % 2 == 0, np.nan, values), np.nan * values):
         checks = checks_of({**channels, name: replace(channels[name], values=wrong)})
         assert not any("nan" in c.remedy or "inf" in c.remedy for c in checks)

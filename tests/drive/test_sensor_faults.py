@@ -122,9 +122,7 @@ def road(seed: int, *, degrees: float = 4.0, factor: float = 1.0) -> Signals:
     noise = rng.standard_t(degrees, (2, len(s))) / math.sqrt(degrees / (degrees - 2.0))
     s.friction[:] = 0.85
     return replace(
-        s,
-        ay_m_s2=s.ay_m_s2 + level * S0[0] * noise[0],
-        yaw_rate_rad_s=s.yaw_rate_rad_s + level * S0[1] * noise[1],
+        s, ay_m_s2=s.ay_m_s2 + level * S0[0] * noise[0], yaw_rate_rad_s=s.yaw_rate_rad_s + level * S0[1] * noise[1]
     )
 
 

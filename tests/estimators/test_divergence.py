@@ -141,8 +141,8 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(sample_
     )
     write_drive(drive, sweep := tmp_path / "sweep.mcap")
     names = ("phy-ukf", "physics", "zero")
-    config = RunConfig(car=sample_logs_dir / "vehicle_mu03.toml", estimators=names, annotate="none")
-    result = run_logs([str(sweep)], tmp_path, config)
+    config = RunConfig(car=sample_logs_dir / "vehicle_mu03.toml", estimators=names, keep="estimates")
+    result = run_logs([str(sweep)], tmp_path, config, report=False)
     folder = tmp_path / "logs" / "sweep"
     table = pl.read_parquet(folder / "estimates.parquet")
     true = table.filter(pl.col("estimator") == "truth").select("stamp_ns", true="sideslip_rad")

@@ -1,6 +1,9 @@
 """GNSS velocity in ``physics``: benefit on a simulated car, causality, and samples that the filter must ignore."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -8,41 +11,65 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.gnss_aided import GnssAided
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.table import make_estimator, runnable
-from pdhef_logtool.records.signals import GNSS_COMPONENTS
+from pdhef_logtool.records.signals import GNSS_COMPONENTS, Signals
 from studies import reference as study
-from tests.estimators.made_gnss_drive import gnss_drive
 from truthsim.batch import DriveSpec
+from truthsim.drive import write_drive
 
 AVAILABLE = frozenset({"steer_rad", "speed_m_s", "ay_m_s2", "yaw_rate_rad_s"})
 
 
+CAR = study.ROOT / "sample_logs" / "vehicle.toml"
+#: A receiver's velocity arrives so late.
+LATE_S = 0.06
+DRIVES = {
+    "fishhook": study.SIMULATED["fishhook, 70 km/h"],
+    "low grip": DriveSpec("fishhook", 55.0, 0.5, 13, 14.0),
+    "road": replace(study.SIMULATED["road, 20 s"], duration_s=45.0),
+}
+
+
+@dataclass(frozen=True)
+class GnssDrive:
+    """Signals without and with GNSS velocity, and the true velocity [N] at their stamps."""
+
+    signals: Signals
+    aided: Signals
+    vx_m_s: np.ndarray
+    vy_m_s: np.ndarray
+
+
+@cache
+def gnss_drive(name: str) -> GnssDrive:
+    """Simulate a drive, read its log with the vehicle file of the car, and add the velocity of a receiver."""
+    drive = DRIVES[name].simulate()
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / "drive.mcap"
+        write_drive(drive, log)
+        with read_drive(log, Car.load(CAR), None, ReadOptions(waived=study.SPIN_CHECKS)) as opened:
+            signals = opened.whole().signals
+    t = (signals.stamps_ns - drive.start_ns) * 1e-9
+    names = ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
+    motion = study.Motion(signals.stamps_ns, *(np.interp(t, drive.times_s, drive.truth[name]) for name in names))
+    stamps_ns, made = study.made_gnss(motion, study.RECEIVERS[study.MADE])
+    velocity = np.full((len(t), 2), np.nan)
+    velocity[np.minimum(np.searchsorted(signals.stamps_ns, stamps_ns), len(t) - 1)] = made
+    late_s = np.where(np.isfinite(velocity[:, 0]), LATE_S, np.nan)
+    aided = replace(signals, gnss_velocity_m_s=velocity, gnss_late_s=late_s)
+    return GnssDrive(signals, aided, motion.vx_m_s, motion.vy_m_s)
+
+
 @pytest.fixture(scope="module")
 def bare():
-    return Car(Car.load(study.ROOT / "sample_logs" / "vehicle.toml").vehicle)
-
-
-@pytest.fixture(scope="module")
-def fishhook():
-    drive = gnss_drive(study.SIMULATED["fishhook, 70 km/h"])
-    return drive, drive.aided
-
-
-@pytest.fixture(scope="module")
-def low_grip():
-    drive = gnss_drive(DriveSpec("fishhook", 55.0, 0.5, 13, 14.0))
-    return drive, drive.aided
-
-
-@pytest.fixture(scope="module")
-def road():
-    drive = gnss_drive(replace(study.SIMULATED["road, 20 s"], duration_s=45.0))
-    return drive, drive.aided
+    return Car(Car.load(CAR).vehicle)
 
 
 def _aided(car):
@@ -60,11 +87,11 @@ def _error_deg(drive, track):
     )
 
 
-def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(low_grip, bare):
-    drive, signals = low_grip
+def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(bare):
+    drive = gnss_drive("low grip")
     causality = CausalityCheck()
-    plain, _ = _error_deg(drive, run_estimator(make_estimator("physics", bare), signals))
-    aided, coverage = _error_deg(drive, run_estimator(_aided(bare), signals, causality=causality))
+    plain, _ = _error_deg(drive, run_estimator(make_estimator("physics", bare), drive.aided))
+    aided, coverage = _error_deg(drive, run_estimator(_aided(bare), drive.aided, causality=causality))
     assert not causality.failed
     assert plain > 0.8
     assert aided < 0.6 * plain
@@ -73,8 +100,8 @@ def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(low_grip, bar
 
 @settings(max_examples=8, deadline=None)
 @given(share=st.floats(0.1, 0.8), late_s=st.floats(0.0, 0.4))
-def test_a_sample_acts_when_it_arrives_and_not_before(low_grip, bare, share, late_s):
-    _, signals = low_grip
+def test_a_sample_acts_when_it_arrives_and_not_before(bare, share, late_s):
+    signals = gnss_drive("low grip").aided
     signals = replace(signals, gnss_late_s=np.full(len(signals), late_s))
     estimator = _aided(bare)
     one, _ = estimator.run(signals, None)
@@ -89,18 +116,19 @@ def test_a_sample_acts_when_it_arrives_and_not_before(low_grip, bare, share, lat
     assert signals.ready_ns[differs[0]] - signals.stamps_ns[k] < round((late_s + 0.3) * 1e9)
 
 
-def test_without_a_sample_the_estimate_is_that_of_the_filter_bit_for_bit(fishhook, bare):
-    drive, _ = fishhook
-    plain = run_estimator(make_estimator("physics", bare), drive.signals)
-    aided = run_estimator(_aided(bare), drive.signals)
+def test_without_a_sample_the_estimate_is_that_of_the_filter_bit_for_bit(bare):
+    signals = gnss_drive("fishhook").signals
+    plain = run_estimator(make_estimator("physics", bare), signals)
+    aided = run_estimator(_aided(bare), signals)
     np.testing.assert_array_equal(aided.vy_m_s, plain.vy_m_s)
     np.testing.assert_array_equal(aided.covariance, plain.covariance)
 
 
 @pytest.mark.parametrize("fault", ["multipath", "swapped", "outage", "wild", "slow clock", "lag", "noise"])
 @pytest.mark.parametrize("driven", ["road", "fishhook"])
-def test_wrong_gnss_costs_nothing(request, bare, driven, fault):
-    drive, signals = request.getfixturevalue(driven)
+def test_wrong_gnss_costs_nothing(bare, driven, fault):
+    drive = gnss_drive(driven)
+    signals = drive.aided
     velocity = signals.gnss_velocity_m_s.copy()
     t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
     if fault == "multipath":

@@ -4,16 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference_car import (
-    FRONT_M,
-    FRONT_TYRE,
-    MASS_KG,
-    REAR_M,
-    REAR_TYRE,
-    WHEELBASE_M,
-    derivative,
-    forces,
-)
+from reference_car import FRONT_M, FRONT_TYRE, MASS_KG, REAR_M, REAR_TYRE, WHEELBASE_M, derivative, forces
 
 from pdhef_logtool.car import nominal_model
 from pdhef_logtool.car.nominal_model import model_parameters

@@ -169,9 +169,7 @@ SILENT = random_network(constant=(0.0, 0.0))
 #: As a car that was identified: a single track with the cures and the noise that it was found with.
 PARTS = FLAT.physics.model_copy(update={"force_scale": True, "bank": True})
 PHYSICS = VehicleUkf(
-    FLAT.model_copy(update={"physics": PARTS}),
-    q_std=(0.089, 0.06, 0.03, 0.021, 0.4, 0.4),
-    r_std=(0.3, 0.003, 0.08),
+    FLAT.model_copy(update={"physics": PARTS}), q_std=(0.089, 0.06, 0.03, 0.021, 0.4, 0.4), r_std=(0.3, 0.003, 0.08)
 )
 #: The same filter without the additional physics of ``PARTS``.
 PLAIN = replace(PHYSICS, vehicle=FLAT)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from half_slip_package import example_code, install
 from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
@@ -29,6 +28,23 @@ from pdhef_logtool.residual_model.interface import ENTRY_POINTS, plug_in_names
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.command_line import called
+
+
+def example_code() -> str:
+    """Return the estimator as the docstring shows it."""
+    return dedent((table.__doc__ or "").partition("Example::\n")[2])
+
+
+def install(
+    folder: Path, code: str, name: str = "half_slip", group: str = "pdhef.estimators", of: str = "SPEC"
+) -> Path:
+    """Write a distribution with one module and an entry point to its ``of``; return the folder for ``sys.path``."""
+    (folder / f"{name}.py").write_text(code, encoding="utf-8")
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", encoding="utf-8")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {name}:{of}\n", encoding="utf-8")
+    return folder
 
 
 @dataclass(frozen=True)

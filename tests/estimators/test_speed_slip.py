@@ -131,9 +131,7 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimato
     silent = good.time_s > 9.0
     signals = without_impossible(good.signals)
     signals = replace(
-        signals,
-        speed_m_s=np.where(silent, np.nan, signals.speed_m_s),
-        ax_m_s2=np.where(silent, -4.0, signals.ax_m_s2),
+        signals, speed_m_s=np.where(silent, np.nan, signals.speed_m_s), ax_m_s2=np.where(silent, -4.0, signals.ax_m_s2)
     )
     steps, _ = estimator.run(signals, None)
     back = steps.x[:, 0] < 0.0

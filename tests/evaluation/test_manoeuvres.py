@@ -1,5 +1,6 @@
 """Manoeuvres: every one of the simulator is found, on both sides, at any rate and time; ordinary roads have few."""
 
+from contextlib import closing
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -181,39 +182,21 @@ def test_roads_have_few_manoeuvres():
 
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
-DRIVES = {
-    "comma2k19_segment.mcap": ("comma2k19", "comma2k19_rav4"),
-    "lunda_v40": ("lunda_v40", "lunda_v40"),
-    "v40_slalom.mcap": ("../../../studies/peers/v40_gnss", "lunda_v40"),
-}
-
-
-@pytest.fixture(scope="module")
-def drive(shared_dir):
-    done = {}
-
-    def read(name):
-        if name not in done:
-            mapping_name, vehicle_name = DRIVES[name]
-            log = open_log(shared_dir / "data" / "drives" / name)
-            mapping = load_mapping(REFERENCE / "mappings" / f"{mapping_name}.toml")
-            clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-            channels = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
-            log.close()
-            done[name] = channels, read_vehicle_file(REFERENCE / "vehicles" / f"{vehicle_name}.toml").vehicle
-        return done[name]
-
-    return read
-
-
-def aligned(channels, vehicle):
-    return align(channels.signals, plan_alignment(channels.signals, vehicle))[0]
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"),
-    [("lunda_v40", ["sine-with-dwell"]), ("v40_slalom.mcap", ["slalom"]), ("comma2k19_segment.mcap", [])],
+    ("name", "mapping_name", "car", "expected"),
+    [
+        ("lunda_v40", "lunda_v40", "lunda_v40", ["sine-with-dwell"]),
+        ("v40_slalom.mcap", "../../../studies/peers/v40_gnss", "lunda_v40", ["slalom"]),
+        ("comma2k19_segment.mcap", "comma2k19", "comma2k19_rav4", []),
+    ],
 )
-def test_recorded_manoeuvres_are_recognised(drive, name, expected):
-    channels, vehicle = drive(name)
-    assert [m.name for m in find_manoeuvres(aligned(channels, vehicle), vehicle)] == expected
+def test_recorded_manoeuvres_are_recognised(shared_dir, name, mapping_name, car, expected):
+    vehicle = read_vehicle_file(REFERENCE / "vehicles" / f"{car}.toml").vehicle
+    mapping = load_mapping(REFERENCE / "mappings" / f"{mapping_name}.toml")
+    with closing(open_log(shared_dir / "data" / "drives" / name)) as log:
+        clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+        channels = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    aligned, _ = align(channels.signals, plan_alignment(channels.signals, vehicle))
+    assert [m.name for m in find_manoeuvres(aligned, vehicle)] == expected

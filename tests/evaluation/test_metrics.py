@@ -86,16 +86,6 @@ def test_every_error_figure_is_its_formula_over_the_scored_stamps(seed, n):
     assert len([r for r in rows.values() if r.metric in ORACLES]) == seen
 
 
-def test_a_row_names_log_estimator_and_unit_and_what_is_unknown_has_none():
-    truth = track(vx_m_s=[10, 10, 10, 10], vy_m_s=[0, 0, 0, 0])
-    rows = score(track("ukf", vx_m_s=[11, 7, 10, 12], vy_m_s=[0, 0, 0, 0]), truth)
-    row = rows["vx_m_s", "all", "rmse"]
-    assert (row.log, row.estimator, row.unit, row.n, row.independent) == ("drive", "ukf", "m/s", 4, True)
-    assert ("vx_m_s", "all", "coverage95") not in rows  # no covariance
-    assert ("position_m", "all", "rmse") not in rows  # no pose of the ground truth
-    assert ("yaw_rate_rad_s", "all", "rmse") not in rows  # no yaw rate of the ground truth
-
-
 def test_sideslip_errors_wrap():
     truth = track(vx_m_s=[-10] * 4, vy_m_s=[0.1] * 4)
     estimate = track(vx_m_s=[-10] * 4, vy_m_s=[-0.1] * 4)

@@ -10,17 +10,17 @@ import polars as pl
 import pytest
 from mcap.reader import make_reader
 
-from pdhef_logtool.cli.compare_tables import render_comparison
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.evaluation import metrics
 from pdhef_logtool.evaluation.metrics import metric as registry
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.reports.comparison import comparison_page
+from pdhef_logtool.results import comparing
 from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from tests.command_line import rendered
+from tests.command_line import printed, rendered
 
 NAME, LABEL = "interval_width", "interval width"
 
@@ -88,7 +88,7 @@ def test_plans_and_compare_accept_it(toy, result):
     (compared,) = found.figures
     assert (compared.verdict, compared.unit, compared.requirement.name) == ("equal", "rad", f"sideslip {LABEL}")
     changed = replace(found, changed=1, figures=(replace(compared, verdict="worse"),))
-    assert f"sideslip {LABEL}" in rendered(render_comparison, changed, 120)
+    assert f"sideslip {LABEL}" in printed("comparison", changed, 120, comparing=comparing)
     assert LABEL.encode() in comparison_page(changed)
 
 

@@ -73,15 +73,6 @@ def test_staged_manoeuvres_are_found_where_they_are(noise):
         np.testing.assert_allclose(found, expected, atol=0.35, err_msg=name)
 
 
-def test_mirror():
-    t, speed, ax, ay = staged()
-    a = segment_masks(signals(t, speed, ax, ay), None, VEHICLE)
-    b = segment_masks(signals(t, speed, ax, -ay), None, VEHICLE)
-    swap = {"cornering-left": "cornering-right", "cornering-right": "cornering-left"}
-    for name, mask in a.items():
-        np.testing.assert_array_equal(mask, b[swap.get(name, name)], err_msg=name)
-
-
 def test_grip_use_follows_friction():
     s = signals(*staged())
     t = (s.stamps_ns - T0) * 1e-9

@@ -4,12 +4,10 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
-from fake_drive_log import FakeLog, FakeTopic
 from reference_car import Drive
 from residual_car import PULL_M_S2, weaving
 
@@ -17,7 +15,6 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
 from pdhef_logtool.logs.discovery import hash_log
@@ -28,9 +25,10 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.outputs import OutputFolder
 from tests.run_report import follows
+from tests.runs.test_inspection_report import write_log
 
 MAPPING = "".join(
-    f'[{place}]\ntopic = "/{topic}"\nfield = "{field}"\nstamp = "stamp"\n'
+    f'[{place}]\ntopic = "/{topic}"\nfield = "{field}"\nstamp = "log_time"\n'
     for topic, fields in {
         "steer": {"signals.steer_rad": "angle"},
         "imu": {"signals.ax_m_s2": "ax", "signals.ay_m_s2": "ay", "signals.yaw_rate_rad_s": "r"},
@@ -42,51 +40,31 @@ MAPPING = "".join(
 MAPPING += '[truth_quality]\ntopic = "/ins"\nfield = "fix"\nvalues = [4]\n'
 
 
-def _topic(stamps: np.ndarray, **columns: np.ndarray) -> FakeTopic:
-    return FakeTopic("vendor/msg/Any", stamps + 5_000_000, {"stamp": stamps, **columns})
-
-
-def _log(made: Drive, sigma: float = 0.0) -> FakeLog:
-    """The drive as recorded, its truth noisy, and bad for a second."""
+def _extract(folder: Path, made: Drive, sigma: float = 0.0) -> ExtractResult:
+    """Extract a drive of phy-ukf as recorded, its truth noisy, and bad for a second."""
     signals = made.signals
     stamps, s = signals.stamps_ns, np.stack([made.vx, made.vy, made.r], axis=1)
-    rng = np.random.default_rng(2)
-    noise = rng.normal(0.0, [sigma, sigma, 0.2 * sigma], s.shape)
+    noise = np.random.default_rng(2).normal(0.0, [sigma, sigma, 0.2 * sigma], s.shape)
     fix = np.full(len(stamps), 4.0)
     fix[1000:1100] = 1.0
     bad = np.where(fix == 4.0, 0.0, 3.0)
-    return FakeLog(
-        {
-            "/steer": _topic(stamps, angle=signals.steer_rad),
-            "/imu": _topic(stamps, ax=signals.ax_m_s2, ay=signals.ay_m_s2, r=s[:, 2]),
-            "/speed": _topic(stamps[::2], v=s[::2, 0]),
-            "/ins": _topic(
-                stamps,
-                vx=s[:, 0] + noise[:, 0],
-                vy=s[:, 1] + noise[:, 1] + bad,
-                r=s[:, 2] + noise[:, 2] + (0.0 if sigma else 1e-5 * np.sin(np.arange(len(stamps)))),
-                fix=fix,
-            ),
-        }
-    )
-
-
-def _extract(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: FakeLog, **settings: Any) -> ExtractResult:
-    (tmp_path / "drive.mcap").write_bytes(b"in memory")
-    (tmp_path / "m.toml").write_text(MAPPING)
-    (tmp_path / "v.toml").write_text(part_toml(default_vehicle()))
-    monkeypatch.setattr(reading, "open_log", lambda *_, **__: log)
-    monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
-    monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
-    config = RunConfig(car=tmp_path / "v.toml", mapping=tmp_path / "m.toml")
-    return extract(
-        [str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **{"model": "phy-ukf", **settings})
-    )
+    rate = s[:, 2] + noise[:, 2] + (0.0 if sigma else 1e-5 * np.sin(np.arange(len(stamps))))
+    topics = {
+        "/steer": {"angle": signals.steer_rad},
+        "/imu": {"ax": signals.ax_m_s2, "ay": signals.ay_m_s2, "r": s[:, 2]},
+        "/speed": {"v": s[::2, 0]},
+        "/ins": {"vx": s[:, 0] + noise[:, 0], "vy": s[:, 1] + noise[:, 1] + bad, "r": rate, "fix": fix},
+    }
+    log = write_log(folder / "drive.mcap", topics, dict.fromkeys(topics, stamps) | {"/speed": stamps[::2]})
+    (folder / "m.toml").write_text(MAPPING)
+    (folder / "v.toml").write_text(part_toml(default_vehicle()))
+    config = RunConfig(car=folder / "v.toml", mapping=folder / "m.toml")
+    return extract([str(log)], folder / "out", ExtractSettings(config, model="phy-ukf"))
 
 
 @pytest.mark.slow
-def test_noisy_truth_is_smoothed_and_unbiased(tmp_path, monkeypatch):
-    result = _extract(tmp_path, monkeypatch, _log(weaving(30.0), 0.01))
+def test_noisy_truth_is_smoothed_and_unbiased(tmp_path):
+    result = _extract(tmp_path, weaving(30.0), 0.01)
     (entry,) = result.manifest["drives"]
     assert entry["truth"]["smoothing_half_s"] == 0.15
     assert entry["truth"]["difference_noise"]["vy_dot_m_s2"] == pytest.approx(np.sqrt(2), rel=0.1)
@@ -100,8 +78,8 @@ def test_noisy_truth_is_smoothed_and_unbiased(tmp_path, monkeypatch):
     assert smoothed[0] < 0.12, "the noise of one-step differences is above 1"
 
 
-def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(tmp_path, monkeypatch):
-    result = _extract(tmp_path, monkeypatch, _log(weaving(4.0, speed=2.0)))
+def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(tmp_path):
+    result = _extract(tmp_path, weaving(4.0, speed=2.0))
     (one,) = result.results
     assert one.entry is not None and one.entry["rows"] == 401 and one.entry["usable_rows"] == 0
     assert "not one usable target: no ground truth above the low-speed limit" in one.record.notes

@@ -14,7 +14,6 @@ from scipy.signal import lfilter
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.learning.network.train_command import (
     CHECKPOINT,
-    PAPER_RECIPE,
     FeatureSequence,
     Recipe,
     run_training,
@@ -102,12 +101,6 @@ def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path):
             (tmp_path / CHECKPOINT).write_bytes(damaged)
             with pytest.raises(ModelError, match=r"checkpoint.*remove it to train again"):
                 train(training, validation, replace(SMALL, epochs=1), tmp_path)
-
-
-def test_paper_recipe_is_table_1():
-    r = PAPER_RECIPE
-    assert (r.batch, r.epochs, r.learning_rate, r.dropout) == (64, 200, 1e-3, 0.2)
-    assert (r.hidden, r.layers, r.head, len(r.feature_names)) == (128, 2, (64, 32), 6)
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,6 @@ from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.cli.learning import render_learning
-from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import make_estimator
@@ -32,7 +31,7 @@ from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 from tests.command_line import rendered
-from tests.fake_drive_log import FakeLog, FakeTopic
+from tests.runs.test_inspection_report import write_log
 
 SPAN = {"start": "60", "end": "130"}
 
@@ -166,40 +165,35 @@ def test_a_pool_of_logs_mends_the_file_without_ground_truth(bare, sample_logs_di
 
 
 SIGNALS = ("steer_rad", "yaw_rate_rad_s", "ax_m_s2", "ay_m_s2", "speed_m_s")
+GNSS = ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")
 MAPPING = "".join(
-    f'[signals.{name}]\ntopic = "{topic}"\nfield = "{name}"\nstamp = "stamp"\n'
-    for topic, names in (("/drive", SIGNALS), ("/gnss", ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")))
-    for name in names
+    f'[signals.{name}]\ntopic = "/{name}"\nfield = "value"\nstamp = "log_time"\n' for name in (*SIGNALS, *GNSS)
 )
 
 
 @pytest.fixture(scope="module")
-def recorded(sample_logs_dir):
+def recorded(sample_logs_dir, tmp_path_factory):
     """Return a fishhook with a GNSS velocity at 10 Hz in place of its ground truth, and the true sideslip at stamps."""
     car = Car.load(sample_logs_dir / "vehicle.toml", network="none")
-    with reading.read_drive(sample_logs_dir / "fishhook.mcap", car) as drive:
+    with read_drive(sample_logs_dir / "fishhook.mcap", car) as drive:
         whole = drive.whole()
-    signals, truth = whole.signals, whole.truth
-    stamps, heading = signals.stamps_ns, np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s)) * 0.01
+    stamps, truth = whole.signals.stamps_ns, whole.truth
+    heading = np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s)) * 0.01
     velocity = (truth.vx_m_s + 1j * truth.vy_m_s) * np.exp(1j * (heading + 0.7))
-    known = np.flatnonzero(np.isfinite(velocity))[::10]
-    noise = 0.02 * np.random.default_rng(1).standard_normal((2, len(known)))
-    gnss = {
-        "gnss_velocity_east_m_s": velocity[known].real + noise[0],
-        "gnss_velocity_north_m_s": velocity[known].imag + noise[1],
-    }
-    columns = {name: getattr(signals, name) for name in SIGNALS}
-    topics = {"/drive": (stamps, columns), "/gnss": (stamps[known], gnss)}
-    log = {name: FakeTopic("vendor/msg/Any", at + 5_000_000, {"stamp": at, **of}) for name, (at, of) in topics.items()}
-    return FakeLog(log), stamps, truth.sideslip_rad
+    received = velocity + 0.02 * (np.random.default_rng(1).standard_normal((2, len(stamps))).T @ [1.0, 1j])
+    received[np.arange(len(stamps)) % 10 != 0] = np.nan
+    columns = {name: getattr(whole.signals, name) for name in SIGNALS}
+    columns |= dict(zip(GNSS, (received.real, received.imag), strict=True))
+    known = {f"/{name}": np.isfinite(values) for name, values in columns.items()}
+    topics = {f"/{name}": {"value": values[np.isfinite(values)]} for name, values in columns.items()}
+    log = write_log(
+        tmp_path_factory.mktemp("log") / "drive.mcap", topics, {name: stamps[at] for name, at in known.items()}
+    )
+    return str(log), stamps, truth.sideslip_rad
 
 
 @pytest.fixture
-def reference_config(recorded, bare_vehicle, tmp_path, monkeypatch):
-    monkeypatch.setattr(reading, "open_log", lambda *_, **__: recorded[0])
-    monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
-    monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
-    (tmp_path / "drive.mcap").write_bytes(b"in memory")
+def reference_config(bare_vehicle, tmp_path):
     (tmp_path / "m.toml").write_text(MAPPING)
     (tmp_path / "vehicle.toml").write_text(bare_vehicle)
     return RunConfig(car=tmp_path / "vehicle.toml", mapping=tmp_path / "m.toml", reference="on")
@@ -211,13 +205,9 @@ def test_the_weight_is_one_over_the_variance_of_sideslip_and_model():
 
 
 def test_extract_takes_it_where_it_is_independent_and_says_so(reference_config, recorded, tmp_path):
-    log = [str(tmp_path / "drive.mcap")]
+    log = [recorded[0]]
     with pytest.raises(EstimatorError, match="expected ground truth"):
-        extract(
-            log,
-            tmp_path / "off",
-            ExtractSettings(RunConfig(car=reference_config.car, mapping=reference_config.mapping)),
-        )
+        extract(log, tmp_path / "off", ExtractSettings(replace(reference_config, reference="auto")))
     result = extract(log, tmp_path / "on", ExtractSettings(reference_config, split="train"))
     (entry,) = result.manifest["drives"]
     assert entry["truth"]["kind"] == ESTIMATED and result.manifest["settings"]["reference"] == "on"
@@ -232,14 +222,10 @@ def test_extract_takes_it_where_it_is_independent_and_says_so(reference_config, 
     assert np.mean(np.abs(error) < 1.96 * used["truth_std_rad"].to_numpy()) > 0.8
 
 
-def test_learn_is_taught_by_it_on_request_alone(reference_config, tmp_path, monkeypatch):
+def test_learn_is_taught_by_it_on_request_alone(reference_config, recorded, tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "LEAST_S", 3.0)
-    log = [str(tmp_path / "drive.mcap")]
-    off = learn(
-        log,
-        tmp_path / "off",
-        LearnSettings(config=RunConfig(car=reference_config.car, mapping=reference_config.mapping)),
-    )
+    log = [recorded[0]]
+    off = learn(log, tmp_path / "off", LearnSettings(config=replace(reference_config, reference="auto")))
     assert off.records[0].truth == () and read_model(off.car / MODEL_FILE).truth == ""
     result = learn(log, tmp_path / "car", LearnSettings(config=reference_config))
     assert result.records[0].truth == (ESTIMATED,) and f"taught by {ESTIMATED}" in result.text
@@ -247,9 +233,8 @@ def test_learn_is_taught_by_it_on_request_alone(reference_config, tmp_path, monk
     assert any(f"taught by {ESTIMATED}" in note for note in Car.load(tmp_path / "car").notes)
 
 
-def test_ground_truth_has_priority(reference_config, sample_logs_dir, monkeypatch):
-    monkeypatch.undo()
+def test_ground_truth_has_priority(reference_config, sample_logs_dir):
     car = Car.load(reference_config.car, network="none")
-    with reading.read_drive(sample_logs_dir / "step.mcap", car) as drive:
+    with read_drive(sample_logs_dir / "step.mcap", car) as drive:
         record, opened = learning.open_drive(drive, reference_config)
     assert opened is not None and opened.truth.name != "reference" and record.truth != (ESTIMATED,)

@@ -1,7 +1,5 @@
 """A format of logs in one file: NumPy archives with a time and columns by topic, ``imu/ax [g]``."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.logs.formats import LogFormat

@@ -1,7 +1,5 @@
 """Table reader with faults. Its input file selects the fault: ``PLANTED deed argument``."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import socket
@@ -26,7 +24,7 @@ def open_planted(file: TableFile) -> Tables:
     before = _do(deed, file, argument)
     fields = tuple(FieldInfo(name, "number", unit="m/s") for name in ("good", "segv", "bad", "better"))
 
-    def load(path: str, rows: slice) -> np.ndarray:  # type: ignore[type-arg]
+    def load(path: str, rows: slice) -> np.ndarray:
         _do(path, file, argument)
         return np.arange(5.0)[rows] + before
 

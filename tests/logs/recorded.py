@@ -1,7 +1,5 @@
 """Helpers for the reader tests: contents of logs, by this and by independent readers, and writers of small logs."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Parquet and MAT files: types, budgets, and files that ask for more than they contain or for other files."""
 
-from __future__ import annotations
-
 import io
 from decimal import Decimal
 from functools import partial
@@ -32,7 +30,7 @@ AY = np.round(np.sin(TIME_S), 4)
 read_mat = partial(parsed, open_mat)
 
 
-def test_columns_of_a_matrix_have_the_titles_and_units_beside_it() -> None:
+def test_columns_of_a_matrix_have_the_titles_and_units_beside_it():
     out = io.BytesIO()
     cells = {"names": np.array(["t", "v"], object), "units": np.array(["s", "km/h"], object)}
     savemat(out, {"data": np.stack([TIME_S, AY], axis=1), **cells})
@@ -48,7 +46,7 @@ def _parquet(columns: Any, limits: ResourceLimits = DEFAULT_LIMITS) -> Contents:
     return parsed(open_parquet, out.getvalue(), limits)
 
 
-def test_decimals_texts_and_integers_with_nulls_are_numbers_and_other_types_are_named() -> None:
+def test_decimals_texts_and_integers_with_nulls_are_numbers_and_other_types_are_named():
     imu = pa.StructArray.from_arrays([pa.array(AY), pa.array([b"x"] * N)], ["ay", "raw"])
     read = _parquet({
         "t": TIME_S,
@@ -75,7 +73,7 @@ def test_decimals_texts_and_integers_with_nulls_are_numbers_and_other_types_are_
 
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 @pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
-def test_dates_of_each_unit_and_those_outside_of_int64(unit: str, zone: str | None) -> None:
+def test_dates_of_each_unit_and_those_outside_of_int64(unit, zone):
     per_s = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
     values = [(1_714_521_600 + i) * per_s for i in range(N)]
     values[3] = 10**12 * per_s if unit != "ns" else values[3]
@@ -89,7 +87,7 @@ def test_dates_of_each_unit_and_those_outside_of_int64(unit: str, zone: str | No
     assert read.counts == [("bad-stamp", 1)] * lost
 
 
-def test_a_damaged_column_costs_its_rows_of_one_group() -> None:
+def test_a_damaged_column_costs_its_rows_of_one_group():
     out = io.BytesIO()
     pq.write_table(pa.table({"t": TIME_S, **{f"c{i}": AY + i for i in range(5)}}), out, row_group_size=50)
     data = bytearray(out.getvalue())
@@ -103,7 +101,7 @@ def test_a_damaged_column_costs_its_rows_of_one_group() -> None:
         np.testing.assert_array_equal(read.columns[f"c{i}"], np.where(is_lost, np.nan, AY + i))
 
 
-def test_rows_and_texts_above_the_limits_are_refused_before_they_are_read() -> None:
+def test_rows_and_texts_above_the_limits_are_refused_before_they_are_read():
     constant = {"t": np.zeros(1_000_000), "ay": np.zeros(1_000_000)}
     with pytest.raises(LogError, match="table bytes"):
         _parquet(constant, DEFAULT_LIMITS.times(0.01))
@@ -128,7 +126,7 @@ NUMBERS = ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?"]
 
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(NUMBERS), st.integers(2, 60), st.integers(1, 16), st.booleans(), st.integers(0, 2**32 - 1))
-def test_arrays_of_each_class_come_back(kind: str, rows: int, width: int, compressed: bool, seed: int) -> None:
+def test_arrays_of_each_class_come_back(kind, rows, width, compressed, seed):
     rows += width
     values = np.random.default_rng(seed).integers(0, 100, (rows, width)).astype(kind)
     inner = {"time": np.arange(rows) * 0.02, "x": values, "deep": {"x": values[:, 0]}}
@@ -140,14 +138,14 @@ def test_arrays_of_each_class_come_back(kind: str, rows: int, width: int, compre
 
 
 @pytest.mark.parametrize("rows", [9, 200])
-def test_a_matrix_of_unsigned_numbers_that_fall_has_no_times(rows: int) -> None:
+def test_a_matrix_of_unsigned_numbers_that_fall_has_no_times(rows):
     values = np.column_stack([np.arange(rows)[::-1] % 250, np.arange(rows) % 7]).astype("u1")
     read = read_mat(_mat({"d": {"time": np.arange(rows) * 0.02, "x": values}}))
     assert read.lost == ()
     np.testing.assert_array_equal(read.columns["x_0"], values[:, 0])
 
 
-def test_what_is_no_array_of_numbers_is_named() -> None:
+def test_what_is_no_array_of_numbers_is_named():
     deep: dict[str, Any] = {"x": AY}
     for _ in range(12):
         deep = {"d": deep}
@@ -166,7 +164,7 @@ def test_what_is_no_array_of_numbers_is_named() -> None:
     )
 
 
-def test_a_compressed_variable_above_the_limits_costs_itself() -> None:
+def test_a_compressed_variable_above_the_limits_costs_itself():
     data = _mat({"t": TIME_S, "ay": AY}) + _mat({"zeros": np.zeros(4_000_000)}, compressed=True)[128:]
     read = read_mat(data, DEFAULT_LIMITS.times(0.01))
     assert {*read.columns} == {"ay"}
@@ -182,7 +180,7 @@ SEED = _mat(
 @given(
     st.lists(st.tuples(st.integers(128, len(SEED) - 1), st.sampled_from([0, 1, 5, 14, 15, 127, 128, 255])), max_size=4)
 )
-def test_any_damage_of_a_mat_file_is_a_loss_or_one_line(changes: list[tuple[int, int]]) -> None:
+def test_any_damage_of_a_mat_file_is_a_loss_or_one_line(changes):
     data = bytearray(SEED)
     for place, value in changes:
         data[place] = value
@@ -194,7 +192,7 @@ def test_any_damage_of_a_mat_file_is_a_loss_or_one_line(changes: list[tuple[int,
     assert all(len(table.stamps_ns) == len(table.load(f.path, slice(None))) for table in tables for f in table.fields)
 
 
-def test_clocks_of_one_mat_file_share_a_unit_and_unlike_lengths_are_a_loss(tmp_path: Path) -> None:
+def test_clocks_of_one_mat_file_share_a_unit_and_unlike_lengths_are_a_loss(tmp_path):
     slow = {"time": np.arange(4) * 10.0, "x": AY[:4]}
     one = read_mat(_mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": slow}))
     assert [int(np.ptp(stamps)) // 10**9 for stamps in one.stamps_ns.values()] == [35, 30]
@@ -219,7 +217,7 @@ def _mat73(path: Path, fill: Any) -> Contents:
 
 
 @pytest.mark.parametrize("kind", ["external", "virtual", "soft", "external link", "filter", "unwritten", "huge chunk"])
-def test_a_dataset_that_is_not_in_the_file_is_a_loss_and_no_byte_of_others_is_read(kind: str, tmp_path: Path) -> None:
+def test_a_dataset_that_is_not_in_the_file_is_a_loss_and_no_byte_of_others_is_read(kind, tmp_path):
     (tmp_path / "secret").write_bytes(SECRET)
 
     def fill(h5py: Any, file: Any) -> None:
@@ -250,13 +248,13 @@ def test_a_dataset_that_is_not_in_the_file_is_a_loss_and_no_byte_of_others_is_re
     assert (loss.severity, loss.what.partition(":")[0]) == ("lost", "leak cannot be read")
 
 
-def test_an_array_without_bytes_costs_itself_and_not_the_others(tmp_path: Path) -> None:
+def test_an_array_without_bytes_costs_itself_and_not_the_others(tmp_path):
     read = _mat73(tmp_path / "a.mat", lambda _, file: file.create_dataset("A", (2 * 10**9,), "f8", chunks=(10**6,)))
     assert {*read.columns} == {"ay"}
     assert "table bytes" in read.lost[0].what
 
 
-def test_structs_texts_units_and_cells_of_version_7_3(tmp_path: Path) -> None:
+def test_structs_texts_units_and_cells_of_version_7_3(tmp_path):
     def fill(h5py: Any, file: Any) -> None:
         group = file.create_group("signal")
         group["data"], group["time"] = AY[None], TIME_S[None]

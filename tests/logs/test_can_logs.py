@@ -1,7 +1,5 @@
 """BLF and ASC logs, and signals of DBC files in them. python-can writes files and is an independent reader."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence
@@ -103,9 +101,7 @@ def messages(draw: st.DrawFn) -> list[Any]:
 
 @settings(max_examples=25, deadline=None)
 @given(written=messages(), container=st.sampled_from([200, 1000, 100_000]), level=st.sampled_from([0, 6]))
-def test_blf_is_read_as_python_can_reads_it(
-    written: list[Any], container: int, level: int, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_blf_is_read_as_python_can_reads_it(written, container, level, tmp_path_factory):
     path = tmp_path_factory.mktemp("blf") / "a.blf"
     write(path, written, max_container_size=container, compression_level=level)
     tables = read(path)
@@ -119,9 +115,7 @@ def test_blf_is_read_as_python_can_reads_it(
 @pytest.mark.parametrize("suffix", ["asc", "log"])
 @settings(max_examples=25, deadline=None)
 @given(written=messages())
-def test_text_is_read_as_python_can_wrote_it(
-    written: list[Any], suffix: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_text_is_read_as_python_can_wrote_it(written, suffix, tmp_path_factory):
     path = tmp_path_factory.mktemp(suffix) / f"a.{suffix}"
     write(path, written)
     tables = read(path)
@@ -148,14 +142,14 @@ def candump(path: Path, *lines: str) -> Tables:
         ("(1714564800.500000) can3 7FF##3" + "AB" * 12, (0x7FF, 0, 3, 0, 0, 12, b"\xab" * 12)),
     ],
 )
-def test_forms_of_candump(line: str, row: tuple[Any, ...], tmp_path: Path) -> None:
+def test_forms_of_candump(line, row, tmp_path):
     tables = candump(tmp_path / "a.log", line)
     assert rows_of(tables) == [row]
     assert frames_of(tables).stamps_ns.tolist() == [START_NS + 500 * 10**6]
     assert tables.losses == []
 
 
-def test_lines_of_candump_that_are_no_frames_are_counted(tmp_path: Path) -> None:
+def test_lines_of_candump_that_are_no_frames_are_counted(tmp_path):
     bad = [
         "(5.0) can0 12#11",
         "(5.0) can0 123#1",
@@ -170,7 +164,7 @@ def test_lines_of_candump_that_are_no_frames_are_counted(tmp_path: Path) -> None
         candump(tmp_path / "b.log", " can0  123   [1]  11")
 
 
-def test_times_of_candump_may_be_differences_and_frames_recorded_again_are_left_out(tmp_path: Path) -> None:
+def test_times_of_candump_may_be_differences_and_frames_recorded_again_are_left_out(tmp_path):
     lines = [f" (000.0{1 + i % 2}0000)  can0  123   [1]  {i:02X}" for i in range(20)]
     tables = candump(tmp_path / "a.log", *lines)
     assert np.ptp(frames_of(tables).stamps_ns) == 29 * 10**7
@@ -238,16 +232,14 @@ def numbers_of(tables: Tables) -> list[int]:
     ],
     ids=["before the trigger", "units and versions of headers", "without a date"],
 )
-def test_times_of_a_blf(
-    objects: list[bytes], times_ns: list[float], date: tuple[int, ...] | None, tmp_path: Path
-) -> None:
+def test_times_of_a_blf(objects, times_ns, date, tmp_path):
     tables = read(blf(tmp_path / "a.blf", container(b"".join(objects)), **({"date": date} if date else {})))
     assert (frames_of(tables).stamps_ns - (RELATIVE_NS if date else START_NS)).tolist() == times_ns
     assert tables.losses == []
 
 
 @pytest.mark.parametrize("compressed", [True, False])
-def test_damage_costs_its_container_only(compressed: bool, tmp_path: Path) -> None:
+def test_damage_costs_its_container_only(compressed, tmp_path):
     stream, size = numbered(300), 1500  # objects that continue in the next container
     parts = [container(stream[i : i + size], compressed=compressed) for i in range(0, len(stream), size)]
     damaged = bytearray(parts[3])
@@ -266,7 +258,7 @@ def test_damage_costs_its_container_only(compressed: bool, tmp_path: Path) -> No
     [(8, bytes(4)), (8, b"\xff" * 4), (0, b"XXXX"), (4, b"\0\0"), (6, b"\7\0")],
     ids=["size-0", "size-4GiB", "signature", "header-0", "version-7"],
 )
-def test_a_damaged_object_costs_itself(offset: int, value: bytes, tmp_path: Path) -> None:
+def test_a_damaged_object_costs_itself(offset, value, tmp_path):
     objects = bytearray(numbered(20))
     place = 48 * 7 + offset
     objects[place : place + len(value)] = value
@@ -284,9 +276,7 @@ def test_a_damaged_object_costs_itself(offset: int, value: bytes, tmp_path: Path
     ],
     ids=["beyond the limits", "together beyond the limits", "larger than it states"],
 )
-def test_a_container_that_harms_is_a_loss_of_itself(
-    bad: list[bytes], limits: dict[str, int], kind: str, text: str, tmp_path: Path
-) -> None:
+def test_a_container_that_harms_is_a_loss_of_itself(bad, limits, kind, text, tmp_path):
     path = blf(tmp_path / "a.blf", container(numbered(5)), *bad, container(numbered(5, first=5)))
     with path.open("rb") as stream:
         tables = open_blf(TableFile(stream, path.stat().st_size, "a.blf", replace(DEFAULT_LIMITS, **limits)))
@@ -295,7 +285,7 @@ def test_a_container_that_harms_is_a_loss_of_itself(
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".asc", ".log"])
-def test_mutants_are_read_or_refused_in_one_line(suffix: str, tmp_path: Path) -> None:
+def test_mutants_are_read_or_refused_in_one_line(suffix, tmp_path):
     messages = [sent(i / 100, 0x100 + i % 3, bytes(range(i % 9))) for i in range(60)]
     more = {"max_container_size": 700} if suffix == ".blf" else {}
     sound = write(tmp_path / f"a{suffix}", messages, **more).read_bytes()
@@ -340,13 +330,13 @@ def asc(path: Path, *lines: str, encoding: str = "utf-8") -> Tables:
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
-def test_dates_of_an_asc(date: str, expected_ns: int, encoding: str, tmp_path: Path) -> None:
+def test_dates_of_an_asc(date, expected_ns, encoding, tmp_path):
     lines = f"date {date}", "base hex  timestamps absolute", "   0.010000 1  100  Rx   d 2 01 02"
     tables = asc(tmp_path / "a.asc", *lines, encoding=encoding)
     assert frames_of(tables).stamps_ns.tolist() == [expected_ns + 10**7]
 
 
-def test_relative_times_of_an_asc_are_summed_over_all_lines(tmp_path: Path) -> None:
+def test_relative_times_of_an_asc_are_summed_over_all_lines(tmp_path):
     tables = asc(
         tmp_path / "a.asc",
         "date Wed May 1 12:00:00 2024",
@@ -368,7 +358,7 @@ def test_relative_times_of_an_asc_are_summed_over_all_lines(tmp_path: Path) -> N
     assert tables.losses == []
 
 
-def test_lines_of_an_asc_that_are_no_frames(tmp_path: Path) -> None:
+def test_lines_of_an_asc_that_are_no_frames(tmp_path):
     tables = asc(
         tmp_path / "a.asc",
         "base hex timestamps absolute",
@@ -397,7 +387,7 @@ def measurement(date: str, first_s: float, *, count: int = 3) -> list[str]:
     return [f"Begin Triggerblock {date}", *frames, "End TriggerBlock"]
 
 
-def test_measurements_of_an_asc_follow_their_dates(tmp_path: Path) -> None:
+def test_measurements_of_an_asc_follow_their_dates(tmp_path):
     head = "date Wed May 1 12:00:00 2024", "base hex timestamps absolute"
     first = measurement("Wed May 1 12:00:00 2024", 0.0)
     restarted = asc(tmp_path / "a.asc", *head, *first, *measurement("Wed May 1 12:01:00 2024", 0.0))
@@ -408,7 +398,7 @@ def test_measurements_of_an_asc_follow_their_dates(tmp_path: Path) -> None:
         assert tables.losses == []
 
 
-def test_a_measurement_that_begins_before_the_end_of_another_is_a_loss(tmp_path: Path) -> None:
+def test_a_measurement_that_begins_before_the_end_of_another_is_a_loss(tmp_path):
     first = ["base hex timestamps absolute", *measurement("", 0.0, count=9), " 5.0 1 100 Rx d 0"]
     for second in (measurement("", 0.05), measurement("", 0.0)[1:]):
         tables = asc(tmp_path / "a.asc", *first, *second)
@@ -447,7 +437,7 @@ def column(table: Any, path: str) -> list[float]:
     return table.load(path, slice(0, len(table.stamps_ns))).tolist()
 
 
-def test_the_same_identifiers_on_two_buses_are_two_tables() -> None:
+def test_the_same_identifiers_on_two_buses_are_two_tables():
     rows = [(bus, 291, struct.pack("<hH4x", 100 * bus + i, 0)) for i in range(5) for bus in (1, 0)]
     tables, lost, _ = decoded(made(rows), MOTION)
     assert [*tables] == ["Motion", "Motion#bus1"]
@@ -474,13 +464,13 @@ def j1939(identifier: int, signals: str = ' SG_ Speed : 0|16@1+ (0.01,0) [0|0] "
         (0x17330B10, 0x17330B11, False),  # no null address, and no broadcast: another message
     ],
 )
-def test_messages_of_j1939_are_identified_by_their_group(stated: int, sent_as: int, matches: bool) -> None:
+def test_messages_of_j1939_are_identified_by_their_group(stated, sent_as, matches):
     tables, lost, _ = decoded([(sent_as, bytes([i, 0, 0, 0, 0, 0, 0, 0])) for i in range(4)], j1939(stated))
     assert [*tables] == (["Group"] if matches else [])
     assert [(loss.kind, loss.severity) for loss in lost] == ([] if matches else [("unknown-frame", "note")])
 
 
-def test_the_frame_format_of_a_dbc_states_j1939() -> None:
+def test_the_frame_format_of_a_dbc_states_j1939():
     dbc = j1939(0x18EF0003) + (
         'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
         'BA_DEF_DEF_ "VFrameFormat" "StandardCAN";\n'
@@ -490,14 +480,14 @@ def test_the_frame_format_of_a_dbc_states_j1939() -> None:
     assert [*tables] == ["Group"]
 
 
-def test_each_source_address_has_a_table() -> None:
+def test_each_source_address_has_a_table():
     rows = [(0x18FEF121, b"\1"), (0x18FEF10B, b"\2"), (0x0CFEF10B, b"\3"), (0x18FEF10B, b"\4")]
     tables, _, _ = decoded([(i, d.ljust(8, b"\0")) for i, d in rows], j1939(0x18FEF1FE))
     values = {name: column(table, "Speed") for name, table in tables.items()}
     assert values == {"Group": pytest.approx([0.02, 0.03, 0.04]), "Group#sa21": pytest.approx([0.01])}
 
 
-def test_raw_values_without_a_meaning_are_not_available() -> None:
+def test_raw_values_without_a_meaning_are_not_available():
     signals = (
         ' SG_ Speed : 0|16@1+ (0.01,0) [0|0] "km/h" A\n SG_ Switch : 16|2@1+ (1,0) [0|0] "" A\n'
         ' SG_ Accel : 32|16@1- (0.001,0) [0|0] "g" A\n'
@@ -515,14 +505,14 @@ def test_raw_values_without_a_meaning_are_not_available() -> None:
     assert column(standard["Motion"], "Speed") == [655.35]
 
 
-def test_named_raw_values_of_a_dbc_are_not_available() -> None:
+def test_named_raw_values_of_a_dbc_are_not_available():
     dbc = MOTION + 'VAL_ 291 Speed 65535 "SNA" 65534 "Signal_Error" 0 "No_Error" ;\n'
     tables, _, columns = decoded([(291, struct.pack("<hH4x", 0, s)) for s in (65535, 65534, 0, 500)], dbc)
     np.testing.assert_allclose(column(tables["Motion"], "Speed"), [np.nan, np.nan, 0, 5])
     assert [x.count for x in columns["Motion", "Speed"]] == [2]
 
 
-def test_values_outside_of_the_range_of_the_dbc_are_lost() -> None:
+def test_values_outside_of_the_range_of_the_dbc_are_lost():
     dbc = MOTION.replace("(0.01,0) [0|0]", "(0.01,0) [0|250]")
     raw = [100, 0xFFFF, 25_000, 25_001, 200, 0xFFFF]
     tables, _, columns = decoded([(291, struct.pack("<hH4x", 0, r)) for r in raw], dbc)
@@ -533,14 +523,14 @@ def test_values_outside_of_the_range_of_the_dbc_are_lost() -> None:
     assert "655.35" in loss.what
 
 
-def test_a_range_that_the_signal_does_not_keep_is_ignored() -> None:
+def test_a_range_that_the_signal_does_not_keep_is_ignored():
     dbc = MOTION.replace("(0.01,0) [0|0]", "(0.01,0) [0|1]")
     tables, _, columns = decoded([(291, struct.pack("<hH4x", 0, 10 * r)) for r in range(200)], dbc)
     assert np.isfinite(column(tables["Motion"], "Speed")).all()
     assert [(loss.kind, loss.severity) for loss in columns["Motion", "Speed"]] == [("out-of-range", "note")]
 
 
-def test_short_frames_give_the_signals_that_they_contain() -> None:
+def test_short_frames_give_the_signals_that_they_contain():
     frames = [(291, struct.pack("<h", i)) for i in range(4)]
     tables, lost, _ = decoded(frames, MOTION)
     assert [f.path for f in tables["Motion"].fields] == ["AccelY"]
@@ -555,14 +545,14 @@ def test_short_frames_give_the_signals_that_they_contain() -> None:
     assert columns == {("Motion", "Speed"): []}
 
 
-def test_frames_that_all_end_before_their_multiplexer_are_a_loss() -> None:
+def test_frames_that_all_end_before_their_multiplexer_are_a_loss():
     dbc = 'BO_ 291 Pages: 4 A\n SG_ Page M : 24|8@1+ (1,0) [0|0] "" A\n SG_ X m0 : 0|8@1+ (1,0) [0|0] "" A\n'
     tables, lost, _ = decoded([(291, bytes(2))], dbc)
     assert tables == {}
     assert [(loss.kind, loss.count) for loss in lost] == [("undecodable", 1)]
 
 
-def test_frames_of_no_database_are_named() -> None:
+def test_frames_of_no_database_are_named():
     frames = [(291, bytes(8)), *((0x300 + i, bytes(8)) for i in range(7))]
     tables, lost, _ = decoded(frames, MOTION)
     assert [*tables] == ["Motion"]
@@ -570,7 +560,7 @@ def test_frames_of_no_database_are_named() -> None:
     assert lost[0].what.startswith("7 frames, no identifier of 0.dbc: 0x300, 0x301")
 
 
-def test_multiplexed_signals_have_a_table_for_each_selector() -> None:
+def test_multiplexed_signals_have_a_table_for_each_selector():
     dbc = """BO_ 5 Mux: 2 A
  SG_ Sel M : 0|8@1+ (1,0) [0|0] "" A
  SG_ First m0 : 8|8@1+ (1,0) [0|0] "deg" A
@@ -588,7 +578,7 @@ STEERING = MOTION.replace("291 Motion", "292 Steering").replace("AccelY", "Angle
 
 
 @pytest.fixture(params=[".blf", ".asc", ".log", ".mf4"])
-def drive(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def drive(request, tmp_path):
     """A log of Motion and Steering frames on bus 1, with others between them."""
     if request.param == ".mf4":
         pytest.importorskip("asammdf")
@@ -604,7 +594,7 @@ def kinds_of(log: DriveLog) -> list[str]:
     return [loss.kind for loss in log.lost if loss.kind != "no-clock"]
 
 
-def test_a_log_is_decoded_by_its_mapping_or_by_given_databases(drive: Path, tmp_path: Path) -> None:
+def test_a_log_is_decoded_by_its_mapping_or_by_given_databases(drive, tmp_path):
     (tmp_path / "dbc").mkdir()
     (tmp_path / "dbc/car.dbc").write_text(HEAD + MOTION)
     (tmp_path / "dbc/steering.dbc").write_text(HEAD + STEERING)
@@ -630,7 +620,7 @@ def test_a_log_is_decoded_by_its_mapping_or_by_given_databases(drive: Path, tmp_
     np.testing.assert_allclose(found.signals["ay_m_s2"].values, np.arange(300) * 9.80665e-3, atol=1e-9)
 
 
-def test_a_mapping_of_frames_names_the_bus_where_several_send_a_message(tmp_path: Path) -> None:
+def test_a_mapping_of_frames_names_the_bus_where_several_send_a_message(tmp_path):
     path = write(tmp_path / "a.blf", [sent(i / 100, 291, bytes([i % 2] * 3), channel=i % 2) for i in range(100)])
     (tmp_path / "car.dbc").write_text(HEAD + MOTION)
     signal = '[signals.ay_m_s2]\ntopic = "can"\nfield = "can:Motion.AccelY"\n'
@@ -649,7 +639,7 @@ def test_a_mapping_of_frames_names_the_bus_where_several_send_a_message(tmp_path
     assert {bus: round(max(values), 9) for bus, values in read.items()} == {0: 0.0, 1: 0.257}
 
 
-def test_a_dbc_that_matches_nothing_is_named(tmp_path: Path) -> None:
+def test_a_dbc_that_matches_nothing_is_named(tmp_path):
     path = write(tmp_path / "a.blf", [sent(i / 100, 300, bytes(8)) for i in range(100)])
     (tmp_path / "car.dbc").write_text(HEAD + MOTION)
     notes = " ".join(map(str, inspect_log(path, options=ReadOptions(msgs=tmp_path / "car.dbc")).to_dict()["notes"]))
@@ -657,7 +647,7 @@ def test_a_dbc_that_matches_nothing_is_named(tmp_path: Path) -> None:
     assert "--set msgs" not in notes
 
 
-def test_an_object_that_covers_others_costs_itself(tmp_path: Path) -> None:
+def test_an_object_that_covers_others_costs_itself(tmp_path):
     marker = bytearray(blf_object(96, bytes(48), 0))
     marker[8:12] = struct.pack("<I", 1001)
     parts = [bytearray(container(numbered(5, first=i))) for i in range(40, 60, 5)]
@@ -668,7 +658,7 @@ def test_an_object_that_covers_others_costs_itself(tmp_path: Path) -> None:
     assert {loss.kind for loss in tables.losses} == {"bad-chunk"}
 
 
-def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path):
     path = write(
         tmp_path / "a.blf", [sent(i / 100, 256, struct.pack("<I", i)) for i in range(600)], max_container_size=2000
     )
@@ -681,7 +671,7 @@ def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     assert [loss.kind for loss in tables.losses] == ["truncated"]
 
 
-def test_many_damaged_places_are_counted(tmp_path: Path) -> None:
+def test_many_damaged_places_are_counted(tmp_path):
     bad = container(numbered(1))[:32] + b"no zlib!"
     parts = [bad[:8] + struct.pack("<I", len(bad)) + bad[12:]] * 50
     tables = read(blf(tmp_path / "a.blf", container(numbered(5)), *parts))

@@ -1,7 +1,5 @@
 """Columns of random message types against rosbags' deserialiser, message by message; payloads that nobody reads."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import closing
@@ -19,8 +17,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pdhef_logtool.logs.container import RawMessage, block_of
 from pdhef_logtool.logs.definitions import message_definition
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 
 pytestmark = pytest.mark.slow
 
@@ -127,9 +126,7 @@ def _expected(message: Any, path: str) -> Any:
 # Without shrinking, which takes minutes through files; the failing type is printed whole.
 @settings(max_examples=25, deadline=None, derandomize=True, report_multiple_bugs=False, phases=[Phase.generate])
 @given(root=_struct(2), seed=st.integers(0, 2**32 - 1), change=st.sampled_from(["never", "once", "always"]))
-def test_columns_equal_the_independent_deserialiser(
-    tmp_path_factory: pytest.TempPathFactory, root: list[Any], seed: int, change: str
-) -> None:
+def test_columns_equal_the_independent_deserialiser(tmp_path_factory, root, seed, change):
     text, types = _definition(root)
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, "own/msg/T0"))
@@ -151,7 +148,7 @@ def test_columns_equal_the_independent_deserialiser(
             writer.write([], [block_of(message for pair in raws for message in pair)])
     messages = [store.deserialize_cdr(p, "own/msg/T0") for p in payloads]
     with closing(open_log(path)) as log:
-        assert len(log.containers[0].spans) == 5  # type: ignore[attr-defined]
+        assert len(log.containers[0].spans) == 5
         paths = list(_numeric_paths(types, "T0"))
         read = log.read({"/t": paths})["/t"].fields
         assert log.lost == ()
@@ -189,7 +186,7 @@ def _peak_bytes(path: Path) -> int:
     return peak
 
 
-def test_memory_does_not_grow_with_payloads_that_nobody_reads(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_payloads_that_nobody_reads(tmp_path):
     _with_payloads(tmp_path / "none.mcap", 0)
     _with_payloads(tmp_path / "mixed.mcap", 300_000)
     _peak_bytes(tmp_path / "none.mcap")  # imports
@@ -220,7 +217,7 @@ _texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size
 
 
 @st.composite
-def _batches(draw: st.DrawFn) -> list[TopicBatch]:
+def _batches(draw: st.DrawFn) -> list[Columns]:
     """Return a batch of each type; its topic has the name of the type."""
     batches = []
     for name, widths in FIELDS.items():
@@ -232,15 +229,13 @@ def _batches(draw: st.DrawFn) -> list[TopicBatch]:
             width = len(shape) if isinstance(shape, str) else shape
             elements = _ELEMENTS.get(path, st.floats(allow_nan=True, allow_infinity=True, width=64))
             fields[path] = draw(hnp.arrays(np.float64, (n, width) if width else n, elements=elements))
-        batches.append(TopicBatch(name, log_time, log_time - 5, fields))
+        batches.append(Columns(name, log_time, log_time - 5, fields))
     return batches
 
 
 @settings(max_examples=20, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(batches=_batches(), frame=_texts)
-def test_what_is_written_is_read_back_by_this_and_by_other_readers(
-    tmp_path: Path, batches: list[TopicBatch], frame: str
-) -> None:
+def test_what_is_written_is_read_back_by_this_and_by_other_readers(tmp_path, batches, frame):
     path = tmp_path / "log.mcap"
     with McapLogWriter(path) as writer:
         for name in FIELDS:

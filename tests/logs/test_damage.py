@@ -1,7 +1,5 @@
 """Damaged files: a log opens with a loss or one clear error; what only a checksum shows is a loss, too."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from contextlib import closing, suppress
@@ -16,9 +14,10 @@ from mcap.writer import CompressionType, IndexType
 from recorded import counts_of, numeric_paths, summary_of, write_vectors
 
 from pdhef_logtool.logs.container import Wanted
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, PdhefError
 from tests.command_line import called
 from tests.mcap_files import mcap_writer
@@ -34,9 +33,7 @@ def _mcap(folder: Path) -> bytes:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
         for at in range(0, N, 100):  # a chunk a call
             cut = slice(at, at + 100)
-            writer.write(
-                [TopicBatch("/imu", stamps[cut], stamps[cut], {"angular_velocity.z": np.arange(N)[cut] * 0.5})]
-            )
+            writer.write([Columns("/imu", stamps[cut], stamps[cut], {"angular_velocity.z": np.arange(N)[cut] * 0.5})])
     return path.read_bytes()
 
 
@@ -88,7 +85,7 @@ _SOURCES: dict[str, Callable[[Path], bytes]] = {
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def good(tmp_path_factory):
     return {kind: make(tmp_path_factory.mktemp(kind)) for kind, make in _SOURCES.items()}
 
 
@@ -104,9 +101,7 @@ def _read_everything(path: Path) -> tuple[int, bool]:
 @pytest.mark.parametrize("kind", sorted(_SOURCES))
 @settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_every_byte_ends_somewhere_and_no_message_is_missing_in_silence(
-    good: dict[str, bytes], tmp_path: Path, kind: str, data: st.DataObject
-) -> None:
+def test_every_byte_ends_somewhere_and_no_message_is_missing_in_silence(good, tmp_path, kind, data):
     content = bytearray(good[kind])
     places = st.one_of(st.integers(0, len(content) - 1), st.integers(0, 300), st.integers(1, 300).map(lambda n: -n))
     for at, mask in data.draw(st.lists(st.tuples(places, st.integers(1, 255)), max_size=3)):
@@ -132,7 +127,7 @@ def test_every_byte_ends_somewhere_and_no_message_is_missing_in_silence(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", "mcap-lz4", "bag"])
-def test_a_cut_file_never_gives_more_nor_passes_as_whole(good: dict[str, bytes], tmp_path: Path, kind: str) -> None:
+def test_a_cut_file_never_gives_more_nor_passes_as_whole(good, tmp_path, kind):
     content, counts = good[kind], []
     path = tmp_path / "cut"
     for cut in np.linspace(len(content) * 0.2, len(content) - 1, 60).astype(int):
@@ -148,9 +143,7 @@ def test_a_cut_file_never_gives_more_nor_passes_as_whole(good: dict[str, bytes],
 
 
 @pytest.mark.parametrize("is_summary_sound", [True, False])
-def test_a_damaged_record_length_costs_at_most_what_the_summary_does_not_describe(
-    good: dict[str, bytes], tmp_path: Path, is_summary_sound: bool
-) -> None:
+def test_a_damaged_record_length_costs_at_most_what_the_summary_does_not_describe(good, tmp_path, is_summary_sound):
     (tmp_path / "good").write_bytes(good["mcap"])
     summary = summary_of(tmp_path / "good")
     content = bytearray(good["mcap"])
@@ -164,7 +157,7 @@ def test_a_damaged_record_length_costs_at_most_what_the_summary_does_not_describ
         assert [loss.kind for loss in log.lost] == ["bad-record"] * (not is_summary_sound)
 
 
-def test_a_byte_that_only_the_crc_shows_costs_its_chunk(tmp_path: Path) -> None:
+def test_a_byte_that_only_the_crc_shows_costs_its_chunk(tmp_path):
     path = _json_log(tmp_path, compression=CompressionType.NONE)
     content = path.read_bytes()
     path.write_bytes(content.replace(b'{"a": 350}', b'{"a": 950}'))
@@ -176,13 +169,13 @@ def test_a_byte_that_only_the_crc_shows_costs_its_chunk(tmp_path: Path) -> None:
         assert not np.isin([350.0, 950.0], values).any()
 
 
-def test_a_chunk_whose_index_is_cut_gives_all_its_topics(tmp_path: Path) -> None:
+def test_a_chunk_whose_index_is_cut_gives_all_its_topics(tmp_path):
     path = tmp_path / "log.mcap"
     stamps = T0 + np.arange(N) * 10_000_000
     with McapLogWriter(path) as writer:
         for topic in ("/a", "/b"):
             writer.add_topic(topic, "sensor_msgs/msg/Imu")
-        writer.write([TopicBatch(topic, stamps, stamps, {}) for topic in ("/a", "/b")])
+        writer.write([Columns(topic, stamps, stamps, {}) for topic in ("/a", "/b")])
     (chunk,) = summary_of(path).chunk_indexes
     second_index = sorted(chunk.message_index_offsets.values())[1]
     path.write_bytes(path.read_bytes()[: second_index + 20])
@@ -219,7 +212,7 @@ def _first_numbers(path: Path) -> list[int]:
 
 
 @pytest.mark.parametrize("message", range(0, N, N // 12))
-def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: Path, message: int) -> None:
+def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path, message):
     path = _plain_numbers(tmp_path / "log.mcap", chunk_crcs=False, data_crc=True)
     content = bytearray(path.read_bytes())
     content[_first_numbers(path)[message] + 3] ^= 1 << message % 8
@@ -233,14 +226,14 @@ def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: P
 
 
 @pytest.mark.parametrize("chunked", [True, False])
-def test_a_sound_log_whose_data_has_a_crc_is_covered_by_it(tmp_path: Path, chunked: bool) -> None:
+def test_a_sound_log_whose_data_has_a_crc_is_covered_by_it(tmp_path, chunked):
     path = _plain_numbers(tmp_path / "log.mcap", chunk_crcs=False, data_crc=True, chunked=chunked)
     with closing(open_log(path)) as log:
         assert log.lost == ()
     assert called("inspect", path).returncode == EXIT_OK
 
 
-def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp_path: Path) -> None:
+def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp_path):
     pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
     from tests.counting_server import serving
 
@@ -263,7 +256,7 @@ def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp
             assert log.lost == ()
 
 
-def test_damage_of_a_summary_is_a_note(tmp_path: Path) -> None:
+def test_damage_of_a_summary_is_a_note(tmp_path):
     path = _plain_numbers(tmp_path / "log.mcap", chunk_crcs=True, data_crc=False)
     content = bytearray(path.read_bytes())
     last = struct.pack("<Q", summary_of(path).chunk_indexes[-1].chunk_start_offset)

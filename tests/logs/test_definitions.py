@@ -1,7 +1,5 @@
 """Logs without type definitions: shipped definitions, definitions in a user's folder, and errors for unknown types."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence
@@ -40,7 +38,7 @@ def steering_bag(tmp_path: Path) -> Path:
     return bag(tmp_path / "b", "/steer", STEER, "steering_angle")
 
 
-def test_a_missing_definition_is_the_cause_that_is_told(tmp_path: Path) -> None:
+def test_a_missing_definition_is_the_cause_that_is_told(tmp_path):
     log = open_log(steering_bag(tmp_path))
     assert log.fields("/steer") == ()
     assert "no definition of teamx_msgs/DriverInput" in log.unreadable("/steer")
@@ -49,7 +47,7 @@ def test_a_missing_definition_is_the_cause_that_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", ["vesc_msgs/msg", ".", "msg", "src/vesc_msgs/msg"])
-def test_definitions_of_a_folder_of_a_package_or_a_workspace(tmp_path: Path, layout: str) -> None:
+def test_definitions_of_a_folder_of_a_package_or_a_workspace(tmp_path, layout):
     path = bag(tmp_path / "b", "/car", STATE, "imu.linear_acceleration.x")
     folder = tmp_path / "defs" / layout
     folder.mkdir(parents=True)
@@ -60,14 +58,14 @@ def test_definitions_of_a_folder_of_a_package_or_a_workspace(tmp_path: Path, lay
     np.testing.assert_allclose(read["imu.linear_acceleration.x"], [0, 0.1, 0.2])
 
 
-def test_common_packages_are_shipped(tmp_path: Path) -> None:
+def test_common_packages_are_shipped(tmp_path):
     name = "ackermann_msgs/msg/AckermannDriveStamped"
     log = open_log(bag(tmp_path / "b", "/drive", name, "drive.steering_angle"))
     assert auto_map(log).mapping.signals["steer_rad"].field == "drive.steering_angle"
     assert "MSG: ackermann_msgs/AckermannDrive" in message_definition(name)
 
 
-def test_an_empty_topic_is_said_to_be_empty(tmp_path: Path) -> None:
+def test_an_empty_topic_is_said_to_be_empty(tmp_path):
     path = bag(tmp_path / "b", "/imu", "sensor_msgs/msg/Temperature", "temperature")
     import sqlite3
 
@@ -77,7 +75,7 @@ def test_an_empty_topic_is_said_to_be_empty(tmp_path: Path) -> None:
         choose_mapping(open_log(path), None, prefer_truth="perfect")
 
 
-def test_a_folder_without_definitions_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_definitions_is_refused(tmp_path):
     with pytest.raises(UsageError, match="without any"):
         read_definitions(tmp_path)
     with pytest.raises(UsageError, match="neither folder nor archive"):
@@ -85,7 +83,7 @@ def test_a_folder_without_definitions_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["definitions.zip", "car_msgs-1.0-py3-none-any.whl"])
-def test_definitions_of_a_zip_file_or_a_wheel(tmp_path: Path, name: str) -> None:
+def test_definitions_of_a_zip_file_or_a_wheel(tmp_path, name):
     import zipfile
 
     path = steering_bag(tmp_path)
@@ -99,9 +97,7 @@ def test_definitions_of_a_zip_file_or_a_wheel(tmp_path: Path, name: str) -> None
 
 
 @pytest.mark.parametrize("variable", ["AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH"])
-def test_an_installed_ros_is_looked_in_and_named(
-    tmp_path: Path, variable: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_installed_ros_is_looked_in_and_named(tmp_path, variable, monkeypatch):
     path = steering_bag(tmp_path)
     folder = tmp_path / "ros" / ("share" if variable == "AMENT_PREFIX_PATH" else "stack") / "teamx_msgs" / "msg"
     folder.mkdir(parents=True)
@@ -131,7 +127,7 @@ def _read_json(path: Path, messages: Sequence[object], schema: object, fields: S
     return fields_of(path, "/t", *fields)
 
 
-def test_missing_json_fields_and_short_arrays_are_nan(tmp_path: Path) -> None:
+def test_missing_json_fields_and_short_arrays_are_nan(tmp_path):
     messages = [{"a": 1, "b": {"c": [1.5, 2.5]}, "d": True}, {"b": {"c": [3.5]}}, {"a": None, "b": {}, "d": False}]
     number = {"type": "number"}
     inner = {"type": "object", "properties": {"c": {"type": "array", "items": number}}}
@@ -143,21 +139,21 @@ def test_missing_json_fields_and_short_arrays_are_nan(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["d"], [1, np.nan, 0])
 
 
-def test_json_times_are_nanoseconds_and_missing_ones_are_marked(tmp_path: Path) -> None:
+def test_json_times_are_nanoseconds_and_missing_ones_are_marked(tmp_path):
     messages = [{"stamp": {"sec": 5, "nsec": 7}}, {}]
     read = _read_json(tmp_path / "x.mcap", messages, None, ["stamp"])
     assert read["stamp"].dtype == np.int64
     assert read["stamp"].tolist() == [5_000_000_007, NO_TIME_NS]
 
 
-def test_places_that_a_json_schema_leaves_open_are_found_in_the_messages(tmp_path: Path) -> None:
+def test_places_that_a_json_schema_leaves_open_are_found_in_the_messages(tmp_path):
     messages = [{"m": {"v": [1, 2]}}, {"m": {"v": [3, 4]}}]
     read = _read_json(tmp_path / "x.mcap", messages, {"type": "object"}, ["m.v", "m.v[1]"])
     np.testing.assert_array_equal(read["m.v"], [[1, 2], [3, 4]])
     np.testing.assert_array_equal(read["m.v[1]"], [2, 4])
 
 
-def test_a_json_message_that_is_no_json_is_counted(tmp_path: Path) -> None:
+def test_a_json_message_that_is_no_json_is_counted(tmp_path):
     _write_raw(tmp_path / "x.mcap", [b'{"a": 1}', b"{", b'{"a": 3}'], "json", "T", "", "")
     with closing(open_log(tmp_path / "x.mcap")) as log:
         for start in (None, T0 + 1):  # a second read must not count it twice
@@ -167,7 +163,7 @@ def test_a_json_message_that_is_no_json_is_counted(tmp_path: Path) -> None:
             assert (loss.kind, loss.count, loss.severity) == ("undecodable", 1, "lost")
 
 
-def test_a_cut_payload_costs_only_its_own_message(tmp_path: Path) -> None:
+def test_a_cut_payload_costs_only_its_own_message(tmp_path):
     store = get_typestore(Stores.ROS2_HUMBLE)
     name = "geometry_msgs/msg/Vector3"
     full = [bytes(store.serialize_cdr(store.types[name](x=float(i), y=0.0, z=0.0), name)) for i in range(5)]
@@ -190,7 +186,7 @@ def test_a_cut_payload_costs_only_its_own_message(tmp_path: Path) -> None:
         ("", "dotted path"),
     ],
 )
-def test_a_wrong_path_names_the_nearest(tmp_path: Path, path: str, problem: str) -> None:
+def test_a_wrong_path_names_the_nearest(tmp_path, path, problem):
     with McapLogWriter(tmp_path / "x.mcap") as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu")
     with closing(open_log(tmp_path / "x.mcap")) as log:
@@ -200,7 +196,7 @@ def test_a_wrong_path_names_the_nearest(tmp_path: Path, path: str, problem: str)
             log.read({"/imv": ["x"]})
 
 
-def test_an_empty_window_has_columns_of_the_right_shape(tmp_path: Path) -> None:
+def test_an_empty_window_has_columns_of_the_right_shape(tmp_path):
     with McapLogWriter(tmp_path / "x.mcap") as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu")
     shapes = {"header.stamp": (0,), "orientation": (0, 4), "orientation_covariance": (0, 9), "angular_velocity.z": (0,)}

@@ -1,14 +1,12 @@
 """MDF 3 and 4: conversions, invalid samples, times, frames of newer loggers, damaged and hostile files."""
 
-from __future__ import annotations
-
 import datetime as dt
 import gc
 import struct
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -156,7 +154,7 @@ def mdf(path: Path, version: str = "4.10") -> Path:
 
 
 @pytest.mark.parametrize("version", ["4.10", "4.11", "3.30"])
-def test_channel_groups_keep_their_clocks_and_units(version: str, tmp_path: Path) -> None:
+def test_channel_groups_keep_their_clocks_and_units(version, tmp_path):
     read = opened(mdf(tmp_path / "a.mf4", version))
     assert (read.kind, sorted(read.topics.values()), read.lost) == (f"mdf-{version[0]}", [N // 10, N], ())
     assert read.units == {"IMU_AccY": "g", "IMU_AccX": "g", "Speed": "km/h"}
@@ -167,7 +165,7 @@ def test_channel_groups_keep_their_clocks_and_units(version: str, tmp_path: Path
     assert imu[0] == other[0] == START_NS
 
 
-def test_a_file_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None:
+def test_a_file_that_ends_within_its_data_is_read_so_far(tmp_path):
     whole, cut = opened(tmp_path / "a.mf4", imu()), opened(tmp_path / "b.mf4", imu()[: -16 * 100 - 5])
     assert whole.lost == ()
     np.testing.assert_array_equal(whole.columns["AccY"], AY)
@@ -178,7 +176,7 @@ def test_a_file_that_ends_within_its_data_is_read_so_far(tmp_path: Path) -> None
     assert called("inspect", tmp_path / "b.mf4").returncode == 3
 
 
-def test_links_beyond_the_end_are_a_loss(tmp_path: Path) -> None:
+def test_links_beyond_the_end_are_a_loss(tmp_path):
     data = imu()
     read = read_mdf(patched(data, block(data, b"CN", 0) + 24, len(data) + 64))
     assert "1 blocks are beyond the end of the file" in read.what()
@@ -218,7 +216,7 @@ ORACLES: Mapping[tuple[int, int], tuple[dict[str, Any], Callable[[float], float]
 @pytest.mark.parametrize(("version", "kind"), ORACLES)
 @settings(max_examples=20, deadline=None)
 @given(raw=st.lists(st.floats(-100.0, 100.0), min_size=1))
-def test_a_conversion_is_that_of_the_standard(version: int, kind: int, raw: list[float]) -> None:
+def test_a_conversion_is_that_of_the_standard(version, kind, raw):
     parameters, oracle = ORACLES[version, kind]
     rule = conversion_rule(block_of(version, kind, **parameters), version)
     with np.errstate(all="ignore"):
@@ -226,7 +224,7 @@ def test_a_conversion_is_that_of_the_standard(version: int, kind: int, raw: list
     np.testing.assert_allclose(rule(np.asarray(raw)), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_numbers_with_texts_stay_numbers_and_texts_among_scaled_numbers_are_missing() -> None:
+def test_numbers_with_texts_stay_numbers_and_texts_among_scaled_numbers_are_missing():
     texts = {"ref_param_nr": 3, "val_0": 0, "text_0": b"off", "val_1": 1, "text_1": b"on"}
     raw = np.asarray([0, 1, 200])
     assert conversion_rule(block_of(4, 7, **texts, default_addr=b""), 4)(raw).tolist() == [0, 1, 200]
@@ -249,7 +247,7 @@ def test_numbers_with_texts_stay_numbers_and_texts_among_scaled_numbers_are_miss
         "X := 3", "f'{X}'", "1" * 400 + "*X", "1j*X", "pow(X)",
     ],
 )  # fmt: skip
-def test_a_formula_that_is_no_arithmetic_is_refused_unless_it_is_a_number(text: str) -> None:
+def test_a_formula_that_is_no_arithmetic_is_refused_unless_it_is_a_number(text):
     if text == "9e999999":
         assert np.isinf(formula_rule(text)(np.zeros(2))).all()
         return
@@ -258,7 +256,7 @@ def test_a_formula_that_is_no_arithmetic_is_refused_unless_it_is_a_number(text: 
 
 
 @pytest.mark.parametrize("version", ["4.10", "3.30"])
-def test_a_formula_of_a_file_runs_nothing(version: str, tmp_path: Path) -> None:
+def test_a_formula_of_a_file_runs_nothing(version, tmp_path):
     canary = tmp_path / "canary"
     hostile = {"formula": f"__import__('pathlib').Path('{canary}').touch() or X"}
     ours = [signal("bad", AY, conversion=hostile), signal("good", AY, conversion={"formula": "2*X+1"})]
@@ -272,7 +270,7 @@ def test_a_formula_of_a_file_runs_nothing(version: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", ["4.10", "3.30"])
-def test_conversions_of_a_file_are_applied(version: str, tmp_path: Path) -> None:
+def test_conversions_of_a_file_are_applied(version, tmp_path):
     raw = np.arange(N, dtype=np.int16)
     texts = {"val_0": 0, "text_0": b"P", "val_1": 1, "text_1": b"R", "default_addr": b"?"}
     ours = [
@@ -294,7 +292,7 @@ def test_conversions_of_a_file_are_applied(version: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("low", "high"), [(None, None), (0.5, 2.0), (1.0, 1.2)])
-def test_invalid_samples_are_missing_at_their_own_times(low: float | None, high: float | None, tmp_path: Path) -> None:
+def test_invalid_samples_are_missing_at_their_own_times(low, high, tmp_path):
     invalid = np.arange(N) % 10 == 3
     path = written(tmp_path / "a.mf4", [signal("ay", AY, invalidation_bits=invalid), signal("v", SPEED)])
     window = (None, None) if low is None or high is None else (START_NS + int(low * 1e9), START_NS + int(high * 1e9))
@@ -310,7 +308,7 @@ def test_invalid_samples_are_missing_at_their_own_times(low: float | None, high:
 
 
 @pytest.fixture(params=["UTC", "Asia/Tokyo"])
-def time_zone(request: pytest.FixtureRequest) -> Iterator[str]:
+def time_zone(request):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TZ", request.param)
         time.tzset()
@@ -319,9 +317,7 @@ def time_zone(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("version", ["4.10", "3.10"])
-def test_a_local_start_does_not_depend_on_the_time_zone_of_the_machine(
-    version: str, tmp_path: Path, time_zone: str
-) -> None:
+def test_a_local_start_does_not_depend_on_the_time_zone_of_the_machine(version, tmp_path, time_zone):
     start = START.replace(tzinfo=None) if version[0] == "4" else START
     read = read_mdf(written(tmp_path / "a.mf4", [signal("ay", AY)], version, start))
     assert read.stamps_ns["car"][0] == START_NS
@@ -329,7 +325,7 @@ def test_a_local_start_does_not_depend_on_the_time_zone_of_the_machine(
 
 
 @pytest.mark.parametrize(("sync", "what"), [(2, "an angle"), (3, "a distance"), (4, "an index")])
-def test_a_master_that_is_no_time_is_no_clock(sync: int, what: str, tmp_path: Path) -> None:
+def test_a_master_that_is_no_time_is_no_clock(sync, what, tmp_path):
     samples = np.column_stack([TIME_S, AY]).tobytes()
     distance = Ch("s", kind=2, sync=sync)
     with pytest.raises(LogError, match=f"its master is {what}, no time"):
@@ -393,9 +389,7 @@ LONG = [bytes(range(1, 13)), bytes(range(64))] * 2
         ([Ch("CAN_DataFrame.DataLength", kind=6, bits=0, data_type=0), DLC], {"dlc": [8, 2, 8, 2]}, SHORT, True),
     ],
 )  # fmt: skip
-def test_frames_of_newer_loggers(
-    length: list[Ch], numbers: dict[str, list[int]], frames: list[bytes], is_variable: bool, tmp_path: Path
-) -> None:
+def test_frames_of_newer_loggers(length, numbers, frames, is_variable, tmp_path):
     contents = opened(tmp_path / "a.mf4", can_file(length, numbers, frames, is_variable))
     read = contents.columns
     assert ([*contents.topics], contents.lost) == (["can"], ())
@@ -451,14 +445,12 @@ HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize(("make", "match"), HARMFUL.values(), ids=HARMFUL)
-def test_a_file_that_is_made_to_harm_is_one_line(make: Callable[[], bytes], match: str, tmp_path: Path) -> None:
+def test_a_file_that_is_made_to_harm_is_one_line(make, match, tmp_path):
     with pytest.raises(LogError, match=match):
         read_mdf(make())
 
 
-def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(tmp_path, monkeypatch):
     data = bytearray(imu())
     data[:8] = b"UnFinMF "
     struct.pack_into("<H", data, 60, 0b101)  # counters of rows and the length of the last block

@@ -1,7 +1,5 @@
 """Format detection and rejected inputs. Opening a log writes no file next to it."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import re
@@ -9,7 +7,6 @@ import shutil
 import sqlite3
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
@@ -24,15 +21,16 @@ from recorded import write_vectors
 from pdhef_logtool import Car, inspect_log, load_mapping, read_drive
 from pdhef_logtool.logs import formats, mcap_log
 from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.mat_log import open_mat
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import is_log_folder, open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter
-from pdhef_logtool.logs.table_file import LogFile, TableFile, Tables
+from pdhef_logtool.logs.table_file import LogFile, TableFile
 from pdhef_logtool.logs.table_log import Table, TableLog
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
-from tests.mcap_files import copied, mcap_writer
+from studies import mcap_logs
 
 T0 = 1_700_000_000_000_000_000
 VALUES = np.arange(40) * 0.25
@@ -42,7 +40,7 @@ def _mcap(path: Path, values: np.ndarray = VALUES, start_ns: int = T0) -> Path:
     stamps = start_ns + np.arange(len(values)) * 10_000_000
     with McapLogWriter(path) as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
-        writer.write([TopicBatch("/imu", stamps, stamps, {"angular_velocity.z": values})])
+        writer.write([Columns("/imu", stamps, stamps, {"angular_velocity.z": values})])
     return path
 
 
@@ -69,7 +67,7 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n"
         (b"#ROSBAG V2.0\n" + b"\xff" * 60, "bag header", ".mcap"),
     ],
 )
-def test_what_is_no_log_is_one_clear_line(tmp_path: Path, content: bytes, got: str, suffix: str) -> None:
+def test_what_is_no_log_is_one_clear_line(tmp_path, content, got, suffix):
     path = tmp_path / f"drive{suffix}"
     path.write_bytes(content)
     with pytest.raises(LogError, match=got) as error:
@@ -79,7 +77,7 @@ def test_what_is_no_log_is_one_clear_line(tmp_path: Path, content: bytes, got: s
     assert "\n" not in str(error.value)
 
 
-def test_missing_paths_folders_without_one_log_and_other_databases_are_refused(tmp_path: Path) -> None:
+def test_missing_paths_folders_without_one_log_and_other_databases_are_refused(tmp_path):
     with pytest.raises(LogError, match="no such file"):
         open_log(tmp_path / "missing.mcap")
     with pytest.raises(LogError, match="folder without a log"):
@@ -97,7 +95,7 @@ def test_missing_paths_folders_without_one_log_and_other_databases_are_refused(t
 @pytest.mark.parametrize(
     ("storage", "compression"), [("sqlite3", ""), ("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", "")]
 )
-def test_rosbag2_folders_of_another_writer_read_right(tmp_path: Path, storage: str, compression: str) -> None:
+def test_rosbag2_folders_of_another_writer_read_right(tmp_path, storage, compression):
     folder = write_vectors(tmp_path / "bag", "/v", len(VALUES), storage, compression)
     assert is_log_folder(folder)
     with closing(open_log(folder)) as log:
@@ -106,7 +104,7 @@ def test_rosbag2_folders_of_another_writer_read_right(tmp_path: Path, storage: s
 
 
 @pytest.mark.parametrize("name", ["a.mcap.zstd", "a.mcap.zst"])
-def test_a_compressed_file_opens_and_a_cut_one_gives_its_beginning(tmp_path: Path, name: str) -> None:
+def test_a_compressed_file_opens_and_a_cut_one_gives_its_beginning(tmp_path, name):
     plain = _mcap(tmp_path / "a.mcap", np.random.default_rng(0).normal(size=20_000))
     compressed = zstandard.ZstdCompressor().compress(plain.read_bytes())
     path = tmp_path / name
@@ -121,7 +119,7 @@ def test_a_compressed_file_opens_and_a_cut_one_gives_its_beginning(tmp_path: Pat
         assert any(loss.kind == "truncated" and str(path) == loss.where for loss in log.lost)
 
 
-def test_a_split_folder_with_a_missing_file_says_so_and_reads_the_rest(tmp_path: Path, shared_dir: Path) -> None:
+def test_a_split_folder_with_a_missing_file_says_so_and_reads_the_rest(tmp_path, shared_dir):
     folder = tmp_path / "split"
     shutil.copytree(shared_dir / "data/drives/faulty/revs_250lm_a_split", folder)
     for file in folder.iterdir():
@@ -134,7 +132,7 @@ def test_a_split_folder_with_a_missing_file_says_so_and_reads_the_rest(tmp_path:
 
 
 @pytest.mark.parametrize("text", ["", "a: [", "rosbag2_bagfile_information: 3", "- 1"])
-def test_a_broken_metadata_file_is_one_clear_line(tmp_path: Path, text: str) -> None:
+def test_a_broken_metadata_file_is_one_clear_line(tmp_path, text):
     (tmp_path / "metadata.yaml").write_text(text)
     with pytest.raises(LogError, match=r"metadata\.yaml"):
         open_log(tmp_path)
@@ -160,7 +158,7 @@ def _database_with_pending_writes(folder: Path) -> Path:
     return path
 
 
-def test_rows_in_a_write_ahead_log_are_read_and_nothing_is_written_beside(tmp_path: Path) -> None:
+def test_rows_in_a_write_ahead_log_are_read_and_nothing_is_written_beside(tmp_path):
     path = _database_with_pending_writes(tmp_path)
     before = {p.name: p.read_bytes() for p in path.parent.iterdir()}
     assert len(_values(path, "/v", "x")) == len(VALUES) + 1
@@ -174,24 +172,25 @@ LARGE = b'{"size": %d, "pixels": "' + b"x" * 20_000 + b'"}'
 
 
 @pytest.fixture
-def mixed(sample_logs_dir: Path, tmp_path: Path) -> Path:
+def mixed(sample_logs_dir, tmp_path):
     """A drive with an image after every 50th message, in the same chunks."""
-    path = tmp_path / "mixed.mcap"
-    with mcap_writer(path, profile="ros2", chunk_size=400_000) as writer:
-        image = writer.register_channel("/camera", "json", 0)
-        for i, message in enumerate(copied(sample_logs_dir / "dlc.mcap", writer)):
+
+    def with_images():
+        for i, message in enumerate(mcap_logs.messages(sample_logs_dir / "dlc.mcap")):
+            yield message
             if i % 50 == 0:
-                writer.add_message(image, message.log_time, LARGE % i, message.publish_time)
-    return path
+                yield message._replace(topic="/camera", data=LARGE % i, encoding="json", schema=("", "", b""))
+
+    return mcap_logs.write_log(tmp_path / "mixed.mcap", with_images(), "ros2", chunk_size=400_000)
 
 
-def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_inspection_decompresses_each_chunk_once(mixed, monkeypatch):
     opened: Counter[bytes] = Counter()
     decompress = mcap_log.decompress
 
     def counted(compression: str, stored: memoryview, *rest: object) -> bytes:
         opened[bytes(stored[:4000])] += 1
-        return decompress(compression, stored, *rest)  # type: ignore[arg-type]
+        return decompress(compression, stored, *rest)
 
     monkeypatch.setattr(mcap_log, "decompress", counted)
     inspection = inspect_log(mixed)
@@ -201,11 +200,11 @@ def test_an_inspection_decompresses_each_chunk_once(mixed: Path, monkeypatch: py
     assert sorted(opened.values())[-2:] in ([1, 1], [1, 2])
 
 
-def test_sums_times_and_numbers_of_messages_are_those_of_the_file(tmp_path: Path) -> None:
+def test_sums_times_and_numbers_of_messages_are_those_of_the_file(tmp_path):
     with McapLogWriter(tmp_path / "a.mcap") as writer:
         writer.add_topic("/v", "std_msgs/msg/Float64")
         for times in np.arange(12).reshape(3, 4):
-            writer.write([TopicBatch("/v", times, times, {"data": np.zeros(4)})])
+            writer.write([Columns("/v", times, times, {"data": np.zeros(4)})])
     with (tmp_path / "a.mcap").open("rb") as file:
         records = [*StreamReader(file, validate_crcs=True).records]
     assert [r.sequence for r in records if isinstance(r, Message)] == [*range(12)]
@@ -233,7 +232,7 @@ yaw_rate_rad_s = {topic = "imu", field = "yaw_rate", scale = 0.01745329251994329
 
 
 @pytest.fixture
-def _installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _installed(tmp_path_factory, monkeypatch):
     """Install a package that adds the format: a module and an entry point."""
     folder = tmp_path_factory.mktemp("package")
     shutil.copy(Path(__file__).with_name("npz_log.py"), folder)
@@ -249,9 +248,9 @@ def _installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Mon
 
 
 @pytest.fixture(scope="module")
-def npz(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def npz(sample_logs_dir, tmp_path_factory):
     """Return a log of the format: the signals of a sample log, steering and wheels at half of the IMU's rate."""
-    columns: dict[str, np.ndarray] = {}  # type: ignore[type-arg]
+    columns: dict[str, np.ndarray] = {}
     with read_drive(sample_logs_dir / "dlc.mcap", Car.load("saloon")) as drive:
         signals = drive.whole().signals
         wheels = {f"wheel_speed_{w}_m_s": signals.speed_m_s for w in ("fl", "fr", "rl", "rr")}
@@ -267,7 +266,7 @@ def npz(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.mark.usefixtures("_installed")
-def test_an_inspection_shows_tables_and_their_units(npz: Path) -> None:
+def test_an_inspection_shows_tables_and_their_units(npz):
     found = inspect_log(npz)
     assert found.kind == "npz"
     assert [(t.name, t.encoding, round(t.rate_hz)) for t in found.topics] == [("esp", "npz", 50), ("imu", "npz", 100)]
@@ -280,7 +279,7 @@ def test_an_inspection_shows_tables_and_their_units(npz: Path) -> None:
 
 
 @pytest.mark.usefixtures("_installed")
-def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz: Path, tmp_path: Path) -> None:
+def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz, tmp_path):
     (tmp_path / "drive.npz.zst").write_bytes(zstandard.compress(npz.read_bytes()))
     expected = open_log(npz).read({"imu": ["yaw_rate"]})["imu"]
     for place in (tmp_path / "drive.npz.zst", tmp_path):
@@ -289,7 +288,7 @@ def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz: Path, tmp_
             np.testing.assert_array_equal(found.fields["yaw_rate"], expected.fields["yaw_rate"])
 
 
-def test_a_table_has_ascending_times_and_tables_have_different_names(npz: Path) -> None:
+def test_a_table_has_ascending_times_and_tables_have_different_names(npz):
     stamps_ns, file = np.arange(5) * 10, LogFile(npz, npz, Meter())
     good, descending = (Table.of_arrays("t", stamps, {"x": np.arange(5.0)}, {}) for stamps in (stamps_ns, -stamps_ns))
     for tables, match in (([descending], "ascending times"), ([good, good], "different names")):
@@ -298,7 +297,7 @@ def test_a_table_has_ascending_times_and_tables_have_different_names(npz: Path) 
 
 
 @pytest.mark.usefixtures("_installed")
-def test_a_search_takes_files_of_the_format_and_a_mapping_file_names_their_columns(npz: Path, tmp_path: Path) -> None:
+def test_a_search_takes_files_of_the_format_and_a_mapping_file_names_their_columns(npz, tmp_path):
     assert [log.path for log in find_logs([str(npz.parent)])] == [npz]
     (tmp_path / "m.toml").write_text(MAPPING)
     with read_drive(npz, Car.load("saloon"), load_mapping(tmp_path / "m.toml")) as drive:
@@ -309,9 +308,7 @@ def test_a_search_takes_files_of_the_format_and_a_mapping_file_names_their_colum
     ("module", "reader", "head"),
     [("asammdf", open_mdf, b"MDF     4.10    "), ("h5py", open_mat, b"MATLAB 7.3 MAT-file")],
 )
-def test_a_missing_extra_is_a_usage_error_with_the_command(
-    module: str, reader: Callable[[TableFile], Tables], head: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_extra_is_a_usage_error_with_the_command(module, reader, head, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UsageError, match=re.escape("pip install 'pdhef-logtool[formats]'")):
         reader(TableFile(BytesIO(head + bytes(100)), len(head) + 100, "a", DEFAULT_LIMITS))

@@ -1,7 +1,5 @@
 """Protobuf messages become the columns that protobuf's own objects hold."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from contextlib import closing
@@ -125,9 +123,7 @@ _MESSAGES = st.fixed_dictionaries(
 @pytest.mark.slow
 @settings(max_examples=60, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(values=st.lists(_MESSAGES, min_size=1, max_size=8), choices=st.lists(st.sampled_from(["", "torque", "brake"])))
-def test_columns_equal_protobufs_own_objects(
-    tmp_path_factory: pytest.TempPathFactory, values: list[dict[str, Any]], choices: list[str]
-) -> None:
+def test_columns_equal_protobufs_own_objects(tmp_path_factory, values, choices):
     messages = [STATE(**v) for v in values]
     for message, choice in zip(messages, choices, strict=False):
         if choice:
@@ -157,7 +153,7 @@ def test_columns_equal_protobufs_own_objects(
     np.testing.assert_array_equal(got["packed[2]"], third)
 
 
-def test_fields_are_listed_without_maps_and_recursion(tmp_path: Path) -> None:
+def test_fields_are_listed_without_maps_and_recursion(tmp_path):
     _write(tmp_path / "a.mcap", [b""])
     with closing(open_log(tmp_path / "a.mcap")) as log:
         kinds = {f.path: f.kind for f in log.fields("/state")}
@@ -166,7 +162,7 @@ def test_fields_are_listed_without_maps_and_recursion(tmp_path: Path) -> None:
     assert not [p for p in kinds if p.startswith(("labels", "parent"))]
 
 
-def test_a_payload_that_is_no_message_is_counted_and_nan(tmp_path: Path) -> None:
+def test_a_payload_that_is_no_message_is_counted_and_nan(tmp_path):
     good = STATE(a_double=2.0).SerializeToString()
     _write(tmp_path / "a.mcap", [good, b"\xff\xff\xff", good, good[:-1]])
     with closing(open_log(tmp_path / "a.mcap")) as log:
@@ -189,9 +185,7 @@ def test_a_payload_that_is_no_message_is_counted_and_nan(tmp_path: Path) -> None
          ).SerializeToString(), "protobuf", "imports itself"),
     ],
 )  # fmt: skip
-def test_a_schema_that_cannot_be_used_is_one_clear_line(
-    tmp_path: Path, schema: bytes, encoding: str, says: str
-) -> None:
+def test_a_schema_that_cannot_be_used_is_one_clear_line(tmp_path, schema, encoding, says):
     _write(tmp_path / "a.mcap", [b""], schema=schema, encoding=encoding)
     with closing(open_log(tmp_path / "a.mcap")) as log:
         assert log.fields("/state") == ()
@@ -201,7 +195,7 @@ def test_a_schema_that_cannot_be_used_is_one_clear_line(
 
 
 @pytest.mark.parametrize("ending", ["|hex", "|base64"])
-def test_bytes_that_stand_as_text(tmp_path: Path, ending: str) -> None:
+def test_bytes_that_stand_as_text(tmp_path, ending):
     raw = [b"", b"\x00\xff\x10", b"12345678"]
     texts = [x.hex(" ") if ending == "|hex" else base64.b64encode(x).decode() for x in raw]
     _write(tmp_path / "a.mcap", [STATE(name=t).SerializeToString() for t in (*texts, "no digits")])

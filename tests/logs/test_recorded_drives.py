@@ -1,7 +1,5 @@
 """Recorded drives and their damaged copies: counts, intervals of loss, and values against an independent reader."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from collections import Counter
@@ -15,11 +13,11 @@ from recorded import attribute, counts_of, decoded_by_rosbags, messages_of, nume
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import RawMessage, block_of
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import LogError, MappingError
 from tests.mcap_files import mcap_writer
 
@@ -53,7 +51,7 @@ def _as_column(value: object) -> object:
 
 
 @pytest.mark.parametrize("name", sorted(_COMPARED))
-def test_values_equal_those_of_an_independent_reader(shared_dir: Path, name: str) -> None:
+def test_values_equal_those_of_an_independent_reader(shared_dir, name):
     path = shared_dir / name
     expected = decoded_by_rosbags([path], _COMPARED[name])
     with closing(open_log(path)) as log:
@@ -66,7 +64,7 @@ def test_values_equal_those_of_an_independent_reader(shared_dir: Path, name: str
             assert read[topic].fields[field].dtype == (np.int64 if field.endswith("stamp") else np.float64)
 
 
-def test_elements_of_an_array_are_those_of_the_whole_one(shared_dir: Path) -> None:
+def test_elements_of_an_array_are_those_of_the_whole_one(shared_dir):
     paths = ["data", "data[0]", "data[1]", "data[7]"]
     with closing(open_log(shared_dir / "data/drives/f1tenth_hoons_run2.bag")) as log:
         whole, *elements, missing = log.read({"/sensors/wheel_speed": paths})["/sensors/wheel_speed"].fields.values()
@@ -74,7 +72,7 @@ def test_elements_of_an_array_are_those_of_the_whole_one(shared_dir: Path) -> No
     assert np.all(np.isnan(missing))
 
 
-def test_a_split_folder_is_one_log(shared_dir: Path) -> None:
+def test_a_split_folder_is_one_log(shared_dir):
     split, whole = open_log(shared_dir / FAULTY / "revs_250lm_a_split"), open_log(shared_dir / REVS)
     assert split.kind == "rosbag2-mcap"
     assert [(t.name, t.messages) for t in split.topics] == [(t.name, t.messages) for t in whole.topics]
@@ -114,7 +112,7 @@ def _field_problems(log: DriveLog, file: str) -> list[str]:
     return problems
 
 
-def test_every_recording_ends_as_catalogued_and_every_field_decodes(shared_dir: Path) -> None:
+def test_every_recording_ends_as_catalogued_and_every_field_decodes(shared_dir):
     root = shared_dir / "reader_corpus"
     catalogue = json.loads((root / "CATALOG.json").read_text())
     problems: list[str] = []
@@ -131,7 +129,7 @@ def test_every_recording_ends_as_catalogued_and_every_field_decodes(shared_dir: 
     assert not problems, "\n".join(problems)
 
 
-def test_a_database_that_its_folder_declares_in_another_format_is_not_decoded_as_cdr(shared_dir: Path) -> None:
+def test_a_database_that_its_folder_declares_in_another_format_is_not_decoded_as_cdr(shared_dir):
     folder = shared_dir / "reader_corpus" / "ros2_rosbag2/rosbag2_tests/resources/sqlite3/wrong_rmw_test"
     with closing(open_log(folder)) as log:
         assert {t.encoding for t in log.topics} == {"wrong_format"}
@@ -139,7 +137,7 @@ def test_a_database_that_its_folder_declares_in_another_format_is_not_decoded_as
             log.read({"/test_topic": ["bool_value"]})
 
 
-def test_definitions_behind_a_short_separator_are_read(shared_dir: Path) -> None:
+def test_definitions_behind_a_short_separator_are_read(shared_dir):
     with closing(
         open_log(shared_dir / "reader_corpus" / "plotjuggler_pj-mcap-server/test_embedded_timestamp.mcap")
     ) as log:
@@ -176,7 +174,7 @@ def _annotate(source: Path | ColumnarLog, target: Path, leave_out=lambda _: Fals
             channels = register_channels(writer, log, leave_out=leave_out)
             writer.add_topic("/ours", "std_msgs/msg/Float64")
             stamps = T0 - 50_000_000 + np.arange(7000) * 100_000
-            ours = [TopicBatch("/ours", stamps, stamps, {"data": np.arange(7000.0)})]
+            ours = [Columns("/ours", stamps, stamps, {"data": np.arange(7000.0)})]
             writer.write(ours, iterate_copy(log, channels, *window))
         return log.lost
 
@@ -195,23 +193,23 @@ def _damage_chunk(path: Path, number: int) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_a_damaged_chunk_is_dropped_and_said(tmp_path: Path, compression: CompressionType) -> None:
+def test_a_damaged_chunk_is_dropped_and_said(tmp_path, compression):
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     _write(source, compression=compression)
     intact = _messages(source)
     start, end = _damage_chunk(source, 2)
     lost = _annotate(source, target)
     assert [(x.kind, x.start_ns, x.end_ns) for x in lost] == [("bad-chunk", start, end)]
-    assert _messages(target) == [m for m in intact if not start <= m[0] < end]  # type: ignore[operator]
+    assert _messages(target) == [m for m in intact if not start <= m[0] < end]
     assert _messages(target) != intact
 
 
-def test_a_copy_of_a_window_without_a_topic(tmp_path: Path) -> None:
+def test_a_copy_of_a_window_without_a_topic(tmp_path):
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     _write(source, extra=("/old",))
     start, end = T0 + 100_500_000, T0 + 400_500_000
     assert _annotate(source, target, lambda topic: topic == "/old", (start, end)) == ()
-    kept = [m for m in _messages(source) if m[1] != "/old" and start <= m[0] < end]  # type: ignore[operator]
+    kept = [m for m in _messages(source) if m[1] != "/old" and start <= m[0] < end]
     assert _messages(target) == kept
 
 
@@ -231,7 +229,7 @@ def _split(tmp_path: Path, swap: bool) -> ColumnarLog:
 
 
 @pytest.mark.parametrize("swap", [False, True])
-def test_split_files_become_one_whatever_their_ids(tmp_path: Path, swap: bool) -> None:
+def test_split_files_become_one_whatever_their_ids(tmp_path, swap):
     target = tmp_path / "copy.mcap"
     _annotate(_split(tmp_path, swap), target)
     expected = _messages(tmp_path / "0.mcap") + _messages(tmp_path / "1.mcap")
@@ -261,7 +259,7 @@ def _copy_all(source: Path, target: Path) -> None:
         "reader_corpus/rerun/foxglove_log.mcap",
     ],
 )
-def test_copies_of_recordings_equal_their_sources(shared_dir: Path, tmp_path: Path, name: str) -> None:
+def test_copies_of_recordings_equal_their_sources(shared_dir, tmp_path, name):
     _copy_all(shared_dir / name, tmp_path / "copy.mcap")
     copied, original = messages_of(tmp_path / "copy.mcap"), messages_of(shared_dir / name)
     assert len(copied) == len(original)
@@ -271,7 +269,7 @@ def test_copies_of_recordings_equal_their_sources(shared_dir: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ["data/drives/lunda_v40", "reader_corpus/foxglove_rosbag1/example-bz2.bag"])
-def test_a_copy_of_another_container_keeps_bytes_and_definitions(shared_dir: Path, tmp_path: Path, name: str) -> None:
+def test_a_copy_of_another_container_keeps_bytes_and_definitions(shared_dir, tmp_path, name):
     from rosbags.highlevel import AnyReader
 
     source, target = shared_dir / name, tmp_path / "copy.mcap"

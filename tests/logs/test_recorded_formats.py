@@ -1,7 +1,5 @@
 """Recorded drives in other formats: the same signals give the same sideslip scores as in MCAP."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -75,9 +73,7 @@ def _scores(log: Path, table: _Table, car: Path) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(("file", "table", "more"), [("v40_swd.vbo", V40_VBO, {}), ("v40_swd.mf4", V40_MF4, _GNSS)])
-def test_scores_are_those_of_the_same_drive_in_mcap(
-    file: str, table: _Table, more: _Table, shared_dir: Path, tmp_path: Path
-) -> None:
+def test_scores_are_those_of_the_same_drive_in_mcap(file, table, more, shared_dir, tmp_path):
     car = tmp_path / "vehicle.toml"
     car.write_text(f'name = "test"\n{V40}')
     drive = shared_dir / "data" / "drives" / "v40_swd_gnss.mcap"

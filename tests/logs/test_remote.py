@@ -1,14 +1,12 @@
 """Logs on a server: the same figures as from the file, each byte once, faults in one line, safe redirects."""
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import os
 import random
 import socket
-from collections.abc import Callable, Iterator
 from contextlib import closing
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +15,20 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from pdhef_logtool import Car, ReadOptions, read_drive
 from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.byte_source import SourceError
-from pdhef_logtool.logs.container import Wanted
+from pdhef_logtool.logs.container import ChannelRecord, RawMessage, Wanted, block_of
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import log_metadata, open_log
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, RedirectGuard, is_public
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, LogError, UsageError
-from tests.camera_log import with_camera, write_apart
 from tests.command_line import called
 from tests.counting_server import CountingServer, Fault, cutting, serving, stalling, status
 
@@ -39,12 +38,12 @@ NOTHING_YET = Wanted(frozenset())
 
 
 @pytest.fixture(scope="module")
-def saloon() -> Car:
+def saloon():
     return Car.load("saloon")
 
 
 @pytest.fixture(autouse=True)
-def _impatient_and_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def _impatient_and_alone(monkeypatch):
     monkeypatch.setattr(remote_source, "WAITS_S", (0.01, 0.02))
     for name in ("http_proxy", "HTTP_PROXY", "https_proxy", "HTTPS_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
@@ -75,7 +74,7 @@ def _place(server: CountingServer, name: str) -> RemotePlace:
 
 @settings(max_examples=8, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 400_000), st.integers(0, 200_000)), max_size=8), st.randoms())
-def test_any_split_gives_the_same_bytes_and_none_twice(reads: list[tuple[int, int]], order: random.Random) -> None:
+def test_any_split_gives_the_same_bytes_and_none_twice(reads, order):
     data = random.Random(1).randbytes(400_000)
     with serving(x=data) as server:
         with closing(RemoteSource(_place(server, "x"))) as source:
@@ -93,11 +92,33 @@ def test_any_split_gives_the_same_bytes_and_none_twice(reads: list[tuple[int, in
 # -------------------------------------------------------------------------------------------------- the same log
 
 
-def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(
-    tmp_path: Path, sample_logs_dir: Path, saloon: Car
-) -> None:
-    file = tmp_path / "apart.mcap"
-    write_apart(file, with_camera(sample_logs_dir / "dlc.mcap", 2_000_000_000))
+_CAMERA = ChannelRecord(-1, "/camera", "cdr", "sensor_msgs/msg/CompressedImage", "ros2msg", b"uint8[] data")
+_SLICE_NS, _IMAGE_NS, _IMAGE_BYTES = 2_000_000_000, 200_000_000, 20_000
+
+
+def with_camera(source: Path, target: Path) -> Path:
+    """Copy an MCAP in chunks of 2 s, and behind each write as long a chunk of images."""
+    noise, head = random.Random(1), b"\0\1\0\0" + _IMAGE_BYTES.to_bytes(4, "little")
+    with source.open("rb") as file, McapLogWriter(target) as writer:
+        camera, ids = writer.add_channel(_CAMERA), {}
+        for _, rows in groupby(make_reader(file).iter_messages(), lambda row: row[2].log_time // _SLICE_NS):
+            sensors = []
+            for schema, channel, message in rows:
+                if channel.id not in ids:
+                    record = (channel.topic, "cdr", schema.name, schema.encoding, schema.data)
+                    ids[channel.id] = writer.add_channel(ChannelRecord(-1, *record))
+                at = message.log_time
+                sensors.append(RawMessage(ids[channel.id], at, at, 0, message.data))
+            start_ns = sensors[0].log_time_ns
+            stamps = range(start_ns, start_ns + _SLICE_NS, _IMAGE_NS)
+            images = [RawMessage(camera, at, at, 0, head + noise.randbytes(_IMAGE_BYTES)) for at in stamps]
+            for chunk in (sensors, images):
+                writer.write([], [block_of(chunk)])
+    return target
+
+
+def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(tmp_path, sample_logs_dir, saloon):
+    file = with_camera(sample_logs_dir / "dlc.mcap", tmp_path / "apart.mcap")
     with serving(**{file.name: file.read_bytes()}) as server:
         hashes = []
         for place in (_place(server, file.name), file):
@@ -122,7 +143,7 @@ def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(
     ],
     ids=["cut", "no footer", "damaged"],
 )
-def test_a_damaged_log_loses_the_same(tmp_path: Path, sample_logs_dir: Path, spoil: Callable[[bytes], bytes]) -> None:
+def test_a_damaged_log_loses_the_same(tmp_path, sample_logs_dir, spoil):
     file = tmp_path / "damaged.mcap"
     file.write_bytes(spoil((sample_logs_dir / "dlc.mcap").read_bytes()))
     with serving(**{file.name: file.read_bytes()}) as server:
@@ -134,7 +155,7 @@ def test_a_damaged_log_loses_the_same(tmp_path: Path, sample_logs_dir: Path, spo
         assert server.twice() == 0
 
 
-def test_other_formats_are_fetched_once_as_a_whole(tmp_path: Path, sample_logs_dir: Path) -> None:
+def test_other_formats_are_fetched_once_as_a_whole(tmp_path, sample_logs_dir):
     (database,) = (sample_logs_dir / "step_rosbag2").glob("*.db3")
     plain = (sample_logs_dir / "dlc.mcap").read_bytes()
     files = {"dlc.mcap.zst": zstandard.ZstdCompressor(1).compress(plain), "step.db3": database.read_bytes()}
@@ -145,7 +166,7 @@ def test_other_formats_are_fetched_once_as_a_whole(tmp_path: Path, sample_logs_d
         assert server.twice() == 0
 
 
-def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir: Path) -> None:
+def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir):
     file = sample_logs_dir / "dlc.mcap"
     with serving(**{file.name: file.read_bytes()}) as server:
         server.ranges = False
@@ -158,7 +179,7 @@ def _copies() -> list[Path]:
     return sorted(Path(os.environ["PDHEF_CACHE_DIR"]).glob("remote/*/object/*"))
 
 
-def test_a_later_command_fetches_no_byte_again(served: CountingServer, sample_logs_dir: Path) -> None:
+def test_a_later_command_fetches_no_byte_again(served, sample_logs_dir):
     place = _place(served, "dlc.mcap")
     first = _read(place)
     served.requests.clear()
@@ -174,7 +195,7 @@ def test_a_later_command_fetches_no_byte_again(served: CountingServer, sample_lo
     assert _read(place) == _read(sample_logs_dir / "road.mcap")
 
 
-def test_copies_in_use_stay_and_the_others_are_removed(served: CountingServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_copies_in_use_stay_and_the_others_are_removed(served, monkeypatch):
     served.files["again.mcap"] = served.files["dlc.mcap"]
     with closing(open_log(_place(served, "dlc.mcap"))):
         monkeypatch.setattr(remote_source, "CACHE_BYTES", 0)
@@ -183,7 +204,7 @@ def test_copies_in_use_stay_and_the_others_are_removed(served: CountingServer, m
     assert _copies() == []
 
 
-def test_metadata_is_read_from_head_and_tail(sample_logs_dir: Path) -> None:
+def test_metadata_is_read_from_head_and_tail(sample_logs_dir):
     file = sample_logs_dir / "road.mcap"
     with serving(**{file.name: file.read_bytes()}) as server:
         assert log_metadata(_place(server, file.name)) == log_metadata(file)
@@ -204,7 +225,7 @@ def _error(server: CountingServer, name: str = "dlc.mcap") -> SourceError:
 
 
 @pytest.fixture
-def served(sample_logs_dir: Path) -> Iterator[CountingServer]:
+def served(sample_logs_dir):
     with serving(**{"dlc.mcap": (sample_logs_dir / "dlc.mcap").read_bytes()}) as server:
         yield server
 
@@ -223,9 +244,7 @@ def served(sample_logs_dir: Path) -> Iterator[CountingServer]:
     ],
     ids=["429", "503", "503 later", "404", "403", "round and round", "cuts", "stalls"],
 )
-def test_faults_end_in_one_line(
-    served: CountingServer, monkeypatch: pytest.MonkeyPatch, fault, words: str, requests: int | None
-) -> None:
+def test_faults_end_in_one_line(served, monkeypatch, fault, words, requests):
     served.fault = fault
     if words.startswith("silence"):
         monkeypatch.setattr(remote_source, "SILENCE_S", 0.2)
@@ -233,7 +252,7 @@ def test_faults_end_in_one_line(
     assert requests is None or len(served.requests) == requests
 
 
-def test_a_server_that_is_busy_or_cuts_for_a_while_costs_time_only(served: CountingServer, sample_logs_dir) -> None:
+def test_a_server_that_is_busy_or_cuts_for_a_while_costs_time_only(served, sample_logs_dir):
     served.fault = status(503, times=2)
     assert _read(_place(served, "dlc.mcap")) == _read(sample_logs_dir / "dlc.mcap")
     served.files["again.mcap"] = served.files["dlc.mcap"]
@@ -243,9 +262,8 @@ def test_a_server_that_is_busy_or_cuts_for_a_while_costs_time_only(served: Count
 
 
 @pytest.mark.parametrize("without_headers", [(), ("ETag",), ("ETag", "Last-Modified")])
-def test_a_changed_object_is_an_error(tmp_path: Path, sample_logs_dir: Path, without_headers: tuple[str, ...]) -> None:
-    write_apart(tmp_path / "apart.mcap", with_camera(sample_logs_dir / "dlc.mcap", 2_000_000_000))
-    data = (tmp_path / "apart.mcap").read_bytes()
+def test_a_changed_object_is_an_error(tmp_path, sample_logs_dir, without_headers):
+    data = with_camera(sample_logs_dir / "dlc.mcap", tmp_path / "apart.mcap").read_bytes()
     with serving(**{"apart.mcap": data}) as server:
         server.without = frozenset(without_headers)
         with closing(open_log(_place(server, "apart.mcap"), wanted=NOTHING_YET)) as log:
@@ -256,14 +274,14 @@ def test_a_changed_object_is_an_error(tmp_path: Path, sample_logs_dir: Path, wit
             assert log.lost
 
 
-def test_nobody_answers() -> None:
+def test_nobody_answers():
     with serving(x=b"") as server:
         gone = server.url
     with pytest.raises(SourceError, match="no connection"):
         open_log(f"{gone}/x.mcap")
 
 
-def test_empty_and_other_content(served: CountingServer) -> None:
+def test_empty_and_other_content(served):
     served.files |= {"empty.mcap": b"", "page.html": b"<html>" * 1000}
     with pytest.raises(LogError, match="an empty file"):
         open_log(served.place("empty.mcap"))
@@ -272,7 +290,7 @@ def test_empty_and_other_content(served: CountingServer) -> None:
     assert served.bytes_sent <= remote_source.BLOCK_BYTES
 
 
-def test_no_room_is_said(served: CountingServer) -> None:
+def test_no_room_is_said(served):
     resource = pytest.importorskip("resource", reason="limits the size of files")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
@@ -285,7 +303,7 @@ def test_no_room_is_said(served: CountingServer) -> None:
 # -------------------------------------------------------------------------------------------- names and secrets
 
 
-def test_nothing_secret_is_shown(served: CountingServer) -> None:
+def test_nothing_secret_is_shown(served):
     secret = served.place("dlc.mcap").replace("http://", "http://me:hunter2@") + "?X-Amz-Signature=cafe&part=1"
     place = RemotePlace(secret)
     assert (str(place), place.parent) == (served.place("dlc.mcap"), served.url)
@@ -301,7 +319,7 @@ def test_nothing_secret_is_shown(served: CountingServer) -> None:
     assert [r.path for r in served.requests if r.path != "dlc.mcap"] == []
 
 
-def test_identity_is_url_size_and_etag(served: CountingServer) -> None:
+def test_identity_is_url_size_and_etag(served):
     (log,) = find_logs([served.place("dlc.mcap")])
     first = identity_of(log)
     assert len(served.requests) == 1
@@ -312,7 +330,7 @@ def test_identity_is_url_size_and_etag(served: CountingServer) -> None:
     assert identity_of(log) != first
 
 
-def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_logs_dir: Path) -> None:
+def test_urls_lists_and_files_together(tmp_path, monkeypatch, sample_logs_dir):
     listed = tmp_path / "list.txt"
     dlc = sample_logs_dir / "dlc.mcap"
     listed.write_text(f"# drives\nhttps://host/a/one.mcap\n\n{dlc}\nhttps://host/b/one.mcap\n")
@@ -365,7 +383,7 @@ TARGETS = {
 
 @pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS)
 @pytest.mark.parametrize("code", [302, 307])
-def test_a_redirect_to_another_private_host_is_refused(served: CountingServer, target: str, code: int) -> None:
+def test_a_redirect_to_another_private_host_is_refused(served, target, code):
     served.fault = _redirecting(target.format(port=served.url.rpartition(":")[2]), code)
     place = RemotePlace(served.place("away.mcap"))
     for use in (open_log, lambda p: identity_of(LogInput(p, "x"))):
@@ -377,7 +395,7 @@ def test_a_redirect_to_another_private_host_is_refused(served: CountingServer, t
     assert {r.path for r in served.requests} == {"away.mcap"}, "nothing else was asked for"
 
 
-def test_a_redirect_on_the_same_host_is_followed(served: CountingServer) -> None:
+def test_a_redirect_on_the_same_host_is_followed(served):
     served.fault = _redirecting("/dlc.mcap")
     with serving(**served.files) as other:
         for to in ("/dlc.mcap", served.place("dlc.mcap"), other.place("dlc.mcap")):
@@ -386,7 +404,7 @@ def test_a_redirect_on_the_same_host_is_followed(served: CountingServer) -> None
                 assert log.lost == ()
 
 
-def test_an_option_allows_it(served: CountingServer, tmp_path: Path) -> None:
+def test_an_option_allows_it(served, tmp_path):
     served.fault = _redirecting(served.place("dlc.mcap").replace("127.0.0.1", "localhost"))
     url = served.place("away.mcap")
     with (
@@ -402,9 +420,7 @@ def test_an_option_allows_it(served: CountingServer, tmp_path: Path) -> None:
     assert called("inspect", url, "--fields", cwd=tmp_path).returncode == EXIT_OK
 
 
-def test_a_public_host_may_redirect_to_public_ones_alone(
-    served: CountingServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_public_host_may_redirect_to_public_ones_alone(served, monkeypatch):
     monkeypatch.setattr("pdhef_logtool.logs.redirect_guard.is_public", lambda ip: ip.startswith("127."))
     port = served.url.rpartition(":")[2]
     _named(monkeypatch, one=["127.0.0.1"], two=["127.0.0.1"], inside=["10.0.0.1"])
@@ -418,7 +434,7 @@ def test_a_public_host_may_redirect_to_public_ones_alone(
                 open_log(place)
 
 
-def test_a_name_that_turns_private_is_not_connected_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_that_turns_private_is_not_connected_to(monkeypatch):
     _named(monkeypatch, origin=["8.8.8.8", "127.0.0.1"], other=["8.8.4.4", "10.0.0.1"], intranet=["10.1.1.1"])
 
     async def resolved() -> None:
@@ -444,5 +460,5 @@ PUBLIC = {
 
 
 @pytest.mark.parametrize("address", PUBLIC)
-def test_which_addresses_are_public(address: str) -> None:
+def test_which_addresses_are_public(address):
     assert is_public(address) is PUBLIC[address]

@@ -1,10 +1,6 @@
 """Logs in an S3 store: moto's server on this machine."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 
@@ -14,18 +10,18 @@ from pdhef_logtool.logs.discovery import find_logs, folders_of, identity_of
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import UsageError
 from tests.counting_server import empty_cache
-from tests.s3_store import S3Store, s3_store
+from tests.s3_store import s3_store
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def store() -> Iterator[S3Store]:
+def store():
     with s3_store() as empty:
         yield empty
 
 
-def test_a_prefix_is_searched_like_a_folder(store: S3Store) -> None:
+def test_a_prefix_is_searched_like_a_folder(store):
     keys = ["day/b.mcap", "day/car/a.bag.zst", "day/notes.txt", "day/.old/c.mcap", "day/run/run.json", "day/run/d.mcap"]
     for key in [*keys, "other/e.mcap"]:
         store.put(key, b"x")
@@ -40,7 +36,7 @@ def test_a_prefix_is_searched_like_a_folder(store: S3Store) -> None:
         find_logs(["s3://bikes/"])
 
 
-def test_same_log_and_a_changed_one(store: S3Store, sample_logs_dir: Path) -> None:
+def test_same_log_and_a_changed_one(store, sample_logs_dir):
     file = sample_logs_dir / "road.mcap"
     store.put("a b/dlc+1.mcap", file.read_bytes())
     url = f"{store.url}/a b/dlc+1.mcap"

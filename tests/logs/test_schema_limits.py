@@ -1,11 +1,8 @@
 """Schemas and messages that cost more than they hold: refused in time, as a loss that names the channel."""
 
-from __future__ import annotations
-
 import json
 import time
 from contextlib import closing, nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,7 +92,7 @@ _BOMBS = {
 
 
 @pytest.mark.parametrize("case", _BOMBS)
-def test_a_schema_that_costs_too_much_is_refused_in_time(case: str) -> None:
+def test_a_schema_that_costs_too_much_is_refused_in_time(case):
     encoding, text, says = _BOMBS[case]
     started = time.process_time()
     with pytest.raises(SchemaError, match=says):
@@ -103,14 +100,14 @@ def test_a_schema_that_costs_too_much_is_refused_in_time(case: str) -> None:
     assert time.process_time() - started < 5.0
 
 
-def test_higher_limits_read_what_is_sound_and_large() -> None:
+def test_higher_limits_read_what_is_sound_and_large():
     channel = ChannelRecord(1, "/t", "cdr", "p/msg/A", "ros2msg", b"string[4000] x\n")
     with pytest.raises(SchemaError, match="--set budget"):
         channel_schema(channel)
     assert len(list(leaves(channel_schema(channel, limits=DEFAULT_LIMITS.times(2.0)).root))) == 1
 
 
-def test_a_schema_that_refers_to_itself_is_open_there() -> None:
+def test_a_schema_that_refers_to_itself_is_open_there():
     schema = _schema(
         "jsonschema", '{"$ref": "#/d", "d": {"properties": {"a": {"$ref": "#/d"}, "b": {"type": "number"}}}}'
     )
@@ -119,7 +116,7 @@ def test_a_schema_that_refers_to_itself_is_open_there() -> None:
     np.testing.assert_array_equal(values, [2.0])
 
 
-def test_an_array_without_end_does_not_take_its_neighbours_along() -> None:
+def test_an_array_without_end_does_not_take_its_neighbours_along():
     schema = _schema("ros2msg", "int8 y\nfloat64[4294967295] x\n")
     with pytest.raises(MappingError, match="4294967295 elements, too many"):
         resolve(schema, "/t", "x")
@@ -131,7 +128,7 @@ def test_an_array_without_end_does_not_take_its_neighbours_along() -> None:
     [b'{"a": ' * 900 + b"1" + b"}" * 900, b"[" * 50_000, b'{"a": ' + b"9" * 100_000 + b"}", b"\xff", b"", b"null"],
     ids=["deep", "deeper", "a long number", "no text", "nothing", "null"],
 )
-def test_a_hostile_json_message_is_one_that_does_not_decode(message: bytes) -> None:
+def test_a_hostile_json_message_is_one_that_does_not_decode(message):
     schema = _schema("jsonschema", '{"properties": {"a": {"type": "number"}}}')
     values, undecodable = _columns(schema, "a", b'{"a": 1}', message, b'{"a": ' + b"9" * 4000 + b"}")
     assert values[0] == 1.0
@@ -144,7 +141,7 @@ def test_a_hostile_json_message_is_one_that_does_not_decode(message: bytes) -> N
 
 
 @pytest.mark.parametrize(("wire", "head"), [("ros2msg", b"\0\1\0\0"), ("ros2msg", b"\0\0\0\0"), ("ros1msg", b"")])
-def test_a_claimed_length_allocates_nothing(wire: str, head: bytes) -> None:
+def test_a_claimed_length_allocates_nothing(wire, head):
     schema = _schema(wire, f"int8 y\nE[] x\nfloat64[] z\nstring s\n{_NEXT}MSG: p/E\nuint8 a\n")
     for at in (4, 8, 12):
         message = bytearray(head + bytes(40))
@@ -152,7 +149,7 @@ def test_a_claimed_length_allocates_nothing(wire: str, head: bytes) -> None:
         assert _columns(schema, "y", bytes(message))[1] == [0]
 
 
-def test_a_message_of_objects_without_end_is_not_turned_into_them() -> None:
+def test_a_message_of_objects_without_end_is_not_turned_into_them():
     many = 40_000_000
     schema = _schema("ros2msg", f"E[] x\nint8 y\n{_NEXT}MSG: p/E\nuint8 a\n")
     assert _columns(schema, "y", b"\0\1\0\0" + many.to_bytes(4, "little") + bytes(many + 1))[1] == [0]
@@ -161,7 +158,7 @@ def test_a_message_of_objects_without_end_is_not_turned_into_them() -> None:
     assert _columns(image, "y", b"\0\1\0\0" + many.to_bytes(4, "little") + bytes(many) + b"\5")[0].tolist() == [5.0]
 
 
-def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_path: Path) -> None:
+def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_path):
     path = tmp_path / "a.mcap"
     with mcap_writer(path) as writer:
         for topic, encoding, text, messages in [
@@ -179,12 +176,12 @@ def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_
 
 
 @pytest.mark.parametrize("name", ["../../x", "p/msg/../../../x", "/etc/x", "p/msg/T\n", "p/T", "", "no_such/msg/Type"])
-def test_a_type_name_becomes_no_path(name: str) -> None:
+def test_a_type_name_becomes_no_path(name):
     with pytest.raises(KeyError):
         message_definition(name)
 
 
-def test_a_type_without_a_definition_is_no_loss() -> None:
+def test_a_type_without_a_definition_is_no_loss():
     with pytest.raises(NoSchemaError):
         _schema("", b"", "p/msg/Nowhere", None)
     with pytest.raises(NoSchemaError):
@@ -214,7 +211,7 @@ _TEXTS = {
     ),
     st.binary(max_size=60),
 )
-def test_a_mutated_schema_is_read_or_refused(encoding: str, cuts: list[tuple[int, int, str]], message: bytes) -> None:
+def test_a_mutated_schema_is_read_or_refused(encoding, cuts, message):
     text = _TEXTS[encoding]
     for at, n, new in cuts:
         text = text[: at % (len(text) + 1)] + new + text[at % (len(text) + 1) + n :]
@@ -252,15 +249,15 @@ MIB = 1 << 20
         ("seconds_per_mib", 10.0, 200.0),
     ],
 )
-def test_sound_amounts_pass_and_harmful_ones_do_not(limit: str, sound: float, harmful: float) -> None:
+def test_sound_amounts_pass_and_harmful_ones_do_not(limit, sound, harmful):
     DEFAULT_LIMITS.check(limit, sound, "a file")
     with pytest.raises(LimitError, match=f"a file: expected at most .* {limit.replace('_', ' ')}, got .*--set budget"):
         DEFAULT_LIMITS.check(limit, harmful, "a file")
     DEFAULT_LIMITS.times(harmful / sound).check(limit, harmful, "a file")
 
 
-def test_every_default_is_tested() -> None:
-    (mark,) = test_sound_amounts_pass_and_harmful_ones_do_not.pytestmark  # type: ignore[attr-defined]
+def test_every_default_is_tested():
+    (mark,) = test_sound_amounts_pass_and_harmful_ones_do_not.pytestmark
     assert {name for name, *_ in mark.args[1]} == set(ResourceLimits.__slots__)
 
 
@@ -268,13 +265,13 @@ def test_every_default_is_tested() -> None:
     ("size", "stored", "limit"),
     [(2, 1, ""), (1, 1 / MIB, ""), (2, 100 / MIB, "chunk ratio"), (1024, 1024, "chunk bytes"), (2, 0, "chunk ratio")],
 )
-def test_small_parts_may_unfold_as_they_like(size: int, stored: float, limit: str) -> None:
+def test_small_parts_may_unfold_as_they_like(size, stored, limit):
     with pytest.raises(LimitError, match=limit) if limit else nullcontext():
         DEFAULT_LIMITS.check_unpacked(size * MIB, round(stored * MIB), "a chunk")
 
 
 @pytest.mark.parametrize(("size", "stored", "limit"), [(100, 1, ""), (600, 1, "table bytes"), (600, 20, "")])
-def test_tables_may_be_as_large_as_their_file_gives_reason_for(size: int, stored: int, limit: str) -> None:
+def test_tables_may_be_as_large_as_their_file_gives_reason_for(size, stored, limit):
     with pytest.raises(LimitError, match=limit) if limit else nullcontext():
         DEFAULT_LIMITS.check_table(size * MIB, stored * MIB, "a file")
 
@@ -283,12 +280,12 @@ def test_tables_may_be_as_large_as_their_file_gives_reason_for(size: int, stored
     ("count", "stored", "limit"),
     [(60_000, 1, ""), (10**5, 10**5, ""), (10**5, 1000, "messages per byte"), (10**7, 1 << 30, "chunk messages")],
 )
-def test_many_messages_need_bytes(count: int, stored: int, limit: str) -> None:
+def test_many_messages_need_bytes(count, stored, limit):
     with pytest.raises(LimitError, match=limit) if limit else nullcontext():
         DEFAULT_LIMITS.check_messages(count, stored)
 
 
-def test_time_grows_with_what_is_read_and_counts_again_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_grows_with_what_is_read_and_counts_again_each_time(monkeypatch):
     now = [0.0]
     monkeypatch.setattr("pdhef_logtool.logs.resource_limits.time.thread_time", lambda: now[0])
     meter = Meter(ResourceLimits(seconds=5.0, seconds_per_mib=20.0))

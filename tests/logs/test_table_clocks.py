@@ -1,10 +1,7 @@
 """Clocks of tables: times in every unit are recovered, assumptions are noted, and no row is moved."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +9,6 @@ import polars as pl
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pdhef_logtool.logs.table_clocks import (
     NO_TIME,
@@ -25,15 +21,15 @@ from pdhef_logtool.logs.table_clocks import (
 )
 from pdhef_logtool.logs.table_columns import Sheet, find_clock, split_unit, tables_of
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 from tests.table_contents import opened
 
 MAY_1_NS = 1_714_521_600 * 10**9  # 2024-05-01
 UNIX_TO_GPS_S = 315_964_800 - 18
 
 
-def _clock(unit: str = "", name: str = "time", **columns: object):  # type: ignore[no-untyped-def]
-    return find_clock(Sheet("csv", columns, {name: unit} if unit else {}), "a.csv")  # type: ignore[arg-type]
+def _clock(unit: str = "", name: str = "time", **columns: object):
+    return find_clock(Sheet("csv", columns, {name: unit} if unit else {}), "a.csv")
 
 
 def _times(rate_hz: float, n: int) -> IntArray:
@@ -48,9 +44,7 @@ def _times(rate_hz: float, n: int) -> IntArray:
     start_s=st.sampled_from([0.0, 3.7, 52_000.0]),
     in_name=st.booleans(),
 )
-def test_times_since_a_start_come_back_in_each_stated_unit(
-    unit: str, rate_hz: float, n: int, start_s: float, in_name: bool
-) -> None:
+def test_times_since_a_start_come_back_in_each_stated_unit(unit, rate_hz, n, start_s, in_name):
     expected = _times(rate_hz, n)
     values = (expected + round(start_s * 1e9)) / TIME_UNITS_NS[unit]
     name = f"time_{unit.replace('μ', 'u').replace('µ', 'u')}" if in_name else "time"
@@ -67,7 +61,7 @@ def test_times_since_a_start_come_back_in_each_stated_unit(
     n=st.integers(5, 3000),
     stated=st.sampled_from(["", "s"]),
 )
-def test_dates_come_back_whatever_their_unit(factor: int, rate_hz: float, start_s: int, n: int, stated: str) -> None:
+def test_dates_come_back_whatever_their_unit(factor, rate_hz, start_s, n, stated):
     expected = start_s * 10**9 + _times(rate_hz, n)
     values = expected // factor if factor < 10**6 else expected / factor
     clock = _clock(stated, time=values)
@@ -84,7 +78,7 @@ def test_dates_come_back_whatever_their_unit(factor: int, rate_hz: float, start_
         ["excel", "matlab", "%Y-%m-%dT%H:%M:%S.%fZ", "%d.%m.%Y %H:%M:%S.%f", "%m/%d/%Y %I:%M:%S.%f %p", "week"]
     ),
 )
-def test_dates_of_tables_and_texts_come_back(rate_hz: float, start: dt.datetime, n: int, form: str) -> None:
+def test_dates_of_tables_and_texts_come_back(rate_hz, start, n, form):
     start = start.replace(microsecond=0)
     expected = round(start.replace(tzinfo=dt.UTC).timestamp()) * 10**9 + _times(rate_hz, n)
     if form in ("excel", "matlab"):
@@ -115,7 +109,7 @@ def test_dates_of_tables_and_texts_come_back(rate_hz: float, start: dt.datetime,
         (40_000.0 + np.arange(9000) * 0.5e-3, 4.4995, ""),
     ],
 )
-def test_a_clock_without_a_unit_is_one_of_a_usual_recording(values: FloatArray, length_s: float, note: str) -> None:
+def test_a_clock_without_a_unit_is_one_of_a_usual_recording(values, length_s, note):
     clock = _clock(time=values)
     assert (clock.stamps_ns[-1] - clock.stamps_ns[0]) * 1e-9 == pytest.approx(length_s, abs=1e-6)
     assert [note in text for text in clock.notes] == [True] * bool(note)
@@ -125,7 +119,7 @@ def test_a_clock_without_a_unit_is_one_of_a_usual_recording(values: FloatArray, 
     ("name", "beside", "year"),
     [("gps_time", {}, 2024), ("time", {}, 2014), ("time", {"utc_time": MAY_1_NS * 1e-9}, 2024)],
 )
-def test_gps_time_is_recognised_by_its_name_or_another_clock(name: str, beside: dict[str, float], year: int) -> None:
+def test_gps_time_is_recognised_by_its_name_or_another_clock(name, beside, year):
     gps_s = MAY_1_NS * 1e-9 - UNIX_TO_GPS_S + np.arange(100) * 0.02
     clock = _clock("s", name, **{name: gps_s}, **{n: v + np.arange(100) * 0.02 for n, v in beside.items()})
     assert clock.stamps_ns.astype("datetime64[ns]").astype("datetime64[Y]").astype(int)[0] + 1970 == year
@@ -134,7 +128,7 @@ def test_gps_time_is_recognised_by_its_name_or_another_clock(name: str, beside: 
         assert abs(int(clock.stamps_ns[0]) - MAY_1_NS) < 1000
 
 
-def test_weeks_of_ten_bits_and_values_that_are_no_weeks() -> None:
+def test_weeks_of_ten_bits_and_values_that_are_no_weeks():
     week, second = np.array([264.0, np.nan, 264.0, 264.0]), np.array([300_000.0, 1.0, np.inf, 300_001.0])
     clock = week_clock(week, second)
     assert clock.stamps_ns.tolist() == [1_714_562_382 * 10**9, NO_TIME, NO_TIME, 1_714_562_383 * 10**9]
@@ -158,13 +152,13 @@ def test_weeks_of_ten_bits_and_values_that_are_no_weeks() -> None:
         (["59:59.0", "00:01.0"], (89_999.0, 90_001.0), False),
     ],
 )
-def test_texts_have_one_order_of_day_and_month(texts: list[str], seconds: tuple[float, float], note: bool) -> None:
+def test_texts_have_one_order_of_day_and_month(texts, seconds, note):
     clock = text_clock(pl.Series(texts))
     np.testing.assert_allclose(clock.stamps_ns * 1e-9, seconds, atol=1e-6)
     assert bool(clock.notes) == note
 
 
-def test_times_that_do_not_fit_are_none_and_never_wrap() -> None:
+def test_times_that_do_not_fit_are_none_and_never_wrap():
     assert text_clock(pl.Series(["9999-01-01 00:00:00", "2024-02-30", "x", None, "2024-05-01"])).stamps_ns.tolist() == [
         NO_TIME, NO_TIME, NO_TIME, NO_TIME, MAY_1_NS,
     ]  # fmt: skip
@@ -175,7 +169,7 @@ def test_times_that_do_not_fit_are_none_and_never_wrap() -> None:
     assert _clock(time=years).stamps_ns.tolist() == [MAY_1_NS, NO_TIME, NO_TIME]
 
 
-def test_a_clock_without_values_is_not_chosen() -> None:
+def test_a_clock_without_values_is_not_chosen():
     nan, good = np.full(50, np.nan), np.arange(50) * 0.02
     assert _clock(time=nan, t=good).columns == {"t"}
     assert _clock(timestamp=np.where(np.arange(50) < 5, good, np.nan), t=good).columns == {"t"}
@@ -190,7 +184,7 @@ def _losses(losses: list[Loss]) -> list[tuple[str, int | None, str]]:
     return [(loss.kind, loss.count, loss.severity) for loss in losses]
 
 
-def test_of_a_clock_that_starts_again_the_first_pass_is_kept() -> None:
+def test_of_a_clock_that_starts_again_the_first_pass_is_kept():
     one = RELATIVE_NS + _times(50.0, 1000)
     rows, losses = ascending_rows(np.concatenate([one, one + 5_000_000]), "a")
     np.testing.assert_array_equal(rows, np.arange(1000))
@@ -203,7 +197,7 @@ def test_of_a_clock_that_starts_again_the_first_pass_is_kept() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(0, 199), max_size=8, unique=True), st.integers(-900, 900))
-def test_rows_out_of_order_are_left_out_and_none_is_moved(wrong: list[int], by_ms: int) -> None:
+def test_rows_out_of_order_are_left_out_and_none_is_moved(wrong, by_ms):
     stamps = RELATIVE_NS + _times(50.0, 200)
     stamps[wrong] += by_ms * 10**6
     rows, losses = ascending_rows(stamps, "a")
@@ -213,17 +207,13 @@ def test_rows_out_of_order_are_left_out_and_none_is_moved(wrong: list[int], by_m
     assert sum(count or 0 for _, count, _ in _losses(losses)) == 200 - len(rows)
 
 
-def test_rows_without_a_time_or_of_another_day_are_counted() -> None:
+def test_rows_without_a_time_or_of_another_day_are_counted():
     stamps = RELATIVE_NS + _times(50.0, 2000)
     stamps[:10] += 400 * RELATIVE_NS
     stamps[500], stamps[900] = NO_TIME, 2 * 10**18
     rows, losses = ascending_rows(stamps, "a")
     assert len(rows) == 1988
-    assert {kind: count for kind, count, _ in _losses(losses)} == {
-        "bad-stamp": 1,
-        "other-epoch": 10,
-        "outlier": 1,
-    }
+    assert {kind: count for kind, count, _ in _losses(losses)} == {"bad-stamp": 1, "other-epoch": 10, "outlier": 1}
 
 
 ROW, RANDOM = np.arange(1000), np.random.default_rng(1).random(1000)
@@ -243,7 +233,7 @@ ROW, RANDOM = np.arange(1000), np.random.default_rng(1).random(1000)
     ],
     ids=["dropout", "a third", "two thirds", "every tenth", "each second", "1 Hz", "1 Hz from the middle", "20 Hz"],
 )
-def test_a_column_has_its_own_table_if_its_clock_is_slower(there: NDArray[np.bool_], own_rows: int) -> None:
+def test_a_column_has_its_own_table_if_its_clock_is_slower(there, own_rows):
     columns: dict[str, Any] = {"t": ROW * 0.02, "ay": ROW * 1.0, "gnss": np.where(there, ROW, np.nan)}
     losses: list[Loss] = []
     tables = list(tables_of(Sheet("csv", columns | {"driver": pl.Series(["me"] * 1000)}, {}), "a.csv", losses))
@@ -290,7 +280,7 @@ CHANNELS = json.dumps({"channels": [{"name": "Speed", "unit": "km/h", "samplerat
         ("a.jsonl", KEYS, "json", "data_VehicleSpeed", np.arange(20)),
     ],
 )
-def test_layouts(name: str, text: str, topic: str, field: str, values: np.ndarray, tmp_path: Path) -> None:
+def test_layouts(name, text, topic, field, values, tmp_path):
     read = opened(tmp_path / name, text)
     assert topic in read.topics
     np.testing.assert_allclose(read.columns[field], values, atol=1e-9)
@@ -307,5 +297,5 @@ def test_layouts(name: str, text: str, topic: str, field: str, values: np.ndarra
         ("a, b", "a, b", ""),
     ],
 )
-def test_units_in_titles(title: str, name: str, unit: str) -> None:
+def test_units_in_titles(title, name, unit):
     assert split_unit(title) == (name, unit)

@@ -1,7 +1,5 @@
 """Logs of tables against the arrays that were written: CSV, JSON lines, VBO, Parquet, MAT, their rates and folders."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import io
@@ -138,7 +136,7 @@ ASSUMED = {n: [("clock", "note")] for n in ("milliseconds-by-step", "month-first
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_every_dialect_of_csv_gives_the_same_columns(dialect: str, tmp_path: Path) -> None:
+def test_every_dialect_of_csv_gives_the_same_columns(dialect, tmp_path):
     data, start_ns = DIALECTS[dialect]
     read = opened(tmp_path / "drive.csv", data)
     assert [*read.topics] == ["csv"]
@@ -157,9 +155,7 @@ def test_every_dialect_of_csv_gives_the_same_columns(dialect: str, tmp_path: Pat
     comma=st.booleans(),
     quoted=st.booleans(),
 )
-def test_any_numbers_come_back(
-    values: list[float], separator: str, comma: bool, quoted: bool, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_any_numbers_come_back(values, separator, comma, quoted, tmp_path_factory):
     comma = comma and separator != ","
     rows = [[f"{i * 0.02:.2f}", f"{v:.6f}"] for i, v in enumerate(values)]
     cells = [[c.replace(".", ",") if comma else c for c in row] for row in rows]
@@ -183,7 +179,7 @@ def test_any_numbers_come_back(
         (["1,234", "0.5"], [1234.0, 0.5]),
     ],
 )
-def test_a_number_in_any_spelling(texts: list[str], numbers: list[float], tmp_path: Path) -> None:
+def test_a_number_in_any_spelling(texts, numbers, tmp_path):
     rows = [f"{i};{text}" for i, text in enumerate(texts * 9)]
     read = opened(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
     np.testing.assert_array_equal(read.columns["a"], numbers * 9)
@@ -198,14 +194,14 @@ UNREADABLE = [
 ]  # fmt: skip
 
 
-def test_cells_without_a_number_are_empty_or_a_loss(tmp_path: Path) -> None:
+def test_cells_without_a_number_are_empty_or_a_loss(tmp_path):
     rows = [f"{i};{text}" for i, text in enumerate(["1.5", *EMPTY, *UNREADABLE, *["0.25"] * 200])]
     read = opened(tmp_path / "a.csv", "\n".join(["time [s];a", *rows, ""]))
     assert read.columns["a"][np.isfinite(read.columns["a"])].tolist() == [1.5, *[0.25] * 200]
     assert read.counts == [("bad-cell", len(UNREADABLE))]
 
 
-def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_number(tmp_path: Path) -> None:
+def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_number(tmp_path):
     rows = [f"{t:.2f},{AY[i]},{SPEED[i] if i % 10 == 0 else ''},{2 * AY[i]}" for i, t in enumerate(TIME_S)]
     read = opened(tmp_path / "a.csv", "\n".join(["t,ay,speed,ay", *rows]))
     assert read.topics == {"csv": N, "csv_2": N // 10}
@@ -229,12 +225,12 @@ def test_columns_at_another_rate_have_their_own_clock_and_repeated_names_a_numbe
         ("utf-8", "2nd gear", "n_2nd_gear"),
     ],
 )
-def test_the_bytes_of_the_titles_show_their_encoding(encoding: str, title: str, name: str, tmp_path: Path) -> None:
+def test_the_bytes_of_the_titles_show_their_encoding(encoding, title, name, tmp_path):
     rows = [f"{t:.2f},{a:.4f}" for t, a in zip(TIME_S, AY, strict=True)]
     assert [*opened(tmp_path / "a.csv", "\n".join([f"t,{title}", *rows]).encode(encoding)).columns] == [name]
 
 
-def test_columns_behind_times_of_their_own_have_these_and_a_lap_time_is_none(tmp_path: Path) -> None:
+def test_columns_behind_times_of_their_own_have_these_and_a_lap_time_is_none(tmp_path):
     rows = [f"{t:.2f};{a:.4f};{t % 0.5:.2f};" for t, a in zip(TIME_S, AY, strict=True)]
     rows = [row + (f"{0.003 + 0.05 * i:.3f};{SPEED[i]}" if i < N // 5 else ";") for i, row in enumerate(rows)]
     read = opened(tmp_path / "a.csv", "\n".join(["time;ay;time;time;speed", *rows]))
@@ -245,7 +241,7 @@ def test_columns_behind_times_of_their_own_have_these_and_a_lap_time_is_none(tmp
     assert np.abs(read.stamps_ns["csv_2"] - expected).max() < 500
 
 
-def test_damaged_rows_are_losses_and_the_others_are_read(tmp_path: Path) -> None:
+def test_damaged_rows_are_losses_and_the_others_are_read(tmp_path):
     lines = _csv(SECONDS, _HEAD).splitlines()
     lines[10], lines[20], lines[30] = "0.09,1", "0.19,2,3,4,5", ",1.0,2.0"
     text = "\n".join([*lines[:-1], "1.99,1.2"])  # cut within the last row
@@ -257,7 +253,7 @@ def test_damaged_rows_are_losses_and_the_others_are_read(tmp_path: Path) -> None
     assert "bad-row" in done.stdout
 
 
-def test_rows_without_a_quoted_cell_shift_no_columns(tmp_path: Path) -> None:
+def test_rows_without_a_quoted_cell_shift_no_columns(tmp_path):
     lines = ["time,note,ay,speed", *(f'{t},"ok, {i}",{AY[i]},{SPEED[i]}' for i, t in enumerate(SECONDS))]
     lines[1], lines[50], lines[60] = '0.0,"ok",1.0', '0.49,"ok",1,2,3', '0.59,"two\nlines",1.5,2.5'
     read = opened(tmp_path / "a.csv", "\n".join([*lines, ""]))
@@ -268,7 +264,7 @@ def test_rows_without_a_quoted_cell_shift_no_columns(tmp_path: Path) -> None:
     assert any("line 2 " in x.where for x in read.lost if (x.kind, x.count) == ("bad-row", 2))
 
 
-def test_a_cell_without_an_end_costs_only_the_cells_behind_it(tmp_path: Path) -> None:
+def test_a_cell_without_an_end_costs_only_the_cells_behind_it(tmp_path):
     lines = ["time,ay,speed", *(f"{0.01 * i:.2f},1.5,{i}" for i in range(40_000))]
     lines[10] = '0.09,"1.5,9'
     read = opened(tmp_path / "a.csv", "\n".join([*lines, ""]))
@@ -281,7 +277,7 @@ def test_a_cell_without_an_end_costs_only_the_cells_behind_it(tmp_path: Path) ->
     ("row", "kinds"),
     [("#0.1,5,5", {"bad-cell", "bad-stamp"}), ("#a comment", {"comment"}), ("# one, two", {"comment"})],
 )
-def test_rows_that_begin_with_a_hash_are_counted(row: str, kinds: set[str], tmp_path: Path) -> None:
+def test_rows_that_begin_with_a_hash_are_counted(row, kinds, tmp_path):
     lines = ["# made by hand", "# time,ay,speed", *(f"{t},{a},{v}" for t, a, v in zip(SECONDS, AY, SPEED, strict=True))]
     lines.insert(30, row)
     read = opened(tmp_path / "a.csv", "\n".join([*lines, ""]))
@@ -289,7 +285,7 @@ def test_rows_that_begin_with_a_hash_are_counted(row: str, kinds: set[str], tmp_
     assert set(read.counts) == {(kind, 1) for kind in kinds}
 
 
-def test_a_decimal_comma_counts_in_whichever_row_it_is(tmp_path: Path) -> None:
+def test_a_decimal_comma_counts_in_whichever_row_it_is(tmp_path):
     steer = [0.0] * 1500 + [-0.125, 0.25]
     rows = [f"{0.01 * i:.2f};{v:g};1.{i % 10}00,5".replace(".", ",", 1) for i, v in enumerate(steer)]
     text = "\n".join(["time;steer;rpm", *(r.replace("-0.125", "-0,125").replace("0.25", "0,25") for r in rows), ""])
@@ -312,9 +308,7 @@ def test_a_decimal_comma_counts_in_whichever_row_it_is(tmp_path: Path) -> None:
         (";", "7", "1,234", 1.234, True),  # no other column decides
     ],
 )
-def test_other_columns_decide_what_a_mark_between_digits_is(
-    separator: str, other: str, cell: str, value: float, note: bool, tmp_path: Path
-) -> None:
+def test_other_columns_decide_what_a_mark_between_digits_is(separator, other, cell, value, note, tmp_path):
     rows = [separator.join([str(i), other, cell, str(i)]) for i in range(30)]
     read = opened(tmp_path / "a.csv", "\n".join([separator.join(["time [s]", "a", "b", "c"]), *rows, ""]))
     assert set(read.columns["b"]) == {value}
@@ -330,7 +324,7 @@ def test_other_columns_decide_what_a_mark_between_digits_is(
         ("hello\nworld\n", "row of column names"),
     ],
 )
-def test_a_csv_without_header_or_times_is_refused_in_one_line(text: str, words: str, tmp_path: Path) -> None:
+def test_a_csv_without_header_or_times_is_refused_in_one_line(text, words, tmp_path):
     with pytest.raises(PdhefError, match=words) as refused:
         opened(tmp_path / "a.csv", text)
     assert "\n" not in str(refused.value)
@@ -352,7 +346,7 @@ def vbo(clock: list[str], *, units: str = "g\n\n°/s\n", created: str = "11/04/2
     return (head + "\n".join(rows) + "\n").replace("\n", "\r\n").encode("latin-1")
 
 
-def test_a_vbo_file_keeps_minutes_units_and_the_clock_over_midnight(tmp_path: Path) -> None:
+def test_a_vbo_file_keeps_minutes_units_and_the_clock_over_midnight(tmp_path):
     clock = ["235959.980", "235959.990", "000000.000", "000000.010", "000003.000"]
     read = opened(tmp_path / "a.vbo", vbo(clock))
     assert (read.topics, read.lost) == ({"vbox": 5}, ())
@@ -373,9 +367,7 @@ def test_a_vbo_file_keeps_minutes_units_and_the_clock_over_midnight(tmp_path: Pa
         ("g\nm/s2\n°/s\n°C\n", {"Y_Accel": "", "YawRate": "°/s", "Temp": ""}),  # whose is g?
     ],
 )
-def test_of_too_many_or_too_few_units_those_that_belong_to_one_quantity_are_used(
-    lines: str, units: dict[str, str], tmp_path: Path
-) -> None:
+def test_of_too_many_or_too_few_units_those_that_belong_to_one_quantity_are_used(lines, units, tmp_path):
     read = opened(tmp_path / "a.vbo", vbo(["100000.00", "100000.01"], units=lines))
     assert {name: read.units[name] for name in units} == units
     (loss,) = read.lost
@@ -383,7 +375,7 @@ def test_of_too_many_or_too_few_units_those_that_belong_to_one_quantity_are_used
 
 
 @pytest.mark.parametrize(("east", "turn"), [(1, 90), (-1, 90), (1, 1), (-1, 1)])
-def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp_path: Path) -> None:
+def test_the_heading_shows_which_longitude_is_positive(east, turn, tmp_path):
     head = "File created on 01/05/2024\n\n[header]\ntime\nlatitude\nlongitude\nheading\n\n[data]\n"
     heading = np.linspace(0.0, turn, N)
     north, to_east = (np.cumsum(1e-3 * f(np.radians(heading))) for f in (np.cos, np.sin))
@@ -397,7 +389,7 @@ def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp
     assert (read.columns["longitude"][0] < 0.0) == (is_clear or east < 0)
 
 
-def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path):
     data = vbo([f"1000{i // 100:02d}.{i % 100:02d}" for i in range(N)])
     read = opened(tmp_path / "a.vbo", data[:-40])
     assert [(x.kind, x.severity) for x in read.lost] == [("truncated", "lost")]
@@ -407,9 +399,7 @@ def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("turned_deg", "recognised"), [(0.0, True), (3.0, True), (90.0, False), (180.0, False)])
-def test_speed_and_course_of_a_receiver_are_gnss_signals_if_the_path_agrees(
-    turned_deg: float, recognised: bool, tmp_path: Path
-) -> None:
+def test_speed_and_course_of_a_receiver_are_gnss_signals_if_the_path_agrees(turned_deg, recognised, tmp_path):
     time_s = np.arange(0.0, 60.0, 0.1)
     course = 0.4 * np.sin(0.1 * time_s) + 0.8  # clockwise from north, 15 m/s
     north, east = (np.cumsum(15.0 * 0.1 * f(course)) for f in (np.cos, np.sin))
@@ -432,7 +422,7 @@ def test_speed_and_course_of_a_receiver_are_gnss_signals_if_the_path_agrees(
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path: Path) -> None:
+def test_a_table_in_long_form_has_a_column_for_each_signal(suffix, tmp_path):
     rows = [(t, "Lat Acc [m/s²]", a) for t, a in zip(TIME_S, AY, strict=True)]
     rows += [(t, "speed [km/h]", v) for t, v in zip(TIME_S, SPEED, strict=True)]
     rows += [(t, "gnss", 2.0 * t) for t in TIME_S[::10]]
@@ -453,7 +443,7 @@ def test_a_table_in_long_form_has_a_column_for_each_signal(suffix: str, tmp_path
 
 
 @pytest.mark.parametrize("clock", ["millis", "sensorTimestamp_since1970(s)"])
-def test_a_clock_is_dates_before_times_since_a_start(clock: str, tmp_path: Path) -> None:
+def test_a_clock_is_dates_before_times_since_a_start(clock, tmp_path):
     start = 1.7e9 if "1970" in clock else 0.0
     factor = 1.0 if "1970" in clock else 1e3
     rows = [f"{(start + t) * factor:.6f},{100.0 + t:.3f},{v:.4f}" for t, v in zip(TIME_S, SPEED, strict=True)]
@@ -461,7 +451,7 @@ def test_a_clock_is_dates_before_times_since_a_start(clock: str, tmp_path: Path)
     assert read.stamps_ns["csv"][0] == (RELATIVE_NS if start == 0.0 else round(start * 1e9))
 
 
-def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them(tmp_path: Path) -> None:
+def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them(tmp_path):
     def entry(name: str, data: np.ndarray, unit: str) -> dict[str, object]:
         return {"Name": name, "Data": data, "Unit": unit}
 
@@ -478,12 +468,12 @@ def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them
     np.testing.assert_allclose((stamps - RELATIVE_NS) * 1e-9, slow, atol=1e-9)
 
 
-def test_texts_that_name_no_signals_make_no_columns(tmp_path: Path) -> None:
+def test_texts_that_name_no_signals_make_no_columns(tmp_path):
     rows = [f"{t:.2f},entry {i},{v:.3f}" for i, (t, v) in enumerate(zip(TIME_S, SPEED, strict=True))]
     assert [*opened(tmp_path / "a.csv", "\n".join(["time,name,value", *rows, ""])).columns] == ["value"]
 
 
-def test_a_clock_in_two_columns_or_with_named_months(tmp_path: Path) -> None:
+def test_a_clock_in_two_columns_or_with_named_months(tmp_path):
     rows = [(1_700_000_000 + i // 4, 250_000 * (i % 4)) for i in range(1, 40)]
     parts = "stamp.sec;stamp.usec;speed\n" + "".join(f"{s};{u};{i}\n" for i, (s, u) in enumerate(rows))
     assert opened(tmp_path / "a.csv", parts).stamps_ns["csv"].tolist() == [s * 10**9 + u * 1000 for s, u in rows]
@@ -491,7 +481,7 @@ def test_a_clock_in_two_columns_or_with_named_months(tmp_path: Path) -> None:
     assert opened(tmp_path / "b.csv", named).stamps_ns["csv"][0] == 1_762_336_800_500_000_000
 
 
-def test_rows_that_share_whole_seconds_are_spread(tmp_path: Path) -> None:
+def test_rows_that_share_whole_seconds_are_spread(tmp_path):
     rows = "time,speed\n" + "".join(f"10:00:{(i + 3) // 5:02},{i}\n" for i in range(99))
     assert {*np.diff(opened(tmp_path / "a.csv", rows).stamps_ns["csv"]).tolist()} == {200_000_000}
 
@@ -506,7 +496,7 @@ def _json_lines(*records: object) -> str:
     return "".join(f"{json.dumps(record)}\n" for record in records)
 
 
-def test_wide_json_lines_are_columns_with_exact_integers(tmp_path: Path) -> None:
+def test_wide_json_lines_are_columns_with_exact_integers(tmp_path):
     first_ns = START_S * 10**9 + 1
     records = [{"time": first_ns + i * 10**7, "imu": {"ay": [0.5 * i, i]}, "v [km/h]": i or None} for i in range(40)]
     read = opened(tmp_path / "a.jsonl", _json_lines(*records))
@@ -516,7 +506,7 @@ def test_wide_json_lines_are_columns_with_exact_integers(tmp_path: Path) -> None
     np.testing.assert_array_equal(read.columns["v"], [np.nan, *range(1, 40)])
 
 
-def test_json_lines_in_long_form_have_a_column_for_each_name(tmp_path: Path) -> None:
+def test_json_lines_in_long_form_have_a_column_for_each_name(tmp_path):
     records = [{"name": n, "value": i + k, "time": START_S + 0.1 * i} for i in range(40) for k, n in enumerate("ab")]
     read = opened(tmp_path / "a.ndjson", _json_lines(*records, [1], "x"))
     np.testing.assert_array_equal(read.columns["b"], np.arange(40) + 1)
@@ -524,7 +514,7 @@ def test_json_lines_in_long_form_have_a_column_for_each_name(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("text", ["", '[{"a": 1}]\n', "{\n", "x\n"])
-def test_a_file_without_objects_in_lines_is_one_line(text: str, tmp_path: Path) -> None:
+def test_a_file_without_objects_in_lines_is_one_line(text, tmp_path):
     with pytest.raises(LogError, match="a JSON object a line"):
         opened(tmp_path / "a.json", text or "\n")
 
@@ -540,14 +530,14 @@ def test_a_file_without_objects_in_lines_is_one_line(text: str, tmp_path: Path) 
         ("a.txt", "# Imu,ay,time\n" + "".join(f"Imu,{a},{t}\nGps,1,2,3\n" for t, a in zip(TIME_S, AY, strict=True))),
     ],
 )
-def test_documents_line_protocol_and_rows_of_several_kinds(name: str, text: str, tmp_path: Path) -> None:
+def test_documents_line_protocol_and_rows_of_several_kinds(name, text, tmp_path):
     read = opened(tmp_path / name, text)
     assert len(read.topics) == 1
     (values,) = [values for name, values in read.columns.items() if name.endswith("ay")]
     np.testing.assert_allclose(values, AY)
 
 
-def test_limits_of_json_lines() -> None:
+def test_limits_of_json_lines():
     """Each line has other keys: rows times columns grow as the square of the file."""
 
     def read(limits: dict[str, int], *records: object) -> list[str]:
@@ -570,7 +560,7 @@ def test_limits_of_json_lines() -> None:
 # ------------------------------------------------------------------------------------------------ rates and runs
 
 
-def test_a_table_without_times_asks_for_its_rate(tmp_path: Path) -> None:
+def test_a_table_without_times_asks_for_its_rate(tmp_path):
     text = "ax,ay\n" + "".join(f"{i}.5,{i}\n" for i in range(100))
     with pytest.raises(LogError, match="--set rate_hz=100, or rate_hz in the mapping file"):
         opened(tmp_path / "a.csv", text)
@@ -582,7 +572,7 @@ def test_a_table_without_times_asks_for_its_rate(tmp_path: Path) -> None:
         opened(tmp_path / "b.csv", long, rate_hz=50.0)
 
 
-def test_a_rate_decides_a_unit_that_is_not_stated(tmp_path: Path) -> None:
+def test_a_rate_decides_a_unit_that_is_not_stated(tmp_path):
     text = "time,ay\n" + "".join(f"{100 * i},{i}\n" for i in range(600))
     for rate_hz, length_s in ((None, 59.9), (100.0, 5.99), (1e4, 0.0599)):
         read = opened(tmp_path / "a.csv", text, rate_hz=rate_hz)
@@ -592,14 +582,14 @@ def test_a_rate_decides_a_unit_that_is_not_stated(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ticks_per_s", [1, 10, 1000, 10_000, 1_000_000])
 @pytest.mark.parametrize("unit_m_s", [1.0, 1 / 3.6])
-def test_speed_and_positions_decide_the_unit_of_a_clock(ticks_per_s: int, unit_m_s: float, tmp_path: Path) -> None:
+def test_speed_and_positions_decide_the_unit_of_a_clock(ticks_per_s, unit_m_s, tmp_path):
     t = np.arange(0, 60, 0.1)
     rows = zip(np.round(t * ticks_per_s, 1), 48.0 + 20.0 * t / 111_195.0, np.full(600, 20.0 / unit_m_s), strict=True)
     text = "time,latitude,longitude,speed\n" + "".join(f"{k:g},{lat:.8f},9.5,{v}\n" for k, lat, v in rows)
     assert np.ptp(opened(tmp_path / "a.csv", text).stamps_ns["csv"]) * 1e-9 == pytest.approx(59.9, abs=1e-6)
 
 
-def test_a_group_is_the_beginning_or_the_end_of_names(tmp_path: Path) -> None:
+def test_a_group_is_the_beginning_or_the_end_of_names(tmp_path):
     imu = {"time": TIME_S, "ay": AY}
     savemat(tmp_path / "a.mat", {"run_1": {"imu": imu}, "run_2": {"imu": imu, "gps": imu}})
     for group, names in (("run_2", ["run_2_gps", "run_2_imu"]), ("imu", ["run_1_imu", "run_2_imu"])):
@@ -608,7 +598,7 @@ def test_a_group_is_the_beginning_or_the_end_of_names(tmp_path: Path) -> None:
         opened(tmp_path / "a.mat", group="run_3")
 
 
-def test_rate_and_group_of_a_mapping_file_apply_where_the_user_gives_none(tmp_path: Path) -> None:
+def test_rate_and_group_of_a_mapping_file_apply_where_the_user_gives_none(tmp_path):
     (tmp_path / "m.toml").write_text('rate_hz = 100\ngroup = "run_1"\n')
     mapping = load_mapping(tmp_path / "m.toml")
     assert tables_for(mapping, TableSettings()) == TableSettings(100.0, "run_1")
@@ -638,7 +628,7 @@ def _telephone(folder: Path, start_s: float = START_S) -> Path:
 
 
 @pytest.mark.parametrize("start_s", [0.0, START_S])
-def test_files_of_one_recording_are_one_log(start_s: float, tmp_path: Path) -> None:
+def test_files_of_one_recording_are_one_log(start_s, tmp_path):
     folder = _telephone(tmp_path / "telephone", start_s)
     assert [log.path for log in find_logs(str(tmp_path))] == [folder]
     read = opened(folder)
@@ -651,9 +641,7 @@ def test_files_of_one_recording_are_one_log(start_s: float, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("start_s", [0.0, START_S])
 @pytest.mark.parametrize(("titles", "late_s"), [(("time,ax", "time,ax"), 0.0), (("time,ax", "time,ay,az"), 6.0)])
-def test_files_of_the_same_columns_or_other_times_are_drives(
-    titles: tuple[str, str], late_s: float, start_s: float, tmp_path: Path
-) -> None:
+def test_files_of_the_same_columns_or_other_times_are_drives(titles, late_s, start_s, tmp_path):
     for i, title in enumerate(titles):
         _sensor(tmp_path / "drives" / f"{i}.csv", title, start_s + i * late_s, 100.0, 1000)
     folder = tmp_path / "drives"
@@ -665,7 +653,7 @@ def test_files_of_the_same_columns_or_other_times_are_drives(
     assert [*opened(folder, folder="recording").topics] == ["n_0", "n_1"]
 
 
-def test_a_damaged_file_of_a_recording_is_a_loss(tmp_path: Path) -> None:
+def test_a_damaged_file_of_a_recording_is_a_loss(tmp_path):
     folder = _telephone(tmp_path / "telephone")
     (folder / "Gravity.csv").write_text("\n".join("damaged" * 3 for _ in range(9)))
     assert [loss.where for loss in opened(folder).lost if loss.severity == "lost"] == [str(folder / "Gravity.csv")]
@@ -681,35 +669,35 @@ def test_a_damaged_file_of_a_recording_is_a_loss(tmp_path: Path) -> None:
         ("three/e.vbo three/f.csv", "three/e.vbo"),
     ],
 )
-def test_a_search_takes_general_files_only_where_there_are_no_others(files: str, logs: str, tmp_path: Path) -> None:
+def test_a_search_takes_general_files_only_where_there_are_no_others(files, logs, tmp_path):
     for name in files.split():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("x")
-    found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}  # type: ignore[union-attr]
+    found = {log.path.relative_to(tmp_path).as_posix() for log in find_logs([str(tmp_path)])}
     assert found == set(logs.split())
 
 
-def test_bytes_that_are_no_utf_8_cost_no_other_character(tmp_path: Path) -> None:
+def test_bytes_that_are_no_utf_8_cost_no_other_character(tmp_path):
     data = _csv(SECONDS, "time,ay [m/s²],speed [km/h]").encode() + "2.00,1.0,caf\xe9\n".encode("latin-1")
     read = opened(tmp_path / "a.csv", data)
     assert (len(read.columns["ay"]), read.units["ay"]) == (N + 1, "m/s²")
     assert ("bad-cell", 1) in read.counts
 
 
-def test_a_title_may_have_two_lines(tmp_path: Path) -> None:
+def test_a_title_may_have_two_lines(tmp_path):
     text = _csv(SECONDS, '"time","ay\n[m/s²]","speed, measured"') + '"2.0","1","2"\n'
     read = opened(tmp_path / "a.csv", text)
     assert (read.units, read.lost) == ({"ay": "m/s²", "speed_measured": ""}, ())
 
 
-def test_more_columns_than_the_limit_are_refused_before_they_are_read(tmp_path: Path) -> None:
+def test_more_columns_than_the_limit_are_refused_before_they_are_read(tmp_path):
     width = 70_000
     text = "\n".join([",".join(["time", *(f"c{i}" for i in range(width))]), *(f"{i}" + "," * width for i in range(30))])
     with pytest.raises(PdhefError, match="array width"):
         opened(tmp_path / "a.csv", text)
 
 
-def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:
+def test_titles_of_a_vbo_file_may_contain_units(tmp_path):
     data = vbo(["100000.00", "100000.01"], units="\n\n\n")
     data = data.replace(b"YawRate\r", b"YawRate [deg/s]\r").replace(b"Y_Accel\r", b"Y_Accel (g)\r")
     read = opened(tmp_path / "a.vbo", data)
@@ -717,7 +705,7 @@ def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:
     assert read.lost == ()
 
 
-def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
+def test_a_damaged_variable_costs_only_itself(tmp_path):
     savemat(tmp_path / "a.mat", {"t": TIME_S, "ay": AY, "speed": SPEED}, do_compression=True)
     data = bytearray((tmp_path / "a.mat").read_bytes())
     second = 128 + 8 + int.from_bytes(data[132:136], "little")
@@ -729,7 +717,7 @@ def test_a_damaged_variable_costs_only_itself(tmp_path: Path) -> None:
     assert called("inspect", tmp_path / "c.mat").returncode == 3
 
 
-def test_a_magnitude_and_its_sign_are_one_signal(tmp_path: Path) -> None:
+def test_a_magnitude_and_its_sign_are_one_signal(tmp_path):
     signed = np.sin(TIME_S)
     rows = [f"{t:.2f},{abs(v):.6f},{int(v < 0)},{int(v < 0)}" for t, v in zip(TIME_S, signed, strict=True)]
     path = tmp_path / "a.csv"
@@ -738,9 +726,7 @@ def test_a_magnitude_and_its_sign_are_one_signal(tmp_path: Path) -> None:
     assert (source.field, source.combine) == (("ESP_Gierrate", "ESP_VZ_Gierrate"), "signed")
 
 
-def test_of_a_table_that_starts_again_the_first_pass_is_kept_and_rows_that_share_seconds_are_still_spread(
-    tmp_path: Path,
-) -> None:
+def test_of_a_table_that_starts_again_the_first_pass_is_kept_and_rows_that_share_seconds_are_still_spread(tmp_path):
     passes = [f"{1_700_000_000 + i / 50:.2f},{i}\n" for i in range(150)] * 3
     seconds = [f"{1_700_000_000 + i // 5},{i}\n" for i in range(150)]
     seconds[70] = "1699999999,0\n"

@@ -1,7 +1,5 @@
 """Raw CAN frames become the columns that cantools decodes frame by frame."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Callable, Sequence
@@ -73,11 +71,11 @@ def _signals(draw: st.DrawFn) -> tuple[Signal, int]:
 
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(layout=_signals(), frames=st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
-def test_any_layout_decodes_as_cantools_decodes_it(layout: tuple[Signal, int], frames: list[bytes]) -> None:
+def test_any_layout_decodes_as_cantools_decodes_it(layout, frames):
     signal, size = layout
     message = Message(1, "M", size, [signal])
     data = np.frombuffer(b"".join(f[:size] for f in frames), np.uint8).reshape(len(frames), size)
-    expected = [float(message.decode(f[:size], decode_choices=False)["S"]) for f in frames]  # type: ignore[index,call-overload,arg-type]
+    expected = [float(message.decode(f[:size], decode_choices=False)["S"]) for f in frames]
     with np.errstate(over="ignore", invalid="ignore"):
         got = signal_values(data, signal)
     # Integers above 2^53 are rounded once more or less than in cantools' integer arithmetic.
@@ -178,9 +176,7 @@ _FRAMES = st.lists(
 @pytest.mark.parametrize("form", ["ros", "json", "hex", "base64"])
 @settings(max_examples=8, derandomize=True, deadline=None)
 @given(frames=_FRAMES)
-def test_frames_of_every_encoding_decode_as_cantools_decodes_them(
-    tmp_path_factory: pytest.TempPathFactory, form: str, frames: list[Frame]
-) -> None:
+def test_frames_of_every_encoding_decode_as_cantools_decodes_them(tmp_path_factory, form, frames):
     folder = tmp_path_factory.mktemp("can")
     path = folder / "can.mcap"
     more = ""
@@ -202,7 +198,7 @@ def test_frames_of_every_encoding_decode_as_cantools_decodes_them(
     assert counted == ({"/can/raw.can:Motion": short} if short else {})
 
 
-def test_error_and_remote_frames_carry_no_data(tmp_path: Path) -> None:
+def test_error_and_remote_frames_carry_no_data(tmp_path):
     data = bytes(range(8))
     frames = [Frame(256, data), Frame(256, data, error=True), Frame(256, data, remote=True), Frame(256, data)]
     _write_ros(tmp_path / "a.mcap", frames)
@@ -210,7 +206,7 @@ def test_error_and_remote_frames_carry_no_data(tmp_path: Path) -> None:
     assert channel.stamps_ns.tolist() == [S, S + 3_000_000]
 
 
-def test_another_bus_and_masked_bits_are_told_apart(tmp_path: Path) -> None:
+def test_another_bus_and_masked_bits_are_told_apart(tmp_path):
     rows = [{"msg": {"no": 256 | priority << 11, "raw": [value, 0, 0, 0, 0, 0, 0, 0]}, "port": bus, "ide": 0}
             for priority, value, bus in ((0, 1, 0), (0, 2, 1), (0, 3, 0))]  # fmt: skip
     _write(tmp_path / "a.mcap", "json", ("", "", b""), [json.dumps(r).encode() for r in rows])
@@ -225,7 +221,7 @@ def test_another_bus_and_masked_bits_are_told_apart(tmp_path: Path) -> None:
     assert channel["speed_m_s"].values.tolist() == pytest.approx([0.0, 0.01, 0.07])
 
 
-def test_inspect_shows_the_signals_and_counts_short_frames(tmp_path: Path) -> None:
+def test_inspect_shows_the_signals_and_counts_short_frames(tmp_path):
     frames = [Frame(256, bytes([i, 0] + [0] * 6)) for i in range(50)] + [Frame(256, b"1")]
     _write_ros(tmp_path / "a.mcap", frames)
     mapping = _mapping(tmp_path, {"speed_m_s": "can:Motion.Speed"})
@@ -252,7 +248,7 @@ def test_inspect_shows_the_signals_and_counts_short_frames(tmp_path: Path) -> No
         ("can:Motion.Speed", "two files", "Motion is in car.dbc and in other.dbc"),
     ],
 )
-def test_a_dbc_that_cannot_be_used_is_one_clear_line(tmp_path: Path, field: str, dbc: str | None, says: str) -> None:
+def test_a_dbc_that_cannot_be_used_is_one_clear_line(tmp_path, field, dbc, says):
     _write_ros(tmp_path / "a.mcap", [Frame(256, bytes(8))])
     two = dbc == "two files"
     mapping = _mapping(tmp_path, {"speed_m_s": field}, dbc=DBC if two else dbc or "")
@@ -277,13 +273,13 @@ def test_a_dbc_that_cannot_be_used_is_one_clear_line(tmp_path: Path, field: str,
         ({"id": 256, "data": "AA"}, "data_encoding"),
     ],
 )
-def test_frames_that_are_not_recognised_ask_for_the_field(tmp_path: Path, row: dict[str, object], says: str) -> None:
+def test_frames_that_are_not_recognised_ask_for_the_field(tmp_path, row, says):
     _write(tmp_path / "a.mcap", "json", ("", "", b""), [json.dumps(row).encode()])
     with pytest.raises(MappingError, match=says):
         _read(tmp_path / "a.mcap", _mapping(tmp_path, {"speed_m_s": "can:Motion.Speed"}))
 
 
-def test_frames_without_their_description_are_said_to_need_one(tmp_path: Path) -> None:
+def test_frames_without_their_description_are_said_to_need_one(tmp_path):
     frames = [Frame(0x10, bytes([i, 2, 3])) for i in range(5)]
     _write_ros(tmp_path / "ros.mcap", frames)
     _write_json(tmp_path / "json.mcap", frames, list)

@@ -1,10 +1,7 @@
 """Candidates: signals selected from a drive with third-party names, units, nesting and signs."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -59,7 +56,7 @@ def unsettled(auto: AutoMapping) -> set[str]:
     return {c.subject for c in auto.mapping.checks if c.name.endswith((".sign", ".candidate", ".corrected"))}
 
 
-def test_a_constant_speed_with_a_unit_is_taken_with_a_doubt_and_a_filler_is_not() -> None:
+def test_a_constant_speed_with_a_unit_is_taken_with_a_doubt_and_a_filler_is_not():
     steady = topic(speed_mps=np.full(N, 20.0), yaw_rate_radps=RATE, ay_mps2=20.0 * RATE)
     assert found(car=steady).mapping.signals["speed_m_s"].field == "speed_mps"
     assert "speed_m_s.candidate" in {c.name for c in found(car=steady).mapping.checks}
@@ -67,7 +64,7 @@ def test_a_constant_speed_with_a_unit_is_taken_with_a_doubt_and_a_filler_is_not(
 
 
 def taken(auto: AutoMapping) -> dict[str, tuple[str, float]]:
-    return {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.signals.items()}  # type: ignore[arg-type]
+    return {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.signals.items()}
 
 
 def undecided(auto: AutoMapping) -> set[str]:
@@ -91,9 +88,7 @@ SPEED = {"vehicle__speed": topic(speed_mps=V)}
 
 @pytest.mark.parametrize("acceleration", [1.0, G, G * 1e-3])
 @pytest.mark.parametrize(("rate", "prefix"), [(1.0, ""), (DEG, "imu__")])
-def test_units_that_no_name_tells_come_from_gravity_and_from_turning(
-    acceleration: float, rate: float, prefix: str
-) -> None:
+def test_units_that_no_name_tells_come_from_gravity_and_from_turning(acceleration, rate, prefix):
     auto = found(sensors__core=topic(**imu_fields(acceleration, rate, prefix)), **SPEED)
     got = taken(auto)
     assert set(got) == {"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}
@@ -102,7 +97,7 @@ def test_units_that_no_name_tells_come_from_gravity_and_from_turning(
     assert undecided(auto) == set()
 
 
-def test_a_unit_that_nothing_tells_is_taken_by_convention_and_told() -> None:
+def test_a_unit_that_nothing_tells_is_taken_by_convention_and_told():
     still = {k: v * 0.001 for k, v in imu_fields().items() if "angular" in k}
     auto = found(gyro=topic(**still))
     assert taken(auto) == {"yaw_rate_rad_s": ("/gyro.angular_velocity.z", 1.0)}
@@ -122,9 +117,7 @@ def test_a_unit_that_nothing_tells_is_taken_by_convention_and_told() -> None:
         ("steering_deg", -STEER * 16.0 / DEG, "steering_wheel_rad", -DEG),
     ],
 )
-def test_a_steering_angle_is_told_by_the_paths_curvature(
-    field: str, raw: np.ndarray, signal: str, scale: float
-) -> None:
+def test_a_steering_angle_is_told_by_the_paths_curvature(field, raw, signal, scale):
     auto = surveyed(imu__data=topic(**imu_fields()), chassis=topic(**{field: raw}), **SPEED)
     steering = {n: v for n, v in taken(auto).items() if n.startswith("steer")}
     assert steering == ({signal: (f"/chassis.{field}", round(scale, 6))} if signal else {})
@@ -132,14 +125,14 @@ def test_a_steering_angle_is_told_by_the_paths_curvature(
     assert not unsettled(auto)
 
 
-def test_steering_is_not_turned_after_an_imu_that_may_hang_upside_down() -> None:
+def test_steering_is_not_turned_after_an_imu_that_may_hang_upside_down():
     down = imu_fields()
     down |= {k: -down[k] for k in ("linear_acceleration__y", "linear_acceleration__z", "angular_velocity__z")}
     contents = {"vn__common": topic(**down), "chassis": topic(steering_wheel_angle_deg=STEER * 16.0 / DEG), **SPEED}
     assert taken(surveyed(**contents))["steering_wheel_rad"][1] == round(DEG, 6)
 
 
-def test_a_measured_angle_of_any_type_goes_before_a_command() -> None:
+def test_a_measured_angle_of_any_type_goes_before_a_command():
     drive = topic("ackermann_msgs/msg/AckermannDriveStamped", drive__steering_angle=STEER)
     imu = {"imu__data": topic("sensor_msgs/msg/Imu", **imu_fields())}
     alone = found(drive=drive, chassis=topic(torque=STEER), **imu, **SPEED)
@@ -152,14 +145,14 @@ def test_a_measured_angle_of_any_type_goes_before_a_command() -> None:
     assert [a.chosen for a in both.ambiguities] == ["/chassis.steering_wheel_angle_deg"]
 
 
-def test_a_steering_angle_that_does_not_follow_the_car_is_in_doubt() -> None:
+def test_a_steering_angle_that_does_not_follow_the_car_is_in_doubt():
     noise = np.random.default_rng(0).normal(0.0, 0.2, N)
     auto = found(imu__data=topic(**imu_fields()), a__steering=topic("std_msgs/msg/Float32", data=noise), **SPEED)
     (candidate,) = [c for c in auto.candidates if c.source.topic == "/a/steering"]
     assert "correlation with the path's curvature is only" in candidate.doubt
 
 
-def test_commands_setpoints_and_estimates_are_no_sensors() -> None:
+def test_commands_setpoints_and_estimates_are_no_sensors():
     auto = found(
         steering_cmd=topic(steering_wheel_angle=STEER),
         target__steering=topic(angle=STEER),
@@ -181,7 +174,7 @@ def test_commands_setpoints_and_estimates_are_no_sensors() -> None:
         (("lf", "rf", "lr", "rr"), 1.0, "m_s", 1.0),
     ],
 )
-def test_wheel_speeds_by_the_speed(names: tuple[str, ...], unit: float, signal: str, scale: float) -> None:
+def test_wheel_speeds_by_the_speed(names, unit, signal, scale):
     sides = (-1.0, 1.0, -1.0, 1.0)
     wheels = {n: (V + side * HALF_TRACK * RATE) / unit for n, side in zip(names, sides, strict=True)}
     auto = found(imu__data=topic(**imu_fields()), can__wheel_speeds=topic("x/WheelSpeeds", **wheels), **SPEED)
@@ -190,7 +183,7 @@ def test_wheel_speeds_by_the_speed(names: tuple[str, ...], unit: float, signal: 
     assert undecided(auto) == set()
 
 
-def test_the_odd_sign_is_turned_by_the_wheels_and_of_two_alone_is_told() -> None:
+def test_the_odd_sign_is_turned_by_the_wheels_and_of_two_alone_is_told():
     lateral = {"lat_accel_mps2": AY, "long_accel_mps2": AX, "yaw_rate_dps": -RATE / DEG}
     both = surveyed(daq=topic(**lateral), chassis=topic(steering_angle_rad=STEER), **SPEED, **WITNESSES["wheels"])
     assert taken(both)["yaw_rate_rad_s"] == ("/daq.yaw_rate_dps", round(-DEG, 6))
@@ -215,7 +208,7 @@ WITNESSES = {
 
 
 @pytest.mark.parametrize("witness", WITNESSES.values(), ids=WITNESSES)
-def test_what_is_all_positive_to_the_right_is_turned_by_the_way_the_car_turned(witness: dict[str, FakeTopic]) -> None:
+def test_what_is_all_positive_to_the_right_is_turned_by_the_way_the_car_turned(witness):
     right = {"lat_accel_mps2": -AY, "long_accel_mps2": AX, "yaw_rate_dps": -RATE / DEG}
     auto = surveyed(daq=topic(**right), chassis=topic(roadwheel_angle_rad=-STEER), **SPEED, **witness)
     got = {n: v[1] for n, v in taken(auto).items() if not n.startswith("wheel")}
@@ -235,9 +228,7 @@ def test_what_is_all_positive_to_the_right_is_turned_by_the_way_the_car_turned(w
     ids=["compass deg", "compass rad", "east rad", "east deg", "turned away"],
 )
 @pytest.mark.parametrize("names", [("vel_n", "vel_e", "vel_d"), ("north_velocity", "east_velocity", "up_velocity"), ()])
-def test_the_path_shows_how_a_heading_counts(
-    raw: np.ndarray, scale: float | None, offset: float | None, names: tuple[str, ...]
-) -> None:
+def test_the_path_shows_how_a_heading_counts(raw, scale, offset, names):
     north, east = V * np.sin(PATH_YAW), V * np.cos(PATH_YAW)
     velocity = dict(zip(names, (north, east, 0.01 * np.sin(S)), strict=False))
     auto = found(ins__solution=topic(heading=raw, **WHERE, **velocity), imu__data=topic(**imu_fields()), **SPEED)
@@ -252,7 +243,7 @@ def test_the_path_shows_how_a_heading_counts(
 
 
 @pytest.mark.parametrize("attitude", [True, False])
-def test_a_receiver_has_a_course_and_an_ins_a_heading_also_without_a_vertical_velocity(attitude: bool) -> None:
+def test_a_receiver_has_a_course_and_an_ins_a_heading_also_without_a_vertical_velocity(attitude):
     north, east = V * np.sin(PATH_YAW), V * np.cos(PATH_YAW)
     fields = {"north_vel_cmps": 100.0 * north, "east_vel_cmps": 100.0 * east} if attitude else {}
     fields |= {"roll": 0.01 * np.sin(S)} if attitude else {}
@@ -271,7 +262,7 @@ def test_a_receiver_has_a_course_and_an_ins_a_heading_also_without_a_vertical_ve
         assert mapping_from_dict(tables, where="m").truth["enu_velocity_m_s"].scale == velocity.scale
 
 
-def test_a_magnitude_takes_its_sign_from_another_field() -> None:
+def test_a_magnitude_takes_its_sign_from_another_field():
     bus = topic(steering_angle_deg=np.abs(STEER) / DEG, steering_angle_deg_sign=1.0 * (STEER < 0.0))
     source = found(bus=bus, imu__data=topic(**imu_fields()), **SPEED).mapping.signals["steer_rad"]
     assert source.field == ("steering_angle_deg", "steering_angle_deg_sign")
@@ -283,20 +274,20 @@ def test_a_magnitude_takes_its_sign_from_another_field() -> None:
     assert mapping_from_dict(tables, where="m").signals["steer_rad"].combine == "signed"
 
 
-def test_a_steering_beside_pedals_is_a_share() -> None:
+def test_a_steering_beside_pedals_is_a_share():
     auto = found(controls=topic(steer=STEER / 0.5, throttle=0.3 + 0.0 * S), imu__data=topic(**imu_fields()), **SPEED)
     assert not {"steer_rad", "steering_wheel_rad"} & set(auto.mapping.signals)
     assert any(note.startswith("/controls.steer is not used: it may be a share") for note in auto.mapping.notes)
 
 
 @pytest.mark.parametrize("share", [1.0, 3.0])
-def test_a_steering_without_a_unit_may_be_a_share(share: float) -> None:
+def test_a_steering_without_a_unit_may_be_a_share(share):
     auto = found(controls=topic(steer=STEER * share), imu__data=topic(**imu_fields()), **SPEED)
     doubts = [c.evidence for c in auto.mapping.checks if c.name == "steer_rad.candidate"]
     assert any("a share of the largest angle" in doubt for doubt in doubts) is (share > 1.0)
 
 
-def test_a_velocity_in_the_axes_of_the_world_is_no_speed() -> None:
+def test_a_velocity_in_the_axes_of_the_world_is_no_speed():
     course = np.cumsum(RATE) * 0.01 + 0.3
     world = {"velocity__linear__x": V * np.cos(course), "velocity__linear__y": V * np.sin(course)}
     auto = found(car=topic(**world, **imu_fields()))
@@ -305,7 +296,7 @@ def test_a_velocity_in_the_axes_of_the_world_is_no_speed() -> None:
     assert any("not in the car's axes" in note for note in auto.mapping.notes)
 
 
-def test_short_names_beside_others() -> None:
+def test_short_names_beside_others():
     short = {"ax": AX, "ay": AY, "az": G + 0.0 * S, "gx": 0.01 * np.sin(S), "gy": 0.01 * np.cos(S), "gz": RATE}
     assert taken(found(ins=topic(**short), **SPEED))["yaw_rate_rad_s"] == ("/ins.gz", 1.0)
     state = {"vx": V, "vy": 0.01 * RATE, "r": RATE, "ax": AX, "ay": AY}
@@ -313,16 +304,16 @@ def test_short_names_beside_others() -> None:
 
 
 @pytest.mark.parametrize("units", [(G, 1.0 / 3.6), (1.0, 1.0), (1.0, 0.44704)])
-def test_units_of_a_speed_and_an_acceleration_at_once(units: tuple[float, float]) -> None:
+def test_units_of_a_speed_and_an_acceleration_at_once(units):
     auto = found(car=topic(accx=2.0 * AX / units[0], speed=(V + np.cumsum(AX) * 0.01) / units[1]))
     got = taken(auto)
     assert (got["ax_m_s2"][1], got["speed_m_s"][1]) == pytest.approx(units, rel=1e-4)
 
 
-def test_truth_of_a_vendors_message_by_its_names() -> None:
+def test_truth_of_a_vendors_message_by_its_names():
     slip = topic(lng_vel_kmh=V * 3.6, lat_vel_kmh=0.2 * RATE * 3.6, yaw_rate_dps=-RATE / DEG)
     auto = surveyed(imu__data=topic(**imu_fields()), ins__slip=slip, **SPEED)
-    truth = {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.truth.items()}  # type: ignore[arg-type]
+    truth = {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.truth.items()}
     assert truth == {
         "vx_m_s": ("/ins/slip.lng_vel_kmh", round(1 / 3.6, 6)),
         "vy_m_s": ("/ins/slip.lat_vel_kmh", round(1 / 3.6, 6)),
@@ -330,21 +321,21 @@ def test_truth_of_a_vendors_message_by_its_names() -> None:
     }
 
 
-def test_a_sideslip_that_does_not_say_what_it_is_is_told() -> None:
+def test_a_sideslip_that_does_not_say_what_it_is_is_told():
     auto = found(imu__data=topic(**imu_fields()), esp=topic(sideslip_deg=RATE), **SPEED)
     assert set(auto.mapping.truth) == {"sideslip_rad"}
     assert "truth.source" in undecided(auto)
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_a_vector_whose_x_is_not_the_speed_is_no_velocity_of_the_body(turned: bool) -> None:
+def test_a_vector_whose_x_is_not_the_speed_is_no_velocity_of_the_body(turned):
     yaw = np.cumsum(RATE) * 0.01 if turned else 0.02 * RATE
     state = topic(speed_mps=V, velocities__x=V * np.cos(yaw), velocities__y=V * np.sin(yaw))
     state.fields = {n.replace("velocities", "linear_velocities"): v for n, v in state.fields.items()}
     assert ("vy_m_s" in found(state=state).mapping.truth) is not turned
 
 
-def test_odometry_stands_in_for_a_gyro_and_a_navigation_system_for_a_speed() -> None:
+def test_odometry_stands_in_for_a_gyro_and_a_navigation_system_for_a_speed():
     motion = {"linear__x": V, "linear__y": 0.0 * V, "angular__z": RATE}
     fields = {f"twist__twist__{n}": v for n, v in motion.items()} | {f"pose__pose__position__{a}": S for a in "xy"}
     odometry = topic("nav_msgs/msg/Odometry", **fields)
@@ -356,7 +347,7 @@ def test_odometry_stands_in_for_a_gyro_and_a_navigation_system_for_a_speed() -> 
     assert any("input is the true speed" in n for n in ins.mapping.notes)
 
 
-def test_documented_types_say_unit_sign_and_page() -> None:
+def test_documented_types_say_unit_sign_and_page():
     raptor = topic("raptor_dbw_msgs/msg/SteeringReport", steering_wheel_angle=STEER * 16.0 / DEG)
     px4 = topic("px4_msgs/msg/SensorCombined")
     px4.fields |= {"gyro_rad": np.stack([0 * S, 0 * S, -RATE], axis=1)}
@@ -368,7 +359,7 @@ def test_documented_types_say_unit_sign_and_page() -> None:
     assert all("https://" in c.reason for c in auto.candidates if c.taken)
 
 
-def test_an_ins_whose_type_is_documented_is_truth_before_a_bare_fix() -> None:
+def test_an_ins_whose_type_is_documented_is_truth_before_a_bare_fix():
     velocity = {"north_velocity": V, "east_velocity": 0 * V, "up_velocity": 0 * V}
     ins = topic("novatel_oem7_msgs/msg/INSPVA", **WHERE, **velocity, azimuth=S)
     fix = topic("sensor_msgs/msg/NavSatFix", **WHERE, status__status=0 * S)
@@ -380,26 +371,26 @@ def test_an_ins_whose_type_is_documented_is_truth_before_a_bare_fix() -> None:
     assert any("/gps/fix is not used" in n for n in auto.mapping.notes)
 
 
-def test_latitude_and_longitude_of_two_topics_show_the_path() -> None:
+def test_latitude_and_longitude_of_two_topics_show_the_path():
     apart = {f"bus__{n}": topic(value=v) for n, v in WHERE.items()}
     auto = found(**apart, bus__vehicle_speed=topic(value=3.6 * V))
     assert taken(auto) == {"speed_m_s": ("/bus/vehicle_speed.value", round(1 / 3.6, 6))}
     assert undecided(auto) == set()
 
 
-def test_the_unit_of_a_speed_by_positions() -> None:
+def test_the_unit_of_a_speed_by_positions():
     auto = found(gps__fix=topic("sensor_msgs/msg/NavSatFix", **WHERE), bus=topic(vehicle_speed=3.6 * V))
     assert taken(auto) == {"speed_m_s": ("/bus.vehicle_speed", round(1 / 3.6, 6))}
     assert undecided(auto) == set()
 
 
-def test_a_documented_trap_is_left_out_with_its_reason() -> None:
+def test_a_documented_trap_is_left_out_with_its_reason():
     auto = found(novatel__corrimu=topic("novatel_oem7_msgs/msg/CORRIMU", yaw_rate=RATE, lateral_acc=AY))
     assert auto.mapping.signals == {}
     assert any("per sample" in n for n in auto.mapping.notes)
 
 
-def test_wheels_by_axle_and_the_output_of_a_steering_system() -> None:
+def test_wheels_by_axle_and_the_output_of_a_steering_system():
     axles = {f"axle_{i}_{side}_wheel_speed": V / 0.3 for i in (1, 2) for side in ("left", "right")}
     auto = found(
         wheel_rpt=topic(**axles), steering_rpt=topic(output=16.0 * STEER), imu__data=topic(**imu_fields()), **SPEED
@@ -411,7 +402,7 @@ def test_wheels_by_axle_and_the_output_of_a_steering_system() -> None:
     assert wheels["wheel_speed_rl_rad_s"] == "/wheel_rpt.axle_2_left_wheel_speed"
 
 
-def test_a_documented_sign_decides_which_one_is_wrong() -> None:
+def test_a_documented_sign_decides_which_one_is_wrong():
     rates = FakeTopic("px4_msgs/msg/VehicleAngularVelocity", T, {"xyz": np.stack([0.0 * S, 0.0 * S, -RATE], axis=1)})
     auto = surveyed(rates=rates, rover=topic(measured_forward_speed=V, measured_lateral_acceleration=-AY))
     assert taken(auto)["ay_m_s2"] == ("/rover.measured_lateral_acceleration", -1.0)
@@ -422,16 +413,14 @@ def test_a_documented_sign_decides_which_one_is_wrong() -> None:
     ("factor", "signal", "scale", "is_doubted"),
     [(3.6, "m_s", 1 / 3.6, True), (60.0 / (2.0 * math.pi * 0.3), "rad_s", 2.0 * math.pi / 60.0, False)],
 )
-def test_wheels_without_any_speed_are_told_by_turning_and_a_tie_with_a_doubt(
-    factor: float, signal: str, scale: float, is_doubted: bool
-) -> None:
+def test_wheels_without_any_speed_are_told_by_turning_and_a_tie_with_a_doubt(factor, signal, scale, is_doubted):
     wheels = {f"{w}_speed": factor * V for w in ("lf", "rf", "lb", "rb")}
     auto = found(imu__data=topic(**imu_fields()), wheels=topic(**wheels))
     assert taken(auto)[f"wheel_speed_rl_{signal}"] == ("/wheels.lb_speed", round(scale, 6))
     assert (f"wheel_speed_rl_{signal}.candidate" in undecided(auto)) is is_doubted
 
 
-def test_an_export_is_told_by_its_fields() -> None:
+def test_an_export_is_told_by_its_fields():
     vbo = {"satellites": 9.0 + 0.0 * S, "latitude": 60.0 * WHERE["latitude"], "longitude": -60.0 * WHERE["longitude"],
            "velocity kmh": 3.6 * V, "heading": (90.0 - np.degrees(np.cumsum(RATE) * 0.01)) % 360.0,
            "Long accel g": AX / G, "Lat accel g": AY / G, "Yaw_rate deg/s": RATE / DEG}  # fmt: skip
@@ -444,7 +433,7 @@ def test_an_export_is_told_by_its_fields() -> None:
     assert {auto.mapping.truth[n].scale for n in ("lat_deg", "lon_deg")} == {1 / 60.0, -1 / 60.0}
 
 
-def test_every_shipped_entry_names_its_page() -> None:
+def test_every_shipped_entry_names_its_page():
     vendors = load_vendors()
     assert len(vendors.types) > 20
     for f in (f for kind in vendors.types.values() for f in kind.fields.values()):
@@ -453,7 +442,7 @@ def test_every_shipped_entry_names_its_page() -> None:
         assert f.meaning.quantity
 
 
-def test_a_users_file_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_users_file_comes_first(tmp_path, monkeypatch):
     entry = (
         '[[types]]\ntype = ["car_msgs/State"]\nvendor = "me"\npage = "https://example.org"\nread = "2026-11-22"\n'
         'fields = [{ field = "q7", signal = "yaw_rate_rad_s", scale = -0.5 }]\n'
@@ -488,7 +477,7 @@ def test_a_users_file_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("StePinRelInit_An_Sns [Degrees]", ""), ("Lateral [deg]", ""),
     ],
 )  # fmt: skip
-def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
+def test_what_is_beside_a_quantity_is_not_it(path, quantity):
     name, _, unit = path.partition(" [")
     meaning = meaning_of("/topic", "a/B", name, unit.rstrip("]"))
     assert (meaning.quantity if meaning else "") == quantity
@@ -496,7 +485,7 @@ def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
 
 @pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 @pytest.mark.parametrize("values", ["nan", "inf", "huge", "zero", "noise", "few"])
-def test_values_that_are_no_drive_break_nothing(values: str) -> None:
+def test_values_that_are_no_drive_break_nothing(values):
     noise = np.random.default_rng(0).normal(size=N)
     made = {"nan": S * np.nan, "inf": S + np.inf, "huge": 1e300 * noise, "zero": 0.0 * S}.get(values, noise)
     names = ("speed", "yaw_rate", "accel_x", "accel_y", "accel_z", "steering_angle", "fl_speed", "fr_speed")
@@ -514,7 +503,7 @@ def test_values_that_are_no_drive_break_nothing(values: str) -> None:
         assert undecided(auto)
 
 
-def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
+def test_a_rate_of_the_steering_is_no_steering_angle():
     assert meaning_of("/steering_velocity", "std_msgs/msg/Float64", "data") is None
     for name, path in (("/steering", "data"), ("/velocity_and_steering", "angle")):
         meaning = meaning_of(name, "std_msgs/msg/Float64", path)
@@ -550,11 +539,8 @@ def test_a_rate_of_the_steering_is_no_steering_angle() -> None:
         ("StW_Angl", "deg", "steering", "wheel", DEG),
     ],
 )  # fmt: skip
-def test_abbreviations_and_spelled_out_units(
-    name: str, unit: str, quantity: str, part: str, scale: float | None
-) -> None:
+def test_abbreviations_and_spelled_out_units(name, unit, quantity, part, scale):
     meaning = meaning_of("log", "", name, unit)
-    assert meaning is not None
     assert (meaning.quantity, meaning.part) == (quantity, part)
     assert meaning.scale == (None if scale is None else pytest.approx(scale))
 
@@ -572,14 +558,13 @@ def test_abbreviations_and_spelled_out_units(
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("text", ["{k} {n} # {c}\n", "# {c}\n{k} {n}\n{k} x\n", "S s\n===\nMSG: p/S\n{k} {n} #{c}\n"])
-def test_units_in_comments_of_a_definition(kind: str, comment: str, name: str, scale: float | None, text: str) -> None:
+def test_units_in_comments_of_a_definition(kind, comment, name, scale, text):
     units = stated_units(text.format(k=kind, n=name, c=comment))
     meaning = meaning_of("log", "", name, units["S" if "S" in units else ""][name][1])
-    assert meaning is not None
     assert meaning.scale == (None if scale is None else pytest.approx(scale))
 
 
-def test_a_comment_above_describes_the_fields_up_to_a_blank_line_and_no_field_with_a_comment_of_its_own() -> None:
+def test_a_comment_above_describes_the_fields_up_to_a_blank_line_and_no_field_with_a_comment_of_its_own():
     units = stated_units("# km/h\nfloat32 a\nfloat32 b # Nm\nfloat32 c\n\nfloat32 d\n#\nfloat32 e\n")[""]
     assert {name: unit for name, (_, unit) in units.items()} == {"a": "km/h", "b": "", "c": "km/h", "d": "", "e": ""}
 
@@ -595,20 +580,18 @@ def test_a_comment_above_describes_the_fields_up_to_a_blank_line_and_no_field_wi
         ("s.r", ("s.u", "s.v"), ("rate", "z")),
     ],
 )
-def test_a_short_name_is_what_the_names_beside_it_show(
-    path: str, beside: tuple[str, ...], meant: tuple[str, str] | None
-) -> None:
+def test_a_short_name_is_what_the_names_beside_it_show(path, beside, meant):
     meaning = meaning_among("log", "", path, "", {path, *beside})
     assert (meaning and (meaning.quantity, meaning.part)) == meant
 
 
-def test_a_v_without_a_unit_is_a_speed_if_the_acceleration_follows_it() -> None:
+def test_a_v_without_a_unit_is_a_speed_if_the_acceleration_follows_it():
     fields = {"v": V, "ax": AX, "ay": AY, "yaw_rate": RATE}
     assert taken(found(state=topic(**fields)))["speed_m_s"] == ("/state.v", 1.0)
     assert "speed_m_s" not in taken(found(state=topic(**(fields | {"v": np.sin(np.arange(len(V)))}))))
 
 
-def test_the_axis_of_a_lateral_velocity_is_that_of_the_acceleration_beside_it() -> None:
+def test_the_axis_of_a_lateral_velocity_is_that_of_the_acceleration_beside_it():
     fields = {"VelForward": V, "VelLateral": -0.2 * RATE, "AccelLateral": -AY, "AngRateDown": -RATE}
     fields["AccelDown"] = np.full(len(V), -G)
     steering = topic(road_wheel_angle_rad=2.7 * RATE / np.maximum(V, 1.0))
@@ -627,13 +610,12 @@ def test_the_axis_of_a_lateral_velocity_is_that_of_the_acceleration_beside_it() 
         ("kmph", ("speed", "")),
     ],
 )
-def test_words_of_languages_and_directions(name: str, meant: tuple[str, str]) -> None:
+def test_words_of_languages_and_directions(name, meant):
     meaning = meaning_among("log", "", name, "")
-    assert meaning is not None
     assert (meaning.quantity, meaning.part) == meant
 
 
-def test_columns_without_names_by_the_drive() -> None:
+def test_columns_without_names_by_the_drive():
     auto = found(box=topic(ch1=3.6 * V, ch2=AX, ch3=AY, ch4=RATE, ch5=12.0 + 0.0 * S))
     assert {n: s[0] for n, s in taken(auto).items()} == {
         "speed_m_s": "/box.ch1", "ax_m_s2": "/box.ch2", "ay_m_s2": "/box.ch3", "yaw_rate_rad_s": "/box.ch4",
@@ -641,18 +623,18 @@ def test_columns_without_names_by_the_drive() -> None:
     assert {c.subject for c in auto.mapping.checks} >= {"speed_m_s", "yaw_rate_rad_s"}
 
 
-def test_axes_by_gravity() -> None:
+def test_axes_by_gravity():
     down = {"acc_x": AX, "acc_y": -AY, "acc_z": -G + 0.0 * S, "gyro_z": -RATE}
     assert taken(found(box=topic(**down)))["ay_m_s2"] == ("/box.acc_y", -1.0)
     assert taken(found(box=topic(**down)))["yaw_rate_rad_s"] == ("/box.gyro_z", -1.0)
 
 
-def test_an_acceleration_alone_is_not_proposed() -> None:
+def test_an_acceleration_alone_is_not_proposed():
     """It may be the derivative of the speed."""
     assert set(taken(found(state=topic(vEgo=V, aEgo=AX, yawRate=RATE)))) == {"speed_m_s", "yaw_rate_rad_s"}
 
 
-def test_axes_of_a_level_device_by_the_speed() -> None:
+def test_axes_of_a_level_device_by_the_speed():
     box = topic(acc_x=-AY, acc_y=AX, acc_z=G + 0.0 * S, speed_kmh=3.6 * V)
     turned = taken(found(box=box))
     assert (turned["ax_m_s2"], turned["ay_m_s2"]) == (("/box.acc_y", 1.0), ("/box.acc_x", -1.0))

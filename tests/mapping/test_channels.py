@@ -1,7 +1,5 @@
 """Reading mapped fields: values, times, cleaning with counts, and the truth gate."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +33,7 @@ def imu_log(n: int = 200, seed: int = 1, **changes: np.ndarray) -> FakeLog:
 def imu_mapping(**changes: object) -> Mapping:
     ay = SignalSource("ay_m_s2", "/imu", "linear_acceleration.y")
     yaw = SignalSource("yaw_rate_rad_s", "/imu", "angular_velocity.z")
-    return Mapping(signals={s.name: replace(s, **changes) for s in (ay, yaw)})  # type: ignore[arg-type]
+    return Mapping(signals={s.name: replace(s, **changes) for s in (ay, yaw)})
 
 
 def read_all(log: FakeLog, mapping: Mapping) -> tuple[dict[str, Channel], dict[str, Channel], dict[str, Loss]]:
@@ -44,7 +42,7 @@ def read_all(log: FakeLog, mapping: Mapping) -> tuple[dict[str, Channel], dict[s
     return got.signals, got.truth, {f"{x.kind} {x.where.split(' ')[0]}": x for x in got.losses}
 
 
-def test_scale_offset_latency_and_arrival() -> None:
+def test_scale_offset_latency_and_arrival():
     log = imu_log()
     signals, _, losses = read_all(log, imu_mapping(scale=-9.81, offset=0.5, latency_s=0.0031))
     topic = log.contents["/imu"]
@@ -57,7 +55,7 @@ def test_scale_offset_latency_and_arrival() -> None:
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("s", 1e-9), ("ms", 1e-6), ("us", 1e-3)])
-def test_numbers_as_stamps(unit: str, factor: float) -> None:
+def test_numbers_as_stamps(unit, factor):
     log = imu_log()
     topic = log.contents["/imu"]
     topic.fields["t"] = topic.fields.pop("header.stamp") * factor
@@ -67,7 +65,7 @@ def test_numbers_as_stamps(unit: str, factor: float) -> None:
 
 
 @pytest.mark.parametrize("names", [("sec", "nanosec"), ("seconds", "nanos")])
-def test_a_stamp_in_two_numbers_is_exact(names: tuple[str, str]) -> None:
+def test_a_stamp_in_two_numbers_is_exact(names):
     log = imu_log()
     topic = log.contents["/imu"]
     stamps = topic.fields.pop("header.stamp")
@@ -77,7 +75,7 @@ def test_a_stamp_in_two_numbers_is_exact(names: tuple[str, str]) -> None:
     np.testing.assert_array_equal(signals["ay_m_s2"].stamps_ns, stamps)
 
 
-def test_what_is_dropped_is_counted_and_named() -> None:
+def test_what_is_dropped_is_counted_and_named():
     log = imu_log()
     topic = log.contents["/imu"]
     ay, yaw, stamps = (topic.fields[p] for p in ("linear_acceleration.y", "angular_velocity.z", "header.stamp"))
@@ -106,7 +104,7 @@ def test_what_is_dropped_is_counted_and_named() -> None:
 
 
 @pytest.mark.parametrize("shift_s", [-3.0, 5.0])
-def test_a_delay_that_cannot_be_is_unknown(shift_s: float) -> None:
+def test_a_delay_that_cannot_be_is_unknown(shift_s):
     log = imu_log()
     log.contents["/imu"].log_time_ns += np.int64(shift_s * 1e9)
     signals, _, losses = read_all(log, imu_mapping())
@@ -114,7 +112,7 @@ def test_a_delay_that_cannot_be_is_unknown(shift_s: float) -> None:
     assert losses["delay-unknown /imu"].severity == "note"
 
 
-def test_vectors_take_a_scale_per_axis_and_lists_of_fields() -> None:
+def test_vectors_take_a_scale_per_axis_and_lists_of_fields():
     stamps = T0 + np.arange(20, dtype=np.int64) * 50 * MS
     xyz = np.random.default_rng(3).normal(size=(20, 3))
     fields = {"v": xyz, "w": np.full(20, 0.5)} | {f"q.{a}": xyz[:, i] for i, a in enumerate("xyz")}
@@ -126,7 +124,7 @@ def test_vectors_take_a_scale_per_axis_and_lists_of_fields() -> None:
     np.testing.assert_allclose(truth["quat_wxyz"].values, np.column_stack([np.full(20, 0.5), xyz]))
 
 
-def test_an_empty_window_gives_empty_channels() -> None:
+def test_an_empty_window_gives_empty_channels():
     log = imu_log()
     mapping = imu_mapping()
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
@@ -151,7 +149,7 @@ def messy_samples(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(samples=messy_samples())
-def test_cleaning_agrees_with_a_dictionary(samples: tuple[np.ndarray, ...]) -> None:
+def test_cleaning_agrees_with_a_dictionary(samples):
     stamps, arrival, values = samples
     best: dict[int, tuple[int, float]] = {}
     for s, a, v in zip(stamps.tolist(), arrival.tolist(), values.tolist(), strict=True):
@@ -169,7 +167,7 @@ def test_cleaning_agrees_with_a_dictionary(samples: tuple[np.ndarray, ...]) -> N
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000))
-def test_gate_agrees_with_a_search_by_hand(seed: int) -> None:
+def test_gate_agrees_with_a_search_by_hand(seed):
     rng = np.random.default_rng(seed)
     stamps = np.sort(rng.integers(0, 100, 30))
     gate_stamps = np.sort(rng.integers(0, 100, rng.integers(0, 12)))
@@ -190,7 +188,7 @@ def test_gate_agrees_with_a_search_by_hand(seed: int) -> None:
     ],
     ids=["rejected", "silent for more than two periods"],
 )
-def test_truth_that_the_gate_rejects_is_counted(sent: slice, modes: np.ndarray, kept: np.ndarray) -> None:
+def test_truth_that_the_gate_rejects_is_counted(sent, modes, kept):
     log = imu_log(100)
     stamps = log.contents["/imu"].fields["header.stamp"]
     log.contents["/status"] = FakeTopic("x/S", stamps[sent] + MS, {"stamp": stamps[sent], "mode": modes})
@@ -221,9 +219,7 @@ def columns(**fields: np.ndarray) -> Columns:
         ("speed_m_s", np.ones((N, 3)), (N,)),
     ],
 )
-def test_what_is_not_the_signal_s_shape_is_missing_at_every_sample(
-    name: str, raw: np.ndarray, shape: tuple[int, ...]
-) -> None:
+def test_what_is_not_the_signal_s_shape_is_missing_at_every_sample(name, raw, shape):
     values = si_values(columns(v=raw), SignalSource(name, "/a", "v"))
     assert values.shape == shape
     assert np.isnan(values).all()

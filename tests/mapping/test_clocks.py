@@ -1,18 +1,17 @@
 """Device clocks against log time, and unusable header stamps: log time replaces them and a note reports it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdhef_logtool.cli.inspecting import render_inspection
 from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, clock_key, fit_clocks, read_signals
 from pdhef_logtool.mapping.clocks import apply_clock, fit_clock_line, why_unusable
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray
-from pdhef_logtool.runs.inspection import inspect_drive_log, render_inspection
+from pdhef_logtool.runs.inspection import inspect_drive_log
 from pdhef_logtool.runs.inspection.report import Steps
 from tests.command_line import rendered
 
@@ -27,9 +26,7 @@ T0 = 1_700_000_000_000_000_000
     jitter_ms=st.floats(0.1, 20),
     outliers=st.booleans(),
 )
-def test_the_line_finds_offset_and_drift(
-    seed: int, offset_s: float, drift_ppm: float, jitter_ms: float, outliers: bool
-) -> None:
+def test_the_line_finds_offset_and_drift(seed, offset_s, drift_ppm, jitter_ms, outliers):
     rng = np.random.default_rng(seed)
     n = 6000
     true_s = np.arange(n) * 0.01
@@ -46,7 +43,7 @@ def test_the_line_finds_offset_and_drift(
     assert np.abs(error_s - 0.003).max() < 0.3 * jitter_ms * 1e-3 + 1e-5
 
 
-def test_a_step_of_the_clock_shows_in_the_residual() -> None:
+def test_a_step_of_the_clock_shows_in_the_residual():
     device = np.arange(2000, dtype=np.int64) * 10_000_000
     log_time = T0 + device
     device[1000:] += 400_000_000
@@ -54,7 +51,7 @@ def test_a_step_of_the_clock_shows_in_the_residual() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
-def test_a_few_messages_are_enough(n: int) -> None:
+def test_a_few_messages_are_enough(n):
     device = np.arange(n, dtype=np.int64) * 10_000_000 + 77
     reference, reference_log, drift, _ = fit_clock_line(device, T0 + device)
     got = apply_clock(device, ClockModel(reference, reference_log, drift))
@@ -67,7 +64,7 @@ def device_log(n: int, duration_s: float) -> FakeLog:
     return FakeLog({"/imu": FakeTopic("x/Imu", log_time, {"t": stamps * 1e-9, "a": np.zeros(n)})})
 
 
-def test_a_long_log_is_surveyed_in_parts() -> None:
+def test_a_long_log_is_surveyed_in_parts():
     log = device_log(40_000, 4000.0)
     source = SignalSource("ay_m_s2", "/imu", "a", stamp="t", stamp_unit="s", clock="device")
     clock = fit_clocks(log, Mapping(signals={"ay_m_s2": source}), log.start_ns, log.end_ns)[clock_key(source)]
@@ -79,7 +76,7 @@ def test_a_long_log_is_surveyed_in_parts() -> None:
     assert clock.median_period_s == pytest.approx(0.1, rel=1e-3)
 
 
-def test_a_device_clock_without_stamps_is_one_line() -> None:
+def test_a_device_clock_without_stamps_is_one_line():
     log = device_log(100, 1.0)
     log.contents["/imu"].fields["t"][:] = np.nan
     source = SignalSource("ay_m_s2", "/imu", "a", stamp="t", stamp_unit="s", clock="device")
@@ -107,7 +104,7 @@ UNUSABLE = {
 
 
 @pytest.mark.parametrize("name", UNUSABLE)
-def test_log_time_serves(name: str) -> None:
+def test_log_time_serves(name):
     stamps, why = UNUSABLE[name]
     assert why in why_unusable(stamps, LOG)
     log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": stamps, "v": np.arange(float(N))})})
@@ -122,7 +119,7 @@ def test_log_time_serves(name: str) -> None:
     assert +found.counts["signal", "ay_m_s2"] == {"read": N}
 
 
-def test_sound_stamps_stay() -> None:
+def test_sound_stamps_stay():
     late = LOG.copy()
     late[300:500] += np.linspace(5 * S, 0, 200).astype(np.int64)  # held up for five seconds, then sent in order
     twice = np.repeat(TRUE, 2)
@@ -145,7 +142,7 @@ def test_sound_stamps_stay() -> None:
 
 
 @pytest.mark.parametrize(("behind_ns", "serves"), [(3600 * S, True), (-3 * S, True), (20 * MS, False)])
-def test_one_topic_of_another_clock(behind_ns: int, serves: bool) -> None:
+def test_one_topic_of_another_clock(behind_ns, serves):
     """A clock offset shared by all topics is accepted; a topic with a different offset has unusable stamps."""
     topics = {
         "/imu": FakeTopic("a/b", LOG, {"header.stamp": TRUE - behind_ns, "v": np.arange(float(N))}),
@@ -163,7 +160,7 @@ def test_one_topic_of_another_clock(behind_ns: int, serves: bool) -> None:
     assert not alone["/imu.header.stamp"].unusable
 
 
-def test_a_step_between_the_parts_of_a_survey_is_found() -> None:
+def test_a_step_between_the_parts_of_a_survey_is_found():
     n = 3600 * 10
     true = START + np.arange(n, dtype=np.int64) * 100 * MS
     stamps = true - np.where(np.arange(n) < 17_437, 0, 3 * S)
@@ -173,7 +170,7 @@ def test_a_step_between_the_parts_of_a_survey_is_found() -> None:
     assert "step back by 2.9 s" in clocks["/imu.header.stamp"].unusable
 
 
-def test_zero_stamps_lose_no_topic() -> None:
+def test_zero_stamps_lose_no_topic():
     zeros = np.zeros(N, np.int64)
     log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": zeros, "v": np.arange(float(N))})})
     mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
@@ -185,15 +182,13 @@ def test_zero_stamps_lose_no_topic() -> None:
 @given(
     burst=st.integers(1, 12), spread_us=st.integers(0, 3000), period_ms=st.integers(40, 300), seed=st.integers(0, 99)
 )
-def test_the_rate_of_any_burst_pattern_is_messages_over_time(
-    burst: int, spread_us: int, period_ms: int, seed: int
-) -> None:
+def test_the_rate_of_any_burst_pattern_is_messages_over_time(burst, spread_us, period_ms, seed):
     jitter = np.random.default_rng(seed).integers(0, 1 + 1000 * spread_us, 200 * burst)
     stamps = np.sort(START + np.repeat(np.arange(200) * period_ms * MS, burst) + jitter)
     assert Steps.of([stamps]).rate_hz == pytest.approx(burst * 1000.0 / period_ms, rel=0.06)
 
 
-def test_a_delay_of_another_clock_is_named_and_not_shown_as_a_delay() -> None:
+def test_a_delay_of_another_clock_is_named_and_not_shown_as_a_delay():
     count = np.arange(300, dtype=np.int64)
     text = {}
     for name, offset in (("simulation", START), ("boot", 3600 * S), ("arrival", 20 * MS)):

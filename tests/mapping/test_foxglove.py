@@ -1,7 +1,5 @@
 """Foxglove's messages, and ROS types in JSON and protobuf, are recognised like their ROS counterparts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from contextlib import closing
@@ -43,9 +41,7 @@ FIX = {"latitude": 57.0 + STEP * 1e-5, "longitude": 12.0 * ONE, "altitude": 30.0
 
 
 @ENCODINGS
-def test_a_location_fix_is_a_satellite_fix_with_angles_from_north(
-    tmp_path: Path, container: str, times: tuple[str, str]
-) -> None:
+def test_a_location_fix_is_a_satellite_fix_with_angles_from_north(tmp_path, container, times):
     fix = {**stamped("timestamp", times), **FIX, "heading": 0.1 * STEP, "course": 0.1 * STEP + 0.02}
     found, got = mapped(tmp_path, container, gps=("foxglove.LocationFix", fix))
     assert set(found.mapping.truth) == {"lat_deg", "lon_deg", "alt_m", "yaw_rad", "course_rad"}
@@ -55,7 +51,7 @@ def test_a_location_fix_is_a_satellite_fix_with_angles_from_north(
     assert any("two antennas" in note for note in found.mapping.notes)
 
 
-def test_a_heading_that_repeats_the_course_is_no_yaw() -> None:
+def test_a_heading_that_repeats_the_course_is_no_yaw():
     fix = FakeTopic("foxglove.LocationFix", STAMPS, {**FIX, "heading": 0.1 * STEP, "course": 0.1 * STEP})
     mapping = auto_map(FakeLog({"/gps": fix})).mapping
     assert "yaw_rad" not in mapping.truth
@@ -64,7 +60,7 @@ def test_a_heading_that_repeats_the_course_is_no_yaw() -> None:
 
 
 @ENCODINGS
-def test_odometry_is_truth_or_speed_by_its_name(tmp_path: Path, container: str, times: tuple[str, str]) -> None:
+def test_odometry_is_truth_or_speed_by_its_name(tmp_path, container, times):
     def odometry(scale: float) -> tuple[str, Fields]:
         position = {"pose.position.x": 2.0 * STEP, "pose.position.y": 0.5 * ONE, "pose.position.z": 0.0 * ONE}
         attitude = dict(zip("xyzw", (0.0, 0.0, 0.6, 0.8), strict=True))
@@ -84,7 +80,7 @@ def test_odometry_is_truth_or_speed_by_its_name(tmp_path: Path, container: str, 
     np.testing.assert_array_equal(got["vx_m_s"].stamps_ns, STAMPS)
 
 
-def test_a_list_of_poses_is_said_and_not_guessed() -> None:
+def test_a_list_of_poses_is_said_and_not_guessed():
     poses = FakeTopic("foxglove.PosesInFrame", STAMPS, {"poses[].position.x": ONE})
     found = auto_map(FakeLog({"/ground_truth/poses": poses}))
     assert not found.mapping.truth
@@ -97,7 +93,7 @@ IMU = {"linear_acceleration.x": ONE, "linear_acceleration.y": 2.0 * ONE, "linear
 
 
 @pytest.mark.parametrize("name", ["sensor_msgs/Imu", "sensor_msgs/msg/Imu", "sensor_msgs.Imu", "ros.sensor_msgs.Imu"])
-def test_a_ros_type_in_json_is_recognised_by_its_name(tmp_path: Path, name: str) -> None:
+def test_a_ros_type_in_json_is_recognised_by_its_name(tmp_path, name):
     imu = {**stamped("header.stamp", ("sec", "nanosec")), **IMU}
     found, got = mapped(tmp_path, "mcap-json", imu=(name, imu))
     assert set(found.mapping.signals) == {"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"}
@@ -105,7 +101,7 @@ def test_a_ros_type_in_json_is_recognised_by_its_name(tmp_path: Path, name: str)
     np.testing.assert_array_equal(got["ay_m_s2"].stamps_ns, STAMPS)
 
 
-def test_a_name_without_the_fields_is_said_and_spoils_nothing(tmp_path: Path) -> None:
+def test_a_name_without_the_fields_is_said_and_spoils_nothing(tmp_path):
     other, fix = ("sensor_msgs/Imu", {"acc": np.ones((40, 3))}), ("foxglove.LocationFix", {"lat": ONE})
     found, _ = mapped(tmp_path, "mcap-json", imu=("sensor_msgs/Imu", IMU), x=other, gps=fix)
     assert found.mapping.signals["ax_m_s2"].topic == "/imu"

@@ -1,7 +1,5 @@
 """mapping.toml: strict reading, all problems at once, and writing that loads back."""
 
-from __future__ import annotations
-
 import math
 import string
 from itertools import permutations
@@ -57,7 +55,7 @@ def load_text(tmp_path: Path, text: str) -> Mapping:
     return load_mapping(path)
 
 
-def test_the_documented_example_loads(tmp_path: Path) -> None:
+def test_the_documented_example_loads(tmp_path):
     mapping = load_text(tmp_path, DESIGN_EXAMPLE)
     assert mapping.signals["steer_rad"] == SignalSource(
         "steer_rad", "/vehicle/status/steering_status", "steering_tire_angle", "stamp", valid_min=-1.0, valid_max=1.0
@@ -81,7 +79,7 @@ def test_the_documented_example_loads(tmp_path: Path) -> None:
         ("wheel_speed_fl_rad_s", "rpm", math.pi / 30.0),
     ],
 )
-def test_a_unit_states_the_scale(tmp_path: Path, signal: str, unit: str, scale: float) -> None:
+def test_a_unit_states_the_scale(tmp_path, signal, unit, scale):
     entry = f'[signals.{signal}]\ntopic = "/x"\nfield = "y"\nunit = "{unit}"\n'
     assert load_text(tmp_path, entry).signals[signal].scale == pytest.approx(scale)
     assert load_text(tmp_path, f"{entry}scale = -1.0\n").signals[signal].scale == pytest.approx(-scale)
@@ -91,7 +89,7 @@ def test_a_unit_states_the_scale(tmp_path: Path, signal: str, unit: str, scale: 
         load_text(tmp_path, entry.replace(f'"{unit}"', '"furlong"'))
 
 
-def test_all_problems_come_in_one_line(tmp_path: Path) -> None:
+def test_all_problems_come_in_one_line(tmp_path):
     text = """
     signal.speed_m_s = {topic = "/s", field = "v"}
     [signals]
@@ -151,7 +149,7 @@ def test_all_problems_come_in_one_line(tmp_path: Path) -> None:
         ("not toml", "mapping TOML"),
     ],
 )
-def test_contradictions_are_named(tmp_path: Path, text: str, said: str) -> None:
+def test_contradictions_are_named(tmp_path, text, said):
     with pytest.raises(MappingError) as caught:
         load_text(tmp_path, text)
     assert said in str(caught.value)
@@ -205,14 +203,14 @@ MAPPINGS = st.builds(
 @pytest.mark.slow
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(mapping=MAPPINGS, comment=texts)
-def test_what_is_written_loads_back(tmp_path_factory: pytest.TempPathFactory, mapping: Mapping, comment: str) -> None:
+def test_what_is_written_loads_back(tmp_path_factory, mapping, comment):
     text = mapping_to_toml(mapping, comments={"": comment, "ax_m_s2": comment, "vx_m_s": comment})
     path = tmp_path_factory.mktemp("toml") / "m.toml"
     path.write_text(text, encoding="utf-8", newline="")
     assert load_mapping(path) == mapping
 
 
-def test_missing_signals_stand_ready_as_comments(tmp_path: Path) -> None:
+def test_missing_signals_stand_ready_as_comments(tmp_path):
     text = mapping_to_toml(Mapping(notes=("first\nsecond = 3\r[signals]",)), comments={"speed_m_s": "perhaps /can.v"})
     assert load_text(tmp_path, text) == Mapping()
     for name in ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"):
@@ -254,7 +252,7 @@ def mapping(**sources: SignalSource) -> Mapping:
     return Mapping(signals=sources)
 
 
-def test_what_is_there_passes() -> None:
+def test_what_is_there_passes():
     sources = (
         SignalSource("ax_m_s2", "/imu/data", "linear_acceleration.x"),
         SignalSource("ay_m_s2", "/steer", "gyro[1]", stamp="stamp"),
@@ -269,7 +267,7 @@ def test_what_is_there_passes() -> None:
     check_mapping(Mapping({s.name: s for s in sources}, {s.name: s for s in vectors}, quality=gate), log())
 
 
-def test_everything_that_lacks_is_named_with_the_nearest() -> None:
+def test_everything_that_lacks_is_named_with_the_nearest():
     bad = Mapping(
         signals={
             "ax_m_s2": SignalSource("ax_m_s2", "/imu/dat", "linear_acceleration.x"),
@@ -303,13 +301,13 @@ def test_everything_that_lacks_is_named_with_the_nearest() -> None:
     ("stamp", "unit", "said"),
     [("seconds", "ros", "give stamp_unit"), ("header.stamp", "s", "stamp_unit = "), ("header", "ros", "is no time")],
 )
-def test_the_kind_of_the_stamp_is_checked(stamp: str, unit: str, said: str) -> None:
-    source = SignalSource("ax_m_s2", "/imu/data", "linear_acceleration.x", stamp=stamp, stamp_unit=unit)  # type: ignore[arg-type]
+def test_the_kind_of_the_stamp_is_checked(stamp, unit, said):
+    source = SignalSource("ax_m_s2", "/imu/data", "linear_acceleration.x", stamp=stamp, stamp_unit=unit)
     with pytest.raises(MappingError, match=said):
         check_mapping(mapping(ax_m_s2=source), log())
 
 
-def test_stamps_that_the_file_leaves_open_come_from_the_schema() -> None:
+def test_stamps_that_the_file_leaves_open_come_from_the_schema():
     open_ = (("ax_m_s2", "/imu/data", "linear_acceleration.x"), ("steer_rad", "/steer", "angle"))
     sources = {n: SignalSource(n, *where) for n, *where in (*open_, ("speed_m_s", "/bare", "data"))}
     stated = SignalSource("ay_m_s2", "/imu/data", "linear_acceleration.y", stamp="publish_time")
@@ -321,7 +319,6 @@ def test_stamps_that_the_file_leaves_open_come_from_the_schema() -> None:
         "speed_m_s": "log_time",
         "ay_m_s2": "publish_time",
     }
-    assert got.quality is not None
     assert got.quality.stamp == "stamp"
 
 
@@ -346,12 +343,12 @@ field = "vy"
 BETA = {"beta": np.zeros(10)}
 
 
-def _log(**topics: dict[str, np.ndarray]) -> FakeLog:  # type: ignore[type-arg]
+def _log(**topics: dict[str, np.ndarray]) -> FakeLog:
     times = np.arange(10, dtype=np.int64) * 10_000_000 + 1_700_000_000_000_000_000
     return FakeLog({name: FakeTopic("custom/Type", times, fields) for name, fields in topics.items()})
 
 
-def test_tables_are_read_and_written_back(tmp_path: Path) -> None:
+def test_tables_are_read_and_written_back(tmp_path):
     (tmp_path / "m.toml").write_text(TABLES)
     mapping = load_mapping(tmp_path / "m.toml")
     assert list(mapping.estimates) == ["esc", "my ekf 2.1"]
@@ -361,36 +358,35 @@ def test_tables_are_read_and_written_back(tmp_path: Path) -> None:
     assert load_mapping(tmp_path / "again.toml").estimates == mapping.estimates
 
 
-def test_topics_with_dots_are_found_by_the_longest_that_fits() -> None:
+def test_topics_with_dots_are_found_by_the_longest_that_fits():
     values = {"c": np.zeros(10), "b.c": np.zeros(10)}
     log = _log(**{"a": values, "a.b": values})
-    sources, _ = sources_of(log, ["vx_m_s=a.b.c", "vy_m_s=a.c"], ESTIMATE_UNITS, "--estimate")  # type: ignore[arg-type]
+    sources, _ = sources_of(log, ["vx_m_s=a.b.c", "vy_m_s=a.c"], ESTIMATE_UNITS, "--estimate")
     assert {n: (s.topic, s.field) for n, s in sources.items()} == {"vx_m_s": ("a.b", "c"), "vy_m_s": ("a", "c")}
 
 
-def test_flags_win_over_tables(tmp_path: Path) -> None:
+def test_flags_win_over_tables(tmp_path):
     (tmp_path / "m.toml").write_text(TABLES)
     mapping = load_mapping(tmp_path / "m.toml")
     log = _log(**{"/esc": BETA})
-    (flag,) = choose_estimates(log, ["sideslip_rad=/esc.beta"], mapping, None)  # type: ignore[arg-type]
+    (flag,) = choose_estimates(log, ["sideslip_rad=/esc.beta"], mapping, None)
     assert flag.name == "esc"
     assert flag.signals["sideslip_rad"].scale == 1.0
-    tables = choose_estimates(log, [], mapping, None)  # type: ignore[arg-type]
+    tables = choose_estimates(log, [], mapping, None)
     assert [e.name for e in tables] == ["esc", "my ekf 2.1"]
 
 
-def test_a_topic_named_as_a_whole_brings_its_covariance_and_a_field_does_not(sample_logs_dir: Path) -> None:
+def test_a_topic_named_as_a_whole_brings_its_covariance_and_a_field_does_not(sample_logs_dir):
     log = open_log(sample_logs_dir / "step.mcap")
     sources, covariance = sources_of(log, ["/rtk/odometry"], ESTIMATE_UNITS, "--estimate")
     assert {"vx_m_s", "vy_m_s"} <= sources.keys()
-    assert covariance is not None
     assert covariance.topic == "/rtk/odometry"
     _, none = sources_of(log, ["vx_m_s=/rtk/odometry.twist.twist.linear.x"], ESTIMATE_UNITS, "--estimate")
     assert none is None
     log.close()
 
 
-def test_losses_of_one_kind_at_one_place_become_one_that_spans_and_counts_all() -> None:
+def test_losses_of_one_kind_at_one_place_become_one_that_spans_and_counts_all():
     first, second = Loss("nan", "w", "/a.x", 40, 50, 3), Loss("nan", "w", "/a.x", 10, 20, 4)
     whole = Loss("nan", "w", "/a.x")  # uncounted: adds no bound and no count
     for order in permutations((first, second, whole)):
@@ -406,6 +402,6 @@ def test_losses_of_one_kind_at_one_place_become_one_that_spans_and_counts_all() 
         Loss("nan", "w", "/a", 1, 2, 1, "note"),
     ],
 )
-def test_losses_that_differ_in_kind_words_place_or_weight_stay_apart(other: Loss) -> None:
+def test_losses_that_differ_in_kind_words_place_or_weight_stay_apart(other):
     loss = Loss("nan", "w", "/a", 1, 2, 1)
     assert merge_losses([[loss, other], [loss]]) == (Loss("nan", "w", "/a", 1, 2, 2), other)

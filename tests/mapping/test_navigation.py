@@ -1,7 +1,5 @@
 """Motion over ground: velocities, receivers as sensors, instruments that are ground truth, and joints of a model."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 
@@ -49,7 +47,7 @@ def of_table(**columns: np.ndarray) -> AutoMapping:
 @pytest.mark.parametrize(
     "name", ["{}", "truth_{}", "{}_gt", "rtk_{}", "ins_{}", "oxts_{}", "{}_rt3000", "kistler_{}", "true_{}"]
 )
-def test_a_table_of_two_instruments(name: str) -> None:
+def test_a_table_of_two_instruments(name):
     """Sideslip and the words beside its name show the ground truth's instrument; the other columns are the car's."""
     truth = {name.format("vx"): V, name.format("vy"): 0.3 * RATE, name.format("yaw_rate"): 1.001 * RATE}
     own = {"speed": V, "accel_y": V * RATE, "yaw_rate": RATE, "steer": 2.9 * RATE / V}
@@ -71,7 +69,7 @@ def twist(factor: float = 1.0) -> FakeTopic:
 
 
 @pytest.mark.parametrize("witness", [{}, {"fix": topic("sensor_msgs/msg/NavSatFix", FIX)}])
-def test_a_velocity_east_and_north_gives_the_speed(witness: dict[str, FakeTopic]) -> None:
+def test_a_velocity_east_and_north_gives_the_speed(witness):
     auto = found(vel=twist(), **witness)
     np.testing.assert_allclose(speed_of(auto), V)
     assert any("/vel" in n and "never negative" in n for n in auto.mapping.notes)
@@ -79,14 +77,14 @@ def test_a_velocity_east_and_north_gives_the_speed(witness: dict[str, FakeTopic]
 
 
 @pytest.mark.parametrize("names", [("VelN", "VelE"), ("v_n", "v_e"), ("north_speed", "east_speed")])
-def test_north_and_east_in_a_table_of_everything_are_speed_and_receiver(names: tuple[str, str]) -> None:
+def test_north_and_east_in_a_table_of_everything_are_speed_and_receiver(names):
     table = {"AccX": IMU["linear_acceleration.x"], "AccY": IMU["linear_acceleration.y"], "GyroZ": RATE}
     signals = of_table(**table, **dict(zip(names, (NORTH, EAST), strict=True))).mapping.signals
     assert signals["speed_m_s"].paths == names[::-1]
     assert signals["gnss_velocity_north_m_s"].paths + signals["gnss_velocity_east_m_s"].paths == names
 
 
-def test_the_truths_velocity_stands_in_with_a_mark() -> None:
+def test_the_truths_velocity_stands_in_with_a_mark():
     pva = {"north_velocity": NORTH, "east_velocity": EAST, "up_velocity": 0.0 * S}
     place = {"latitude": FIX["latitude"], "longitude": FIX["longitude"], "height": 0.0 * S}
     auto = found(ins=topic("novatel_oem7_msgs/msg/INSPVA", pva | place))
@@ -94,7 +92,7 @@ def test_the_truths_velocity_stands_in_with_a_mark() -> None:
     assert any("is also the ground truth" in n for n in auto.mapping.notes)
 
 
-def test_a_length_is_written_and_read_back(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_a_length_is_written_and_read_back(tmp_path):
     mapping = found(vel=twist()).mapping
     (tmp_path / "m.toml").write_text(mapping_to_toml(mapping))
     assert load_mapping(tmp_path / "m.toml").signals == mapping.signals
@@ -113,7 +111,7 @@ def joints(*examples: object) -> FakeTopic:
     return topic("sensor_msgs/msg/JointState", {"position": position, "velocity": velocity}, *examples)
 
 
-def test_joints_by_the_names_in_the_messages() -> None:
+def test_joints_by_the_names_in_the_messages():
     signals = found(joint_states=joints({"name": list(NAMES)}, {"name": list(NAMES)})).mapping.signals
     steer = signals["steer_rad"]
     assert (steer.paths, steer.scale) == (("position[0]",), 1.0)
@@ -129,7 +127,7 @@ def test_joints_by_the_names_in_the_messages() -> None:
 
 @pytest.mark.parametrize("swap", [False, True])
 @pytest.mark.parametrize("name", ["vel", "gnss_velocity", "gps_speed"])
-def test_a_twist_that_turns_with_the_car_is_a_receivers_velocity(name: str, swap: bool) -> None:
+def test_a_twist_that_turns_with_the_car_is_a_receivers_velocity(name, swap):
     """The car drives mostly to the east, so that x alone looks like a forward velocity."""
     sides = {"twist.linear.x": NORTH if swap else EAST, "twist.linear.y": EAST if swap else NORTH}
     fields = {**sides, "twist.linear.z": 0.0 * S}
@@ -140,14 +138,14 @@ def test_a_twist_that_turns_with_the_car_is_a_receivers_velocity(name: str, swap
     assert (east, north) == (("twist.linear.y", "twist.linear.x") if swap else ("twist.linear.x", "twist.linear.y"))
 
 
-def test_position_speed_and_heading_of_one_table_are_a_receivers() -> None:
+def test_position_speed_and_heading_of_one_table_are_a_receivers():
     place = {"LATITUDE": FIX["latitude"], "LONGITUDE": FIX["longitude"]}
     signals = of_table(**place, SPEED_KPH=3.6 * V, HEADING_DEG=90.0 - np.degrees(YAW)).mapping.signals
     assert {"gnss_latitude_deg", "gnss_longitude_deg", "gnss_speed_m_s", "gnss_course_rad"} <= set(signals)
     assert signals["gnss_speed_m_s"].scale == pytest.approx(1.0 / 3.6)
 
 
-def test_letters_are_signals_where_physics_shows_them() -> None:
+def test_letters_are_signals_where_physics_shows_them():
     forces = {"a_x": IMU["linear_acceleration.x"], "a_y": np.roll(V * RATE, -8)}
     mapping = of_table(u=V, v=0.3 * RATE, r=RATE, delta=2.9 * RATE / V, **forces).mapping
     paths = {n: s.paths[0] for n, s in mapping.signals.items()}
@@ -156,7 +154,7 @@ def test_letters_are_signals_where_physics_shows_them() -> None:
 
 
 @pytest.mark.parametrize("name", ["steer_angle_status", "steer_angle_state"])
-def test_a_status_that_is_an_angle_is_read(name: str) -> None:
+def test_a_status_that_is_an_angle_is_read(name):
     signals = of_table(yaw_rate=RATE, speed=V, accel_y=V * RATE, **{name: 2.9 * RATE / V}).mapping.signals
     assert "steer_rad" in signals or "steering_wheel_rad" in signals
 
@@ -239,7 +237,7 @@ def write(path: Path, container: str) -> Path:
 
 
 @pytest.mark.parametrize("container", ["rosbag1", "rosbag2"])
-def test_joints_of_real_messages(tmp_path: Path, container: str) -> None:
+def test_joints_of_real_messages(tmp_path, container):
     with closing(open_log(write(tmp_path / "log", container))) as log:
         (topic,) = (t for t in log.topics if t.name == "/joint_states")
         assert joint_names(log, topic) == ("left_steer", "right_steer")

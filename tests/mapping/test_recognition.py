@@ -1,7 +1,5 @@
 """Recognition of well-known types: mapped, ambiguous and excluded topics."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +68,7 @@ def fields_of(auto: AutoMapping) -> dict[str, tuple[str, object, str]]:
     return {n: (s.topic, s.field, s.stamp) for n, s in both.items()}
 
 
-def test_autoware_types() -> None:
+def test_autoware_types():
     steer = topic("autoware_vehicle_msgs/msg/SteeringReport", "stamp", steering_tire_angle=S)
     speed = topic("autoware_auto_vehicle_msgs/msg/VelocityReport", longitudinal_velocity=S)
     auto = found({"/imu": imu(), "/steer": steer, "/speed": speed})
@@ -84,7 +82,7 @@ def test_autoware_types() -> None:
     assert (auto.ambiguities, auto.missing, auto.mapping.origin) == ((), (), "auto")
 
 
-def test_wheel_speeds_and_perfect_truth_of_the_simulator() -> None:
+def test_wheel_speeds_and_perfect_truth_of_the_simulator():
     wheels = topic("truthsim_msgs/msg/WheelSpeeds", fl_m_s=S, fr_m_s=S, rl_m_s=S, rr_m_s=S)
     truths = {"/truth/perfect/odometry": odometry(), "/rtk/odometry": odometry(), "/rtk/fix": fix(2.0)}
     contents = {"/imu": imu(), "/wheels": wheels, **truths}
@@ -103,7 +101,7 @@ def test_wheel_speeds_and_perfect_truth_of_the_simulator() -> None:
     assert {s.topic for s in auto_map(FakeLog(contents)).mapping.truth.values()} == {"/rtk/odometry"}
 
 
-def test_our_own_outputs_are_never_read_back() -> None:
+def test_our_own_outputs_are_never_read_back():
     state = topic("pdhef_msgs/msg/VehicleStateEstimate", vx_m_s=S)
     auto = found({"/pdhef/phy_ukf/odometry": odometry(), "/vehicle/state": state})
     assert fields_of(auto) == {}
@@ -111,7 +109,7 @@ def test_our_own_outputs_are_never_read_back() -> None:
     assert auto.missing == ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
 
-def test_two_imus_are_said() -> None:
+def test_two_imus_are_said():
     (ambiguity,) = found({"/camera/imu": imu(), "/imu/data": imu()}).ambiguities
     assert (ambiguity.subject, ambiguity.chosen) == ("imu", "/imu/data")
     assert set(ambiguity.candidates) == {"/camera/imu", "/imu/data"}
@@ -126,7 +124,7 @@ def test_two_imus_are_said() -> None:
         ("/localization/kinematic_state", "neither"), ("/something", "neither"), ("/ground/odometry", "speed"),
     ],
 )  # fmt: skip
-def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
+def test_names_tell_sensors_from_truth(name, role):
     auto = found({name: odometry()})
     assert ("speed_m_s" in auto.mapping.signals) == (role == "speed")
     assert ("vy_m_s" in auto.mapping.truth) == (role == "truth")
@@ -135,7 +133,7 @@ def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
     assert any("lateral velocity, which" in n for n in auto.mapping.notes) == (role == "speed")
 
 
-def test_commands_are_no_sensors() -> None:
+def test_commands_are_no_sensors():
     drive = topic("ackermann_msgs/msg/AckermannDriveStamped", drive__steering_angle=S)
     command = twist("geometry_msgs/msg/TwistStamped", "twist", S, S)
     unstamped = twist("geometry_msgs/msg/Twist", "", 5 + S, 0 * S, stamp="")
@@ -148,7 +146,7 @@ def test_commands_are_no_sensors() -> None:
     assert any("command" in n for n in auto.mapping.notes)
 
 
-def test_what_a_message_disowns_is_not_mapped() -> None:
+def test_what_a_message_disowns_is_not_mapped():
     minus = np.full((N, 9), -1.0)
     auto = found({"/imu": imu(angular_velocity_covariance=minus)})
     assert set(auto.mapping.signals) == {"ax_m_s2", "ay_m_s2"}
@@ -163,18 +161,18 @@ def test_what_a_message_disowns_is_not_mapped() -> None:
     assert set(auto.mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
 
 
-def test_a_velocity_frame_that_cannot_be_told_is_not_guessed() -> None:
+def test_a_velocity_frame_that_cannot_be_told_is_not_guessed():
     auto = found({"/gps/vel": twist("geometry_msgs/msg/TwistStamped", "twist", 0 * S, 0 * S)})
     assert auto.mapping.truth == {}
     assert [a.chosen for a in auto.ambiguities] == [None]
 
 
-def test_a_zero_twist_beside_a_moving_pose_is_a_filler() -> None:
+def test_a_zero_twist_beside_a_moving_pose_is_a_filler():
     auto = found({"/gps/odom": odometry(forward=0 * S, left=0 * S)})
     assert set(auto.mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
 
 
-def test_a_yaw_rate_of_nothing_but_zeros_is_a_filler() -> None:
+def test_a_yaw_rate_of_nothing_but_zeros_is_a_filler():
     out = odometry()
     out.fields["twist.twist.angular.z"] = np.zeros(N)
     assert set(found({"/ins/odom": out}).mapping.truth) == {"vx_m_s", "vy_m_s", "x_m", "y_m", "quat_wxyz"}
@@ -184,7 +182,7 @@ def test_a_yaw_rate_of_nothing_but_zeros_is_a_filler() -> None:
     assert set(found({"/ins/odom": out}).mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
 
 
-def test_what_was_ambiguous_names_its_readings_and_the_one_that_was_taken() -> None:
+def test_what_was_ambiguous_names_its_readings_and_the_one_that_was_taken():
     heading = 0.5 * S
     vel = twist("geometry_msgs/msg/TwistStamped", "twist", 10 * np.cos(heading), 10 * np.sin(heading))
     (doubt,) = found({"/gps/vel": vel}).ambiguities
@@ -202,10 +200,9 @@ def test_what_was_ambiguous_names_its_readings_and_the_one_that_was_taken() -> N
 
 
 @pytest.mark.parametrize(
-    ("name", "status", "lowest"),
-    [("/rtk/fix", 2.0, 2.0), ("/rtk/fix", 1.0, 0.0), ("/gps/fix", 2.0, 0.0)],
+    ("name", "status", "lowest"), [("/rtk/fix", 2.0, 2.0), ("/rtk/fix", 1.0, 0.0), ("/gps/fix", 2.0, 0.0)]
 )
-def test_a_fix_is_gated_by_the_best_that_its_receiver_can_say(name: str, status: float, lowest: float) -> None:
+def test_a_fix_is_gated_by_the_best_that_its_receiver_can_say(name, status, lowest):
     auto = found({name: fix(status)})
     gate = auto.mapping.quality
     assert gate is not None and (gate.topic, gate.min, gate.stamp) == (name, lowest, "header.stamp")
@@ -224,7 +221,7 @@ def test_a_fix_is_gated_by_the_best_that_its_receiver_can_say(name: str, status:
         ("geometry_msgs/msg/PoseStamped", "pose.position.x", {"pose.orientation.w": S}),
     ],
 )
-def test_a_types_name_promises_nothing(type_name: str, lacks: str, has: dict[str, np.ndarray]) -> None:
+def test_a_types_name_promises_nothing(type_name, lacks, has):
     """A topic without the fields of its type is not used, and does not hide one that has them."""
     name = "/ins/speed"
     bare = topic(type_name)
@@ -237,7 +234,7 @@ def test_a_types_name_promises_nothing(type_name: str, lacks: str, has: dict[str
     assert auto.ambiguities == ()
 
 
-def test_a_reference_instrument_beside_a_receiver_is_ground_truth_and_no_input(shared_dir: Path) -> None:
+def test_a_reference_instrument_beside_a_receiver_is_ground_truth_and_no_input(shared_dir):
     log = open_log(shared_dir / "data" / "drives" / "v40_swd_gnss.mcap")
     mapping = auto_map(log).mapping
     log.close()
@@ -254,7 +251,7 @@ def test_a_reference_instrument_beside_a_receiver_is_ground_truth_and_no_input(s
         ("f1tenth_hoons_run2.bag", "f1tenth", set()),  # The speed is an array element, identified by a_y ≈ v r.
     ],
 )
-def test_real_drives_map_as_by_hand(shared_dir: Path, drive: str, reference: str, unmapped: set[str]) -> None:
+def test_real_drives_map_as_by_hand(shared_dir, drive, reference, unmapped):
     log = open_log(shared_dir / "data" / "drives" / drive)
     auto = auto_map(log)
     by_hand = load_mapping(Path(__file__).parents[1] / "reference" / "mappings" / f"{reference}.toml")
@@ -268,7 +265,7 @@ def test_real_drives_map_as_by_hand(shared_dir: Path, drive: str, reference: str
     log.close()
 
 
-def test_a_standard_imu_in_g_and_degrees() -> None:
+def test_a_standard_imu_in_g_and_degrees():
     wrong = imu(**{"linear_acceleration.x": 0.01 * np.sin(S), "linear_acceleration.y": 0.1 * np.sin(S)})
     wrong.fields |= {"linear_acceleration.z": np.ones(N), "angular_velocity.z": 20.0 * np.sin(S)}
     auto = found({"/imu": wrong})
@@ -285,12 +282,12 @@ def _circle(twist_angle: np.ndarray) -> FakeTopic:
     return out
 
 
-def test_a_twist_in_the_axes_of_the_world_is_a_velocity_over_ground() -> None:
+def test_a_twist_in_the_axes_of_the_world_is_a_velocity_over_ground():
     assert "enu_velocity_m_s" in found({"/ground_truth/odom": _circle(0.5 * S)}).mapping.truth
     assert "vx_m_s" in found({"/ground_truth/odom": _circle(0.02 * np.sin(S))}).mapping.truth
 
 
-def test_a_sideslip_that_follows_the_heading_is_in_the_axes_of_the_body() -> None:
+def test_a_sideslip_that_follows_the_heading_is_in_the_axes_of_the_body():
     heading = 0.05 * np.sin(2.0 * S)  # about east, so that the axes of body and earth are nearly parallel
     sensor = imu(**{"angular_velocity.z": np.gradient(heading, S)})
 
@@ -303,12 +300,12 @@ def test_a_sideslip_that_follows_the_heading_is_in_the_axes_of_the_body() -> Non
     assert "enu_velocity_m_s" in truth(heading)
 
 
-def test_a_simulators_odometry_with_a_lateral_velocity_is_ground_truth() -> None:
+def test_a_simulators_odometry_with_a_lateral_velocity_is_ground_truth():
     assert "vy_m_s" in found({"/carla/hero/odometry": _circle(0.02 * np.sin(S))}).mapping.truth
     assert "vy_m_s" not in found({"/robot/odometry": _circle(0.02 * np.sin(S))}).mapping.truth
 
 
-def test_a_status_of_a_drive_is_measured() -> None:
+def test_a_status_of_a_drive_is_measured():
     status = topic("ackermann_msgs/msg/AckermannDriveStamped", drive__steering_angle=S, drive__speed=5 + S)
     command = topic("ackermann_msgs/msg/AckermannDrive", "", steering_angle=S, speed=5 + S)
     signals = found({"/drive": command, "/drive_status": status}).mapping.signals

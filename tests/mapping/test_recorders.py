@@ -1,7 +1,5 @@
 """Recorders and runs: a folder of mappings serves several; a file of several runs needs a choice; recorded drives."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 
@@ -10,15 +8,7 @@ import pytest
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_file import TableSettings
-from pdhef_logtool.mapping import (
-    Mapping,
-    SignalSource,
-    auto_map,
-    clock_key,
-    fit_clocks,
-    load_mapping,
-    mapping_to_toml,
-)
+from pdhef_logtool.mapping import Mapping, SignalSource, auto_map, clock_key, fit_clocks, load_mapping, mapping_to_toml
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.mapping.clocks import apply_clock
 from pdhef_logtool.records.errors import MappingError, MappingFileError
@@ -51,7 +41,7 @@ def chosen(log: FakeLog, folder: Path) -> str:
     return found.mapping.file
 
 
-def test_the_topics_and_fields_of_a_log_choose(tmp_path: Path) -> None:
+def test_the_topics_and_fields_of_a_log_choose(tmp_path):
     folder = folder_of(tmp_path, a=A, b=B, wide=WIDE)
     assert chosen(log_of(gyro=("z", "x/Gyro")), folder) == "b.toml"
     assert chosen(log_of(imu=("wz", "x/Imu")), folder) == "a.toml"
@@ -59,7 +49,7 @@ def test_the_topics_and_fields_of_a_log_choose(tmp_path: Path) -> None:
     assert chosen(log_of(imu=("wz", "x/Imu"), speed=("v", "x/Speed")), folder) == "wide.toml"
 
 
-def test_none_and_several_are_one_clear_line(tmp_path: Path) -> None:
+def test_none_and_several_are_one_clear_line(tmp_path):
     folder = folder_of(tmp_path, a=A, b=B)
     with pytest.raises(MappingError) as none:
         chosen(log_of(imu=("gyro_z", "x/Imu")), folder)
@@ -72,7 +62,7 @@ def test_none_and_several_are_one_clear_line(tmp_path: Path) -> None:
     assert "\n" not in str(several.value)
 
 
-def test_types_decide_between_logs_of_equal_topics(tmp_path: Path) -> None:
+def test_types_decide_between_logs_of_equal_topics(tmp_path):
     old = '[recorder]\n"/imu" = "x/msg/Imu"\n' + A
     new = '[recorder]\n"/imu" = "y/Imu"\n' + A + "scale = 0.0174\n"
     folder = folder_of(tmp_path, old=old, new=new)
@@ -88,7 +78,7 @@ def test_types_decide_between_logs_of_equal_topics(tmp_path: Path) -> None:
     assert load_mapping(tmp_path / "again.toml") == mapping
 
 
-def test_wrong_rules_and_empty_folders_are_refused(tmp_path: Path) -> None:
+def test_wrong_rules_and_empty_folders_are_refused(tmp_path):
     (tmp_path / "m.toml").write_text('[recorder]\n"/imu" = 3\n')
     with pytest.raises(MappingFileError, match="a type by topic"):
         load_mapping(tmp_path / "m.toml")
@@ -97,7 +87,7 @@ def test_wrong_rules_and_empty_folders_are_refused(tmp_path: Path) -> None:
         load_mapping(tmp_path / "none")
 
 
-def test_a_fleet_of_two_recorders_is_run_with_one_folder(tmp_path: Path) -> None:
+def test_a_fleet_of_two_recorders_is_run_with_one_folder(tmp_path):
     folder, logs = tmp_path / "mappings", tmp_path / "logs"
     folder.mkdir()
     logs.mkdir()
@@ -127,7 +117,7 @@ def write(path: Path, *runs: str) -> Path:
     return path
 
 
-def test_a_choice_between_runs_is_asked_for(tmp_path: Path) -> None:
+def test_a_choice_between_runs_is_asked_for(tmp_path):
     path = write(tmp_path / "runs.mat", "run_1", "run_2")
     with closing(open_log(path)) as log:
         with pytest.raises(MappingError, match=r"2 runs: run_1, run_2.*--set group=run_1"):
@@ -141,7 +131,7 @@ def test_a_choice_between_runs_is_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("start_s", [0.0, 100.0])
-def test_repeated_channel_groups_of_an_mdf_are_runs_if_one_follows_the_other(start_s: float, tmp_path: Path) -> None:
+def test_repeated_channel_groups_of_an_mdf_are_runs_if_one_follows_the_other(start_s, tmp_path):
     asammdf = pytest.importorskip("asammdf")
     mdf = asammdf.MDF(version="4.10")
     rate = 0.2 * np.sin(S)
@@ -161,7 +151,7 @@ def test_repeated_channel_groups_of_an_mdf_are_runs_if_one_follows_the_other(sta
             assert [t.name for t in log.topics] == [name]
 
 
-def test_phone_clock_is_found_from_log_times(shared_dir: Path) -> None:
+def test_phone_clock_is_found_from_log_times(shared_dir):
     path = shared_dir / "data" / "drives" / "comma2k19_segment.mcap"
     log = open_log(path)
     source = SignalSource(
@@ -175,7 +165,7 @@ def test_phone_clock_is_found_from_log_times(shared_dir: Path) -> None:
     log.close()
 
 
-def test_a_file_may_name_one_signal_and_leave_the_rest_to_recognised_types(tmp_path: Path) -> None:
+def test_a_file_may_name_one_signal_and_leave_the_rest_to_recognised_types(tmp_path):
     text = '[signals.friction]\ntopic = "/truth/perfect/state"\nfield = "friction"\n'
     log_path = next(Path("sample_logs").glob("dlc*.mcap"))
     log = open_log(log_path)

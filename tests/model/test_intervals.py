@@ -21,13 +21,14 @@ from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consiste
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
 from pdhef_logtool.model.intervals import (
     CAR_STD_RAD,
+    CROSSFALL_STD_RAD,
     DRIVE_SHARE,
     IDENTIFIED_SHARE,
     OWN_SHARE,
     drive_intervals,
     running_consistency,
 )
-from pdhef_logtool.model.priors import prior_variations
+from pdhef_logtool.model.priors import coefficients, prior_variations
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.records.signals import Signals
@@ -118,7 +119,8 @@ def test_on_an_identified_car_it_is_the_sum_of_its_parts(signals):
     vehicles = tuple(v.model_copy(update=parts) for v in vehicles)
     unknown = replace(signals, friction=np.full(len(signals), np.nan))  # each has its own
     running = running_consistency(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2)
-    expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + running**2 + spread(vehicles, NOISE, unknown)
+    road_m_s = CROSSFALL_STD_RAD / coefficients(car.physics_vehicle)[1] * plain.vx_m_s
+    expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + running**2 + road_m_s**2 + spread(vehicles, NOISE, unknown)
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
     assert_alike(wide.vy_std_m_s[fast], np.sqrt(expected[fast]))
 

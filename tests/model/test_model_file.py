@@ -164,18 +164,15 @@ def slalom(folder: Path, noise: SensorNoise) -> Path:
     return log
 
 
-def test_noisy_sensors_are_taken_as_noisy(tmp_path):
-    with read_drive(slalom(tmp_path, NOISY), Car.load(None), None, ReadOptions()) as drive:
+@pytest.mark.parametrize("noise", [NOISY, SensorNoise()], ids=["noisy", "sound"])
+def test_noisy_sensors_are_taken_as_noisy_and_sound_ones_keep_their_noise(tmp_path, noise):
+    with read_drive(slalom(tmp_path, noise), Car.load(None), None, ReadOptions()) as drive:
         posterior = DriveModel.fit(drive).posterior
-    assert posterior.r_std["yaw_rate_rad_s"] == pytest.approx(NOISY.yaw_rate_rad_s, rel=0.4)
-    assert "yaw_rate_rad_s 0.0" in posterior.text
-
-
-def test_sound_sensors_keep_their_noise(tmp_path):
-    with read_drive(slalom(tmp_path, SensorNoise()), Car.load(None), None, ReadOptions()) as drive:
-        posterior = DriveModel.fit(drive).posterior
-    assert posterior.r_std == {}
-    assert "noise" not in posterior.text
+    if noise is NOISY:
+        assert posterior.r_std["yaw_rate_rad_s"] == pytest.approx(NOISY.yaw_rate_rad_s, rel=0.4)
+        assert "yaw_rate_rad_s 0.0" in posterior.text
+    else:
+        assert (posterior.r_std, "noise" in posterior.text) == ({}, False)
 
 
 def test_a_model_that_explains_the_yaw_rate_worse_with_more_noise_keeps_its_noise(tmp_path, monkeypatch):

@@ -3,8 +3,6 @@
 python tests/release/check_dist.py dist
 """
 
-from __future__ import annotations
-
 import sys
 import tarfile
 import tomllib

@@ -3,8 +3,6 @@
 python tests/release/check_sbom.py dist/sbom.cdx.json
 """
 
-from __future__ import annotations
-
 import json
 import re
 import sys

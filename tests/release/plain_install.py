@@ -6,8 +6,6 @@ The package is installed from a copy of this tree into a new environment, which 
 import or a run failed.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

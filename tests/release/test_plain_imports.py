@@ -1,7 +1,5 @@
 """Without the packages of the extras every module imports, or its error names the extra."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -13,7 +11,7 @@ OPTIONAL = ("aiobotocore", "aiohttp", "asammdf", "botocore", "h5py", "ray", "s3f
 
 
 @pytest.mark.slow
-def test_every_module_imports_without_extras() -> None:
+def test_every_module_imports_without_extras():
     without = f"import sys; sys.modules.update(dict.fromkeys({OPTIONAL!r}))"
     command = [sys.executable, "-c", f"{without}\n{plain_install.IMPORTS}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

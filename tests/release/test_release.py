@@ -1,7 +1,5 @@
 """A release: one version everywhere, and a container file that names existing files."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path
@@ -14,13 +12,13 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def test_one_version_everywhere() -> None:
+def test_one_version_everywhere():
     assert PROJECT["version"] == __version__
     newest = re.search(r"^## (\S+) \((.+)\)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert newest is not None and (newest[1] == __version__ or newest[2] == "unreleased")
 
 
-def test_the_container_file_is_for_this_package() -> None:
+def test_the_container_file_is_for_this_package():
     lines = [line for line in (ROOT / "Dockerfile").read_text().splitlines() if not line.startswith("#")]
     steps = [line.split()[0] for line in lines if re.match(r"[A-Z]+ ", line)]
     assert steps[0] == "FROM" and steps.index("USER") > max(i for i, s in enumerate(steps) if s == "RUN")
@@ -34,7 +32,7 @@ def test_the_container_file_is_for_this_package() -> None:
     assert "RUN pdhef compile" in lines
 
 
-def test_every_dependency_is_locked_and_a_run_needs_no_torch() -> None:
+def test_every_dependency_is_locked_and_a_run_needs_no_torch():
     extras = PROJECT["optional-dependencies"]
     names = {
         check_sbom.normalized(re.split(r"[<>=~\[]", requirement)[0])

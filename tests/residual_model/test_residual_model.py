@@ -162,24 +162,6 @@ def test_service_equals_torch(hidden):
     np.testing.assert_allclose(rates, expected, atol=2e-6)
 
 
-def test_shipped_networks_say_what_torch_makes_of_them():
-    for folder in SHIPPED_FOLDERS.values():
-        whole = load_bundle(folder)
-        for bundle in (whole, whole.pure_lstm, whole.paper_network):
-            if bundle is None:
-                continue
-            n, rng = bundle.normalisation, np.random.default_rng(3)
-            features = np.zeros((400, len(FEATURES)))
-            spread = 2.0 * rng.normal(size=(400, len(n.feature_std)))
-            features[:, bundle.columns] = np.array(n.feature_mean) + np.array(n.feature_std) * spread
-            said, _ = bundle.run(features, np.zeros(400, dtype=np.bool_), None)
-            scaled = bundle.normalise(features)
-            expected = said_by_torch(bundle, scaled)
-            if bundle.odd:
-                expected = 0.5 * (expected - said_by_torch(bundle, scaled * bundle.signs))
-            np.testing.assert_allclose(said / np.array(n.target_std), expected, rtol=0, atol=1e-5)
-
-
 def test_weights_of_another_shape_are_refused(tmp_path):
     # Compiled code would read beyond them.
     replace(make_bundle(), hidden=32).save(tmp_path)

@@ -178,10 +178,7 @@ def test_a_history_has_a_row_per_run_and_reads_only_tables(tmp_path):
 
 
 @settings(max_examples=8, deadline=None)
-@given(
-    changed=st.sets(st.sampled_from(["asked", "other signal", "other estimator", "stamps"])),
-    gated=st.booleans(),
-)
+@given(changed=st.sets(st.sampled_from(["asked", "other signal", "other estimator", "stamps"])), gated=st.booleans())
 def test_verdict_and_number_of_changed_drives_never_contradict(changed, gated):
     def rows(of: set[str]) -> list[Any]:
         more = [row(k, 1.0 + ("other signal" in of), signal="vx_m_s") for k in TEN]

@@ -15,7 +15,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
 from pdhef_logtool.results.sink import Event
-from tests.mcap_files import copied, mcap_writer
+from studies import mcap_logs
 
 STATE = "pdhef_msgs/msg/VehicleStateEstimate"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -174,8 +174,7 @@ def test_metrics_record_and_report_attachment(annotated):
 
 def cdr_only(path: Path, source: Path) -> None:
     """Copy the CDR topics, as rosbags opens no file with other encodings."""
-    with mcap_writer(path, profile="ros2") as writer:
-        list(copied(source, writer, lambda channel: channel.message_encoding == "cdr"))
+    mcap_logs.write_log(path, (m for m in mcap_logs.messages(source) if m.encoding == "cdr"), "ros2")
 
 
 @pytest.fixture

@@ -125,9 +125,9 @@ def test_only_a_users_plan_closes_the_gate():
     for file, strict, closed in (("", True, False), ("plan.toml", False, True)):
         plan = ValidationPlan((BETA,), file=file)
         verdicts = plan_verdicts(plan, figures_of_rows(rows), [JudgedDrive(x, "pd-hef") for x in SIX], strict=strict)
-        assert verdicts.closes_gate is closed
+        assert bool(verdicts.closing) is closed
     nothing = plan_verdicts(ValidationPlan((BETA,), file="plan.toml"), figures_of_rows([]), [], strict=True)
-    assert nothing.closes_gate and not plan_verdicts(nothing.plan, figures_of_rows([]), []).closes_gate
+    assert nothing.closing and not plan_verdicts(nothing.plan, figures_of_rows([]), []).closing
     assert nothing.to_dict()["requirements"][0]["value"] is None
 
 

@@ -1,4 +1,3 @@
-import importlib.metadata
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.plotted import colour_rgb
-from pdhef_logtool.results.run_report import LogOutcome, build_run, lines_of, report_markdown, tool_versions, write_json
+from pdhef_logtool.results.run_report import LogOutcome, build_run, lines_of, report_markdown, write_json
 from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.results.sink import Event
 from tests.run_report import GNSS, MAIN, MODEL, SHA, TRUTH, VELOCITY, errors_deg, figures, follows, ran, report, truth
@@ -92,16 +91,6 @@ def test_run_says_how_each_log_ended(tmp_path):
     with pytest.raises(jsonschema.ValidationError):
         follows(run, "run.schema.json")
     follows(build_run({}, ("st-resnet", SHA), []), "run.schema.json")
-
-
-def test_json_is_sorted_and_the_same_each_time_and_versions_are_installed(tmp_path):
-    write_json(tmp_path / "a.json", {"b": [float("nan")], "a": float("inf"), "c": {"z": 1, "y": "β"}})
-    assert (tmp_path / "a.json").read_bytes() == (
-        '{\n "a": null,\n "b": [\n  null\n ],\n "c": {\n  "y": "β",\n  "z": 1\n }\n}\n'.encode()
-    )
-    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
-    versions = tool_versions()
-    assert versions["numpy"] == importlib.metadata.version("numpy") and "python" in versions
 
 
 def test_colours_are_red_green_blue_and_a_names_own():

@@ -13,27 +13,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.cli.inspecting import render_inspection
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.byte_source import LocalFile
 from pdhef_logtool.logs.mcap_index import read_index
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.mapping import SignalSource, load_mapping
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.runs.inspection import (
-    ask_mapping,
-    fields_of_log,
-    inspect_drive_log,
-    inspect_log,
-    render_fields,
-    render_inspection,
-    write_mapping,
-)
+from pdhef_logtool.runs.inspection import ask_mapping, fields_of_log, inspect_drive_log, inspect_log, write_mapping
 from pdhef_logtool.runs.inspection.page import inspection_page, sparkline
 from pdhef_logtool.runs.inspection.report import Inspection
 from pdhef_logtool.storage.documents import jsonable
-from tests.command_line import called, rendered
+from tests.command_line import called, printed, rendered
 from tests.counting_server import serving
 from tests.mcap_files import mcap_writer
 from tests.reports.browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
@@ -96,7 +89,7 @@ def test_signals_are_measured():
     assert found.signals["ax_m_s2"].dropped == {}
     assert found.missing == ("steer_rad", "speed_m_s")
     assert [(x.kind, x.severity) for x in found.lost] == [("truncated", "lost"), ("nan", "lost")]
-    assert found.is_partial
+    assert found.exit_code == EXIT_PARTIAL
 
 
 def test_an_empty_log_is_reported():
@@ -168,7 +161,7 @@ def test_a_log_with_a_dropout_and_losses(shared_dir):
     assert found.signals["ay_m_s2"].dropped == {"nan": 2, "duplicate-stamp": 20}
     # The ground truth of the same name has lost no sample.
     assert found.truth["yaw_rate_rad_s"].dropped == {}
-    assert found.is_partial
+    assert found.exit_code == EXIT_PARTIAL
 
 
 def test_covariances_do_not_hide_the_gyro(sample_logs_dir):
@@ -181,7 +174,7 @@ def test_covariances_do_not_hide_the_gyro(sample_logs_dir):
     assert gravity["type"] == "float64"
     assert gravity["minimum"] <= gravity["mean"] <= gravity["maximum"]
     assert found["whole"]
-    text = rendered(render_fields, found)
+    text = printed("fields", found)
     assert max(map(len, text.splitlines()[1:])) <= 80
     json.dumps(jsonable(found), allow_nan=False)
 
@@ -297,8 +290,8 @@ def test_damage_that_is_met_has_all_of_it_read(tmp_path, sample_logs_dir, spoil,
     file.write_bytes((sample_logs_dir / "road.mcap").read_bytes())
     spoil(file)
     found, whole = inspect_log(file), inspect_log(file, whole=True)
-    assert whole.is_partial
-    assert found.is_partial is seen
+    assert whole.exit_code == EXIT_PARTIAL
+    assert found.exit_code == (EXIT_PARTIAL if seen else EXIT_OK)
     assert (found.sample is None) is seen
     if seen:
         assert found.to_dict() == whole.to_dict()

@@ -1,7 +1,5 @@
 """The scorer against known series, the containers against what was written, CAN with DBC, and some of the logs."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -15,13 +13,13 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.can_frames import decoded_frames
 from pdhef_logtool.records.signals import Channel
+from studies.mcap_logs import messages, write_log
 from studies.strangers.__main__ import score_recording
 from studies.strangers.cars import Series, drive
 from studies.strangers.containers import Topic, write
 from studies.strangers.layouts import layout
 from studies.strangers.recordings import answers, imu, road_car, scalar
 from studies.strangers.scoring import ANSWERS, agrees, other_recording
-from tests.mcap_files import copied, mcap_writer
 
 _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
 _WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
@@ -47,7 +45,7 @@ def _channel(values: np.ndarray, shift_ns: int = 0) -> Channel:
         (_WAVE[:0], 0, False),
     ],
 )
-def test_values_decide_whether_a_channel_is_right(values: np.ndarray, shift_ns: int, right: bool) -> None:
+def test_values_decide_whether_a_channel_is_right(values, shift_ns, right):
     channel = _channel(values, shift_ns) if values.size else Channel("a", "1", "", _NS[:0], _NS[:0], values)
     assert agrees(channel, Series(_NS, _NS, _WAVE), "yaw_rate_rad_s") is right
 
@@ -57,7 +55,7 @@ _CONTAINERS = (*_MCAP, "rosbag1", "rosbag2", "rosbag2-bare", "rosbag2-mcap")
 
 
 @pytest.mark.parametrize("container", _CONTAINERS)
-def test_containers_give_back_what_was_written(container: str, tmp_path: Path) -> None:
+def test_containers_give_back_what_was_written(container, tmp_path):
     car = drive("short")
     force = Series(car.force.stamps_ns[:200], car.force.arrival_ns[:200], car.force.values[:200])
     topics = (imu(force, car.rate), scalar("/speed", force[0]))
@@ -78,7 +76,7 @@ def test_containers_give_back_what_was_written(container: str, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
+def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path):
     sound = score_recording(layout("autoware"), tmp_path)
     assert set(sound.items.values()) == {"right"}
     assert not list(tmp_path.iterdir())
@@ -90,14 +88,14 @@ def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["yaw-rate-deg", "steering-sign"])
-def test_wrong_units_and_signs_are_corrected_or_told(name: str, tmp_path: Path) -> None:
+def test_wrong_units_and_signs_are_corrected_or_told(name, tmp_path):
     recording = layout(name)
     result = score_recording(recording, tmp_path)
     assert result.count("wrong, not reported") == 0
     assert result.named is not False
 
 
-def test_a_log_without_type_names_is_still_scored(tmp_path: Path) -> None:
+def test_a_log_without_type_names_is_still_scored(tmp_path):
     result = score_recording(layout("vbox"), tmp_path)
     assert set(result.items) >= {"ax", "ay", "yaw rate", "speed"}
     assert result.count("wrong, not reported") == 0
@@ -107,7 +105,7 @@ _QUICK = ("data/drives/comma2k19_segment.mcap", "data/drives/lunda_v40", "data/d
 
 
 @pytest.mark.parametrize("file", _QUICK)
-def test_answers_are_found_in_their_recordings(file: str, shared_dir: Path) -> None:
+def test_answers_are_found_in_their_recordings(file, shared_dir):
     table, found = ANSWERS[file], other_recording(file)
     assert set(found.right) == table.keys() - {"allowed", "at_fault"}
     assert set(found.allowed) == table.get("allowed", {}).keys()
@@ -127,14 +125,12 @@ def _topics(names: tuple[str, str]) -> list[Topic]:
 
 def _without_attachments(source: Path, target: Path, metadata: dict[str, bytes]) -> None:
     """Copy the messages of an MCAP, with DBC texts as a metadata record."""
-    with mcap_writer(target) as writer:
-        list(copied(source, writer))
-        if metadata:
-            writer.add_metadata("dbc", {name: text.decode() for name, text in metadata.items()})
+    texts = {name: text.decode() for name, text in metadata.items()}
+    write_log(target, messages(source), end=lambda writer: writer.add_metadata("dbc", texts) if texts else None)
 
 
 @pytest.mark.parametrize("place", ["attachments", "metadata", "given"])
-def test_frames_in_mcap_are_decoded_by_the_files_in_it_or_given_with_it(tmp_path: Path, place: str) -> None:
+def test_frames_in_mcap_are_decoded_by_the_files_in_it_or_given_with_it(tmp_path, place):
     path = write(_topics(("chassis", "steering")), tmp_path / "log", "can-mcap")
     msgs = None
     if place != "attachments":
@@ -161,7 +157,7 @@ def test_frames_in_mcap_are_decoded_by_the_files_in_it_or_given_with_it(tmp_path
 
 
 @pytest.mark.parametrize("container", ["can-blf", "can-asc", "can-mdf", "can-mcap"])
-def test_an_identifier_of_two_buses_is_decoded_by_the_file_that_fits_its_bus(tmp_path: Path, container: str) -> None:
+def test_an_identifier_of_two_buses_is_decoded_by_the_file_that_fits_its_bus(tmp_path, container):
     pytest.importorskip("can")
     pytest.importorskip("asammdf")
     one, two = _topics(("a", "b"))

@@ -1,7 +1,5 @@
 """Axle slip angles and forces from ground truth, and the curve through them, on numbers worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -46,7 +44,7 @@ def fit_drive(seconds: float = 6.0, period_s: float = 0.01, **changes: Any) -> F
 # ---- axle forces ----
 
 
-def test_axle_forces_follow_from_newton_and_euler() -> None:
+def test_axle_forces_follow_from_newton_and_euler():
     """A steady turn-in: v_x and v_y constant, r growing by 0.1 rad/s², a_y constant."""
     n = 400
     stamps = 10**18 + np.arange(n, dtype=np.int64) * 10_000_000
@@ -54,26 +52,26 @@ def test_axle_forces_follow_from_newton_and_euler() -> None:
     r = 0.1 * np.arange(n) * 0.01
     truth = make_track("t", stamps, vx_m_s=20 * full, vy_m_s=-0.4 * full, yaw_rate_rad_s=r, ay_m_s2=3.0 * full)
     signals = replace(fit_drive(3.99).signals, stamps_ns=stamps, steer_rad=0.2 * full)
-    samples = axle_samples([FitDrive("t", signals, truth)] * 2, CAR)
-    assert samples.front_force_n.size == 2 * n
+    (front_slip, front_force), (rear_slip, rear_force) = axle_samples([FitDrive("t", signals, truth)] * 2, CAR).values()
+    assert front_force.size == 2 * n
     at = slice(100, 300)  # away from the ends of the smoothing
     lf, lr, m, iz = 1.16, 1.71, 1440.0, 1523.0
     # Newton: F_f cos δ + F_r = m a_y. Euler: l_f F_f cos δ − l_r F_r = I_z ṙ.
-    forward, rear = samples.front_force_n[at] * math.cos(0.2), samples.rear_force_n[at]
+    forward, rear = front_force[at] * math.cos(0.2), rear_force[at]
     np.testing.assert_allclose(forward + rear, m * 3.0, rtol=1e-9)
     np.testing.assert_allclose(lf * forward - lr * rear, iz * 0.1, rtol=1e-4)
-    np.testing.assert_allclose(samples.front_slip_rad[at], 0.2 - np.arctan((-0.4 + lf * r[at]) / 20), atol=1e-9)
-    np.testing.assert_allclose(samples.rear_slip_rad[at], -np.arctan((-0.4 - lr * r[at]) / 20), atol=1e-9)
+    np.testing.assert_allclose(front_slip[at], 0.2 - np.arctan((-0.4 + lf * r[at]) / 20), atol=1e-9)
+    np.testing.assert_allclose(rear_slip[at], -np.arctan((-0.4 - lr * r[at]) / 20), atol=1e-9)
 
 
-def test_the_curve_is_the_magic_formula() -> None:
+def test_the_curve_is_the_magic_formula():
     curve = AxleCurve(100_000.0, 8000.0, 1.3)
     assert curve.force_n(np.array([1e-6]))[0] == pytest.approx(0.1)
     assert curve.force_n(np.array([0.05]))[0] == pytest.approx(8000 * math.sin(1.3 * math.atan(0.05 * 1e5 / 10_400)))
 
 
 @pytest.mark.parametrize("count", [300, 9000])
-def test_the_fit_minimises_the_cost_of_method_14(count: int) -> None:
+def test_the_fit_minimises_the_cost_of_method_14(count):
     """Its cost is written out here once more: no curve beside the one that is returned has a lower one."""
     slip = np.linspace(-0.06, 0.08, count)
     prior = AxleCurve(70_000.0, 6500.0, 1.35)
@@ -128,7 +126,7 @@ def guess(front: float = 1.0, rear: float = 1.0, **changes) -> VehicleParameters
 
 
 @pytest.fixture(scope="module")
-def static() -> FitDrive:
+def static():
     return static_drive(1)
 
 
@@ -136,7 +134,7 @@ def static() -> FitDrive:
 
 
 @pytest.mark.slow
-def test_stiffness_is_found_within_the_posteriors_interval(static: FitDrive) -> None:
+def test_stiffness_is_found_within_the_posteriors_interval(static):
     start = guess(0.7, 1.4)
     found = fit_physics([static], start, starts=STARTS[:1], iterations=12)
     by_name = {p.name: (p.value(t), p.value(t - 2.5 * s), p.value(t + 2.5 * s), s)

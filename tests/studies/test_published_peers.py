@@ -1,7 +1,5 @@
 """The scores and the page of ``studies.peers``."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -50,7 +48,7 @@ def test_slow_stamps_are_not_scored_and_an_offset_is_removed_where_it_is_declare
     assert (found["offset_deg"], found["rmse_deg"]) == (pytest.approx(2.0), pytest.approx(1.5))
 
 
-def test_the_page_shows_the_stored_scores_of_every_drive(tmp_path: Path):
+def test_the_page_shows_the_stored_scores_of_every_drive(tmp_path):
     stored = pl.read_parquet(RESULTS / "peers" / "scores.parquet")
     assert stored["log"].unique(maintain_order=True).to_list() == [drive.log for drive in PEER_DRIVES]
     assert study.main(["--stored", "--out", str(tmp_path)]) == 0
@@ -78,7 +76,7 @@ def made_table(file: Path) -> Path:
     return file
 
 
-def test_a_published_table_is_a_log_for_each_run(tmp_path: Path):
+def test_a_published_table_is_a_log_for_each_run(tmp_path):
     entries = list(study.published(made_table(tmp_path / "hoons_all_test.csv"), tmp_path))
     assert [e.log.name for e in entries] == ["hoons_all_test_4.csv", "hoons_all_test_7.csv"]
     rows = {row["estimator"]: row for row in scores(entries[1])[0]}
@@ -108,14 +106,14 @@ def pair(untaught: float, hybrid: float) -> Pair:
     return {**about, **scores, "kinematic_deg": 1.0, "paper_deg": 1.0}
 
 
-def test_a_pair_is_worse_beyond_the_larger_of_both_limits() -> None:
+def test_a_pair_is_worse_beyond_the_larger_of_both_limits():
     assert not is_worse(pair(0.2, 0.229)) and is_worse(pair(0.2, 0.231))
     assert not is_worse(pair(2.0, 2.09)) and is_worse(pair(2.0, 2.11))
     text = summary([pair(1.0, 0.5), pair(1.0, 0.8)])
     assert "0.63 (2 pairs)" in text and "worse" in pair_table([pair(0.2, 0.3)])
 
 
-def test_the_stored_results_have_every_pair_and_none_is_worse_than_untaught() -> None:
+def test_the_stored_results_have_every_pair_and_none_is_worse_than_untaught():
     stored = json.loads((RESULTS / "teaching" / STORED).read_text(encoding="utf-8"))
     counts = {car.name: len(car.parts) for car in CARS}
     for car in CARS:
@@ -127,7 +125,7 @@ def test_the_stored_results_have_every_pair_and_none_is_worse_than_untaught() ->
     assert pair_table(stored) in page and summary(stored) in page
 
 
-def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(sample_logs_dir: Path) -> None:
+def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(sample_logs_dir):
     vehicle = Car.load(sample_logs_dir / "vehicle.toml").vehicle
     fitted = fit_vehicle(choose_vehicle("sedan,mass=1.2,stiffness=0.85"), 0.3, vehicle)
     assert fitted.mass_kg == pytest.approx(1.2 * 1440.0)
@@ -136,7 +134,7 @@ def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(sample_logs_dir
     assert soft / stiff == pytest.approx(0.85, rel=0.08)
 
 
-def test_the_stored_page_is_that_of_the_stored_results(tmp_path: Path) -> None:
+def test_the_stored_page_is_that_of_the_stored_results(tmp_path):
     results = RESULTS / "conditions"
     for name in ("facts.json", "metrics.parquet"):
         (tmp_path / name).write_bytes((results / name).read_bytes())
@@ -144,7 +142,7 @@ def test_the_stored_page_is_that_of_the_stored_results(tmp_path: Path) -> None:
     assert (tmp_path / "conditions.md").read_bytes() == (DOCS / "conditions.md").read_bytes()
 
 
-def test_a_calibrated_figure_is_accepted_and_others_are_not() -> None:
+def test_a_calibrated_figure_is_accepted_and_others_are_not():
     errors = np.random.default_rng(0).normal(size=2000)
     scores = [
         {"figure": name, "drive": "road", "score": float(e) / sd}
@@ -159,7 +157,7 @@ DOCUMENTS = [*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile", *ROOT.gl
 TEXTS = {p.name: p.read_text(encoding="utf-8") for p in DOCUMENTS}
 
 
-def test_every_command_and_file_that_a_document_names_is_there() -> None:
+def test_every_command_and_file_that_a_document_names_is_there():
     named = {(p, m) for p, t in TEXTS.items() for m in re.findall(r"-m ((?:benchmarks|studies)(?:\.\w+)*)", t)}
     assert {"studies.paper", "studies.peers", "benchmarks.performance"} <= {m for _, m in named}
     assert not {(p, m) for p, m in named if find_spec(m) is None}

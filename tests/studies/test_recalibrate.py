@@ -1,9 +1,5 @@
 """Stages of ``make recalibrate`` with small commands: order, skipping, continuing after a failure, changed inputs."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from studies.recalibrate import Recalibration, Stage
@@ -23,7 +19,7 @@ Path(output).write_text("".join(Path(i).read_text().split("#")[0].strip() for i 
 
 
 @pytest.fixture
-def project(tmp_path: Path) -> Recalibration:
+def project(tmp_path):
     (tmp_path / "join.py").write_text(JOIN)
     (tmp_path / "source.py").write_text("x = 1\n")
     (tmp_path / "other").write_text("o")
@@ -42,14 +38,14 @@ def calls(project: Recalibration) -> str:
     return text.strip()
 
 
-def test_stages_run_in_order_once(project: Recalibration) -> None:
+def test_stages_run_in_order_once(project):
     assert project.run() == 0
     assert calls(project) == "a b c"
     assert project.run() == 0
     assert calls(project) == ""
 
 
-def test_a_failed_stage_ends_the_run_and_the_next_run_continues_with_it(project: Recalibration) -> None:
+def test_a_failed_stage_ends_the_run_and_the_next_run_continues_with_it(project):
     (project.root / "broken").touch()
     assert project.run() == 7
     assert calls(project) == "a b"
@@ -61,7 +57,7 @@ def test_a_failed_stage_ends_the_run_and_the_next_run_continues_with_it(project:
     assert kept.exists()  # same inputs: the work of the failed stage is continued
 
 
-def test_a_changed_input_runs_the_dependents_again_and_deletes_their_work(project: Recalibration) -> None:
+def test_a_changed_input_runs_the_dependents_again_and_deletes_their_work(project):
     project.run()
     calls(project)
     stale = project.root / "work" / "stale"

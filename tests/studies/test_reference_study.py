@@ -1,9 +1,6 @@
 """The study of the sideslip reference: its cases, made receivers, faults, stored figures and page."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 
@@ -21,7 +18,7 @@ def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
     assert page == fill(page, study.blocks(stored), "reference.md")
 
 
-def test_added_gnss_is_read_as_a_topic_of_the_log(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_added_gnss_is_read_as_a_topic_of_the_log(sample_logs_dir, tmp_path):
     log = sample_logs_dir / "step.mcap"
     start = inspect_log(log).to_dict()["start_ns"]
     stamps = start + np.arange(20, dtype=np.int64) * 100_000_000

@@ -1,7 +1,5 @@
 """Every study runs on this version: each on a tiny set, with its page and results in a temporary folder."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -43,24 +41,24 @@ def start(folder: Path, page: str, words: str) -> None:
 
 
 @pytest.mark.parametrize("name", SIMULATED)
-def test_a_study_of_simulated_drives_starts(name: str, tmp_path: Path) -> None:
+def test_a_study_of_simulated_drives_starts(name, tmp_path):
     start(tmp_path, *SIMULATED[name])
 
 
 @pytest.mark.skipif(not DRIVES.is_dir(), reason="needs the recorded drives")
 @pytest.mark.parametrize("name", RECORDED)
-def test_a_study_of_recorded_drives_starts(name: str, tmp_path: Path) -> None:
+def test_a_study_of_recorded_drives_starts(name, tmp_path):
     start(tmp_path, *RECORDED[name])
 
 
 @pytest.mark.skipif(not DRIVES.is_dir(), reason="needs the recorded drives")
-def test_the_benchmark_of_own_logs_prints_a_table_without_a_vehicle_file(tmp_path: Path) -> None:
+def test_the_benchmark_of_own_logs_prints_a_table_without_a_vehicle_file(tmp_path):
     (tmp_path / "v40_slalom.mcap").symlink_to(DRIVES / "v40_slalom.mcap")
     said = ran("studies.peers", "--folder", tmp_path, "--work", tmp_path / "work")
     assert "| `pd-hef` | 1 |" in said
 
 
-def test_the_torture_judges_mutants_of_every_container(tmp_path: Path) -> None:
+def test_the_torture_judges_mutants_of_every_container(tmp_path):
     words = "studies.torture mutations formats --logs 11 --count 1 --format csv --format bag --jobs 1"
     ran(words, "--work", tmp_path, "--out", tmp_path / "none")
     assert (tmp_path / "formats.json").is_file()

@@ -156,7 +156,8 @@ def test_the_samples_are_what_they_are_for():
 @pytest.mark.parametrize(("name", "friction"), [("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)])
 def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(name, friction):
     vehicle = read_vehicle_file(ROOT / "sample_logs" / name).vehicle
-    for axle, (alpha, force) in fit_nominal_tyres.axle_curves(fit_nominal_tyres.ramp(friction)).items():
+    columns = map(fit_nominal_tyres.ramp(friction).column, fit_nominal_tyres.MOTION)
+    for axle, (alpha, force) in fit_nominal_tyres.axle_curves(columns).items():
         b, c, d, e = vehicle.magic_formula(axle == "front", friction)
         x = b * alpha
         model = d * np.sin(c * np.arctan(x - e * (x - np.arctan(x))))

@@ -20,7 +20,7 @@ from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, des
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, raw_error, scorable, total_std
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
 
@@ -99,7 +99,7 @@ def _rms_aligned(
     A lag that is not clear is 0. None without straights: an offset of ground truth is an error elsewhere.
     """
     lag = np.nan_to_num(_lag_of_start(_, since_start_ns, estimate, truth))
-    then_ns = since_start_ns - lag * 1e9
+    then_ns = since_start_ns - lag * NS_PER_S
     covered = (then_ns >= since_start_ns[0]) & (then_ns <= since_start_ns[-1])
     if not straight.any() or not covered.any():
         return None

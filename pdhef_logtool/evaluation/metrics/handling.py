@@ -17,7 +17,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.manoeuvres import RULES
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray
 
 #: Sine with dwell: driving after it, share of its peak below which steering is at zero, steering-wheel angle at its
 #: beginning, and the time of the displacement after that.
@@ -45,7 +45,7 @@ def responses(drive: EvaluatedDrive) -> Iterator[Columns]:
     if drive.calibrated is None:
         return
     signals, vehicle, _ = drive.calibrated
-    since_s: FloatArray = (signals.stamps_ns - signals.stamps_ns[:1]) * np.float64(1e-9)
+    since_s: FloatArray = np.multiply(signals.stamps_ns - signals.stamps_ns[:1], S_PER_NS)
     kinds = [(_first(drive, since_s, names.split()), needed.split(), figures) for names, needed, figures in _KINDS]
     signals_of, steered = {m.name: m.brief for m in METRICS}, np.isfinite(signals.steer_rad)
     for track in (*drive.tracks.values(), *(() if drive.truth is None else (drive.truth,))):

@@ -9,7 +9,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, described, rms
 from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 SPAN_S = 2.0
@@ -32,7 +32,7 @@ def driven_consistency(track: StateTrack, signals: CalibratedSignals, low_speed_
     vy, residual = driven.carried_vy(track), driven.residual(track)
     rows = np.stack([*map(driven.change, (vy, driven.turn, signals.signals.ay_m_s2)), residual])
     stamps_ns = signals.signals.stamps_ns
-    step_s = np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, MAX_STEP_S)
+    step_s = np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * S_PER_NS, MAX_STEP_S)
     step_s = np.where(np.isfinite(rows).all(axis=0), step_s, 0.0)
     if (seconds := float(step_s.sum())) < 5.0 * SPAN_S:
         return float("nan")
@@ -62,13 +62,13 @@ class _Driven:
         rising = signals.ay_m_s2 / ay_gain - self.turn
         self._fast = speed > low_speed_m_s
         self._of_lever = vehicle.imu_position_m[0] / ay_gain * rate
-        gained, breaks, steps = np.zeros(len(t)), np.zeros(len(t)), np.diff(t) * 1e-9
+        gained, breaks, steps = np.zeros(len(t)), np.zeros(len(t)), np.diff(t) * S_PER_NS
         broken = ~np.isfinite(rising[1:] + rising[:-1]) | (steps > MAX_STEP_S)
         gained[1:] = np.cumsum(np.where(broken, 0.0, 0.5 * (rising[1:] + rising[:-1]) * steps))
         breaks[1:] = np.cumsum(broken)
-        earlier = np.searchsorted(t, t - round(SPAN_S * 1e9), side="right") - 1
+        earlier = np.searchsorted(t, t - round(SPAN_S * NS_PER_S), side="right") - 1
         self._before = i = np.maximum(earlier, 0)
-        self._whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((SPAN_S + MAX_STEP_S) * 1e9))
+        self._whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((SPAN_S + MAX_STEP_S) * NS_PER_S))
         self._gained = gained - gained[i]
 
     def carried_vy(self, track: StateTrack) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, described, mean, rms
 from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import NS_PER_S, FloatArray, IntArray
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
 #: Time within which the error of the reference is assumed constant, s.
@@ -71,7 +71,7 @@ def _ranked(drive: EvaluatedDrive) -> Iterator[Columns]:
         of_a, of_b = (wrap_angle(t.sideslip_rad - c.sideslip_rad) ** 2 for t in (a, b))
         std = 2.0 * np.abs(wrap_angle(a.sideslip_rad - b.sideslip_rad)) * c.sideslip_std_rad
         of_a = np.where(used & np.isfinite(of_b + std), of_a, np.nan)
-        block = (c.stamps_ns - c.stamps_ns[:1]) // round(BLOCK_S * 1e9)
+        block = (c.stamps_ns - c.stamps_ns[:1]) // round(BLOCK_S * NS_PER_S)
         yield Columns(name, "sideslip_rad", {"of_a": of_a, "of_b": of_b, "std": std, "block": block})
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pdhef_logtool.runs.inspection.asking import ask_mapping as ask_mapping
 from pdhef_logtool.runs.inspection.fields import fields_of_log as fields_of_log
-from pdhef_logtool.runs.inspection.fields import render_fields as render_fields
-from pdhef_logtool.runs.inspection.rendering import render_inspection as render_inspection
 from pdhef_logtool.runs.inspection.report import inspect_drive_log as inspect_drive_log
 from pdhef_logtool.runs.inspection.report import inspect_log as inspect_log
 from pdhef_logtool.runs.inspection.report import write_mapping as write_mapping

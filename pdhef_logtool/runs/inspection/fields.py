@@ -8,8 +8,6 @@ from contextlib import closing
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.text import Text
 
 from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.logs.container import Wanted
@@ -18,9 +16,8 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.runs.inspection.rendering import table_of
-from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed, number_text
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray
+from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed
 
 #: Arrays inside of arrays, or of structs.
 INNER_ARRAY = re.compile(r"\[\].")
@@ -50,8 +47,8 @@ def fields_of_log(
             names = ", ".join(t.name for t in log.topics) or "none"
             raise UsageError(expected="a topic of the log", got=repr(topic), where=str(path), remedy=f"topics: {names}")
         pieces = Pieces(log)
-        seconds = min(log.end_ns - log.start_ns, len(pieces.starts) * PIECE_NS) * 1e-9
-        whole = log.end_ns - log.start_ns <= seconds * 1e9 + 1
+        seconds = min(log.end_ns - log.start_ns, len(pieces.starts) * PIECE_NS) * S_PER_NS
+        whole = log.end_ns - log.start_ns <= seconds * NS_PER_S + 1
         reports = [_topic_fields(log, pieces, t) for t in topics]
         return {"path": str(path), "seconds": seconds, "whole": whole, "topics": reports}
 
@@ -92,18 +89,3 @@ def _report(path: str, kind: str, values: Sequence[FloatArray]) -> dict[str, Any
     with np.errstate(over="ignore"):
         figures = (float(f(every)) if every.size else np.nan for f in (np.min, np.mean, np.max))
         return {"path": path, "type": kind, **dict(zip(_STATISTICS, figures, strict=True))}
-
-
-def render_fields(report: Mapping[str, Any], console: Console) -> None:
-    """Print one table per topic, for a terminal of 80 columns or more."""
-    console.print(Text(report["path"], "bold"), soft_wrap=True)
-    part = "all" if report["whole"] else "pieces"
-    console.print(f"Values over {part} of the log, {report['seconds']:.0f} s, in recorded units.")
-    for topic in report["topics"]:
-        title, fields = f"{topic['name']} ({topic['type']})", topic["fields"]
-        if fields and not topic["reason"]:
-            rows = [(Text(f["path"]), f["type"], *(number_text(f[k]) for k in _STATISTICS)) for f in fields]
-            title = f"{title}, {number_text(topic['rate_hz'])} Hz"
-            console.print(table_of(title, ("field", "type", "min", "mean", "max"), rows, words=2))
-        else:
-            console.print(Text(f"{title}: {topic['reason']}"))

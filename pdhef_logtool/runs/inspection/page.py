@@ -17,8 +17,7 @@ from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, FloatArray
 from pdhef_logtool.reports.page import render
-from pdhef_logtool.runs.inspection.rendering import findings_of
-from pdhef_logtool.runs.inspection.report import Inspection, mapping_text, number_text
+from pdhef_logtool.runs.inspection.report import Inspection, findings_of, mapping_text, number_text
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import check_no_input
 

@@ -31,8 +31,9 @@ from pdhef_logtool.mapping.choosing import choose_mapping, tables_for
 from pdhef_logtool.mapping.clocks import ClockModel, clock_key, fit_clocks, sources_by_clock, survey_windows
 from pdhef_logtool.mapping.mapping_file import mapping_of, mapping_to_toml, missing_signals
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, IntArray, Loss
+from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError
+from pdhef_logtool.records.printable import all_printable
+from pdhef_logtool.records.signals import S_PER_NS, SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, IntArray, Loss
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
@@ -60,7 +61,7 @@ class Steps:
     @classmethod
     def of(cls, parts: Sequence[IntArray]) -> Steps:
         """Return the steps within each part, int64 [K] ascending; a step from one part to the next is left out."""
-        steps = [np.diff(part) * 1e-9 for part in parts]
+        steps = [np.diff(part) * S_PER_NS for part in parts]
         starts = [part[:-1] for part in parts]
         return cls(sum(map(len, parts)), np.concatenate([np.empty(0), *steps]), np.concatenate([_NONE, *starts]))
 
@@ -94,7 +95,7 @@ class Steps:
         i = int(np.argmax(self.steps_s)) if self.steps_s.shape[0] else 0
         gap = math.nan, math.nan
         if (self.steps_s[i : i + 1] > above_s).any():
-            gap = float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * 1e-9
+            gap = float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * S_PER_NS
         return dict(zip(("largest_gap_s", "largest_gap_at_s"), gap, strict=True))
 
     @property
@@ -144,6 +145,7 @@ _IN_DOCUMENT = (
 )  # fmt: skip
 
 
+_TEMPLATES = Path(__file__).parents[1] / "templates"
 _FIGURES: dict[str, Any] = {"mean": np.mean, "std": np.std, "minimum": np.min, "maximum": np.max}
 
 
@@ -250,12 +252,12 @@ class Inspection:
     @property
     def duration_s(self) -> float:
         """Length of the log."""
-        return (self.end_ns - self.start_ns) * 1e-9
+        return (self.end_ns - self.start_ns) * S_PER_NS
 
     @property
-    def is_partial(self) -> bool:
-        """Return whether data that the log should have held is gone (exit code 3)."""
-        return any(loss.severity == "lost" for loss in self.lost)
+    def exit_code(self) -> int:
+        """3 if data that the log should have held is gone, else 0."""
+        return EXIT_PARTIAL if any(loss.severity == "lost" for loss in self.lost) else EXIT_OK
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of ``pdhef inspect --json``; NaN and infinities become None."""
@@ -388,9 +390,9 @@ def _topic_reports(
 
 
 def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log: DriveLog) -> TopicReport:
-    log_s = (log.end_ns - log.start_ns) * 1e-9
+    log_s = (log.end_ns - log.start_ns) * S_PER_NS
     numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
-    delays = np.concatenate([np.empty(0), *((c.log_time_ns - c.publish_time_ns) * 1e-9 for c in stamps)])
+    delays = np.concatenate([np.empty(0), *((c.log_time_ns - c.publish_time_ns) * S_PER_NS for c in stamps)])
     median, late = np.quantile(delays, [0.5, 0.95]).tolist() if delays.size else (math.nan, math.nan)
     return TopicReport(
         name=topic.name,
@@ -460,12 +462,18 @@ def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
     return [text.format(k, r * 1e3) for k in devices if (r := clocks[k].residual_s) > CLOCK_RESIDUAL_S]
 
 
+def findings_of(inspection: Inspection) -> list[list[str]]:
+    """Return lines of findings: a heading, its style and the text."""
+    text = template(_TEMPLATES / "findings.txt").render(i=all_printable(inspection))
+    return [line.split("\t") for line in text.splitlines()]
+
+
 # ------------------------------------------------------------------------------------------------ mapping
 
 
 def mapping_comments(inspection: Inspection) -> dict[str, str]:
     """Return comments for :func:`pdhef_logtool.mapping.mapping_to_toml` that help to edit the mapping."""
-    words: Any = template(Path(__file__).parents[1] / "templates" / "mapping_comments.txt", number=number_text).module
+    words: Any = template(_TEMPLATES / "mapping_comments.txt", number=number_text).module
     types, mapped = {t.name: t.type for t in inspection.topics}, set(inspection.mapping.topics)
     unmapped = [t for t in inspection.topics if t.name not in mapped and t.fields and t.messages]
     comments = {"": words.head(inspection, Path(inspection.path).name, unmapped)}

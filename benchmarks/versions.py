@@ -1,0 +1,51 @@
+"""The same commands by this version and an earlier one, in turns on one machine.
+
+Processor seconds are the best of three rounds, memory the smallest peak of a process. The last column says how many
+times as much the earlier version takes.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+from benchmarks.fleet_drive import DRIVES, drives
+from benchmarks.hour import run_words
+from benchmarks.measuring import CACHE, ROOT, ROUNDS, Cost, Row, command_cost
+from benchmarks.one_hour_log import SHARED_S, drive_log, image_log
+from benchmarks.starting import LIGHT
+
+_FLEET = ("--car", "saloon", "--keep", "metrics", "--no-report")
+
+
+def works() -> dict[str, tuple[str | Path, ...]]:
+    """Return the words of each command."""
+    out = CACHE / "versions"
+    return {
+        "a new process runs 10 s, figures": LIGHT,
+        "inspect 60 s with 150 MB of images in shared chunks": ("inspect", image_log(SHARED_S)),
+        "inspect the hour": ("inspect", drive_log()),
+        f"{DRIVES} drives of a fleet": ("run", *drives(), *_FLEET, "-o", out),
+        "run of the hour, light outputs": run_words(out, light=True),
+        "run of the hour, everything": run_words(out, light=False),
+    }
+
+
+def rows(other: Path) -> list[Row]:
+    """Measure this tree and another one."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=other, check=True, capture_output=True, text=True
+    ).stdout.strip()
+    measured = []
+    for work, words in works().items():
+        costs: dict[Path, list[Cost]] = {ROOT: [], other: []}
+        for _ in range(1 + ROUNDS):  # the first call compiles
+            for tree, of_tree in costs.items():
+                of_tree.append(command_cost(*words, tree=tree))
+        for name, unit, figure in (
+            (work, "s", lambda cost: cost.seconds),
+            ("memory of it", "MB", lambda cost: cost.peak_bytes / 1e6),
+        ):
+            ours, theirs = (min(map(figure, of_tree)) for of_tree in costs.values())
+            measured.append(Row(name, ours, unit, peers={commit: theirs / ours}))
+    return measured
