@@ -103,9 +103,8 @@ def assumed_car(wheelbase_m: float) -> VehicleParameters:
     # The power is that of 1:10 and 1:5 models; sideslip depends on forces over mass.
     mass_kg = sedan.mass_kg * (wheelbase_m / sedan.wheelbase_m) ** 2.5
     axles = dict.fromkeys(("cg_to_front_axle_m", "cg_to_rear_axle_m"), 0.5 * wheelbase_m)
-    raw, _ = completed(
-        {"name": f"model car of {wheelbase_m:.2g} m", "mass_kg": mass_kg, "friction": sedan.friction, **axles}
-    )
+    stated = {"name": f"model car of {wheelbase_m:.2g} m", "mass_kg": mass_kg, "friction": sedan.friction, **axles}
+    raw, _ = completed(stated)
     return VehicleParameters.model_validate(raw)
 
 

@@ -206,9 +206,8 @@ def _with_parts(car: Car, folder: Path) -> Car:
 def read_fit(path: Path) -> Fit:
     """Read a fit.toml; raises VehicleError."""
     what = "a car's fit.toml"
-    return validated(
-        Fit, read_toml(path, what, VehicleError), str(path), VehicleError, expected=f"the entries of {what}"
-    )
+    raw = read_toml(path, what, VehicleError)
+    return validated(Fit, raw, str(path), VehicleError, expected=f"the entries of {what}")
 
 
 def _network_of(folder: Path | None, chosen: Place) -> tuple[str, ModelBundle | PlugInModel | None]:

@@ -160,18 +160,25 @@ def substeps(vx, dt, friction, p):  # type: ignore[no-untyped-def]
     return min(max(n, 1), MAX_SUBSTEPS)
 
 
+# positional: numbers of one point in an inner loop for vectorization.
+@_inline
+def rk4_step(vx, vy, r, ax, steer, h, c, p):  # type: ignore[no-untyped-def]
+    """Return [v_x, v_y, r] after an RK4 step of ``h`` s with constant inputs."""
+    g, sixth = 0.5 * h, h / 6.0
+    a1, b1, c1 = derivative(vx, vy, r, ax, steer, c, p)
+    a2, b2, c2 = derivative(vx + g * a1, vy + g * b1, r + g * c1, ax, steer, c, p)
+    a3, b3, c3 = derivative(vx + g * a2, vy + g * b2, r + g * c2, ax, steer, c, p)
+    a4, b4, c4 = derivative(vx + h * a3, vy + h * b3, r + h * c3, ax, steer, c, p)
+    vx += sixth * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+    vy += sixth * (b1 + 2.0 * b2 + 2.0 * b3 + b4)
+    return vx, vy, r + sixth * (c1 + 2.0 * c2 + 2.0 * c3 + c4)
+
+
 # positional: scalars, as in the model's other functions.
 @njit(cache=True)
-def rk4_step(vx, vy, r, steer, ax, friction, dt, n, p):  # type: ignore[no-untyped-def]
+def rk4_steps(vx, vy, r, steer, ax, friction, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance [v_x, v_y, r] by ``dt`` s in ``n`` RK4 steps with constant inputs."""
-    h, c = dt / n, prepare(steer, friction, p)
-    g = 0.5 * h
+    c = prepare(steer, friction, p)
     for _ in range(n):
-        a1, b1, c1 = derivative(vx, vy, r, ax, steer, c, p)
-        a2, b2, c2 = derivative(vx + g * a1, vy + g * b1, r + g * c1, ax, steer, c, p)
-        a3, b3, c3 = derivative(vx + g * a2, vy + g * b2, r + g * c2, ax, steer, c, p)
-        a4, b4, c4 = derivative(vx + h * a3, vy + h * b3, r + h * c3, ax, steer, c, p)
-        vx += h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        vy += h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4)
-        r += h / 6.0 * (c1 + 2.0 * c2 + 2.0 * c3 + c4)
+        vx, vy, r = rk4_step(vx, vy, r, ax, steer, dt / n, c, p)
     return vx, vy, r

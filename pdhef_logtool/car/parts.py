@@ -11,13 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from pdhef_logtool.car.vehicle import (
-    NonNegative,
-    Positive,
-    Record,
-    Sensors,
-    VehicleParameters,
-)
+from pdhef_logtool.car.vehicle import NonNegative, Positive, Record, Sensors, VehicleParameters
 from pdhef_logtool.storage.documents import digest, one_of
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]

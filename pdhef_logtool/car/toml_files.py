@@ -93,9 +93,8 @@ def vehicle_of_entries(raw: Mapping[str, Any], *, where: object) -> VehicleFile:
         got = "; ".join(stated or problems)
         raise VehicleError(expected="the entries of vehicle.toml", got=got, where=where, remedy=REMEDY)
     fields = VehicleParameters.model_fields
-    vehicle = VehicleParameters.model_construct(
-        file.model_fields_set & fields.keys(), **{name: getattr(file, name) for name in fields}
-    )
+    values = {name: getattr(file, name) for name in fields}
+    vehicle = VehicleParameters.model_construct(file.model_fields_set & fields.keys(), **values)
     return VehicleFile(vehicle, None if file.network is None else file.network.gain, assumed)
 
 

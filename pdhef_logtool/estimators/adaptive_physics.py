@@ -94,22 +94,26 @@ class AdaptiveState:
 
 
 @njit(cache=True)
-def gather_evidence(dt_s, likelihood, starts, evidence):  # type: ignore[no-untyped-def]
-    """Return Λ [K, H], the decaying sum of log-likelihoods [K, H] of steps with durations and starts [K].
+def gather_evidence(kept, likelihood, evidence):  # type: ignore[no-untyped-def]
+    """Return Λ [K, H], the decaying sum of log-likelihoods [K, H]; each step keeps the share ``kept`` [K] of the sum.
 
     ``evidence`` [H] is Λ before the first step and becomes that of the last.
     """
     out = np.empty_like(likelihood)
-    for k in range(dt_s.shape[0]):
-        forgets = starts[k] or not dt_s[k] <= RESTART_GAP_S
-        kept = 0.0 if forgets else math.exp(-dt_s[k] / FORGET_S)
-        heeds = not forgets
-        for h in range(evidence.shape[0]):
-            heeds = heeds and math.isfinite(likelihood[k, h])
-        for h in range(evidence.shape[0]):
-            evidence[h] = kept * evidence[h] + (likelihood[k, h] if heeds else 0.0)
-            out[k, h] = evidence[h]
+    for k in range(kept.shape[0]):
+        evidence[:] = kept[k] * evidence + likelihood[k]
+        out[k] = evidence
     return out
+
+
+def forgotten(dt_s: FloatArray, likelihood: FloatArray, starts: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the share of Λ that steps of durations ``dt_s`` [K] keep, and the log-likelihoods [K, H] that count.
+
+    Nothing is kept, and nothing counts, where a filter starts; a step with an unknown likelihood counts for no filter.
+    """
+    starts = starts | ~(dt_s <= RESTART_GAP_S)
+    counts = np.isfinite(likelihood).all(axis=1) & ~starts
+    return np.where(starts, 0.0, np.exp(-dt_s / FORGET_S)), np.where(counts[:, None], likelihood, 0.0)
 
 
 def weigh(evidence: FloatArray, usable: BoolArray, odds: Sequence[float]) -> FloatArray:
@@ -126,7 +130,7 @@ def weights_of(
 ) -> FloatArray:
     """Return the weights [K, H] of the steps of all filters [H]; ``evidence`` as in :func:`gather_evidence`."""
     likelihood, starts = np.stack([s.log_likelihood for s in steps], axis=1), ~np.isfinite(steps[0].prior[:, VX])
-    gathered = gather_evidence(dt_s, likelihood, starts, evidence)
+    gathered = gather_evidence(*forgotten(dt_s, likelihood, starts), evidence)
     return weigh(gathered, np.stack([s.valid for s in steps], axis=1), odds)
 
 

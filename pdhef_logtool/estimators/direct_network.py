@@ -15,7 +15,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.estimators.base import VX, VY, Steps
+from pdhef_logtool.estimators.base import QUANTITIES, VX, VY, Steps
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, nominal_filter
@@ -52,7 +52,7 @@ class DirectNetwork:
         features, dt_s, _, after = run_features(physics, signals, before)
         vy, carried = self.network.lateral_velocity(features, dt_s, carried)
         usable = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
-        values, rates = np.full((len(features), 4), np.nan), np.zeros((len(features), 4))
+        values, rates = (np.full((len(features), len(QUANTITIES)), fill) for fill in (np.nan, 0.0))
         vx, yaw_rate, vy = features[usable, _VX], features[usable, _RATE], vy[usable]
         ay = features[usable, _AY] / (1.0 + GRAVITY_M_S2 * self.vehicle.roll_gradient_rad_per_m_s2)
         values[usable] = np.stack([vx, vy, yaw_rate, ay], axis=1)

@@ -32,7 +32,7 @@ from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.reference.gnss import LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import RATE_HZ, ROLL_PER_AY_RAD_S2_M, SLOW_S
 from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, sideslip_std
-from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import LEAST_DIVISOR, S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
@@ -239,7 +239,7 @@ def _aid(columns, grip_m_s2, start, start_variance, memory, out):  # type: ignor
         change = memory.x[newest, f.VY] - row[FILTER_VY]
         variance = memory.P[newest, f.VY, f.VY] + PERSISTENT_M_S**2
         usable_heading = now.has_heading > 0 and now.agreement > 0.0 and abs(change) < LARGEST_SHARE * vx[k]
-        weight = 1.0 - GARROTE**2 * variance / max(change * change, 1e-12)
+        weight = 1.0 - GARROTE**2 * variance / max(change * change, LEAST_DIVISOR)
         if usable_heading and weight > 0.0:
             out[k, 0], out[k, 1] = weight * change, 1.0 - weight
             out[k, 2] = weight * (variance + (1.0 - weight) * change * change)
@@ -315,7 +315,7 @@ class GnssAided:
         change, weight, variance = steps.aid[ahead.step].T
         change = np.where(track.valid, change, 0.0)
         vy, covariance = track.vy_m_s + change, track.covariance
-        of_vy = np.sqrt(weight + variance / np.maximum(covariance[:, 1, 1], 1e-12))
+        of_vy = np.sqrt(weight + variance / np.maximum(covariance[:, 1, 1], LEAST_DIVISOR))
         covariance = scaled_covariance(covariance, of_vy)
         return replace(
             track,

@@ -32,7 +32,7 @@ from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.unscented import update
-from pdhef_logtool.estimators.vehicle_model import NOMINAL, PLACES, READINGS, VX, WIDTH, Z_AY
+from pdhef_logtool.estimators.vehicle_model import NOMINAL, READINGS, VX, Z_AY
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
@@ -101,8 +101,8 @@ def adapted_noise(innovation_variance, innovation, predicted_variance, r0, forge
 
 # positional: arrays and records of a compiled function.
 @njit(cache=True)
-def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted):  # type: ignore[no-untyped-def]
-    """Run over one window; ``belief`` is moved in place.
+def _filter(window, tuning, r0, constants, model, parallel, state, scratch, out, adapted):  # type: ignore[no-untyped-def]
+    """Run over one window; ``state`` is updated in place.
 
     ``parallel`` has the columns of the parallel filter's steps, and a_y [K] of its prior without residual. Where its
     prior is missing it starts, and this filter with it. ``r0`` [3] is R_0, and ``adapted`` residual gain and scale of R
@@ -111,14 +111,10 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
     forgetting, process_noise_gain, deviation_tops, intensity_tops, _ = constants
     layout, places, p, f = model
     (start_x, _, inputs, _, _, _, _, start_ok, _, prior), nominal_ay = parallel
-    (x, P, memory), adapted_memory = belief
+    (x, P, memory), adapted_memory = state
     out_x, out_P, _, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_trust, out_r_scale = adapted
-    n = x.shape[0]
-    points, away, reading = np.zeros(PLACES * WIDTH), np.zeros((n, WIDTH)), np.zeros(WIDTH)
-    root, q, S, Pxz = np.zeros((n, n)), np.zeros(n), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
-    nu, use = np.zeros(READINGS), np.zeros(READINGS, np.bool_)
-    no_r = np.zeros(READINGS)  # R is added when it is adapted
+    root, q, points, away, reading, nu, _, no_r, S, Pxz, _, use = scratch  # R is added when it is adapted
     for k in range(window.dt_s.shape[0]):
         m, a, ok, dt = memory[0], adapted_memory[0], start_ok[k], window.dt_s[k]
         steer, friction, has_ax = inputs[k, ukf.U_STEER], inputs[k, ukf.U_FRICTION], inputs[k, ukf.U_AX_KNOWN] > 0.0
@@ -248,17 +244,17 @@ class PaperHybridUkf:
 
         Return its steps, and the states for the next window.
         """
-        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None)
         count, n, nominal = len(signals), NOMINAL.size, self.parallel
-        belief, remembered = ukf.resume(state, n), np.zeros(1, ADAPTED) if adapted is None else adapted.copy()
+        after, remembered = ukf.resume(state, n), np.zeros(1, ADAPTED) if adapted is None else adapted.copy()
+        signals, slip = believable(signals, self.vehicle.sensors, after.slip)
         parallel = physics.written, nominal.expected_ay(physics.prior, physics.inputs)
         steps, columns = ukf.no_posterior(signals.stamps_ns, n, rate), (np.empty(count), np.empty(count))
         steps = replace(steps, inputs=physics.inputs)
-        window, r0 = ukf.make_window(signals, rate), self.measurement_variance
-        tuning, kept = nominal.tuning._replace(q_std=np.array(self.q_std)), (belief, remembered)
-        _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, kept, steps.written, columns)
+        window, r0, scratch = ukf.make_window(signals, rate), self.measurement_variance, ukf.make_scratch(n)
+        tuning, kept = nominal.tuning._replace(q_std=np.array(self.q_std)), (after[:3], remembered)
+        _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, kept, scratch, steps.written, columns)
         paper_steps = PaperSteps(steps.stamps_ns, *[*steps.written, rate, *columns])
-        return paper_steps, ukf.FilterState(belief, slip), remembered
+        return paper_steps, after._replace(slip=slip), remembered
 
 
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import Sensors
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
-from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.stepwise import StepState, advance_speed, prepared_steps
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S
@@ -17,8 +15,6 @@ from pdhef_logtool.records.steps import RESTART_GAP_S
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
 #: Tuned with the ground truth of simulated drives, which is an advantage of this estimator.
 LEAK_S = 0.7
-#: Fields used from a sensor profile; the wheel-slip gate has the default noise.
-_PROFILE = ("speed_hold_s", "speed_zero_m_s", "speed_least_m_s")
 
 
 @njit(cache=True)
@@ -45,30 +41,20 @@ def _kinematic(window, leak_s, hold_s, zero, state, values, rates, valid):  # ty
 
 @dataclass(frozen=True, slots=True)
 class Kinematic:
-    """The integrator of this file as an estimator; it needs no vehicle parameters."""
+    """The integrator of this file as an estimator; of a vehicle it needs the speed sensor alone."""
 
     algorithm = "kinematic"
     version = 1
-    options = ("leak_s", *_PROFILE)
 
-    leak_s: float = LEAK_S
-    speed_hold_s: float = Sensors().speed_hold_s
-    speed_zero_m_s: float = Sensors().speed_zero_m_s
-    speed_least_m_s: float = Sensors().speed_least_m_s
+    vehicle: VehicleParameters
     name: str = "kinematic"
     causal: bool = True
 
     def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        profile = Sensors(**{name: getattr(self, name) for name in _PROFILE})
-        s, dt, steps, after = prepared_steps(signals, state, 4, profile)
+        sensors = self.vehicle.sensors
+        s, dt, steps, after = prepared_steps(signals, state, 4, sensors)
         window = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
-        limits = self.leak_s, self.speed_hold_s, self.speed_zero_m_s
+        limits = LEAK_S, sensors.speed_hold_s, sensors.speed_zero_m_s
         _kinematic(window, *limits, after.state, steps.values, steps.rates, steps.valid)
         return steps, after
-
-
-def build(name: str, car: Car, options: Options) -> Kinematic:
-    """Return ``kinematic`` with the sensors of a car."""
-    del name, options
-    return Kinematic(**{name: getattr(car.vehicle.sensors, name) for name in _PROFILE})

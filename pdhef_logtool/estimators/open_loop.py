@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pdhef_logtool.car.nominal_model import (
     model_parameters,
     planar_lateral_acceleration,
-    rk4_step,
+    rk4_steps,
     state_derivative,
     substeps,
 )
@@ -21,28 +21,29 @@ from pdhef_logtool.records.steps import RESTART_GAP_S
 
 #: Time step of the derivative of a_y along the motion.
 AY_RATE_STEP_S = 0.001
+#: Entries of the state behind v_x, age of the speed sample, v_y and r: steering and friction of the previous step.
+STEER, MU = 4, 5
 
 
 @njit(cache=True)
 def _open_loop(inputs, hold_s, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
     dt, steer, ax, speed, friction = inputs
-    # state: v_x, age of the speed sample, v_y, r, steering and friction of the previous step
     for k in range(dt.shape[0]):
         before = state[0]
         advance_speed(state, dt[k], ax[k], speed[k], hold_s)
         mu = friction[k] if math.isfinite(friction[k]) else default_friction
         ok = math.isfinite(state[0]) and math.isfinite(steer[k])
-        if ok and dt[k] <= RESTART_GAP_S and math.isfinite(before + state[2] + state[4]):
-            n = substeps(before, dt[k], state[5], p)
-            _, state[2], state[3] = rk4_step(before, state[2], state[3], state[4], 0.0, state[5], dt[k], n, p)
+        if ok and dt[k] <= RESTART_GAP_S and math.isfinite(before + state[2] + state[STEER]):
+            n = substeps(before, dt[k], state[MU], p)
+            _, state[2], state[3] = rk4_steps(before, state[2], state[3], state[STEER], 0.0, state[MU], dt[k], n, p)
         elif ok:
             state[3] = state[0] * math.tan(steer[k]) / (p.front_m + p.rear_m)
             state[2] = p.rear_m * state[3]
         ok = ok and math.isfinite(state[2]) and math.isfinite(state[3])
         if not ok:
             state[2] = math.nan  # steering missing, or vehicle too light for its tyres: restart
-        state[4] = steer[k]
-        state[5] = mu
+        state[STEER] = steer[k]
+        state[MU] = mu
         valid[k] = ok
         if ok:
             _, vy_dot, r_dot = state_derivative(state[0], state[2], state[3], steer[k], 0.0, mu, p)
@@ -72,7 +73,7 @@ class OpenLoop:
     def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         p, mu, sensors = model_parameters(self.vehicle), self.vehicle.assumed_friction, self.vehicle.sensors
-        s, dt, steps, after = prepared_steps(signals, state, 6, sensors)
+        s, dt, steps, after = prepared_steps(signals, state, MU + 1, sensors)
         inputs = (dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction)
         _open_loop(inputs, sensors.speed_hold_s, mu, p, after.state, steps.values, steps.rates, steps.valid)
         return steps, after

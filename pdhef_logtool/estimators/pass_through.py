@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import Sensors
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Steps, make_steps
-from pdhef_logtool.estimators.presets import Options, options_of
+from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.signals import Signals
 
@@ -23,21 +22,19 @@ class PassThrough:
 
     algorithm = "pass-through"
     version = 1
-    options = ("claims_zero_sideslip", "speed_hold_s")
+    options = ("claims_zero_sideslip",)
 
+    vehicle: VehicleParameters
     name: str
-    claims_zero_sideslip: bool
-    speed_hold_s: float = Sensors().speed_hold_s
     causal: bool = True
+
+    @property
+    def claims_zero_sideslip(self) -> bool:
+        """Whether v_y is 0, False for ``zero:no-lateral``."""
+        return "no-lateral" not in options_of(self.name)
 
     def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        vx, state = measured_speed(signals, self.speed_hold_s, state)
+        vx, state = measured_speed(signals, self.vehicle.sensors.speed_hold_s, state)
         vy = np.full(len(signals), 0.0 if self.claims_zero_sideslip else np.nan)
         return make_steps(vx, vy, signals.yaw_rate_rad_s, signals.ay_m_s2), state
-
-
-def build(name: str, car: Car, options: Options) -> PassThrough:
-    """Return ``zero`` or its variant ``no-lateral``."""
-    del options
-    return PassThrough(name, "no-lateral" not in options_of(name), car.vehicle.sensors.speed_hold_s)

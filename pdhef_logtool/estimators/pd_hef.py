@@ -16,8 +16,6 @@ from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_s
 from pdhef_logtool.estimators.vehicle_ukf import of_car
 from pdhef_logtool.residual_model.interface import PlugInModel
 
-#: The preset that uses the taught part of a car.
-PRESET = "pd-hef"
 FILTER_ALONE = "taught residual not used: it was fitted to the error of the filter, which differs from the smoother's"
 
 
@@ -27,7 +25,7 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
     The residual gain of the network comes from the name or the car; a name with options selects the network.
     """
     model = car.model
-    if name == PRESET and model is not None and model.residual is not None:
+    if name == "pd-hef" and model is not None and model.residual is not None:
         physics = AdaptivePhysics(of_car(car, use_speed=options.use_speed), name=name)
         if (car.fitted_physics is not None) == model.calibrated:
             return replace(physics, network=model.residual, trust=1.0, notes=(model.evidence,))

@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators.gaussian import dot, times
 
 #: Share of a variance below which the rest of it is rounding: the state depends linearly on the previous ones.
 ROUNDING = 1e-14
@@ -32,7 +33,8 @@ def smooth_states(x, predicted_x, predicted_P, cross):  # type: ignore[no-untype
         _factorize(predicted_P[k], L)
         change = smoothed[k] - predicted_x[k]
         _solve(L, change)
-        _add_product(cross[k], change, smoothed[k - 1])
+        for i in range(change.shape[0]):
+            smoothed[k - 1, i] += dot(cross[k, i], change)
     return smoothed
 
 
@@ -43,15 +45,10 @@ def smooth_covariances(P, predicted_P, cross):  # type: ignore[no-untyped-def]
     L = np.empty_like(P[0])
     for k in range(P.shape[0] - 1, 0, -1):
         _factorize(predicted_P[k], L)
-        change = smoothed[k] - predicted_P[k]
         gain = cross[k].copy()
-        moved = np.zeros_like(gain)
         for i in range(gain.shape[0]):
             _solve(L, gain[i])
-        for i in range(gain.shape[0]):
-            _add_product(change, gain[i], moved[i])
-        for i in range(gain.shape[0]):
-            _add_product(gain, moved[i], smoothed[k - 1, i])
+        smoothed[k - 1] += times(gain, times(smoothed[k] - predicted_P[k], gain.T.copy()))
     return smoothed
 
 
@@ -81,11 +78,3 @@ def _solve(L, b):  # type: ignore[no-untyped-def]
         b[i] = b[i] / L[i, i] if L[i, i] > 0.0 else 0.0
         for m in range(i):
             b[m] -= L[i, m] * b[i]
-
-
-@njit(cache=True)
-def _add_product(A, b, out):  # type: ignore[no-untyped-def]
-    """Add A b to ``out`` [n]."""
-    for i in range(out.shape[0]):
-        for j in range(b.shape[0]):
-            out[i] += A[i, j] * b[j]

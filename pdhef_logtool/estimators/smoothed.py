@@ -19,7 +19,6 @@ bounded.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -27,13 +26,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.adaptive_physics import FORGET_S, AdaptivePhysics, gather_evidence, mix, weigh
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, forgotten, gather_evidence, mix, weigh
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs
 from pdhef_logtool.estimators.rts import smooth_covariances, smooth_states
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, LinkedSteps, VehicleUkf
 from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation
+from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 #: Minimum look-ahead of a step; the maximum is twice as much. Sensor biases have time constants of minutes: compared
@@ -41,29 +39,6 @@ from pdhef_logtool.records.tracks import StateTrack, concatenate
 BLOCK_S = 60.0
 #: Note for the report.
 NOT_CAUSAL = "not causal: estimates use later measurements; to be ranked apart from causal estimators"
-
-
-def smooth_steps(forward: LinkedSteps) -> tuple[FloatArray, FloatArray]:
-    """Return the smoothed states [K, n] and covariances [K, n, n] of steps."""
-    steps, linked = forward.posterior, forward.linked[:, None]
-    predicted_x = np.where(linked, steps.prior, steps.x)
-    predicted_P = np.where(linked[:, :, None], forward.predicted_P, steps.P)
-    cross = np.where(linked[:, :, None], forward.cross, 0.0)
-    return smooth_states(steps.x, predicted_x, predicted_P, cross), smooth_covariances(steps.P, predicted_P, cross)
-
-
-@njit(cache=True)
-def _add_later(dt, likelihood, starts, evidence):  # type: ignore[no-untyped-def]
-    """Add to Λ [N, H] of each step the likelihood of the following steps."""
-    later = np.zeros(likelihood.shape[1])
-    for k in range(dt.shape[0] - 2, -1, -1):
-        if starts[k + 1] or not dt[k + 1] <= RESTART_GAP_S:
-            later[:] = 0.0
-        else:
-            if np.isfinite(likelihood[k + 1]).all():
-                later += likelihood[k + 1]
-            later *= math.exp(-dt[k + 1] / FORGET_S)
-        evidence[k] += later
 
 
 def for_smoothing(physics: VehicleUkf, factors: Sequence[float]) -> VehicleUkf:
@@ -123,9 +98,10 @@ class SmoothedPhysics:
         if len(drives) == 1:
             return tracks, np.ones((len(signals), 1))
         likelihood, starts = np.stack([of_one for _, of_one, _ in drives], axis=1), drives[0][2]
-        dt_s = signals.steps_s
-        evidence = gather_evidence(dt_s, likelihood, starts, np.zeros(len(drives)))
-        _add_later(dt_s, likelihood, starts, evidence)
+        kept, counted = forgotten(signals.steps_s, likelihood, starts)
+        evidence = gather_evidence(kept, counted, np.zeros(len(drives))) - counted  # both directions contain a step
+        backward = np.append(kept[1:], 0.0)[::-1].copy(), counted[::-1].copy()
+        evidence += gather_evidence(*backward, np.zeros(len(drives)))[::-1]
         return tracks, weigh(evidence, np.stack([t.valid for t in tracks], axis=1), self.filtered.odds)
 
     def _smoothed(
@@ -150,10 +126,15 @@ class SmoothedPhysics:
 
 def smoothed_track(physics: VehicleUkf, steps: LinkedSteps, following: LinkedSteps | None) -> StateTrack:
     """Return the smoothed track of steps, with those that follow them."""
-    x, P = smooth_steps(steps if following is None else steps.joined(following))
-    posterior = steps.posterior
-    count, in_place = len(posterior.stamps_ns), Extrapolation.none(posterior.valid)
-    return physics.predict(replace(posterior, x=x[:count], P=P[:count]), in_place, posterior.stamps_ns)
+    joined = steps if following is None else steps.joined(following)
+    run, linked, count = joined.posterior, joined.linked[:, None], len(steps.posterior.stamps_ns)
+    predicted_x = np.where(linked, run.prior, run.x)
+    predicted_P = np.where(linked[:, :, None], joined.predicted_P, run.P)
+    cross = np.where(linked[:, :, None], joined.cross, 0.0)
+    x = smooth_states(run.x, predicted_x, predicted_P, cross)[:count]
+    P = smooth_covariances(run.P, predicted_P, cross)[:count]
+    smoothed = replace(steps.posterior, x=x, P=P)
+    return physics.predict(smoothed, Extrapolation.none(smoothed.valid), smoothed.stamps_ns)
 
 
 def blocks(stamps_ns: IntArray, block_s: float) -> Iterator[slice]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.base import VX, Steps
+from pdhef_logtool.estimators.base import QUANTITIES, VX, Steps
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -37,7 +37,8 @@ def prepared_steps(
         signals = without_impossible(signals)
     else:
         signals, slip = believable(signals, slip_sensors, before.slip if before else None, reckoned=True)
-    steps = Steps(np.full((count, 4), np.nan), np.zeros((count, 4)), np.zeros(count, dtype=np.bool_))
+    shape = count, len(QUANTITIES)
+    steps = Steps(np.full(shape, np.nan), np.zeros(shape), np.zeros(count, dtype=np.bool_))
     return signals, signals.steps_s, steps, StepState(state, slip)
 
 

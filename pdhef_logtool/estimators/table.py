@@ -54,13 +54,7 @@ from typing import Any, Final, Literal, cast
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.presets import (
-    AIDED,
-    OPEN_LOOP,
-    SELF_CALIBRATED,
-    calibration_of,
-    preset_of,
-)
+from pdhef_logtool.estimators.presets import AIDED, OPEN_LOOP, SELF_CALIBRATED, calibration_of, preset_of
 from pdhef_logtool.estimators.presets import Options as Options
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.printable import printable
@@ -167,10 +161,10 @@ GAIN, _GAINS = "pd-hef:gain=1", re.compile(r"pd-hef:gain=(0(\.\d*)?|\.\d+|1(\.0*
 #: Estimators of this package, in the order of the tables. A preset with an option has an entry if it differs.
 SPECS: tuple[Spec, ...] = (
     Spec("zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors",
-         "pass_through:build", _PLANAR, 0xF0E442),
+         "pass_through:PassThrough", _PLANAR, 0xF0E442),
     Spec("zero:no-lateral", "the sensors passed through; claims no lateral velocity",
-         "pass_through:build", _PLANAR, 0xCC79A7),
-    Spec("kinematic", "leaky integral of a_y - v_x r", "kinematic:build", _PLANAR | {"ay_m_s2"}, 0x009E73),
+         "pass_through:PassThrough", _PLANAR, 0xCC79A7),
+    Spec("kinematic", "leaky integral of a_y - v_x r", "kinematic:Kinematic", _PLANAR | {"ay_m_s2"}, 0x009E73),
     Spec("open-loop", "nominal single-track model from steering and speed alone",
          "open_loop:OpenLoop", _INPUTS, 0xE69F00),
     Spec(OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",

@@ -41,10 +41,10 @@ from pdhef_logtool.car.nominal_model import (
     MAX_SUBSTEPS,
     Prepared,
     accelerations,
-    derivative,
     dynamic_share,
     planar_lateral_acceleration,
     prepare,
+    rk4_step,
     substeps,
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
@@ -71,8 +71,8 @@ FORCE_SCALE_TIME_S = 2.0
 BANK_TIME_S = 5.0
 #: Largest product of step and the roll mode's frequency; longer steps are divided.
 _MAX_ROLL_STEP = 0.5
-#: Minimum share of the grip that braking leaves for lateral forces.
-_LEAST_GRIP = 0.2
+#: Minimum share of the grip that braking leaves for lateral forces; minimum factor on forces by their scale.
+_LEAST_GRIP, LEAST_FORCE = 0.2, 0.1
 #: Below this roll gradient, rad/(m/s²), roll does not indicate load transfer, which then follows the acceleration.
 LEAST_ROLL_GRADIENT = 1e-3
 
@@ -229,6 +229,12 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
 
 
 @_inline
+def force_factor(scale):  # type: ignore[no-untyped-def]
+    """Return the factor on the tyres' forces by their scale."""
+    return max(LEAST_FORCE, 1.0 + scale)
+
+
+@_inline
 def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
     """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x is limited to 1, where the inner wheel lifts."""
     x = min(1.0, abs(f.transfer_per_ay * ay))
@@ -253,7 +259,7 @@ def _tyre_forces(points, columns, row, angle, axle, f):  # type: ignore[no-untyp
     for j in range(columns):
         points[row * WIDTH + j] = shape * arctangent(points[row * WIDTH + j], 1.0)
     for j in range(columns):
-        steady, scale = peak * sine(points[row * WIDTH + j]), max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        steady, scale = peak * sine(points[row * WIDTH + j]), force_factor(points[FORCE_SCALE * WIDTH + j])
         factor = _transfer_factor(points[LEAN * WIDTH + j], f.load_sensitivity, f)
         points[row * WIDTH + j] = steady * scale * factor / _transfer_factor(steady / share, held, f)
 
@@ -350,20 +356,12 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
 @_inline
 def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance states of the nominal model in ``n`` RK4 steps."""
-    c, steer = prepare(over.steer, over.friction, p), over.steer
-    h = dt / n
-    g, sixth = 0.5 * h, h / 6.0
+    c = prepare(over.steer, over.friction, p)
     for _ in range(n):
         for j in range(columns):
             x, y, r = points[VX * WIDTH + j], points[VY * WIDTH + j], points[YAW_RATE * WIDTH + j]
-            ax = over.ax - points[AX_BIAS * WIDTH + j]
-            x1, y1, r1 = derivative(x, y, r, ax, steer, c, p)
-            x2, y2, r2 = derivative(x + g * x1, y + g * y1, r + g * r1, ax, steer, c, p)
-            x3, y3, r3 = derivative(x + g * x2, y + g * y2, r + g * r2, ax, steer, c, p)
-            x4, y4, r4 = derivative(x + h * x3, y + h * y3, r + h * r3, ax, steer, c, p)
-            points[VX * WIDTH + j] = x + sixth * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
-            points[VY * WIDTH + j] = y + sixth * (y1 + 2.0 * y2 + 2.0 * y3 + y4)
-            points[YAW_RATE * WIDTH + j] = r + sixth * (r1 + 2.0 * r2 + 2.0 * r3 + r4)
+            x, y, r = rk4_step(x, y, r, over.ax - points[AX_BIAS * WIDTH + j], over.steer, dt / n, c, p)
+            points[VX * WIDTH + j], points[VY * WIDTH + j], points[YAW_RATE * WIDTH + j] = x, y, r
 
 
 # positional: as advance.
@@ -375,7 +373,7 @@ def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
     """
     share = dynamic_share(vx, p) * dt
     for j in range(columns):
-        force = share * max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        force = share * force_factor(points[FORCE_SCALE * WIDTH + j])
         points[VY * WIDTH + j] += force * rate[0]
         points[YAW_RATE * WIDTH + j] += force * rate[1]
 
@@ -399,41 +397,9 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
             ay, turn = front + rear, inertia * (p.front_m * front - p.rear_m * rear)
         else:
             ay, turn = accelerations(vx, vy, r, steer, nominal, p)
-        ay = w * (ay + max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
+        ay = w * (ay + force_factor(points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
         ay = (1.0 + tilt) * ay + w * turn * p.imu_x_m - r * r * p.imu_y_m + GRAVITY_M_S2 * points[ROLL * WIDTH + j]
         out[j] = ay
-
-
-# positional: as advance.
-@_inline
-def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, Pxz):  # type: ignore[no-untyped-def]
-    """Write the covariance of the accelerometer's reading with the state to P_xz [3, n]; return its mean and variance.
-
-    They are those of the sigma points of :func:`read_ay` where all are in the dynamic range of a model with axle
-    forces: it is linear except for r². ``slope`` [WIDTH] is overwritten.
-    """
-    turn, curve, n = p.mass_kg / p.yaw_inertia_kg_m2 * p.imu_x_m, -p.imu_y_m, x.shape[0]
-    tilt = 1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient
-    slope[:] = 0.0
-    slope[FRONT], slope[REAR] = math.cos(steer) * (tilt + turn * p.front_m), tilt - turn * p.rear_m
-    slope[ROLL], slope[FORCE_SCALE] = GRAVITY_M_S2, tilt * rate_vy
-    rate, variance = x[YAW_RATE], P[YAW_RATE, YAW_RATE]
-    slope[YAW_RATE] = 2.0 * curve * rate
-    # The points have the fourth powers of the row of r in the root of the covariance, here its squares.
-    of_vx = P[YAW_RATE, VX] ** 2 / P[VX, VX]
-    of_vy = (P[YAW_RATE, VY] - P[VY, VX] * P[YAW_RATE, VX] / P[VX, VX]) ** 2 / (P[VY, VY] - P[VY, VX] ** 2 / P[VX, VX])
-    of_rate = variance - of_vx - of_vy
-    s = curve * curve * (variance * variance + n * (of_vx * of_vx + of_vy * of_vy + of_rate * of_rate))
-    mean = tilt * rate_vy + curve * (variance - rate * rate)
-    Pxz[Z_AY, :] = 0.0
-    for i in range(n):
-        along = slope[places[i]]
-        mean += along * x[i]
-        for a in range(Pxz.shape[1]):
-            Pxz[Z_AY, a] += along * P[i, a]
-    for i in range(n):
-        s += Pxz[Z_AY, i] * slope[places[i]]
-    return mean, s
 
 
 @njit(cache=True, _nrt=True)
@@ -462,6 +428,6 @@ def planar_ay(x, steer, friction, rate_vy, layout, p):  # type: ignore[no-untype
     w = dynamic_share(x[VX], p)
     if layout.forces < 0:
         return planar_lateral_acceleration(x[VX], x[VY], x[YAW_RATE], steer, friction, p) + w * rate_vy
-    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    force = force_factor(x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     forces = x[FRONT] * math.cos(steer) + x[REAR]
     return w * (forces + force * rate_vy) + (1.0 - w) * x[VX] * x[YAW_RATE]

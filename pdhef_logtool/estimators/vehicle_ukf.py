@@ -19,6 +19,7 @@ and yaw rate then determine v_y. ``phy-ukf`` waits for the steering instead.
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -65,7 +66,6 @@ from pdhef_logtool.estimators.vehicle_model import (
     physics_parameters,
     planar_ay,
     push,
-    quadratic_ay,
     read_ay,
     settle_forces,
 )
@@ -204,12 +204,13 @@ class Tuning(NamedTuple):
     rules: Rules
 
 
-class Belief(NamedTuple):
-    """State [n], covariance [n, n], with columns up to whole vectors, and memory [1] of a filter, moved in place."""
+class FilterState(NamedTuple):
+    """State [n], covariance [n, n] with columns up to whole vectors, memory [1], and memory of the slip detection."""
 
     x: FloatArray
     P: FloatArray
     memory: np.ndarray[Any, Any]
+    slip: FloatArray | None = None
 
 
 class StepInputs(NamedTuple):
@@ -375,17 +376,13 @@ def expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, read
     """Write the innovation [3], NaN for missing samples, the lower triangle of its covariance with R, and P_xz [3, n].
 
     ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
-    the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
+    the sigma points of a_y are sufficient.
     """
-    m, s, n, first = changing(layout), layout.force_scale, x.shape[0], layout.sensor_bias
-    least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
-    if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
-        ay, S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz)
-    else:
-        cholesky(P, root)
-        draw(x, root, places, m, points)
-        read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
-        ay, S[Z_AY, Z_AY] = reading_moments(reading, root, m, away, Pxz, Z_AY)
+    m, first = changing(layout), layout.sensor_bias
+    cholesky(P, root)
+    draw(x, root, places, m, points)
+    read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+    ay, S[Z_AY, Z_AY] = reading_moments(reading, root, m, away, Pxz, Z_AY)
     nu[Z_AY], nu[Z_YAW_RATE], nu[Z_SPEED] = now.ay - ay, now.yaw_rate - x[YAW_RATE], now.speed - x[VX]
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
         for a in range(Pxz.shape[1]):
@@ -529,11 +526,11 @@ def keep(P, out, k):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _filter(window, tuning, model, belief, scratch, out, links):  # type: ignore[no-untyped-def]
-    """Filter one window; ``belief`` is moved in place. ``links`` are of length 0 if not requested."""
+def _filter(window, tuning, model, state, scratch, out, links):  # type: ignore[no-untyped-def]
+    """Filter one window; ``state`` is updated in place. ``links`` are of length 0 if not requested."""
     q_std, r_std, initial_std, standstill_std, rules = tuning
     layout, places, p, car = model
-    x, P, memory = belief
+    x, P, memory = state
     root, q, points, away, reading, nu, at_gate, r, S, Pxz, given, use = scratch
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_linked, out_predicted_P, out_cross = links
@@ -684,14 +681,6 @@ class PosteriorSteps(StepColumns):
     def written(self) -> tuple[Any, ...]:
         """The columns that a kernel writes: all but the first and the last."""
         return tuple(getattr(self, f.name) for f in fields(PosteriorSteps)[1:-1])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FilterState:
-    """Filter state between windows."""
-
-    belief: Belief
-    slip: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -904,14 +893,16 @@ class VehicleUkf:
         linked: bool = True,
     ) -> tuple[LinkedSteps, FilterState]:
         """Return the result of :meth:`run`, bit for bit, with the links between the steps if they are ``linked``."""
-        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None)
-        window, count, n = make_window(signals, residual_rate, extra_r, noise), len(signals), self.layout.size
-        steps, belief = no_posterior(signals.stamps_ns, n, window.residual_rate), resume(state, n)
+        count, n = len(signals), self.layout.size
+        after = resume(state, n)
+        signals, slip = believable(signals, self.vehicle.sensors, after.slip)
+        window = make_window(signals, residual_rate, extra_r, noise)
+        steps = no_posterior(signals.stamps_ns, n, window.residual_rate)
         rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
         tuning = self.tuning._replace(q_std=self.tuning.q_std.copy())  # it changes with the steering
-        _filter(window, tuning, self.parameters, belief, _scratch(n), steps.written, links)
-        return LinkedSteps(steps, *links), FilterState(belief, slip)
+        _filter(window, tuning, self.parameters, after[:3], make_scratch(n), steps.written, links)
+        return LinkedSteps(steps, *links), after._replace(slip=slip)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the filter's model (see :class:`~.base.ModelPredictor`)."""
@@ -939,7 +930,7 @@ def _expected_ay(x, inputs, model, out):  # type: ignore[no-untyped-def]
             out[k] = reading[0] + (x[k, layout.sensor_bias] if layout.sensor_bias >= 0 else 0.0)
 
 
-def _scratch(n: int) -> tuple[Any, ...]:
+def make_scratch(n: int) -> tuple[Any, ...]:
     """Return the arrays of a kernel for ``n`` states that keep nothing between steps, of the readings those from ν."""
     root, of_readings = padded(n, n), np.zeros((3, READINGS))
     block = (np.zeros(PLACES * WIDTH), np.zeros((root.shape[1], WIDTH)), np.zeros(WIDTH))
@@ -947,11 +938,11 @@ def _scratch(n: int) -> tuple[Any, ...]:
     return root, np.zeros(n), *block, *of_readings, *covariances, *chosen
 
 
-def resume(state: FilterState | None, n: int) -> Belief:
+def resume(state: FilterState | None, n: int) -> FilterState:
     """Return a copy of the state before a window, which the kernel updates in place."""
     if state is None:
-        return Belief(np.zeros(n), np.eye(n, padded(n, n).shape[1]), np.zeros(1, MEMORY))
-    return Belief(*(part.copy() for part in state.belief))
+        return FilterState(np.zeros(n), np.eye(n, padded(n, n).shape[1]), np.zeros(1, MEMORY))
+    return deepcopy(state)
 
 
 # ------------------------------------------------------------------------------------------------ presets

@@ -9,9 +9,8 @@ from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray
 #: Degrees of a radian, and standard gravity.
 DEGREES, GRAVITY_M_S2 = 180.0 / np.pi, 9.80665
 
-#: Length of a degree of latitude on a sphere, m: for paths, whose shape counts.
-DEGREE_M = 111_200.0
-WGS84_A_M, WGS84_E2 = 6378137.0, 6.69437999014e-3
+#: Length of a degree of latitude on a sphere, m: for paths, whose shape counts. Axis and squared eccentricity of WGS84.
+DEGREE_M, WGS84_A_M, WGS84_E2 = 111_200.0, 6378137.0, 6.69437999014e-3
 
 
 def wrap_angle(angle_rad: FloatArray) -> FloatArray:

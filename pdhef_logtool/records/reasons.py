@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 # The bits of the yaw rate are the bits of a_y, shifted left by one.
-BURST_AY, BURST_YAW_RATE = 1, 2
-SPIKE_AY, SPIKE_YAW_RATE = 4, 8
+BURST_AY = 1
+SPIKE_AY = 4
 STUCK_AY, STUCK_YAW_RATE = 16, 32
 DEAD_AY, DEAD_YAW_RATE = 64, 128
 MISSING_AY, MISSING_YAW_RATE = 256, 512

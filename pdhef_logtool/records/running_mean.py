@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, FloatArray
 
 
 def running_mean(columns: FloatArray, half: int, weights: FloatArray | float = 1.0) -> FloatArray:
@@ -19,4 +19,5 @@ def running_mean(columns: FloatArray, half: int, weights: FloatArray | float = 1
     table = np.hstack([weight * np.where(finite[:, None], table, 0.0), weight])
     sums = np.concatenate([np.zeros((1, table.shape[1])), np.cumsum(table, axis=0)])
     around = sums[np.minimum(rows + half + 1, n)] - sums[np.maximum(rows - half, 0)]
-    return np.asarray((around[:, :-1] / np.maximum(around[:, -1:], 1e-12)).reshape(columns.shape), dtype=np.float64)
+    mean = around[:, :-1] / np.maximum(around[:, -1:], LEAST_DIVISOR)
+    return np.asarray(mean.reshape(columns.shape), dtype=np.float64)

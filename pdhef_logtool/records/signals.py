@@ -14,6 +14,8 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
 S_PER_NS, NS_PER_S = 1e-9, 1_000_000_000
+#: Divisors that may be 0 are at least this.
+LEAST_DIVISOR = 1e-12
 
 WHEELS = ("fl", "fr", "rl", "rr")
 
@@ -65,7 +67,6 @@ GNSS_COMPONENTS = frozenset({"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
 GNSS_POSITION = ("gnss_latitude_deg", "gnss_longitude_deg")
 #: Signals and ground truth with a position on Earth.
 POSITIONS = frozenset({*GNSS_POSITION, "lat_deg", "lon_deg", "alt_m", "x_m", "y_m", "ecef_position_m"})
-_GNSS_POLAR = frozenset({"gnss_speed_m_s", "gnss_course_rad"})
 #: Signals with one column each in the output of the alignment.
 ALIGNED_SIGNALS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
 
@@ -219,7 +220,7 @@ def step_durations_s(stamps_ns: IntArray) -> FloatArray:
 
 def has_gnss(names: Collection[str]) -> bool:
     """Return whether signals contain a GNSS velocity: its components, or speed and course."""
-    return any(names_of <= set(names) for names_of in (GNSS_COMPONENTS, _GNSS_POLAR))
+    return any(names_of <= set(names) for names_of in (GNSS_COMPONENTS, {"gnss_speed_m_s", "gnss_course_rad"}))
 
 
 def has_position(names: Collection[str]) -> bool:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.records.running_mean import running_mean
-from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, S_PER_NS, BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
 from pdhef_logtool.residual_model.ladder import LINEAR, NONE, RANDOM, REGION_RIDGE, LadderModel, plain
 from pdhef_logtool.residual_model.ladder_kernels import Basis, expand
@@ -163,7 +163,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
         rng.normal(size=(count, EVEN_COUNT)) * FREQUENCY, rng.uniform(0.0, 2.0 * math.pi, count),
     )  # fmt: skip
     responses = [_responses(basis, s) for s in samples]
-    unit = max(float(np.sqrt(np.mean(np.concatenate([r[:, :ODD_COUNT] for r in responses]) ** 2))), 1e-12)
+    unit = max(float(np.sqrt(np.mean(np.concatenate([r[:, :ODD_COUNT] for r in responses]) ** 2))), LEAST_DIVISOR)
     problem = _problem(samples, [r / unit for r in responses], seconds)
     linear = problem.only(ODD_COUNT)
     trials, chosen = _climb({LINEAR: linear} | ({RANDOM: problem} if count else {}))

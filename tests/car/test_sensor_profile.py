@@ -101,14 +101,12 @@ def test_speed_and_steering_are_kept_for_the_times_of_the_profile(clean):
     dark = masked(clean, "speed_m_s", t > 4.0)
 
     def lost_s(**sensors: float) -> float:
-        car = Car(vehicle(**sensors))
-        passed = PassThrough("zero", claims_zero_sideslip=True, speed_hold_s=car.vehicle.sensors.speed_hold_s)
-        values = passed.run(dark, None)[0].values[:, 0]
+        values = PassThrough(vehicle(**sensors), "zero").run(dark, None)[0].values[:, 0]
         return float(t[np.isfinite(values)].max())
 
     assert lost_s() == pytest.approx(4.5, abs=0.02)
     assert lost_s(speed_hold_s=1.5) == pytest.approx(5.5, abs=0.02)
-    kinematic = Kinematic(speed_hold_s=1.5).run(dark, None)[0].valid
+    kinematic = Kinematic(vehicle(speed_hold_s=1.5)).run(dark, None)[0].valid
     assert float(t[kinematic].max()) == pytest.approx(5.5, abs=0.02)
     lost = masked(clean, "steer_rad", t > 4.0)
 

@@ -55,9 +55,9 @@ def test_no_baseline_is_weaker_than_it_was(car, drive):
 _HYBRID = "adaptive-physics 3 (physics=vehicle-ukf, residual_noise=0.5, trust=0.75)"
 #: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
 SHIPPED = {
-    "zero": ("pass-through 1 (claims_zero_sideslip=True)", "138e43c5f7aa"),
-    "zero:no-lateral": ("pass-through 1 (claims_zero_sideslip=False)", "5ba63001dd67"),
-    "kinematic": ("kinematic 1", "6a7d76af0e93"),
+    "zero": ("pass-through 1 (claims_zero_sideslip=True)", "bb9a4e4a0fd4"),
+    "zero:no-lateral": ("pass-through 1 (claims_zero_sideslip=False)", "103764c41c2d"),
+    "kinematic": ("kinematic 1", "8208c390e51c"),
     "open-loop": ("open-loop 1", "5afc5962fabb"),
     "linear-regression": ("linear-regression 1", "9de17837d3ad"),
     "phy-ukf": ("vehicle-ukf 1 (equations=nominal)", "cead32189ec2"),

@@ -50,7 +50,7 @@ def test_steps_are_divided_until_they_are_stable(vx, dt, mu, steer):
     assert 1 <= n <= nominal_model.MAX_SUBSTEPS
     state = (vx, 0.5, -0.5)
     for _ in range(20):
-        state = nominal_model.rk4_step(vx, *state[1:], steer, 0.0, mu, dt, n, P)
+        state = nominal_model.rk4_steps(vx, *state[1:], steer, 0.0, mu, dt, n, P)
     assert abs(state[1]) < 50 and abs(state[2]) < 10
 
 

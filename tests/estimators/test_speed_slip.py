@@ -19,7 +19,7 @@ from pdhef_logtool.records.signals import Signals
 VEHICLE = default_vehicle()
 SENSORS = VEHICLE.sensors
 FILTERS = (nominal_filter(VEHICLE), VehicleUkf(VEHICLE))
-ESTIMATORS = (Kinematic(), OpenLoop(VEHICLE), *FILTERS)
+ESTIMATORS = (Kinematic(VEHICLE), OpenLoop(VEHICLE), *FILTERS)
 
 
 def start_and_stop(t: np.ndarray) -> np.ndarray:

@@ -124,7 +124,7 @@ def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(c
     want, want_reading = states.copy(), np.zeros(LANES)
     for i, state in enumerate(states):
         half = 0.5 * share * dt * np.array(rate)
-        end = nominal_model.rk4_step(state[0], *(state[1:3] + half), steer, ax - state[AX_BIAS], mu, dt, n, p)
+        end = nominal_model.rk4_steps(state[0], *(state[1:3] + half), steer, ax - state[AX_BIAS], mu, dt, n, p)
         want[i, :3] = end[0], *(end[1:] + half)
         w = nominal_model.dynamic_share(state[0], p)
         ay = nominal_model.planar_lateral_acceleration(*state[:3], steer, mu, p) + w * rate[0]

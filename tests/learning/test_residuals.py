@@ -125,6 +125,7 @@ def test_an_offset_of_the_steering_angle_is_no_residual():
         rows.weight[use].astype(np.float32),
         rows.segment[use],
         rows.truth_velocity[use].astype(np.float32),
+        rows.chosen[use],
     )
     mean = (arrays.targets / arrays.step_s[:, None]).mean(axis=0)
     assert np.abs(mean).min() > 0.05
@@ -141,6 +142,7 @@ def arrays(count: int = 200, **changes: Any) -> ResidualRows:
         "weight": np.ones(count, dtype=np.float32),
         "segment": np.zeros(count, dtype=np.int64),
         "truth_velocity": np.tile(np.float32([20.0, 0.1]), (count, 1)),
+        "chosen": np.ones(count, dtype=np.bool_),
     }
     return ResidualRows(**{**columns, **changes})
 

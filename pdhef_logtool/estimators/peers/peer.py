@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.base import VX, VY, YAW_RATE, Steps
+from pdhef_logtool.estimators.base import QUANTITIES, VX, VY, YAW_RATE, Steps
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.readings import without_impossible
@@ -87,7 +87,7 @@ class Peer:
         if len(vx):
             self.estimate(samples, first, step_durations_s(stamps_ns), memory)
         self._roll(samples)
-        values, rates = np.full((2, len(stamps_ns), 4), np.nan)
+        values, rates = np.full((2, len(stamps_ns), len(QUANTITIES)), np.nan)
         values[:, VX], values[:, VY], values[:, YAW_RATE] = samples.vx, *samples.states.T
         before = np.searchsorted(stamps_ns, stamps_ns - RATE_SPAN_NS)
         span_s = np.maximum((stamps_ns - stamps_ns[before]) * S_PER_NS, 1e-3)

@@ -21,15 +21,14 @@ from pdhef_logtool.estimators.reference.gnss import (
 from pdhef_logtool.estimators.reference.inputs import ANTENNA_Y_STD_M, LINEAR_FRICTION, RATE_HZ, knots, sensor_noise
 from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.records.running_mean import running_mean
-from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import LEAST_DIVISOR, S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import INDEPENDENT_SHARE, REFERENCE, StateTrack, make_track
 
 #: Wheelbase for the priors of lengths; for smaller cars they are scaled by the wheelbase.
 WHEELBASE_M = 2.7
-#: 1-sigma of the distance of the rear axle, and of the gain of the gyro.
-REAR_AXLE_STD_M, YAW_RATE_GAIN_STD = 0.1, 0.003
-#: 1-sigma of the gains of accelerometers with known tilt; of the IMU's mounting.
-TILT_GAIN_STD, IMU_YAW_STD_RAD = 0.02, 0.015
+#: 1-sigma of the distance of the rear axle, of the gain of the gyro, of the gains of accelerometers with known tilt,
+#: and of the mounting of the IMU.
+REAR_AXLE_STD_M, YAW_RATE_GAIN_STD, TILT_GAIN_STD, IMU_YAW_STD_RAD = 0.1, 0.003, 0.02, 0.015
 MAX_ITERATIONS, TOLERANCE_M_S, UNSETTLED_M_S = 8, 2e-3, 0.05
 #: The drive is rejected if a parameter is further than this from its prior mean, in prior 1-sigmas. Lengths and the
 #: gain of the gyro have narrow priors (bank in bends has the same effect) and limits of 0.45 m, 0.3 m and 3 %.
@@ -162,10 +161,10 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
         moved = replace(prior, imu_x_m=prior.imu_x_m + prior.unknown_imu_x_m)
         vx, vy = (_solve(rows, moved, noise, gnss=with_gnss)[1].states - best.states)[:, [s.VX, s.VY]].T
         best = replace(best, covariance=best.covariance + np.stack([vx * vx, vx * vy, vy * vy], axis=1))
-    gnss_share = np.clip(1.0 - best.covariance[:, 2] / np.maximum(alone.covariance[:, 2], 1e-12), 0.0, 1.0)
+    gnss_share = np.clip(1.0 - best.covariance[:, 2] / np.maximum(alone.covariance[:, 2], LEAST_DIVISOR), 0.0, 1.0)
     vx, vy = best.states[:, s.VX], best.states[:, s.VY]
     law_m_s = np.where(rows[:, s.LAW_STD] > 0.0, rows[:, s.LAW_STD] * np.hypot(vx, vy), np.inf)
-    law = np.clip(alone.covariance[:, 2] / np.maximum((1.0 + s.LAW_WHITE**2) * law_m_s**2, 1e-12), 0.0, 1.0)
+    law = np.clip(alone.covariance[:, 2] / np.maximum((1.0 + s.LAW_WHITE**2) * law_m_s**2, LEAST_DIVISOR), 0.0, 1.0)
     rate, ax, ay = corrected_inputs(best.states, rows)
     parameters = _parameters(best, prior, tilts=bool(rows[0, s.TILT]))
     refused = _refusal(best, parameters)

@@ -26,7 +26,7 @@ from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import S_PER_NS, BoolArray
+from pdhef_logtool.records.signals import S_PER_NS
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.results.parquet_sink import arrow_array, arrow_schema, parquet_writer
@@ -63,13 +63,13 @@ def write_drive(path: Path, rows: ResidualRows, entry: Mapping[str, Any], *, tru
     OutputError
         When the file cannot be written.
     """
-    chosen = np.ones(len(rows), dtype=np.bool_) if rows.chosen is None else rows.chosen
     schema = arrow_schema(_SCHEMA)
     names = (*FEATURES, *(name for name, _ in TARGETS), *TRUTH)
     numbers = np.hstack([rows.features, rows.targets, rows.truth_velocity])
     columns: dict[str, Any] = dict(zip(names, numbers.T, strict=True))
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
-    columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": chosen, "truth_source": np.full(len(rows), truth_source)}
+    columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": rows.chosen}
+    columns["truth_source"] = np.full(len(rows), truth_source)
     table = pa.Table.from_arrays([arrow_array(columns[f.name], f.type) for f in schema], schema=schema)
     with parquet_writer(path, schema, use_dictionary=["segment"], write_page_checksum=True) as writer:
         writer.write_table(table, row_group_size=ROWS_A_GROUP)
@@ -203,7 +203,6 @@ class DatasetDrive:
         weight = column["weight"].astype(np.float32)
         targets = np.stack([column[name] for name, _ in TARGETS], axis=1).astype(np.float32)
         targets[weight == 0.0] = 0.0
-        chosen: BoolArray = column["chosen"]
         return ResidualRows(
             stamps_ns=stamps[rows],
             features=np.stack([column[name] for name in FEATURES], axis=1).astype(np.float32),
@@ -212,7 +211,7 @@ class DatasetDrive:
             weight=weight,
             segment=column["segment"].astype(np.int64),
             truth_velocity=np.stack([column[name] for name in TRUTH], axis=1).astype(np.float32),
-            chosen=None if chosen.all() else chosen,
+            chosen=column["chosen"],
         )
 
 

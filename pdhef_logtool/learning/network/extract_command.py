@@ -296,11 +296,7 @@ def _plan_jobs(
 
 
 def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
-    """Return the result of each job; a crashed process loses only its own drive."""
-    if len(work) == 1:
-        result = _extract(work[0], reporter.progress)
-        tell_drive(result.record, reporter.warn)
-        return (result,)
+    """Return the result of each job; a crashed process loses only its own drive, a full disk ends the command."""
     results: dict[int, DriveResult] = {}
     progress, preload = FleetProgress(reporter.progress, len(work)), (__name__, *FILTERS)
     ends = supervise(
@@ -308,21 +304,23 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
     )
     with closing(ends):
         for ended in ends:
-            if isinstance(ended.result, OutputError):
-                raise ended.result
             result = ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
+            if isinstance(result, PdhefError):
+                if len(work) == 1 or (isinstance(result, OutputError) and result.ends_run):
+                    raise result
+                result = _failure(ended.item, str(result))
             results[ended.number] = result
             tell_drive(result.record, reporter.warn)
             progress.end(ended.number)
     return tuple(results[number] for number in range(len(work)))
 
 
-def _extract_guarded(job: _Job, progress: Progress) -> DriveResult | OutputError:
-    """Extract a drive; a full disk, which all drives would meet, is returned and ends the command."""
+def _extract_guarded(job: _Job, progress: Progress) -> DriveResult | PdhefError:
+    """Extract a drive, or return its error."""
     try:
         return _extract(job, progress)
     except PdhefError as error:
-        return error if isinstance(error, OutputError) and error.ends_run else _failure(job, str(error))
+        return error
     except MemoryError:
         raise  # another process may have caused it: repeated alone
     except Exception as error:  # noqa: BLE001 (no error in one log may stop the others)
@@ -468,7 +466,7 @@ def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
     truth = derive_truth(plan.survey_truth, plan=plan.truth).track
-    per_white = math.sqrt(2.0) / (median_step_ns(truth.stamps_ns) * 1e-9) ** 1.5  # of one-step differences
+    per_white = math.sqrt(2.0) / (median_step_ns(truth.stamps_ns) * S_PER_NS) ** 1.5  # of one-step differences
     noise = [per_white * white_noise(truth.stamps_ns, c, 0.0) for c in (truth.vy_m_s, truth.yaw_rate_rad_s)]
     within = all(n <= limit for n, limit in zip(noise, residuals.NEGLIGIBLE_NOISE, strict=True))  # False for NaN
     return {

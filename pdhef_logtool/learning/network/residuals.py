@@ -66,8 +66,8 @@ class ResidualRows:
         truth, 1/2 if the uncertainty of its sideslip equals the error of a single track (:func:`~..truth.weight_of`).
     segment : int64 [N], changes wherever the parallel filter restarts: sequences must not cross it.
     truth_velocity : [N, 2], true v_x and v_y at the stamp, as targets of other networks; NaN where unknown.
+    chosen : bool [N], rows selected for training, in addition to a weight above 0.
     truth_std_rad : [N], 1-sigma of the true sideslip.
-    chosen : bool [N], rows selected for training, in addition to a weight above 0; None: all.
     """
 
     stamps_ns: IntArray
@@ -77,8 +77,8 @@ class ResidualRows:
     weight: _Numbers
     segment: IntArray
     truth_velocity: _Numbers
+    chosen: BoolArray
     truth_std_rad: _Numbers | None = None
-    chosen: BoolArray | None = None
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -209,6 +209,7 @@ def residual_rows(
         weight=np.where(usable, weight_of(truth_std), 0.0),
         segment=segment,
         truth_velocity=state[:, :2],
+        chosen=np.ones(count, dtype=np.bool_),
         truth_std_rad=truth_std,
     )
 

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, pairwise
 from pathlib import Path
@@ -191,7 +191,8 @@ def train(
         [p for s in x for p in _pieces(s, empty, len(s.weight))] for x in (validation, test)
     )
     identity = {"recipe": asdict(recipe), "normalisation": asdict(empty.normalisation), "init": init and init.sha256}
-    identity |= {"training": _sha256(train_pieces), "validation": _sha256(validation_pieces)}
+    used = {"training": train_pieces, "validation": validation_pieces}
+    identity |= {name: _sha256(chain.from_iterable(pieces)) for name, pieces in used.items()}
     if (work / CHECKPOINT).is_file():
         run.resume(work / CHECKPOINT, identity)
     for epoch in range(len(run.history), recipe.epochs):
@@ -225,10 +226,10 @@ class _Piece(NamedTuple):
     weight: torch.Tensor
 
 
-def _sha256(pieces: Iterable[_Piece]) -> str:
+def _sha256(parts: Iterable[str | torch.Tensor]) -> str:
     total = hashlib.sha256()
-    for column in chain.from_iterable(pieces):
-        total.update(column.numpy().tobytes())
+    for part in parts:
+        total.update(part.encode() if isinstance(part, str) else part.numpy().tobytes())
     return total.hexdigest()
 
 
@@ -350,7 +351,7 @@ class _Training:
         groups = {"network": self.network.state_dict(), "best": self.best, "optimiser": optimiser}
         tensors = {f"{g}.{name}": value.cpu().contiguous() for g, of in groups.items() for name, value in of.items()}
         document = json.dumps({"identity": identity, "history": [asdict(e) for e in self.history]})
-        about = {"document": document, "sha256": _checkpoint_sha256(document, tensors)}
+        about = {"document": document, "sha256": _sha256([document, *chain(*sorted(tensors.items()))])}
         write_bytes(path, save(tensors, metadata=about))
 
     def resume(self, path: Path, identity: dict[str, Any]) -> None:
@@ -361,7 +362,7 @@ class _Training:
             with safe_open(path, framework="pt") as stored:
                 about = stored.metadata()
                 tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
-            if about["sha256"] != _checkpoint_sha256(about["document"], tensors):
+            if about["sha256"] != _sha256([about["document"], *chain(*sorted(tensors.items()))]):
                 raise ValueError("another hash")
         except (OSError, ValueError, LookupError, TypeError, SafetensorError):
             expected, got = "a checkpoint of a training", "content that is not as it was written"
@@ -382,13 +383,6 @@ class _Training:
         self.network.load_state_dict(groups["network"])
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": states})
         self.history, self.best = [Epoch(**e) for e in document["history"]], groups["best"]
-
-
-def _checkpoint_sha256(document: str, tensors: Mapping[str, torch.Tensor]) -> str:
-    total = hashlib.sha256(document.encode())
-    for name in sorted(tensors):
-        total.update(name.encode() + tensors[name].numpy().tobytes())
-    return total.hexdigest()
 
 
 def _weights(network: ResidualNetwork) -> dict[str, torch.Tensor]:
@@ -522,7 +516,7 @@ def gap_free_runs(drive: ResidualRows) -> Iterable[slice]:
     With a selection of rows, runs end with a selected stretch and begin :data:`LEAD_STEPS` before it.
     """
     piece = drive.segment
-    if drive.chosen is not None:
+    if not drive.chosen.all():
         near = _near(drive.chosen & (drive.weight > 0.0))
         piece = np.cumsum(np.diff(near, prepend=near[:1]) | (np.diff(piece, prepend=piece[:1]) != 0))
     edges = [0, *(np.flatnonzero(np.diff(piece)) + 1).tolist(), drive.stamps_ns.shape[0]]
@@ -534,8 +528,7 @@ def gap_free_runs(drive: ResidualRows) -> Iterable[slice]:
 
 def weights_of(drive: ResidualRows, part: slice) -> FloatArray:
     """Return the weights of a part of a drive, 0 for rows that are not selected."""
-    weight = drive.weight[part].astype(np.float64)
-    return weight if drive.chosen is None else weight * drive.chosen[part]
+    return np.asarray(drive.weight[part] * drive.chosen[part], dtype=np.float64)
 
 
 def _near(chosen: BoolArray) -> BoolArray:
