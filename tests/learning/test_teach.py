@@ -15,7 +15,6 @@ from pdhef_logtool.car.model import ESTIMATED, read_model
 from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.cli.learning import render_learning
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import make_estimator
@@ -30,7 +29,7 @@ from pdhef_logtool.model.priors import REAR_STIFFNESS, TYRES, prior_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
-from tests.command_line import rendered
+from tests.command_line import printed
 from tests.runs.test_inspection_report import write_log
 
 SPAN = {"start": "60", "end": "130"}
@@ -83,7 +82,7 @@ def test_the_figures_say_which_rung_is_used(result):
     figures = result.figures
     assert [t["rung"] for t in figures["rungs"]][:2] == ["none", "linear"]
     assert figures["rung"] in ("none", "linear", "random") and figures["evidence"] in result.text
-    text = rendered(render_learning, result, 150)
+    text = printed("learning", result, 150)
     assert "held-out" in text and "1 drive;" in text
     model = read_model(result.car / MODEL_FILE)
     assert [d.name for d in model.drives] == ["road"] and model.evidence == figures["evidence"]
