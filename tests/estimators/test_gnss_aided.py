@@ -59,7 +59,7 @@ def gnss_drive(name: str) -> GnssDrive:
     t = (signals.stamps_ns - drive.start_ns) * 1e-9
     names = ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
     motion = study.Motion(signals.stamps_ns, *(np.interp(t, drive.times_s, drive.truth[name]) for name in names))
-    stamps_ns, made = study.made_gnss(motion, study.RECEIVERS[study.MADE])
+    stamps_ns, made = study.made_gnss(motion, study.RECEIVERS[study.MADE], "")
     velocity = np.full((len(t), 2), np.nan)
     velocity[np.minimum(np.searchsorted(signals.stamps_ns, stamps_ns), len(t) - 1)] = made
     late_s = np.where(np.isfinite(velocity[:, 0]), LATE_S, np.nan)
