@@ -402,6 +402,38 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
         out[j] = ay
 
 
+# positional: as advance.
+@_inline
+def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, Pxz):  # type: ignore[no-untyped-def]
+    """Write the covariance of the accelerometer's reading with the state to P_xz [3, n]; return its mean and variance.
+
+    They are those of the sigma points of :func:`read_ay` where all are in the dynamic range of a model with axle
+    forces: it is linear except for r². ``slope`` [WIDTH] is overwritten.
+    """
+    turn, curve, n = p.mass_kg / p.yaw_inertia_kg_m2 * p.imu_x_m, -p.imu_y_m, x.shape[0]
+    tilt = 1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient
+    slope[:] = 0.0
+    slope[FRONT], slope[REAR] = math.cos(steer) * (tilt + turn * p.front_m), tilt - turn * p.rear_m
+    slope[ROLL], slope[FORCE_SCALE] = GRAVITY_M_S2, tilt * rate_vy
+    rate, variance = x[YAW_RATE], P[YAW_RATE, YAW_RATE]
+    slope[YAW_RATE] = 2.0 * curve * rate
+    # The points have the fourth powers of the row of r in the root of the covariance, here its squares.
+    of_vx = P[YAW_RATE, VX] ** 2 / P[VX, VX]
+    of_vy = (P[YAW_RATE, VY] - P[VY, VX] * P[YAW_RATE, VX] / P[VX, VX]) ** 2 / (P[VY, VY] - P[VY, VX] ** 2 / P[VX, VX])
+    of_rate = variance - of_vx - of_vy
+    s = curve * curve * (variance * variance + n * (of_vx * of_vx + of_vy * of_vy + of_rate * of_rate))
+    mean = tilt * rate_vy + curve * (variance - rate * rate)
+    Pxz[Z_AY, :] = 0.0
+    for i in range(n):
+        along = slope[places[i]]
+        mean += along * x[i]
+        for a in range(Pxz.shape[1]):
+            Pxz[Z_AY, a] += along * P[i, a]
+    for i in range(n):
+        s += Pxz[Z_AY, i] * slope[places[i]]
+    return mean, s
+
+
 @njit(cache=True, _nrt=True)
 def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-untyped-def]
     """Set the axle forces of a state [n] to the steady tyre forces at their lateral acceleration; without roll."""

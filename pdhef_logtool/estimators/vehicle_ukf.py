@@ -66,6 +66,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     physics_parameters,
     planar_ay,
     push,
+    quadratic_ay,
     read_ay,
     settle_forces,
 )
@@ -376,13 +377,17 @@ def expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, read
     """Write the innovation [3], NaN for missing samples, the lower triangle of its covariance with R, and P_xz [3, n].
 
     ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
-    the sigma points of a_y are sufficient.
+    the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
     """
-    m, first = changing(layout), layout.sensor_bias
-    cholesky(P, root)
-    draw(x, root, places, m, points)
-    read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
-    ay, S[Z_AY, Z_AY] = reading_moments(reading, root, m, away, Pxz, Z_AY)
+    m, s, n, first = changing(layout), layout.force_scale, x.shape[0], layout.sensor_bias
+    least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
+    if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
+        ay, S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz)
+    else:
+        cholesky(P, root)
+        draw(x, root, places, m, points)
+        read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+        ay, S[Z_AY, Z_AY] = reading_moments(reading, root, m, away, Pxz, Z_AY)
     nu[Z_AY], nu[Z_YAW_RATE], nu[Z_SPEED] = now.ay - ay, now.yaw_rate - x[YAW_RATE], now.speed - x[VX]
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
         for a in range(Pxz.shape[1]):
