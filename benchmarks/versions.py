@@ -1,7 +1,7 @@
 """The same commands by this version and an earlier one, in turns on one machine.
 
 Processor seconds are the best of two turns, memory the smallest peak of a process; code is compiled before. The last
-column says how many times as much the earlier version takes.
+column: cost of the earlier version over that of this one.
 """
 
 from __future__ import annotations
