@@ -1,6 +1,6 @@
 """Run the speed benchmarks and print their tables; ``--write-docs`` puts them into docs/reliability.md.
 
-    python -m benchmarks.performance [NAME ...] [--against TREE] [--write-docs]
+    python -m benchmarks.performance [NAME ... | --against TREE] [--write-docs]
 
 A benchmark is a module of this package: its docstring heads its section of the page, ``rows()`` measures.
 ``--against`` compares with another source tree, for example of the last release (``git worktree add``): commands of

@@ -7,9 +7,7 @@ is running, or as start while a module is loaded.
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
@@ -17,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 from benchmarks.hour import run_words
-from benchmarks.measuring import CACHE, ROOT, Row
+from benchmarks.measuring import CACHE, ROOT, Row, command_cost
 from benchmarks.one_hour_log import drive_log
 
 TICK_S = 0.002
@@ -71,8 +69,7 @@ def rows() -> list[Row]:
     measured = []
     for work, words in works.items():
         output = CACHE / "where.json"
-        command = [sys.executable, "-m", "benchmarks.where", str(output), *map(str, words)]
-        subprocess.run(command, cwd=ROOT, capture_output=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=False)
+        command_cost(output, *words, module="benchmarks.where")
         spent = Counter(json.loads(output.read_text(encoding="utf-8")))
         measured.append(Row(work, spent.total(), "s"))
         measured += [Row(f"of it {name}", s, "s") for name, s in spent.most_common() if s >= LEAST_S]

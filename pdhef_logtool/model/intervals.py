@@ -3,14 +3,14 @@
 The variance of sideslip has three sources: the estimator's own, the uncertainty of the parameters, and contradictions
 between the sensors:
 
-    s² = χ² (s_own² + s_car²) + (Σ_i (v_y,i − v_y)² + c² + (s_l r)²) / v_x²,
+    s² = χ² s_own² + s_car² + (Σ_i (v_y,i − v_y)² + c² + (s_l r)²) / v_x²,
 
 where v_y,i is the lateral velocity of the physics filter on the vehicle one 1-sigma away in direction i of the
 posterior, or of the prior without a fit to the log. s_l is the uncertainty of the distance from the rear axle to the
 centre of gravity if no file contains it: the lateral velocity is determined at the rear axle. On a vehicle of the
-drive's posterior, s_car is the model error of a single track, which is nearly constant within a drive, and χ ≥ 1 is the
-RMS error of the fit over the assumed one (Birge 1932); otherwise χ s_car is the rear slip angle on a crossfall. c is
-the lateral kinematic consistency, as far as it correlates with the driving: of the whole drive if the vehicle was
+drive's posterior, χ ≥ 1 is the RMS error of the fit over the assumed one (Birge 1932), and s_car is χ times the model
+error of a single track, which is nearly constant within a drive; otherwise s_car is the rear slip angle on a crossfall.
+c is the lateral kinematic consistency, as far as it correlates with the driving: of the whole drive if the vehicle was
 fitted to it, otherwise as available online (:func:`running_consistency`). The variance of v_y is the same sum as a
 velocity. Estimates are unchanged.
 """
@@ -44,7 +44,7 @@ from pdhef_logtool.records.signals import S_PER_NS, SIGNAL_COLUMNS, FloatArray, 
 from pdhef_logtool.records.steps import RESTART_GAP_S, release
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
-#: Factor of the consistency of a whole drive, and s_car; from seven simulated cars and real drives of four cars.
+#: Factor of the consistency of a whole drive, and s_car over χ; from seven simulated cars and real drives of four cars.
 DRIVE_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
 #: χ without a posterior of the drive, where the noise of a filter includes the model error of a_y; tuned on 8 simulated
 #: cars, each identified on one drive and evaluated on drives of other manoeuvres.
@@ -101,7 +101,7 @@ class Interval:
             added: FloatArray | float = DRIVE_SHARE * driven_consistency(track, calibrated, slow_m_s)
         else:
             added = running_consistency(track, signals, vehicle.roll_gradient_rad_per_m_s2)
-        added = np.hypot(np.nan_to_num(added), self.scale * self.car_std_rad * track.vx_m_s)
+        added = np.hypot(np.nan_to_num(added), self.car_std_rad * track.vx_m_s)
         added = np.hypot(added, self.cg_std_m * track.yaw_rate_rad_s)
         return widened(track, np.hypot(np.nan_to_num(added), self._spread), slow_m_s, self.scale)
 
@@ -162,7 +162,7 @@ def _of_drive(car: Car, posterior: Posterior) -> Interval:
     """Return the interval on the vehicle of the drive's posterior."""
     filters = tuple(physics_filter(v, posterior.noise) for v in (posterior.vehicle, *posterior.varied))
     scale = max(posterior.error_scale, EARLIER_ERROR_SCALE) if posterior.causal else posterior.error_scale
-    return Interval(filters, car.vehicle, scale, CAR_STD_RAD, car.cg_std_m, whole_drive=not posterior.causal)
+    return Interval(filters, car.vehicle, scale, scale * CAR_STD_RAD, car.cg_std_m, whole_drive=not posterior.causal)
 
 
 def _of_file(car: Car, share: float, *, use_speed: bool) -> Interval:
@@ -174,8 +174,7 @@ def _of_file(car: Car, share: float, *, use_speed: bool) -> Interval:
     vehicles = (physics.vehicle, *prior_variations(physics.vehicle, share=share))
     bare = physics.vehicle.physics.model_copy(update=dict.fromkeys(CURES, False))
     filters = tuple(replace(physics, vehicle=v.model_copy(update={"physics": bare})) for v in vehicles)
-    car_std_rad = CROSSFALL_STD_RAD / coefficients(physics.vehicle)[1]
-    return Interval(filters, car.vehicle, car_std_rad=car_std_rad / OWN_SHARE)
+    return Interval(filters, car.vehicle, car_std_rad=CROSSFALL_STD_RAD / coefficients(physics.vehicle)[1])
 
 
 def _in_blocks(signals: Signals) -> tuple[Signals, int, IntArray]:
