@@ -3,7 +3,6 @@
 from collections.abc import Mapping as Mapped
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,9 +31,8 @@ def checks_of(
     truth: Mapped[str, Channel] | None = None,
     derived: TruthTrack | None = None,
     vehicle: VehicleParameters | None = None,
-    **options: Any,
 ) -> tuple[Check, ...]:
-    return check_drive(measure(signals, truth, derived, vehicle), vehicle, **options)
+    return check_drive(measure(signals, truth, derived, vehicle))
 
 
 def channel(name: str, time_s: np.ndarray, values: np.ndarray) -> Channel:
@@ -244,10 +242,7 @@ def planted(found: MappedChannels, lever_m: float = 0.0, gain: float = 1.0, dela
 
 
 def late_checks(found: MappedChannels, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
-    truth = derive_truth(found.truth)
-    return checks_of(
-        found.signals, found.truth, truth, vehicle, latency=truth_latency(found.signals, found.truth, truth)
-    )
+    return checks_of(found.signals, found.truth, derive_truth(found.truth), vehicle)
 
 
 @pytest.mark.parametrize(

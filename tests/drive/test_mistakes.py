@@ -163,11 +163,11 @@ def test_exchanged_degrees_of_a_place_are_named_as_such():
     mapping = Mapping({}, {n: SignalSource(n, "/fix", n) for n in degrees})
     derived = derive_truth(truth)
     measured = measure(signals, truth, derived, VEHICLE, mapping)
-    checks = check_drive(measured, VEHICLE)
+    checks = check_drive(measured)
     (sign,) = (c for c in checks if c.subject == "truth.lat_deg" and c.verdict == "failed")
     assert sign.name == "truth.lat_deg.sign" and "exchanged" in sign.remedy and "lon_deg" in sign.remedy
     both = replace(measured, scales=measured.scales | {"truth.x_m": 1.0, "truth.y_m": 1.0})
-    found = check_drive(both, VEHICLE)  # positions in metres go before degrees
+    found = check_drive(both)  # positions in metres go before degrees
     assert {c.subject for c in found if c.verdict == "failed" and c.subject != "ay_m_s2"} == {"truth.y_m"}
 
 
