@@ -423,4 +423,4 @@ def _partial(
     aside, left = np.stack(others, axis=1)[finite], np.full((2, len(finite)), np.nan)
     for rest, column in zip(left, (predicted, measured), strict=True):
         rest[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
-    return compare(replace(law, least_correlation=MIN_PARTIAL_CORRELATION), *left, finite)
+    return compare(replace(law, least_correlation=MIN_PARTIAL_CORRELATION), left[0], left[1], finite)
