@@ -26,6 +26,8 @@ _STEERING = ("steer_rad", "steering_wheel_rad")
 #: Table names that are not available for estimators.
 RESERVED_NAMES = ("truth", "sensors", "reference")
 
+#: SI units by signal, ground truth and estimate.
+_UNITS = SIGNAL_UNITS | TRUTH_UNITS | ESTIMATE_UNITS
 #: Kind of unit of a quantity by its SI unit.
 _KINDS = {"rad": "angle", "rad/s": "rate", "m/s": "speed", "m/s^2": "acceleration", "m": "position"}
 
@@ -155,7 +157,7 @@ def _complete(name: str, table: object, where: str, problems: list[str]) -> obje
     if (unit := named.pop("unit", None)) is None:
         return named
     scale = table.get("scale", 1.0)
-    si = (SIGNAL_UNITS | TRUTH_UNITS | ESTIMATE_UNITS).get(name, "")
+    si = _UNITS.get(name, "")
     kind = "wheel rate" if si == "rad/s" and name.startswith("wheel") else _KINDS.get(si, "")
     units = UNITS.get(kind, {})
     factor = unit_of(f"x_{plain_unit(unit)}", kind)[1] if units and isinstance(unit, str) else None
@@ -261,15 +263,12 @@ def mapping_to_toml(
         lines += ["", "[recorder]", *(f"{_toml(topic)} = {_toml(kind)}" for topic, kind in mapping.recorder)]
     if mapping.can is not None:
         lines += ["", "[can]", *_lines(mapping.can)]
-    for section, sources, units in (("signals", mapping.signals, SIGNAL_UNITS), ("truth", mapping.truth, TRUTH_UNITS)):
-        for name in (n for n in units if n in sources):
+    tables = {"signals": mapping.signals, "truth": mapping.truth}
+    tables |= {f"estimates.{_toml(name)}": sources for name, sources in mapping.estimates.items()}
+    for section, sources in tables.items():
+        for name in (n for n in _UNITS if n in sources):
             lines += ["", *_comment(notes.get(f"{section}.{name}", notes.get(name, "")))]
-            lines += [_header(section, name, 32), *_lines(sources[name])]
-            lines += _alternative_lines(section, name, alternatives)
-    for estimator, sources in mapping.estimates.items():
-        for name in (n for n in ESTIMATE_UNITS if n in sources):
-            lines += ["", f"[estimates.{_toml(estimator)}.{name}]  # {ESTIMATE_UNITS[name]}"]
-            lines += _lines(sources[name])
+            lines += [*_table(section, sources[name]), *_alternative_lines(section, name, alternatives)]
     if mapping.quality is not None:
         lines += ["", *_comment(notes.get("truth_quality", "Ground truth is used where this condition is met."))]
         lines += ["[truth_quality]", *_lines(mapping.quality)]
@@ -282,61 +281,50 @@ def _missing_lines(mapping: Mapping, notes: MappingABC[str, str], alternatives: 
     lines: list[str] = []
     missing = missing_signals(mapping)
     if missing:
-        lines += ["", "# Not mapped. To add one, remove the # and name its topic and field:"]
-    for name in missing:
-        lines += _alternative_lines("signals", name, alternatives) or [
-            *_example("signals", name),
-            *_comment(notes.get(name, "")),
+        lines += ["", "# Not mapped. To add one, remove the # and name its topic and field (a dotted path, [3] indexes"]
+        lines += [
+            "# an array); scale is to SI and ISO 8855: 0.017453292519943295 for deg, 0.2777777777777778 for km/h."
         ]
+    for name in missing:
+        alternative = _alternative_lines("signals", name, alternatives)
+        lines += alternative or [*_example("signals", name), *_comment(notes.get(name, ""))]
     if not mapping.truth:
         lines += ["", "# No ground truth is mapped. For a comparison name at least a body velocity, for example:"]
-        lines += [line for name in TRUTH_UNITS for line in _alternative_lines("truth", name, alternatives)] or [
-            line for name in ("vx_m_s", "vy_m_s") for line in _example("truth", name)
-        ]
+        alternative = [line for name in TRUTH_UNITS for line in _alternative_lines("truth", name, alternatives)]
+        lines += alternative or [line for name in ("vx_m_s", "vy_m_s") for line in _example("truth", name)]
     return lines
 
 
-def _header(section: str, name: str, width: int) -> str:
-    return f"{f'[{section}.{name}]':{width}} # {(SIGNAL_UNITS | TRUTH_UNITS)[name]}"
+def _table(section: str, source: SignalSource) -> list[str]:
+    return [f"[{section}.{source.name}]  # {_UNITS[source.name]}", *_lines(source)]
 
 
 def _example(section: str, name: str) -> list[str]:
     """Return a commented table for a missing signal."""
-    return [
-        "#",
-        f"# {_header(section, name, 30)}",
-        '# topic = "/..."',
-        '# field = "..."          # dotted path, [3] indexes an array',
-        "# scale = 1.0            # to SI and ISO 8855: 0.017453292519943295 for deg, 0.2777777777777778 for km/h",
-    ]
+    return ["#", *(f"# {line}" for line in _table(section, SignalSource(name, "/...", "...")))]
 
 
 def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate]) -> list[str]:
     """Return commented tables of the best candidates that are not taken."""
-    names = {"steer_rad": _STEERING, "steering_wheel_rad": _STEERING}.get(name, (name,))
+    names = _STEERING if name in _STEERING else (name,)
     mine = [c for c in candidates if c.section == section and c.source.name in names and not c.taken]
     lines: list[str] = []
     for candidate in mine[:ALTERNATIVES]:
-        unit = (SIGNAL_UNITS | TRUTH_UNITS)[candidate.source.name]
         doubt = f"; unsure: {candidate.doubt}" if candidate.doubt else ""
         lines += ["#", *_comment(f"Instead, score {candidate.score:.2f}: {candidate.reason}{doubt}")]
-        lines += [
-            f"# [{section}.{candidate.source.name}]  # {unit}",
-            *(f"# {x}" for x in _lines(candidate.source)),
-        ]
+        lines += [f"# {line}" for line in _table(section, candidate.source)]
     return lines
 
 
 def missing_signals(mapping: Mapping) -> tuple[str, ...]:
     """Return the missing signals that an estimator can use; the speed may come from any wheel."""
-    have = set(mapping.signals)
-    out = []
-    if not have & {"steer_rad", "steering_wheel_rad"}:
-        out.append("steer_rad")
-    out += [name for name in ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s") if name not in have]
-    if "speed_m_s" not in have and not any(name.startswith("wheel_speed_") for name in have):
-        out.append("speed_m_s")
-    return tuple(out)
+    have = mapping.signals.keys()
+    given = {
+        "steer_rad": bool(have & {*_STEERING}),
+        **{name: name in have for name in ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")},
+        "speed_m_s": any(name.startswith(("speed_m_s", "wheel_speed_")) for name in have),
+    }
+    return tuple(name for name, is_given in given.items() if not is_given)
 
 
 def _lines(record: SignalSource | QualityGate | CanSettings) -> list[str]:
