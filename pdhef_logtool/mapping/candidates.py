@@ -205,7 +205,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     results = []
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
-        if len(fields) > _NAMES["most_fields"] or vendors.of(topic.type_name).left_out:
+        if len(fields) > _NAMES["most_fields"]:
             continue
         if is_joints(topic):
             joints = () if role == "command" else joint_meanings(log, topic)
