@@ -23,6 +23,8 @@ PIECE_NS = 10 * NS_PER_S
 #: Cell size of the grid; a car's motion changes little within it.
 CELL_NS = NS_PER_S // 10
 CELL_S = CELL_NS * S_PER_NS
+#: Cells on each side of one over which it is smoothed, and a derivative is taken.
+HALF_CELLS = 2
 #: Larger numbers are no measurements of a car.
 LARGEST = 1e12
 #: Longest gap that is interpolated, for sensors with one sample per second.
@@ -33,6 +35,8 @@ MOST_COLUMNS = 16
 EVIDENCE: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 LOG_ODDS: dict[str, float] = EVIDENCE["log_odds"]
 CLEAR: float = EVIDENCE["relations"]["clear"]
+#: Quantiles between which values are usual; a sensor's code for "invalid" is outside.
+_USUAL = (0.005, 0.995)
 #: Smallest number of cells that gives information.
 FEWEST_CELLS = 40
 
@@ -85,7 +89,7 @@ class Seen:
     def largest(self) -> float:
         """Largest magnitude without a few outliers; NaN without a number."""
         finite = np.abs(self.values[np.isfinite(self.values)])
-        return float(np.quantile(finite, 0.995)) if finite.shape[0] else float("nan")
+        return float(np.quantile(finite, _USUAL[1])) if finite.shape[0] else float("nan")
 
     @property
     def changes(self) -> bool:
@@ -156,11 +160,11 @@ class Pieces:
         busy = max(1, int(np.count_nonzero(count)))
         return cells, float(values.shape[0]) / (busy * CELL_S)
 
-    def rate_of(self, cells: NDArray[Any]) -> NDArray[Any]:
-        """Return the time derivative of values on the grid [M], real or complex, within each piece."""
+    def rate_of(self, cells: NDArray[Any], half: int = HALF_CELLS) -> NDArray[Any]:
+        """Return the time derivative of values on the grid [M], real or complex, over ``half`` cells to each side."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
-        out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_S)
+        out[:, half:-half] = (rows[:, 2 * half :] - rows[:, : -2 * half]) / (2 * half * CELL_S)
         return out.ravel()
 
     def turning(self, direction: NDArray[np.complex128]) -> FloatArray:
@@ -172,7 +176,9 @@ class Pieces:
         """Return the mean of five neighbouring cells [M], to match the bandwidth of :meth:`rate_of`."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
-        out[:, 2:-2] = sum(rows[:, i : rows.shape[1] - 4 + i] for i in range(5)) / 5.0
+        width = 2 * HALF_CELLS + 1
+        inner = rows.shape[1] - 2 * HALF_CELLS
+        out[:, HALF_CELLS:-HALF_CELLS] = sum(rows[:, i : i + inner] for i in range(width)) / width
         return out.ravel()
 
 
@@ -198,7 +204,7 @@ def _usual(values: FloatArray) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     if finite.shape[0] == 0:
         return 0.0, 0.0
-    low, high = np.quantile(finite, [0.005, 0.995])
+    low, high = np.quantile(finite, _USUAL)
     room = 3.0 * max(float(high - low), 1e-9)
     return float(low) - room, float(high) + room
 
@@ -216,8 +222,7 @@ def fit(y: FloatArray, x: FloatArray) -> Fit:
     use = np.isfinite(y) & np.isfinite(x)
     if np.count_nonzero(use) < FEWEST_CELLS:
         return Fit()
-    # Exclude a few outliers, such as a sensor's "invalid".
-    a, b = (np.clip(values, *np.quantile(values, [0.005, 0.995])) for values in (y[use], x[use]))
+    a, b = (np.clip(values, *np.quantile(values, _USUAL)) for values in (y[use], x[use]))
     da, db = a - a.mean(), b - b.mean()
     sa, sb = float(np.sqrt(np.mean(da * da))), float(np.sqrt(np.mean(db * db)))
     if not (sa > 1e-12 and sb > 1e-12):

@@ -504,8 +504,7 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         is_level = np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
         in_g = bool(is_level and abs(abs(means[2]) - 1.0) < EVIDENCE["gravity"]["in_g"])
     if in_g:
-        fast = np.abs(draft.values(gyro, "yaw_rate_rad_s"))
-        in_deg = fast.shape[0] > 0 and float(np.quantile(fast, 0.995)) > MOST["rate"]
+        in_deg = Seen.of(draft.values(gyro, "yaw_rate_rad_s"), np.empty(0), 0.0).largest > MOST["rate"]
         also = ", its rates in deg/s, as no car turns so fast in rad/s" if in_deg else ""
         reason = f"its accelerations are in g, as gravity is 1{also}; its type's unit is m/s²"
         draft.doubt("imu", (imu.name,), imu.name, reason)
