@@ -122,20 +122,19 @@ class Pieces:
         requests: dict[str, list[str]] = {}
         for topic, path in dict.fromkeys(fields):
             requests.setdefault(topic, []).append(path)
-        parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
+        parts: dict[tuple[str, str], list[tuple[IntArray, FloatArray]]] = {}
         for number, start in enumerate(self.starts if requests else ()):
             for topic, columns in self._columns(requests, start).items():
-                cell = (columns.log_time_ns - start) // CELL_NS
+                cells = (columns.log_time_ns - start) // CELL_NS + number * self.cells_a_piece
                 for path in requests[topic]:
                     values = np.asarray(columns.fields[path], dtype=np.float64)
                     values = np.where(np.abs(values) < LARGEST, values, np.nan)
-                    if values.ndim == 1:
-                        parts.setdefault((topic, path), []).append((number, cell, values))
-                        continue
-                    for i, column in enumerate(values.T[:MOST_COLUMNS]):
-                        parts.setdefault((topic, f"{path}[{i}]"), []).append((number, cell, column))
-        whole = {key: np.concatenate([column for _, _, column in samples]) for key, samples in parts.items()}
-        return {key: Seen(values, partial(self._on_grid, values, parts[key])) for key, values in whole.items()}
+                    elements = enumerate(values.T[:MOST_COLUMNS])
+                    its = {path: values} if values.ndim == 1 else {f"{path}[{i}]": v for i, v in elements}
+                    for name, column in its.items():
+                        parts.setdefault((topic, name), []).append((cells, column))
+        whole = {key: [*map(np.concatenate, zip(*samples, strict=True))] for key, samples in parts.items()}
+        return {key: Seen(values, partial(self._on_grid, values, cells)) for key, (cells, values) in whole.items()}
 
     def _columns(self, requests: Mapping[str, Sequence[str]], start: int) -> dict[str, Columns]:
         try:
@@ -144,21 +143,15 @@ class Pieces:
             alone = requests.items() if len(requests) > 1 else ()
             return {t: c for topic, paths in alone for t, c in self._columns({topic: paths}, start).items()}
 
-    def _on_grid(self, values: FloatArray, samples: list[tuple[int, IntArray, FloatArray]]) -> tuple[FloatArray, float]:
+    def _on_grid(self, values: FloatArray, cells: IntArray) -> tuple[FloatArray, float]:
         """Return the means of the usual values on the grid [M], and the sample rate."""
-        total = np.zeros(len(self.starts) * self.cells_a_piece)
-        count = np.zeros_like(total)
         low, high = _usual(values)
-        for number, cell, column in samples:
-            use = (column >= low) & (column <= high)
-            use &= (cell >= 0) & (cell < self.cells_a_piece)
-            where = number * self.cells_a_piece + cell[use]
-            np.add.at(total, where, column[use])
-            np.add.at(count, where, 1.0)
+        use, size = (values >= low) & (values <= high), len(self.starts) * self.cells_a_piece
+        total, count = np.bincount(cells[use], values[use], size), np.bincount(cells[use], minlength=size)
         with np.errstate(invalid="ignore", divide="ignore"):
-            cells = _filled((total / count).reshape(len(self.starts), -1)).ravel()
+            means = _filled((total / count).reshape(len(self.starts), -1)).ravel()
         busy = max(1, int(np.count_nonzero(count)))
-        return cells, float(values.shape[0]) / (busy * CELL_S)
+        return means, float(values.shape[0]) / (busy * CELL_S)
 
     def rate_of(self, cells: NDArray[Any], half: int = HALF_CELLS) -> NDArray[Any]:
         """Return the time derivative of values on the grid [M], real or complex, over ``half`` cells to each side."""
