@@ -23,8 +23,6 @@ PIECE_NS = 10 * NS_PER_S
 #: Cell size of the grid; a car's motion changes little within it.
 CELL_NS = NS_PER_S // 10
 CELL_S = CELL_NS * S_PER_NS
-#: Cells on each side of one over which it is smoothed, and a derivative is taken.
-HALF_CELLS = 2
 #: Larger numbers are no measurements of a car.
 LARGEST = 1e12
 #: Longest gap that is interpolated, for sensors with one sample per second.
@@ -153,7 +151,7 @@ class Pieces:
         busy = max(1, int(np.count_nonzero(count)))
         return means, float(values.shape[0]) / (busy * CELL_S)
 
-    def rate_of(self, cells: NDArray[Any], half: int = HALF_CELLS) -> NDArray[Any]:
+    def rate_of(self, cells: NDArray[Any], half: int = 2) -> NDArray[Any]:
         """Return the time derivative of values on the grid [M], real or complex, over ``half`` cells to each side."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
@@ -165,13 +163,12 @@ class Pieces:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray((self.rate_of(direction) / direction).imag)
 
-    def smooth(self, cells: FloatArray) -> FloatArray:
-        """Return the mean of five neighbouring cells [M], to match the bandwidth of :meth:`rate_of`."""
+    def smooth(self, cells: FloatArray, half: int = 2) -> FloatArray:
+        """Return the mean over ``half`` cells to each side [M], to match the bandwidth of :meth:`rate_of`."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
-        width = 2 * HALF_CELLS + 1
-        inner = rows.shape[1] - 2 * HALF_CELLS
-        out[:, HALF_CELLS:-HALF_CELLS] = sum(rows[:, i : i + inner] for i in range(width)) / width
+        width, inner = 2 * half + 1, rows.shape[1] - 2 * half
+        out[:, half:-half] = sum(rows[:, i : i + inner] for i in range(width)) / width
         return out.ravel()
 
 
