@@ -123,7 +123,9 @@ class Pieces:
         parts: dict[tuple[str, str], list[tuple[IntArray, FloatArray]]] = {}
         for number, start in enumerate(self.starts if requests else ()):
             for topic, columns in self._columns(requests, start).items():
-                cells = (columns.log_time_ns - start) // CELL_NS + number * self.cells_a_piece
+                cells = (columns.log_time_ns - start) // CELL_NS
+                is_inside = (cells >= 0) & (cells < self.cells_a_piece)
+                cells = np.where(is_inside, cells + number * self.cells_a_piece, -1)
                 for path in requests[topic]:
                     values = np.asarray(columns.fields[path], dtype=np.float64)
                     values = np.where(np.abs(values) < LARGEST, values, np.nan)
@@ -144,7 +146,7 @@ class Pieces:
     def _on_grid(self, values: FloatArray, cells: IntArray) -> tuple[FloatArray, float]:
         """Return the means of the usual values on the grid [M], and the sample rate."""
         low, high = _usual(values)
-        use, size = (values >= low) & (values <= high), len(self.starts) * self.cells_a_piece
+        use, size = (values >= low) & (values <= high) & (cells >= 0), len(self.starts) * self.cells_a_piece
         total, count = np.bincount(cells[use], values[use], size), np.bincount(cells[use], minlength=size)
         with np.errstate(invalid="ignore", divide="ignore"):
             means = _filled((total / count).reshape(len(self.starts), -1)).ravel()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Sequence
 from collections.abc import Mapping as MappingABC
 from dataclasses import fields, replace
@@ -13,9 +12,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat
 
 from pdhef_logtool.mapping.naming import UNITS, plain_unit, unit_of
 from pdhef_logtool.mapping.records import CAN_PREFIX, RECORDER_STAMPS, CanSettings, Mapping, QualityGate, SignalSource
-from pdhef_logtool.records.errors import MappingError, MappingFileError
+from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 from pdhef_logtool.storage.documents import checked, one_of, read_toml
+from pdhef_logtool.storage.toml_text import toml_value
 
 if TYPE_CHECKING:
     from pdhef_logtool.mapping.candidates import Candidate
@@ -262,13 +262,13 @@ def mapping_to_toml(
     ]
     lines += _comment("\n".join([notes.get("", ""), *mapping.notes]))
     if mapping.rate_hz or mapping.group:
-        lines += ["", *(f"{n} = {_toml(v)}" for n in ("rate_hz", "group") if (v := getattr(mapping, n)))]
+        lines += ["", *(f"{n} = {toml_value(v)}" for n in ("rate_hz", "group") if (v := getattr(mapping, n)))]
     if mapping.recorder:
-        lines += ["", "[recorder]", *(f"{_toml(topic)} = {_toml(kind)}" for topic, kind in mapping.recorder)]
+        lines += ["", "[recorder]", *(f"{toml_value(topic)} = {toml_value(kind)}" for topic, kind in mapping.recorder)]
     if mapping.can is not None:
         lines += ["", "[can]", *_lines(mapping.can)]
     tables = {"signals": mapping.signals, "truth": mapping.truth}
-    tables |= {f"estimates.{_toml(name)}": sources for name, sources in mapping.estimates.items()}
+    tables |= {f"estimates.{toml_value(name)}": sources for name, sources in mapping.estimates.items()}
     for section, sources in tables.items():
         for name in (n for n in _UNITS if n in sources):
             lines += ["", *_comment(notes.get(f"{section}.{name}", notes.get(name, "")))]
@@ -334,21 +334,15 @@ def missing_signals(mapping: Mapping) -> tuple[str, ...]:
 def _lines(record: SignalSource | QualityGate | CanSettings) -> list[str]:
     """Return the entries of a table that differ from the defaults, and the scale."""
     entries = ((f.name, getattr(record, f.name), f.default) for f in fields(record) if f.name != "name")
-    return [f"{name} = {_toml(value)}" for name, value, default in entries if value != default or name == "scale"]
+    given = {name: value for name, value, default in entries if value != default or name == "scale"}
+    if isinstance(record, CanSettings):
+        given["dbc"] = [*map(_path_text, record.dbc)]
+    return [f"{name} = {toml_value(value)}" for name, value in given.items()]
 
 
 def entries_of(source: SignalSource, *names: str) -> str:
     """Return entries of a source's table in one line, for a remedy."""
-    return ", ".join(f"{name} = {_toml(getattr(source, name))}" for name in names)
-
-
-def _toml(value: object) -> str:
-    """Return a value as TOML: JSON, except that TOML requires DEL to be escaped."""
-    try:
-        text = json.dumps(value, ensure_ascii=False, allow_nan=False, default=_path_text)
-    except ValueError:
-        raise MappingError(expected="finite numbers in a mapping", got=repr(value), where="mapping") from None
-    return text.replace("\x7f", "\\u007f")
+    return ", ".join(f"{name} = {toml_value(getattr(source, name))}" for name in names)
 
 
 def _path_text(path: Path) -> str:
