@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physics_oracle import ALL_PARTS, Oracle, names_of, parts, vehicle
-from reference_car import FRICTION
+from reference_car import FRICTION, on_axles
 
 from pdhef_logtool.car import nominal_model
 from pdhef_logtool.car.nominal_model import model_parameters
@@ -74,12 +74,12 @@ def ay_of(v: VehicleParameters, x: np.ndarray, steer: float) -> float:
 SEDAN = default_vehicle().model_copy(
     update={"imu_position_m": (0.4, -0.3, 0.0), "roll_gradient_rad_per_m_s2": 0.009, "low_speed_blend_m_s": 4.0}
 )
-STIFF = AxleTyre(cornering_stiffness_n_per_rad=105_000.0), AxleTyre(cornering_stiffness_n_per_rad=96_000.0)
 ONE_FRICTION = (
     AxleTyre(B=11.1, C=1.05, D_n=7991.0, E=-0.51, reference_friction=0.85),
     AxleTyre(B=10.6, C=1.65, D_n=5708.0, E=0.34, reference_friction=1.0),
 )
-CARS = [SEDAN, *(SEDAN.model_copy(update={"tyres": Tyres(front=a, rear=b)}) for a, b in (STIFF, ONE_FRICTION))]
+OTHER = SEDAN.model_copy(update={"tyres": Tyres(front=ONE_FRICTION[0], rear=ONE_FRICTION[1])})
+CARS = [SEDAN, on_axles(SEDAN, 105_000.0, 96_000.0), OTHER]
 
 
 @pytest.mark.parametrize("car", CARS, ids=["magic formula", "cornering stiffness", "formula of one friction"])

@@ -1,35 +1,17 @@
 """Axle slip angles and forces from ground truth, and the curve through them, on numbers worked out by hand."""
 
 import math
-from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
-from reference_car import FRONT_TYRE, REAR_TYRE, Drive, drive, keep, slalom, with_noise
+from reference_car import FRONT_TYRE, REAR_TYRE, Drive, drive, keep, on_axles, signals_at, with_noise
 
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.records.tracks import make_track
 from studies.defaults import fit_physics as study
 
-CAR = default_vehicle().model_copy(
-    update={
-        "tyres": Tyres(
-            front=AxleTyre(cornering_stiffness_n_per_rad=110_000.0),
-            rear=AxleTyre(cornering_stiffness_n_per_rad=95_000.0),
-        )
-    }
-)
-
-
-def fit_drive(seconds: float = 6.0, period_s: float = 0.01, **changes: Any) -> study.FitDrive:
-    made = drive(slalom(), seconds, step_s=period_s)
-    stamps = made.signals.stamps_ns
-    truth = make_track(
-        "truth", stamps, vx_m_s=made.vx, vy_m_s=made.vy, yaw_rate_rad_s=made.r, ay_m_s2=made.ay, valid=made.vx > 0
-    )
-    return replace(study.FitDrive("made", made.signals, truth), **changes)
+CAR = on_axles(default_vehicle(), 110_000.0, 95_000.0)
 
 
 # ---- axle forces ----
@@ -42,7 +24,7 @@ def test_axle_forces_follow_from_newton_and_euler():
     full = np.full(n, 1.0)
     r = 0.1 * np.arange(n) * 0.01
     truth = make_track("t", stamps, vx_m_s=20 * full, vy_m_s=-0.4 * full, yaw_rate_rad_s=r, ay_m_s2=3.0 * full)
-    signals = replace(fit_drive(3.99).signals, stamps_ns=stamps, steer_rad=0.2 * full)
+    signals = signals_at(stamps, steer_rad=0.2)
     (front_slip, front_force), (rear_slip, rear_force) = study.axle_samples(
         [study.FitDrive("t", signals, truth)] * 2, CAR
     ).values()
@@ -96,14 +78,14 @@ def weaving(seed: int):
     return lambda t: 0.017 * sum(math.sin(2.0 * math.pi * f * t + p) for f, p in tones)
 
 
-def noisy_fit_drive(made: Drive, seed: int, **changes) -> study.FitDrive:
+def noisy_fit_drive(made: Drive, seed: int) -> study.FitDrive:
     """Drive as identification sees it, at 50 Hz: sensors with noise, truth without."""
     half = np.arange(len(made.signals)) % 2 == 0
     signals = keep(with_noise(made.signals, seed), half)
     columns = {"vx_m_s": made.vx, "vy_m_s": made.vy, "yaw_rate_rad_s": made.r, "ay_m_s2": made.ay}
     truth = make_track("truth", signals.stamps_ns, valid=np.ones(half.sum(), dtype=bool),
                        **{name: column[half] for name, column in columns.items()})  # fmt: skip
-    return replace(study.FitDrive(f"made {seed}", signals, truth), **changes)
+    return study.FitDrive(f"made {seed}", signals, truth)
 
 
 @cache
@@ -111,11 +93,10 @@ def static_drive(seed: int, seconds: float = 24.0) -> study.FitDrive:
     return noisy_fit_drive(drive(weaving(seed), seconds, speed=24.0, speed_every=1), seed)
 
 
-def guess(front: float = 1.0, rear: float = 1.0, **changes) -> VehicleParameters:
+def guess(front: float, rear: float) -> VehicleParameters:
     """The sedan without roll, its tyres known by a stiffness that is wrong by these factors."""
-    tyres = [AxleTyre(cornering_stiffness_n_per_rad=k * s) for k, s in zip((front, rear), STIFFNESS, strict=True)]
-    update = {"tyres": Tyres(front=tyres[0], rear=tyres[1]), "roll_gradient_rad_per_m_s2": 0.0, **changes}
-    return default_vehicle().model_copy(update=update)
+    sedan = on_axles(default_vehicle(), front * STIFFNESS[0], rear * STIFFNESS[1])
+    return sedan.model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
 
 
 @pytest.fixture(scope="module")
