@@ -108,16 +108,7 @@ def test_an_offset_of_the_steering_angle_is_no_residual():
     off = made.signals.steer_rad + 0.002
     rows = residual_rows(*oracle_window(made, steer_rad=off), VehicleUkf(oracle.as_vehicle()), period_s=0.01)
     use = rows.weight > 0
-    arrays = ResidualRows(
-        rows.stamps_ns[use],
-        rows.features[use].astype(np.float32),
-        rows.targets[use].astype(np.float32),
-        rows.step_s[use],
-        rows.weight[use].astype(np.float32),
-        rows.segment[use],
-        rows.truth_velocity[use].astype(np.float32),
-        rows.chosen[use],
-    )
+    arrays = ResidualRows(**{name: getattr(rows, name)[use] for name in ResidualRows.__slots__})
     mean = (arrays.targets / arrays.step_s[:, None]).mean(axis=0)
     assert np.abs(mean).min() > 0.05
     assert np.abs(mean - training.steering_offset(arrays, oracle.as_vehicle())).max() < 0.2 * np.abs(mean).max()
