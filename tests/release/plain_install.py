@@ -77,7 +77,7 @@ def main() -> None:
             (installed,) = (folder / "venv").glob("[Ll]ib/**/site-packages/pdhef_logtool")
             shutil.copytree(ROOT / compiled, installed.parent / compiled, dirs_exist_ok=True)
         pdhef = (python, "-m", "pdhef_logtool")
-        _do("logs", *pdhef, "simulate", "suite", "--count", str(MANY), "--duration", "4", "-o", logs, cwd=folder)
+        _do("logs", *pdhef, "simulate", "suite", "--count", str(MANY), "--duration", "3", "-o", logs, cwd=folder)
         two = sorted(logs.glob("*.mcap"))[:2]
         _do("run of 2 logs with --jobs 2", *pdhef, "run", *two, "-o", folder / "two", *RUN, "--jobs", "2", cwd=folder)
         _do(f"run of {MANY} logs", *pdhef, "run", logs, "-o", folder / "many", *RUN, cwd=folder)
