@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
-    EVERYTHING,
     MAX_TIME_NS,
     MCAP_MAGIC,
     UNVERIFIED,
@@ -39,7 +38,6 @@ from pdhef_logtool.logs.container import (
     RecordT,
     Span,
     SpanDamageError,
-    Wanted,
     block_from_lists,
     describe_damage,
     items_at_bytes,
@@ -81,13 +79,12 @@ class McapContainer(FileContainer):
     remedy = "is it an MCAP 1.0 recording?"
     chunks: list[Extent]
 
-    def __init__(self, file: LogFile, source: ByteSource | None = None, wanted: Wanted = EVERYTHING) -> None:
+    def __init__(self, file: LogFile, source: ByteSource | None = None) -> None:
         self.profile = ""
-        self._wanted = wanted
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
         self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
-        self._unread: dict[int, int] = {}  # start and end of the parts of a remote file that are not wanted
+        self._is_partial = False  # whether the chunks of a remote file are fetched when they are read
         self._closed = False
         self._data_end: int | None = None  # place of the record
         self._is_summary_damaged = False
@@ -138,12 +135,9 @@ class McapContainer(FileContainer):
     def _indexed_places(self) -> dict[int, tuple[Extent, Span | None]]:
         """Return by their places the chunks, and attachments that are not read, that a sound summary describes.
 
-        All parts of a remote file that are read are requested. Its message indexes are not examined.
+        All else of a remote file is requested. Its message indexes are not examined.
         """
         source = self.source
-        is_whole = not source.is_remote or self._wanted == EVERYTHING or source.size <= self._wanted.above_bytes
-        if is_whole:
-            source.prefetch([(0, source.size)])
         index, self._is_summary_damaged = read_index(source, self.meter.limits)
         if index is None or (source.is_remote and not index.in_order):
             source.prefetch([(0, source.size)])
@@ -151,15 +145,11 @@ class McapContainer(FileContainer):
         self._schemas.update(index.schemas)
         self._raw_channels.update(index.channels)
         places: dict[int, tuple[Extent, Span | None]] = {extent.start: (extent, span) for extent, span in index.chunks}
-        if not is_whole:
+        if source.is_remote:
+            self._is_partial = True
             places |= {start: (Extent(start, end, end), None) for start, end in index.attachments}
-            topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
-            unread = dict(index.attachments)
-            for extent, span in index.chunks:
-                if not self._wanted.has([topics[id_] for id_ in span.counts], span):
-                    unread[extent.start] = extent.index_end
-            self._unread = dict(sorted(unread.items()))
-            source.prefetch(zip([0, *self._unread.values()], [*self._unread, source.size], strict=True))
+            ends = [places[start][0].index_end for start in sorted(places)]
+            source.prefetch(zip([0, *ends], [*sorted(places), source.size], strict=True))
         return places
 
     def _add_indexed(self, extent: Extent, span: Span | None) -> int:
@@ -359,18 +349,18 @@ class McapContainer(FileContainer):
             )
 
     def _check_data(self) -> None:
-        """Check the CRC of the data section if no other checksum or count protects the messages.
+        """Check the CRC of the data section if no other checksum or count protects the messages, unless it is remote.
 
         After other damage, the check is skipped: it adds no information.
         """
         if self._data_end is None or self.lost:
             return
         (crc,) = _U32.unpack(self.source.read(self._data_end + RECORD.size, _U32.size))
-        read = [extent for extent in self.chunks if extent.start not in self._unread]
-        if not crc or (self._statistics is not None and all(map(self._has_crc, read))):
+        chunks = self.chunks[:1] if self._is_partial else self.chunks
+        if not crc or (self._statistics is not None and all(map(self._has_crc, chunks))):
             return
-        if self._unread:
-            what = "the CRC of the data section was not verified, as not all of the log was read"
+        if self._is_partial:
+            what = "the CRC of the data section was not verified, as the log is read in parts from its server"
             self.lost.append(Loss(UNVERIFIED, what, str(self.path), severity="note"))
         elif self._crc(0, self._data_end) != crc:
             what = (
