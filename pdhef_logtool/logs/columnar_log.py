@@ -20,11 +20,10 @@ from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
 from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema, concatenate_columns, missing_column
 from pdhef_logtool.logs.definitions import SHIPPED
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, Requests, TopicInfo
 from pdhef_logtool.logs.message_schema import (
     FieldInfo,
     MessageSchema,
-    MissingDefinitionError,
     NoSchemaError,
     SchemaError,
     Selection,
@@ -121,10 +120,10 @@ class ColumnarLog(DriveLog):
         return self
 
     @property
-    def index(self) -> ColumnarLog | None:
-        """The log itself if its index is complete and consistent; else None."""
+    def is_indexed(self) -> bool:
+        """Whether the index of the log is complete and consistent."""
         sound = all(container.by_index for container in self.containers)
-        return self if sound and all(loss.kind == UNVERIFIED for loss in self.lost) else None
+        return sound and all(loss.kind == UNVERIFIED for loss in self.lost)
 
     @property
     def databases(self) -> tuple[Path, ...]:
@@ -219,9 +218,6 @@ class ColumnarLog(DriveLog):
         schemas = [self._schema(channel) for channel in self._by_topic.get(topic, ())]
         if not schemas or any(isinstance(schema, MessageSchema) for schema in schemas):
             return ""
-        if isinstance(schemas[0], MissingDefinitionError):
-            missing = schemas[0].type_name.replace("/msg/", "/")
-            return f"the log contains no definition of {missing}; give its .msg file by --set msgs=DIR"
         return str(schemas[0])
 
     def first_messages(self, topic: str, most: int) -> list[object]:
@@ -245,20 +241,20 @@ class ColumnarLog(DriveLog):
             if block is not None:
                 yield from map(block.message, block.rows.get(id_, ()))
 
-    def _read(
-        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
+    def read(
+        self, requests: Requests, start_ns: int | None = None, end_ns: int | None = None, *, quiet: bool = False
     ) -> dict[str, Columns]:
+        """Read columns; see :class:`~.drive_log.DriveLog`."""
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         if not quiet:
-            for channel in (channel for topic in requests for channel in self._by_topic[topic]):
+            for channel in (channel for topic, paths in requests.items() if paths for channel in self._by_topic[topic]):
                 channel.asked = True
-        plans |= {topic: _Plan((), {}) for topic in stamps if topic not in plans}
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
         for c, container in enumerate(self.containers):
-            spans = tuple(self._to_read(plans, container, *window_ns))
+            spans = tuple(self._to_read(plans, container, start_ns, end_ns))
             container.prefetch(spans)
             with container.meter.running():
-                for columns in (columns for span in spans for columns in self._read_span(plans, c, span, window_ns)):
+                for columns in (its for span in spans for its in self._read_span(plans, c, span, start_ns, end_ns)):
                     parts[columns.topic].append(columns)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
@@ -380,7 +376,9 @@ class ColumnarLog(DriveLog):
             if not ids.isdisjoint(span.counts) and span.overlaps(start_ns, end_ns):
                 yield span
 
-    def _read_span(self, plans: Mapping[str, _Plan], c: int, span: Span, window_ns: Window) -> Iterator[Columns]:
+    def _read_span(
+        self, plans: Mapping[str, _Plan], c: int, span: Span, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[Columns]:
         """Yield the columns of the requested topics in a span, by channel."""
         channels = self.containers[c].channels
         wanted = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
@@ -388,7 +386,7 @@ class ColumnarLog(DriveLog):
         block = self.load(c, span, wanted, payloads)
         if block is None:
             return
-        keep = in_window(block.log_time_ns, *window_ns)
+        keep = in_window(block.log_time_ns, start_ns, end_ns)
         is_inside = bool(keep.all())
         # By the channels of the block: the counts of the span can be from a wrong index.
         for id_, rows in block.rows.items():

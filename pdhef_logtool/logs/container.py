@@ -116,10 +116,10 @@ class Block:
         """Return some of the messages."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
-    def split(self, before_ns: float) -> tuple[Block | None, Block | None]:
-        """Return the messages before a time and the others, None without any; they ascend in log time."""
+    def split(self, before_ns: float) -> tuple[Block, Block]:
+        """Return the messages before a time and the others; they ascend in log time."""
         n = int(np.searchsorted(self.log_time_ns, before_ns))
-        return self.take(slice(n)) if n else None, self.take(slice(n, None)) if n < len(self) else None
+        return self.take(slice(n)), self.take(slice(n, None))
 
     @staticmethod
     def merged(parts: Sequence[Block], head: int = 0) -> Block:

@@ -82,8 +82,8 @@ def channel_schema(
             channel.type_name, channel.schema_encoding, text, channel.encoding, distro, limits, definitions
         )
     if channel.encoding == "json":
-        text = channel.schema_data if channel.schema_encoding == "jsonschema" else b""
-        return json_schema(channel.type_name, text, examples, limits)
+        data = channel.schema_data if channel.schema_encoding == "jsonschema" else b""
+        return json_schema(channel.type_name, data, examples, limits)
     if channel.encoding == "protobuf":
         if channel.schema_encoding != "protobuf":
             raise NoSchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
@@ -168,19 +168,23 @@ class ChannelDecoder:
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self.single_decoder()
-        parts_by_path: dict[str, list[list[Any]]] = {s.path: [[] for _ in s.components] for s in self.selections}
         most = min(self.schema.limits.array_width, _most_columns(len(rows)))
         batch = np.cumsum(block.length[rows]) // _BYTES_AT_ONCE
+        parts = []
         for its in np.split(rows, np.flatnonzero(np.diff(batch)) + 1):
             messages = [decode(block.message(row)) for row in its.tolist()]
             self.undecodable += [row for row, message in zip(its.tolist(), messages, strict=True) if message is None]
-            for s in self.selections:
-                parts = [values_at(messages, steps) for steps in s.components]
-                if s.shape == "array":
-                    parts = [[self._bounded(s, *item, most) for item in zip(its.tolist(), parts[0], strict=True)]]
-                for values, more in zip(parts_by_path[s.path], parts, strict=True):
-                    values += more
-        return {s.path: self._single_column(s, parts_by_path[s.path]) for s in self.selections}
+            parts.append({s.path: self._single_column(s, messages, its, most) for s in self.selections})
+        return {s.path: concatenate_columns([part[s.path] for part in parts]) for s in self.selections}
+
+    def _single_column(self, selection: Selection, messages: list[Any], rows: IntArray, most: int) -> NDArray[Any]:
+        """Return a column of decoded messages, the ``rows`` of a block; arrays have at most this many elements."""
+        parts = [values_at(messages, steps) for steps in selection.components]
+        if selection.shape == "array":
+            arrays = [self._bounded(selection, *item, most) for item in zip(rows.tolist(), parts[0], strict=True)]
+            return _padded(arrays, selection.length)
+        columns = [np.array([_number(value) for value in part], np.float64) for part in parts]
+        return _column(selection, columns, len(messages))
 
     def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> Any:
         """Return the elements of an array; none if too wide."""
@@ -199,12 +203,6 @@ class ChannelDecoder:
             return _tolerant(json.loads, schema)
         function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
         return _tolerant(bind(function, typename=schema.type_name), schema)
-
-    def _single_column(self, selection: Selection, parts: Sequence[Sequence[Any]]) -> NDArray[Any]:
-        if selection.shape == "array":
-            return _padded(parts[0], selection.length)
-        columns = [np.array([_number(value) for value in part], np.float64) for part in parts]
-        return _column(selection, columns, len(parts[0]))
 
 
 def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Callable[[bytes], object]:

@@ -12,7 +12,6 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from functools import cached_property
 from io import BytesIO
 from itertools import accumulate
@@ -89,19 +88,17 @@ class McapContainer(FileContainer):
         self._data_end: int | None = None  # place of the record
         self._is_summary_damaged = False
         self._statistics: Statistics | None = None
-        self._has_end = False  # whether the file ends with its magic bytes
-        self._opened_chunks = 0  # number of chunks that the summary does not describe
+        self._opened_chunks = 0  # number of chunks that no index describes
         super().__init__(file, source)
 
     def _walk(self) -> None:
         source, size = self.source, self.source.size
-        indexed = self._indexed_places()
-        self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
+        indexed = self._indexed_chunks()
         places = [*sorted(indexed), size]
         self.position = self._read_header()
         for offset in self._places():
             if offset in indexed:
-                self.position = self._add_indexed(*indexed[offset])
+                self.position = self._add_chunk(*indexed[offset])
                 continue
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self._closed = True
@@ -132,11 +129,8 @@ class McapContainer(FileContainer):
         opcode, length = RECORD.unpack(self.source.read(offset, RECORD.size))
         return opcode, offset + RECORD.size + length
 
-    def _indexed_places(self) -> dict[int, tuple[Extent, Span | None]]:
-        """Return by their places the chunks, and attachments that are not read, that a sound summary describes.
-
-        All else of a remote file is requested. Its message indexes are not examined.
-        """
+    def _indexed_chunks(self) -> dict[int, tuple[Extent, Span]]:
+        """Return by their places the chunks that a sound summary describes; request all else of a remote file."""
         source = self.source
         index, self._is_summary_damaged = read_index(source, self.meter.limits)
         if index is None or (source.is_remote and not index.in_order):
@@ -144,28 +138,12 @@ class McapContainer(FileContainer):
             return {}
         self._schemas.update(index.schemas)
         self._raw_channels.update(index.channels)
-        places: dict[int, tuple[Extent, Span | None]] = {extent.start: (extent, span) for extent, span in index.chunks}
         if source.is_remote:
             self._is_partial = True
-            places |= {start: (Extent(start, end, end), None) for start, end in index.attachments}
-            ends = [places[start][0].index_end for start in sorted(places)]
-            source.prefetch(zip([0, *ends], [*sorted(places), source.size], strict=True))
-        return places
-
-    def _add_indexed(self, extent: Extent, span: Span | None) -> int:
-        """Add a chunk, or an attachment, by its entry in the summary; return the start of the next record."""
-        if span is None:
-            self._records_at[Attachment].append((extent.start, extent.end))
-            return extent.end
-        named = span if self.source.is_remote else self._span_by_indexes(extent)
-        if named is None or named.counts != span.counts:
-            self._lose_indexes(extent)
-        if named is not None and _agree(named, span):
-            self.add_span(extent, named)
-        else:
-            self._opened_chunks += 1
-            self.add_content(extent, span)
-        return extent.index_end
+            parts = sorted([*((extent.start, extent.index_end) for extent, _ in index.chunks), *index.attachments])
+            starts, ends = [start for start, _ in parts], [end for _, end in parts]
+            source.prefetch(zip([0, *ends], [*starts, source.size], strict=True))
+        return {extent.start: (extent, span) for extent, span in index.chunks}
 
     def _span_by_indexes(self, extent: Extent) -> Span | None:
         """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
@@ -179,10 +157,6 @@ class McapContainer(FileContainer):
         if falls.any():  # some writers sort an index by time
             times = times[np.lexsort((offsets, np.repeat(np.arange(len(parts)), [n for _, n in parts])))]
         return Span.of((id_, times[end - n : end]) for (id_, n), end in zip(parts, ends, strict=True))
-
-    def _lose_indexes(self, extent: Extent) -> None:
-        what = f"the message indexes of the chunk at byte {extent.start} are damaged"
-        self.lose("bad-record", f"{what}: its messages are found without them")
 
     def _read_header(self) -> int:
         """Read the header record, which is the first one; return its end."""
@@ -212,7 +186,7 @@ class McapContainer(FileContainer):
             self._declare(opcode, self._payload(start, end))
             return end
         if opcode == Opcode.CHUNK:
-            return self._add_chunk(start, end)
+            return self._add_chunk(self._extent_of(start, end))
         if opcode == Opcode.ATTACHMENT:
             self._check_attachment(start, end)
         elif opcode == Opcode.DATA_END:
@@ -278,39 +252,41 @@ class McapContainer(FileContainer):
         self.add_span(Extent(offset, base + place, base + place, is_chunk=False), span)
         return base + place
 
-    def _add_chunk(self, start: int, end: int) -> int:
-        """Add a chunk that no summary describes; return the end of its message indexes.
-
-        Its content describes it. In a file without an end, message indexes that agree with the head of the chunk do.
-        """
+    def _extent_of(self, start: int, end: int) -> Extent:
+        """Return the extent of the chunk record in bytes [start, end) and of the message indexes behind it."""
         index_end, size = end, self.source.size
         while index_end + INDEX_RECORD.size <= size:
             opcode, following = self._record_head(index_end)
             if opcode & ~_FIRST_PRIVATE != Opcode.MESSAGE_INDEX or following > size:
                 break  # one wrong bit makes an index a private record
             index_end = following
-        extent = Extent(start, end, index_end)
-        first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
-        claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, {})
-        named = self._span_by_indexes(extent)
-        if named is None:
-            self._lose_indexes(extent)
-        elif sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked:
-            claimed = replace(claimed, counts=named.counts)
-            is_known = bool(named.counts) and named.counts.keys() <= self._raw_channels.keys()
-            fits = _agree(named, claimed) and unpacked <= self.meter.limits.chunk_bytes
-            if not self._has_end and is_known and fits:
-                self.add_span(extent, named)
-                return index_end
+        return Extent(start, end, index_end)
+
+    def _add_chunk(self, extent: Extent, claimed: Span | None = None) -> int:
+        """Add a chunk; return the end of its message indexes.
+
+        The message indexes describe it if they agree with the summary (``claimed``), else with the head of the chunk;
+        if they do not, or name unknown channels, its content does. A remote chunk is described by the summary alone.
+        """
+        named = claimed if self._is_partial else self._span_by_indexes(extent)
+        if claimed is None:
+            first, last, unpacked, *_ = _CHUNK.unpack(self.source.read(extent.start + RECORD.size, _CHUNK.size))
+            fits = named is not None and sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked
+            counts = named.counts if named is not None and fits else {}
+            claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, counts)
+        if named is None or named.counts != claimed.counts:
+            what = f"the message indexes of the chunk at byte {extent.start} are damaged"
+            self.lose("bad-record", f"{what}: its messages are found without them")
+        elif _agree(named, claimed) and named.counts and named.counts.keys() <= self._raw_channels.keys():
+            self.add_span(extent, named)
+            return extent.index_end
         self._opened_chunks += 1
         block = self.add_content(extent, claimed)
-        if block is not None:
-            held = block.counts
-            missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
-            if missing:
-                what = f"{missing} messages that the index names are not in the chunk at byte {start}"
-                self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
-        return index_end
+        held = block.counts if block is not None else claimed.counts
+        if missing := sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items()):
+            what = f"{missing} messages that the index names are not in the chunk at byte {extent.start}"
+            self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
+        return extent.index_end
 
     def _finish(self) -> None:
         if self._closed and not self._data_end:
@@ -457,7 +433,10 @@ class McapContainer(FileContainer):
             yield record
 
     def _check_attachment(self, start: int, end: int) -> None:
-        """Add an attachment record; check its CRC block by block."""
+        """Add an attachment record; check its CRC block by block, unless the file is remote."""
+        if self._is_partial:
+            self._records_at[Attachment].append((start, end))
+            return
         start += RECORD.size
         head = ReadDataStream(BytesIO(self.source.read(start, min(end - start, _ATTACHMENT_HEAD_BYTES))))
         head.read(2 * _U64.size)  # times

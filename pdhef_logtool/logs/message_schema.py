@@ -159,10 +159,6 @@ class NoSchemaError(SchemaError):
 class MissingDefinitionError(NoSchemaError):
     """No definition of a type is available."""
 
-    def __init__(self, type_name: str) -> None:
-        super().__init__(f"no definition of {type_name}")
-        self.type_name = type_name
-
 
 @contextmanager
 def parsing(what: str) -> Iterator[None]:
@@ -249,7 +245,8 @@ def ros_schema(
         text = definitions.text_of(name)
         limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
         if not text.strip():
-            raise MissingDefinitionError(name)
+            what = f"the log contains no definition of {name.replace('/msg/', '/')}"
+            raise MissingDefinitionError(f"{what}; give its .msg file by --set msgs=DIR")
         return text
 
     with parsing(what):
@@ -368,7 +365,8 @@ def json_schema(type_name: str, text: bytes, examples: Iterable[bytes], limits: 
         if text.strip():
             document = json.loads(text.decode("utf-8", errors="replace"))
             root = _json_node(document, document, Unfolding(limits, what), 1, (), 0)
-        for example in islice(examples if _is_open(root) else (), _EXAMPLES):
+        first = islice(examples, _EXAMPLES)
+        while _is_open(root) and (example := next(first, None)) is not None:
             try:
                 limits.check("schema_bytes", len(example), what)
                 root = _filled(root, _example_node(json.loads(example), Unfolding(limits, what), 0))

@@ -117,9 +117,19 @@ def log_metadata(path: LogPlace, limits: ResourceLimits = DEFAULT_LIMITS) -> dic
 
 
 def _open_file(file: LogFile) -> Container | DriveLog:
-    """Open one file."""
-    is_compressed = _head_of(file.path).startswith(ZSTD_MAGIC)
-    return _open_compressed(file) if is_compressed else _open_plain(file)
+    """Open one file; a compressed one is decompressed to a temporary one first."""
+    if not _head_of(file.path).startswith(ZSTD_MAGIC):
+        return _open_plain(file)
+    stack = ExitStack()
+    stack.callback(file.release)
+    try:
+        copy = Path(stack.enter_context(scratch_folder())) / file.path.stem
+        with file.meter.running(file.path.stat().st_size):
+            cut = decompress_file(file.path, copy, file.meter)
+        return _open_plain(replace(file, path=copy, release=stack.close, cut=cut))
+    except BaseException:
+        stack.close()
+        raise
 
 
 def _open_remote(file: LogFile, place: RemotePlace) -> Container | DriveLog:
@@ -163,20 +173,6 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
         if file.cut:
             opened.lose("truncated", file.cut)
     return opened
-
-
-def _open_compressed(file: LogFile) -> Container | DriveLog:
-    """Decompress a file to a temporary one and open that."""
-    stack = ExitStack()
-    stack.callback(file.release)
-    try:
-        copy = Path(stack.enter_context(scratch_folder())) / file.path.stem
-        with file.meter.running(file.path.stat().st_size):
-            cut = decompress_file(file.path, copy, file.meter)
-        return _open_plain(replace(file, path=copy, release=stack.close, cut=cut))
-    except BaseException:
-        stack.close()
-        raise
 
 
 def _open_folder(file: LogFile) -> DriveLog:

@@ -248,7 +248,8 @@ def test_a_log_on_a_server_says_what_was_not_verified(tmp_path):
         place = RemotePlace(server.place("log.mcap"))
         with closing(open_log(place)) as log:
             assert [(loss.kind, loss.severity) for loss in log.lost] == [("unverified", "note")]
-            assert log.index is not None
+            assert log.messages is not None
+            assert log.messages.is_indexed
             assert len(log.read({"/a": ["a"]})["/a"]) == N
 
 

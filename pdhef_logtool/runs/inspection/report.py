@@ -294,13 +294,14 @@ def inspect_log(
     """
     mapping = mapping_of(mapping)
     with closing(open_log(path, options.limits, options.msgs, tables_for(mapping, options.tables))) as log:
-        index = None if whole else log.index
+        source = log.messages
+        index = source if source is not None and source.is_indexed and not whole else None
         # Most of a shorter one is read anyway.
         long = index is not None and (index.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS)
         if index is not None and not (long and index.size > WHOLE_BYTES):
             index = None
-        if index is None and log.messages is not None:
-            log.messages.prefetch({topic.name for topic in log.topics}, [(log.start_ns, log.end_ns)])
+        if index is None and source is not None:
+            source.prefetch({topic.name for topic in log.topics}, [(log.start_ns, log.end_ns)])
         inspection = inspect_drive_log(log, mapping, prefer_truth=options.prefer_truth, index=index)
         sample, damaged = inspection.sample, any(loss.severity == "lost" for loss in log.lost)
         if sample is None or not (damaged or sample.chunks > MOST_SAMPLED * sample.of_chunks):
