@@ -352,7 +352,7 @@ def _listed(length: int | None) -> int:
 
 
 def json_schema(type_name: str, text: bytes, examples: Iterable[bytes], limits: ResourceLimits) -> MessageSchema:
-    """Parse a JSON Schema; the first messages define the places that it leaves open, without a text all.
+    """Parse a JSON Schema; the first three messages define the places that it leaves open, without a text all.
 
     Raises
     ------
@@ -365,7 +365,7 @@ def json_schema(type_name: str, text: bytes, examples: Iterable[bytes], limits: 
         if text.strip():
             document = json.loads(text.decode("utf-8", errors="replace"))
             root = _json_node(document, document, Unfolding(limits, what), 1, (), 0)
-        first = islice(examples, _EXAMPLES)
+        first = islice(examples, 3)
         while _is_open(root) and (example := next(first, None)) is not None:
             try:
                 limits.check("schema_bytes", len(example), what)
@@ -396,8 +396,6 @@ def _filled(node: Node, other: Node) -> Node:
     return node
 
 
-#: Messages by which a JSON Schema is completed.
-_EXAMPLES = 8
 #: Scalars of JSON Schema by their type.
 _JSON_SCALARS: dict[object, Scalar] = {
     "number": Scalar("number"),
@@ -543,21 +541,23 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
     steps = parse_path(path.removesuffix(ending))
     node: Node | None = schema.root
     for step in steps:
-        node = node if isinstance(node, Unknown) else _part(node, step)
+        node = _part(node, step)
     if node is None:
         raise nearest(
             path, [leaf.path for leaf in schema.fields], f"a field of {schema.type_name or 'the message'}", topic
         )
-    if ending:
-        # Records of ROS messages are read without their texts.
-        if not (isinstance(node, Unknown) or _is_text(node)) or schema.wire not in ("json", "protobuf"):
-            raise MappingError(
-                expected=f"a text of {TEXT_ENDINGS[ending]} digits in a JSON or protobuf message",
-                got=repr(path),
-                where=topic,
-                remedy=f"drop the ending {ending}",
-            )
+    # Records of ROS messages are read without their texts.
+    has_texts = schema.wire in ("json", "protobuf")
+    if ending and has_texts and (isinstance(node, Unknown) or _is_text(node)):
         return Selection(path, "array", (steps,), None, TEXT_ENDINGS[ending])
+    if ending:
+        expected = f"a text of {TEXT_ENDINGS[ending]} digits in a JSON or protobuf message"
+        raise MappingError(expected=expected, got=repr(path), where=topic, remedy=f"drop the ending {ending}")
+    return _number_selection(schema, topic, path, node, steps)
+
+
+def _number_selection(schema: MessageSchema, topic: str, path: str, node: Node, steps: tuple[Step, ...]) -> Selection:
+    """Return how the node at some steps becomes a column; raises MappingError for one that is no number."""
     if _is_text(node):
         raise _no_number(schema, topic, path, "a text")
     if isinstance(node, Unknown | Scalar):
@@ -580,7 +580,9 @@ def _is_text(node: Node) -> bool:
 
 
 def _part(node: Node | None, step: Step) -> Node | None:
-    """Return a member of a struct or an element of an array, or None."""
+    """Return a member of a struct or an element of an array, or None; below an open place all is open."""
+    if isinstance(node, Unknown):
+        return node
     if isinstance(node, Struct) and isinstance(step, str):
         return node.members.get(step)
     is_element = isinstance(node, Array) and isinstance(step, int) and (node.length is None or step < node.length)
