@@ -347,18 +347,6 @@ def test_speed_and_course_of_a_receiver_are_gnss_signals_if_the_path_agrees(turn
     assert signals["gnss_speed_m_s"].scale == pytest.approx(1.0 / 3.6)
 
 
-def test_a_table_in_long_form_has_a_column_for_each_signal(tmp_path):
-    rows = [(t, "Lat Acc [m/s²]", a) for t, a in zip(TIME_S, AY, strict=True)]
-    rows += [(t, "speed [km/h]", v) for t, v in zip(TIME_S, SPEED, strict=True)]
-    rows += [(t, "gnss", 2.0 * t) for t in TIME_S[::10]]
-    text = "\n".join(["timestamp,signal,value", *(f"{t:.2f},{n},{float(v)!r}" for t, n, v in sorted(rows)), ""])
-    read = opened(tmp_path / "a.csv", text)
-    assert read.topics == {"csv": N, "csv_2": N // 10}
-    assert read.units == {"Lat_Acc": "m/s²", "speed": "km/h", "gnss": ""}
-    for name, values in (("Lat_Acc", AY), ("speed", SPEED), ("gnss", 2.0 * TIME_S[::10])):
-        np.testing.assert_allclose(read.columns[name], values)
-
-
 @pytest.mark.parametrize("clock", ["millis", "sensorTimestamp_since1970(s)"])
 def test_a_clock_is_dates_before_times_since_a_start(clock, tmp_path):
     start = 1.7e9 if "1970" in clock else 0.0
@@ -366,23 +354,6 @@ def test_a_clock_is_dates_before_times_since_a_start(clock, tmp_path):
     rows = [f"{(start + t) * factor:.6f},{100.0 + t:.3f},{v:.4f}" for t, v in zip(TIME_S, SPEED, strict=True)]
     read = opened(tmp_path / "a.txt", "\n".join([f"{clock},gyroTimestamp_sinceReboot(s),speed (km/h)", *rows, ""]))
     assert read.stamps_ns["csv"][0] == (RELATIVE_NS if start == 0.0 else round(start * 1e9))
-
-
-def test_named_data_of_a_recorder_take_their_name_unit_and_the_clock_beside_them(tmp_path):
-    def entry(name: str, data: np.ndarray, unit: str) -> dict[str, object]:
-        return {"Name": name, "Data": data, "Unit": unit}
-
-    slow = TIME_S[::2]
-    record = {
-        "X": [entry("axis1", TIME_S, "s"), entry("axis2", slow, "s")],
-        "Y": [entry("a_y", AY, "m/s^2"), entry("v_veh", SPEED[::2], "km/h")],
-    }
-    savemat(tmp_path / "a.mat", {"rec": record})
-    read = opened(tmp_path / "a.mat")
-    assert read.units == {"a_y": "m/s^2", "v_veh": "km/h"}
-    np.testing.assert_allclose(read.columns["v_veh"], SPEED[::2])
-    stamps = min(read.stamps_ns.values(), key=len)
-    np.testing.assert_allclose((stamps - RELATIVE_NS) * 1e-9, slow, atol=1e-9)
 
 
 def test_texts_that_name_no_signals_make_no_columns(tmp_path):
