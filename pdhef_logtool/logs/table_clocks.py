@@ -262,6 +262,7 @@ def scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -
     size = np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch)
     has_time = has_time & (size < _CLOCKS["last_ns"] / factor)
     given = values[has_time]
+    given = given if given.dtype.kind in "iu" else given.astype(np.float64)
     # The fraction apart: a product would lose the last digits of a date.
     whole = given if given.dtype.kind in "iu" else np.floor(given)
     fraction = np.round((given - whole) * float(factor)).astype(np.int64)
