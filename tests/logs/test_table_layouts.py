@@ -25,10 +25,7 @@ OTHERS = (
     "csv-stamps csv-dots json-split txt-sentences txt-nmea txt-estimator"
 )
 #: Layouts of signals at the same times.
-ONE_CLOCK = (
-    "txt-kinds jsonl-portuguese txt-aligned txt-positions jsonl-keys jsonl-collection vbo mat-pairs mat-quantities "
-    "mat-names json-channels hdf5-frame"
-)
+ONE_CLOCK = "txt-kinds txt-aligned txt-positions vbo mat-pairs mat-quantities mat-names json-channels hdf5-frame"
 
 
 @pytest.mark.parametrize("layout", [name for name in WRITERS if name not in OTHERS.split()])
