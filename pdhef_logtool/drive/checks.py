@@ -76,21 +76,15 @@ UNKNOWN: Figure = (math.nan, math.inf)
 
 @dataclass(frozen=True, eq=False)
 class CheckedDrive:
-    """Data of a drive for the checks.
-
-    Attributes
-    ----------
-    measured : columns [N] on one grid, SI, by signal; names of ground truth begin with ``truth.``.
-    vehicle : from the file, or the default vehicle (``has_file`` False).
-    latency : of ground truth against the gyro, or of the gyro.
-    related : checks of signals by their relations.
-    """
+    """A drive with the checks of its signals by their relations (``related``)."""
 
     measured: Measured
-    vehicle: VehicleParameters
-    has_file: bool
-    latency: LatencyEstimate | None
     related: tuple[Check, ...]
+
+    @property
+    def vehicle(self) -> VehicleParameters:
+        """The vehicle of the file, or the default vehicle."""
+        return self.measured.vehicle or default_vehicle()
 
     @property
     def columns(self) -> Mapping[str, FloatArray]:
@@ -111,7 +105,7 @@ class CheckedDrive:
     @cached_property
     def errors(self) -> SensorErrors:
         """The errors of the sensors by ground truth; unknown without it, or if it is wrong."""
-        return sensor_errors(self.columns) if self.measured.has_truth and not self.wrong & _TRUTH else SensorErrors()
+        return sensor_errors(self.columns) if self.measured.derived and not self.wrong & _TRUTH else SensorErrors()
 
 
 # ------------------------------------------------------------------------------------------------ IMU
@@ -236,24 +230,24 @@ def _accelerometer(drive: CheckedDrive) -> Iterator[Check]:
         return
     (place, std), file = errors.place_m, drive.vehicle.imu_position_m[0]
     is_outside = abs(place - file) > max(MOST_LEVER_M, FAILS_STD * std)
-    doubt = "no_car" if is_outside else "" if drive.has_file else "no_file"
+    doubt = "no_car" if is_outside else "" if drive.measured.vehicle else "no_file"
     yield judge("ay_m_s2.place", place - file, std, doubt=doubt, place=place, file=file)
     if np.nanstd(drive.columns["truth.vx_m_s"] * drive.columns["truth.yaw_rate_rad_s"]) > LEAST_LATERAL_M_S2:
         unit_is_right = any(c.name == "ay_m_s2.unit" and c.verdict == "passed" for c in drive.related)
         low, high = law("lateral", of="", pace="").gains
         is_other = not low < errors.ay_gain[0] < high
         yield judge("ay_m_s2.gain", *errors.ay_gain, doubt="ground_truth" if is_other and unit_is_right else "")
-    delay = ay_delay(errors, drive.latency)
+    delay = ay_delay(errors, drive.measured.latency)
     if delay is not None and MS_PER_S * delay[1] <= TABLE["ay_m_s2.delay"]["limits"][1]:
         yield judge("ay_m_s2.delay", MS_PER_S * delay[0], MS_PER_S * delay[1], delay_s=delay[0])
 
 
 def _gyro(drive: CheckedDrive) -> Iterator[Check]:
     """Compare gain and delay of the gyro with vehicle file and ground truth."""
-    (gain, std), latency, file = drive.errors.gyro_gain, drive.latency, drive.vehicle.sensors.yaw_rate_gain
+    (gain, std), latency, file = drive.errors.gyro_gain, drive.measured.latency, drive.vehicle.sensors.yaw_rate_gain
     if not math.isnan(gain) and "yaw_rate_rad_s" not in drive.wrong:
         yield judge("yaw_rate_rad_s.gain", gain / file, std, gain=gain)
-    if drive.measured.has_truth and latency is not None and latency.reliable and not latency.identical:
+    if latency is not None and latency.reliable and not latency.identical:
         late_s, error_s, delay_s = latency.gyro_delay_s - latency.latency_s, latency.std_error_s, latency.gyro_delay_s
         value, late_ms, std_ms = (MS_PER_S * x for x in (delay_s, late_s, error_s))
         yield judge("yaw_rate_rad_s.delay", value, late_ms=late_ms, std_ms=std_ms, delay_s=delay_s)
@@ -289,7 +283,7 @@ def change_checks(changes: Iterable[SensorChange], start_ns: int) -> list[Check]
 def _sideslip_of_truth(drive: CheckedDrive) -> Iterator[Check]:
     """Check that ground-truth heading and velocity are consistent, and that sideslip is 0 on straights."""
     columns = drive.columns
-    if not drive.measured.has_truth or not {"truth.vx_m_s", "truth.vy_m_s"} <= columns.keys():
+    if drive.measured.derived is None or not {"truth.vx_m_s", "truth.vy_m_s"} <= columns.keys():
         return
     sideslip = _sideslip(columns)
     finite = moving_at(np.hypot(columns["truth.vx_m_s"], columns["truth.vy_m_s"])) & np.isfinite(sideslip)
@@ -361,7 +355,7 @@ def _radius(drive: CheckedDrive) -> Iterator[Check]:
     """Compare the ratio of speed and wheel speed with the wheel radius of the file."""
     file, wheels = drive.vehicle.wheel_radius_m, {f"wheel_speed_{w}_rad_s" for w in WHEELS}
     per_wheel = [r.gain for r in drive.measured.relations if wheels & r.powers.keys() and "speed_m_s" in r.powers]
-    if drive.has_file and drive.speed is not None and any(per_wheel):
+    if drive.measured.vehicle and drive.speed is not None and any(per_wheel):
         radius = 1.0 / float(np.median(per_wheel))
         yield judge("vehicle.wheel_radius", radius / file, radius=radius, file=file)
 
@@ -373,7 +367,7 @@ def _steering(drive: CheckedDrive) -> Iterator[Check]:
     if steer is None and "steering_wheel_rad" in columns:
         steer = columns["steering_wheel_rad"] / vehicle.steering_ratio
     is_misread = drive.wrong & {"yaw_rate_rad_s", "steer_rad", "steering_wheel_rad"}
-    if not drive.has_file or speed is None or rate is None or steer is None or is_misread:
+    if drive.measured.vehicle is None or speed is None or rate is None or steer is None or is_misread:
         return
     curved, lateral = vehicle.wheelbase_m * rate / speed, rate * speed
     gentle = gentle_at(lateral, moving_at(speed))
@@ -400,7 +394,7 @@ def _mass(drive: CheckedDrive) -> Iterator[Check]:
     """Compare the driven lateral acceleration with the limit by tyres and mass of the file."""
     columns, speed, vehicle = drive.columns, drive.speed, drive.vehicle
     rate, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
-    if not drive.has_file or speed is None or rate is None or ay is None:
+    if drive.measured.vehicle is None or speed is None or rate is None or ay is None:
         return
     # Roll increases a_y, and the yaw rate is too high when a car begins to spin.
     lateral = np.minimum(np.abs(ay), np.abs(rate * speed))
@@ -428,29 +422,15 @@ FUNCTIONS: tuple[Callable[[CheckedDrive], Iterable[Check]], ...] = (
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def check_drive(
-    measured: Measured,
-    vehicle: VehicleParameters | None = None,
-    *,
-    latency: LatencyEstimate | None = None,
-    late: Sequence[LateSensor] = (),
-) -> tuple[Check, ...]:
-    """Return the checks of mapped signals, of ground truth and of the vehicle file.
-
-    Parameters
-    ----------
-    vehicle : from a file; None or the default car without a file.
-    latency : of ground truth against the gyro, or of the gyro. late : late sensors, detected without ground truth.
-    """
-    related = relation_checks(measured)
-    file, has_file = vehicle or default_vehicle(), vehicle not in (None, default_vehicle())
-    drive = CheckedDrive(measured, file, has_file, latency, related)
+def check_drive(measured: Measured) -> tuple[Check, ...]:
+    """Return the checks of mapped signals, of ground truth and of the vehicle file."""
+    drive = CheckedDrive(measured, relation_checks(measured))
     unique: dict[str, Check] = {}
     for check in (check for function in FUNCTIONS for check in function(drive)):
         if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:
             unique[check.name] = check  # the worse of two checks with one name counts
     # Ground truth decides about delays before the signals do.
-    return tuple(({c.name: c for c in delay_checks(late)} | unique).values())
+    return tuple(({c.name: c for c in delay_checks(measured.late)} | unique).values())
 
 
 def misread_channels(checks: Sequence[Check], waived: Sequence[str] = ()) -> dict[str, str]:

@@ -8,14 +8,14 @@ pairs also differ by sideslip, pitch and the vehicle's response; they detect onl
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pdhef_logtool.drive.columns import GRID_S, MS_PER_S
 from pdhef_logtool.drive.correlation import CommonGrid, find_shift, on_common_grid, shift_error, without_trend
-from pdhef_logtool.drive.measured import Measured
+from pdhef_logtool.drive.hypotheses import Relation
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, channel_of, same_share
 from pdhef_logtool.records.signals import Channel
 
@@ -140,10 +140,10 @@ def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) 
     return replace(latency, latency_s=0.0, gyro_delay_s=leads, reason=reason)
 
 
-def late_sensors(measured: Measured) -> tuple[LateSensor, ...]:
-    """Return the sensors with late stamps; relations that do not show a delay are ignored."""
+def late_sensors(relations: Iterable[Relation], names: Iterable[str]) -> tuple[LateSensor, ...]:
+    """Return the sensors with late stamps, of all signals ``names``; relations that show no delay are ignored."""
     late: dict[str, LateSensor] = {}
-    timed = [(r.law, r.law.delay_s, r.sides) for r in measured.relations if r.law.delay_s and r.sides]
+    timed = [(r.law, r.law.delay_s, r.sides) for r in relations if r.law.delay_s and r.sides]
     for law, (low, high), sides in sorted(timed, key=lambda x: not x[0].exact):
         grid = CommonGrid(GRID_S, *map(without_trend, sides))
         lag = lag_of(grid, LEAST_CORRELATION[1 + law.exact], MAX_SHIFT_ERROR_S)
@@ -157,6 +157,6 @@ def late_sensors(measured: Measured) -> tuple[LateSensor, ...]:
             f"{law.text}: delay {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
         )
         delay_s = abs(shift_s) if law.exact else beyond_s
-        wheels = tuple(n for n in measured.topics if n.startswith("wheel_speed_")) if name.startswith("wheel") else ()
+        wheels = tuple(n for n in names if n.startswith("wheel_speed_")) if name.startswith("wheel") else ()
         late.setdefault(name, LateSensor(wheels or (name,), delay_s, law.exact, evidence))
     return tuple(late.values())

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.columns import columns_on_grid, derivative, median_known, moving_at
+from pdhef_logtool.drive.delays import LatencyEstimate, LateSensor, late_sensors, truth_latency
 from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
 from pdhef_logtool.drive.relations import (
     CG_VY,
@@ -38,22 +39,26 @@ _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Columns of the grid by name and the relations between them; names of ground truth begin with ``truth.``.
+    """Channels of a drive, their columns on the grid, and the relations between them.
 
     Attributes
     ----------
-    speed_name : the column used as the speed. topics : topics of the signals, by name.
-    scales : scales of the mapping, by name. open_signs : groups of signals with an undocumented common sign.
-    has_truth : whether ground truth at the CG is available. is_mounted : whether the drive confirms the IMU's mounting.
+    signals, truth : mapped channels by name. derived : ground truth at the CG, if any.
+    columns : [N] by name; names of ground truth begin with ``truth.``. speed_name : the column used as the speed.
+    vehicle : from a file; None without a file. scales : scales of the mapping, by name.
+    open_signs : groups of signals with an undocumented common sign.
+    is_mounted : whether the drive confirms the IMU's mounting.
     """
 
+    signals: Mapping[str, Channel]
+    truth: Mapping[str, Channel]
+    derived: TruthTrack | None
     columns: Mapping[str, FloatArray]
     speed_name: str | None
     relations: tuple[Relation, ...]
-    topics: Mapping[str, str]
-    scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+    vehicle: VehicleParameters | None
+    scales: Mapping[str, float | tuple[float, ...]]
     open_signs: tuple[tuple[str, ...], ...] = ()
-    has_truth: bool = False
     is_mounted: bool = False
 
     @property
@@ -65,15 +70,35 @@ class Measured:
     def without_truth(self) -> Measured:
         """Return the columns and relations of the signals alone."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
-        kept = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
         speed = None if (self.speed_name or "").startswith("truth.") else self.speed_name
-        return replace(self, columns=columns, speed_name=speed, relations=kept, has_truth=False)
+        relations = tuple(self._of_sensors)
+        return replace(self, truth={}, derived=None, columns=columns, speed_name=speed, relations=relations)
 
     def without(self, names: Iterable[str]) -> Measured:
         """Return the measurements without these columns, which have no relations."""
         gone = set(names)
         columns = {n: c for n, c in self.columns.items() if n not in gone}
-        return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
+        return replace(self, columns=columns, signals={n: c for n, c in self.signals.items() if n not in gone})
+
+    @property
+    def _of_sensors(self) -> list[Relation]:
+        """Relations without ground truth."""
+        return [r for r in self.relations if not any(n.startswith("truth.") for n in r.powers)]
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Topics of the signals, by name."""
+        return {n: c.source.split(".")[0] for n, c in self.signals.items()}
+
+    @cached_property
+    def latency(self) -> LatencyEstimate | None:
+        """Latency of ground truth against the gyro, or of the gyro; None if one is missing."""
+        return truth_latency(self.signals, self.truth, self.derived)
+
+    @cached_property
+    def late(self) -> tuple[LateSensor, ...]:
+        """Sensors with late time stamps, from the signals alone."""
+        return late_sensors(self._of_sensors, self.topics)
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -94,7 +119,8 @@ class Measured:
             n for n in ("truth.yaw_rate_rad_s", "truth.vy_m_s", "truth.sideslip_rad", "truth.ay_m_s2") if n in columns
         ]
         speeds = [n for n in ("truth.vx_m_s", "truth.vy_m_s", "truth.position_speed_m_s") if n in columns]
-        groups = [tuple(g) for g in (*topics.values(), truth, speeds) if 2 <= len(g) <= 6]
+        frame = [n for n in (TURNING, COURSE_RATE) if n in columns]  # of a pose, which may be mirrored
+        groups = [tuple(g) for g in (*topics.values(), truth, speeds, frame) if 2 <= len(g) <= 6]
         return [*groups, *([tuple(wheels)] if len(wheels) > 1 else [])]
 
 
@@ -111,16 +137,16 @@ def measure(
     ----------
     derived : ground truth at the CG. vehicle : not used if it is the default car. mapping : of the channels, if known.
     """
-    columns, speed_name = drive_columns(signals, truth or {}, derived)
-    topics = {n: c.source.split(".")[0] for n, c in signals.items()}
+    truth, vehicle = truth or {}, None if vehicle == default_vehicle() else vehicle
+    columns, speed_name = drive_columns(signals, truth, derived)
     sources = {} if mapping is None else mapping.by_subject
-    related = measured_relations(columns, speed_name, None if vehicle == default_vehicle() else vehicle)
+    related = measured_relations(columns, speed_name, vehicle)
     # Two quantities of ground truth from the same field agree trivially.
     of_truth = {n: (s.topic, s.paths) for n, s in sources.items() if n.startswith("truth.")}
     read = [[of_truth[n] for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
     open_signs, scales = () if mapping is None else mapping.open_signs, {n: s.scale for n, s in sources.items()}
-    return Measured(columns, speed_name, tuple(related), topics, scales, open_signs, derived is not None)
+    return Measured(signals, truth, derived, columns, speed_name, tuple(related), vehicle, scales, open_signs)
 
 
 def drive_columns(

@@ -136,33 +136,31 @@ def plan_drive(
     if sensors is not None:
         clocks |= clocks_of(sensors, log, mapping, start_ns)
     span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * NS_PER_S)))
-    looked_at = survey_log(log, mapping, clocks, span_ns, given)
-    mapping, survey = looked_at.mapping, looked_at.channels
+    survey = survey_log(log, mapping, clocks, span_ns, given)
     if sensors is not None:
         alignment = sensors.alignment
     else:
-        alignment = plan_alignment(survey.signals, given, require_imu=require_imu)
+        alignment = plan_alignment(survey.measured.signals, given, require_imu=require_imu)
     # The signals of earlier sensors must not depend on later samples.
-    refused = looked_at.refused(waived, is_causal=sensors is not None)
-    mapping, sound = without_refused_truth(mapping, refused), looked_at
-    if mapping is not looked_at.mapping:
-        sound = looked_at.with_truth(mapping.truth)
-    truth, derived = sound.truth_plan, sound.truth
-    derivation = {} if derived is None else dict(derived.derivation)
+    refused = survey.refused(waived, is_causal=sensors is not None)
+    mapping, sound = without_refused_truth(survey.mapping, refused), survey
+    if mapping is not survey.mapping:
+        sound = survey.with_truth(mapping.truth)
+    measured, truth = sound.measured, sound.truth_plan
     return DrivePlan(
         mapping=mapping,
-        vehicle=vehicle or looked_at.assumed_car,
+        vehicle=vehicle or survey.assumed_car,
         clocks=clocks,
         alignment=alignment.without(refused),
         truth=truth,
-        latency=sound.latency,
-        dependent=dependent_signals(survey.signals, sound.channels.truth) if truth else {},
-        derivation=derivation,
-        survey_truth=sound.channels.truth,
+        latency=measured.latency,
+        dependent=dependent_signals(measured.signals, measured.truth) if truth else {},
+        derivation={} if measured.derived is None else dict(measured.derived.derivation),
+        survey_truth=dict(measured.truth),
         start_ns=start_ns,
         end_ns=end_ns,
         decided_s=(end_ns - start_ns) * S_PER_NS if sensors is None else sensors.decided_s,
-        checks=looked_at.checks,
+        checks=survey.checks,
         refused=refused,
     )
 

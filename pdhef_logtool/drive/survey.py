@@ -24,36 +24,32 @@ from pdhef_logtool.drive.checks import (
     sensor_errors,
     sideslip_offset,
 )
-from pdhef_logtool.drive.delays import LATE_GYRO_S, LatencyEstimate, LateSensor, late_sensors, truth_latency
+from pdhef_logtool.drive.delays import LATE_GYRO_S
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.mounting import ACCELERATIONS, MOUNTED, RATES, Mounting, find_mounting, find_triads
+from pdhef_logtool.drive.mounting import ACCELERATIONS, RATES, Mounting, find_mounting, find_triads
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.relations import effective_wheelbase_m
 from pdhef_logtool.drive.truth import TruthPlan, TruthTrack, derive_truth, plan_truth
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, read_signals
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import Channel
 
 #: Smaller delays of a_y may be due to body roll.
 LEAST_AY_DELAY_S = 0.015
+#: Largest number of corrections of a recognised mapping, one after the other: mounting, undocumented signs, one unit.
+MOST_CORRECTIONS = 3
+_INVERTED = "its sign is not documented, and the drive shows that it is inverted"
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """The first minutes of a log as its mapping reads them, with the IMU rotated to the car's axes if that is certain.
-
-    ``vehicle``: from the vehicle file, or the default car. ``corrected``: checks for the changes of a recognised
-    mapping.
-    """
+    """The first minutes of a log as its mapping reads them; ``corrected``: checks for changes of a recognised one."""
 
     mapping: Mapping
-    channels: MappedChannels
     measured: Measured
-    vehicle: VehicleParameters
-    truth: TruthTrack | None
     truth_plan: TruthPlan | None
-    latency: LatencyEstimate | None
     mounting: Mounting | None = None
     corrected: tuple[Check, ...] = ()
 
@@ -65,15 +61,15 @@ class Survey:
     @cached_property
     def checks(self) -> tuple[Check, ...]:
         """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
-        drive_checks = self._of(self.measured, self.latency)
+        drive_checks = check_drive(self.measured)
         return (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
 
     @cached_property
     def sensor_checks(self) -> tuple[Check, ...]:
         """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
-        if not self.channels.truth:
+        if not self.measured.truth:
             return self.checks
-        return (*self.mounted, *self._of(self.measured.without_truth(), None))
+        return (*self.mounted, *check_drive(self.measured.without_truth()))
 
     @property
     def assumed_car(self) -> VehicleParameters:
@@ -94,18 +90,9 @@ class Survey:
 
     def with_truth(self, names: Collection[str]) -> Survey:
         """Return the survey with the ground truth of some channels only, for its plan, track and latency."""
-        channels = replace(self.channels, truth={n: c for n, c in self.channels.truth.items() if n in names})
-        plan, truth = _derived(channels, self.vehicle)
-        latency = truth_latency(channels.signals, channels.truth, truth)
-        return replace(self, channels=channels, truth_plan=plan, truth=truth, latency=latency)
-
-    def _of(self, measured: Measured, latency: LatencyEstimate | None) -> tuple[Check, ...]:
-        return check_drive(measured, self.vehicle, latency=latency, late=self.late)
-
-    @cached_property
-    def late(self) -> tuple[LateSensor, ...]:
-        """Sensors with late time stamps, from the signals alone."""
-        return late_sensors(self.measured.without_truth())
+        truth = {n: c for n, c in self.measured.truth.items() if n in names}
+        plan, derived = _derived(truth, self.measured.vehicle or default_vehicle())
+        return replace(self, truth_plan=plan, measured=replace(self.measured, truth=truth, derived=derived))
 
     def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
         """Yield the mapping's undecided checks that the drive does not decide either."""
@@ -132,7 +119,7 @@ def survey_log(
     span_ns: tuple[int, int],
     vehicle: VehicleParameters | None = None,
     *,
-    rescale: bool = True,
+    corrections: int = MOST_CORRECTIONS,
 ) -> Survey:
     """Read a span of a log and find the mounting of its IMU and a wrong unit or sign.
 
@@ -140,70 +127,61 @@ def survey_log(
 
     Parameters
     ----------
-    vehicle : of the drive; None uses the default car.
-    rescale : whether to search for a wrong unit or sign.
+    vehicle : of the drive; None uses the default car. corrections : largest number of corrections of the mapping.
     """
     vehicle = vehicle or default_vehicle()
     triads = find_triads(log, mapping)
     extra = {} if triads is None else triads[0].components(ACCELERATIONS) | triads[1].components(RATES)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    truth_plan, truth = _derived(channels, vehicle)
-    measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
+    truth_plan, derived = _derived(channels.truth, vehicle)
+    measured = measure(channels.signals, channels.truth, derived, vehicle, mapping)
     # The inputs of an estimator must not depend on ground truth: a mounting from ground truth is only checked.
     mounting = find_mounting(measured.without_truth(), triads, mapping)
     blind = mounting is not None and mounting.confident
-    if not blind and truth is not None:
+    if not blind and derived is not None:
         mounting = find_mounting(measured, triads, mapping)
-    channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
-    measured = measured.without(extra)
-    corrected: list[Check] = []
-    if mounting is not None and mapping.origin == "auto" and blind and not mounting.is_as_named:
-        note = f"{mounting.text}, and is read so: {mounting.evidence}"
-        signals = mounting.turned(mapping)
-        corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
-        mapping = mapping.with_sources(signals, [note])
-        channels = read_signals(log, mapping, clocks, *span_ns)
-        mounting = replace(mounting, named=mounting.rotation)
-        measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     is_mounted = mounting is not None and mounting.confident and mounting.is_as_named
-    measured, latency = replace(measured, is_mounted=is_mounted), truth_latency(channels.signals, channels.truth, truth)
-    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, mounting, tuple(corrected))
-    return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
-
-
-def _derived(channels: MappedChannels, vehicle: VehicleParameters) -> tuple[TruthPlan | None, TruthTrack | None]:
-    """Return plan and track of the ground truth; None without any."""
-    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
-    plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
-    return plan, None if plan is None else derive_truth(channels.truth, plan=plan)
-
-
-def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
-    """Return the survey with undocumented signs decided, or with one wrong unit or sign corrected.
-
-    A correction must be certain. Documented units and signs are corrected
-    without ground truth, and each such correction is a failed check.
-    """
-    mapping, measured = survey.mapping, survey.measured
-    turned = [n for g in measured.open_signs if measured.posterior.turned(g[0]) >= CERTAIN for n in g]
-    factors = dict.fromkeys(turned, (-1.0, "its sign is not documented, and the drive shows it"))
-    if not turned:
-        measured = replace(measured, open_signs=()).without_truth()
-        factors = explained_factors(measured, most=1)
-    said = {n: (f, f"read with {f:.6g} times its scale: {evidence}") for n, (f, evidence) in factors.items()}
-    if not (proposals := _rescaled(mapping, said)):
+    survey = Survey(mapping, replace(measured.without(extra), is_mounted=is_mounted), truth_plan, mounting)
+    if corrections == 0 or mapping.origin != "auto":
         return survey
-    scaled = replace(apply_proposals(proposals, mapping), open_signs=())
-    again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
+    proposals, kind = _certain_proposals(survey, is_mounting_blind=blind)
+    if not proposals:
+        return survey
+    changed, left = apply_proposals(proposals, mapping), 0 if kind == "unit" else corrections - 1
+    changed = changed if kind == "mounting" else replace(changed, open_signs=())
+    again = survey_log(log, changed, clocks, span_ns, vehicle, corrections=left)
     # A failing sensor resembles a wrong unit of another one, but only a right correction leaves no contradiction.
     failed = [check.name for check in again.checks if check.verdict == "failed"]
-    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis")) for n in failed)
-    checks = [] if turned else [_corrected(p.subject, p.source, f"{p.subject} is {p.evidence}") for p in proposals]
-    return survey if is_bad else replace(again, corrected=(*survey.corrected, *checks, *again.corrected))
+    if kind == "unit" and any(n.endswith((".sign", ".unit", ".axis")) for n in failed):
+        return survey
+    documented = () if kind == "sign" else tuple(map(_corrected, proposals))
+    return replace(again, corrected=(*documented, *again.corrected))
 
 
-def _corrected(name: str, source: SignalSource, note: str) -> Check:
-    return result("SIGNAL.corrected", "failed", name, evidence=note, entries=entries_of(source, "field", "scale"))
+def _derived(truth: Mapped[str, Channel], vehicle: VehicleParameters) -> tuple[TruthPlan | None, TruthTrack | None]:
+    """Return plan and track of the ground truth; None without any."""
+    place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
+    plan = plan_truth(truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
+    return plan, None if plan is None else derive_truth(truth, plan=plan)
+
+
+def _certain_proposals(survey: Survey, *, is_mounting_blind: bool) -> tuple[list[Proposal], str]:
+    """Return the next correction of a recognised mapping, and its kind: ``mounting``, ``sign`` or ``unit``.
+
+    Documented units, signs and axes are corrected without ground truth.
+    """
+    mapping, measured, mounting = survey.mapping, survey.measured, survey.mounting
+    if is_mounting_blind and mounting is not None and not mounting.is_as_named:
+        return _of_mounting(mapping, mounting), "mounting"
+    if signs := [n for g in measured.open_signs if measured.posterior.turned(g[0]) >= CERTAIN for n in g]:
+        return _rescaled(mapping, dict.fromkeys(signs, (-1.0, _INVERTED))), "sign"
+    documented = replace(measured, open_signs=()).without_truth()
+    return _rescaled(mapping, explained_factors(documented, most=1)), "unit"
+
+
+def _corrected(proposal: Proposal) -> Check:
+    entries = entries_of(proposal.source, "field", "scale")
+    return result("SIGNAL.corrected", "failed", proposal.subject, evidence=proposal.evidence, entries=entries)
 
 
 def scaled_source(source: SignalSource, factor: float) -> SignalSource:
@@ -235,10 +213,18 @@ class Proposal:
 
 
 def apply_proposals(proposals: Sequence[Proposal], mapping: Mapping) -> Mapping:
-    """Return the mapping with the corrections in it, each with a note."""
-    return mapping.with_sources(
-        {p.subject: p.source for p in proposals}, [f"{p.subject}: {p.evidence}" for p in proposals]
-    )
+    """Return the mapping with the corrections in it, and a note for each reason."""
+    names: dict[str, list[str]] = {}
+    for proposal in proposals:
+        names.setdefault(proposal.evidence, []).append(proposal.subject)
+    notes = [f"{', '.join(changed)}: {reason}" for reason, changed in names.items()]
+    return mapping.with_sources({p.subject: p.source for p in proposals}, notes)
+
+
+def _of_mounting(mapping: Mapping, mounting: Mounting) -> list[Proposal]:
+    """Return the sources of the IMU's signals that are on other axes than the mapping reads."""
+    reason = f"{mounting.text}: {mounting.evidence}"
+    return [Proposal(n, reason, s) for n, s in mounting.turned(mapping).items() if s != mapping.signals[n]]
 
 
 def _rescaled(mapping: Mapping, factors: Mapped[str, tuple[float, str]]) -> list[Proposal]:
@@ -252,13 +238,10 @@ def _rescaled(mapping: Mapping, factors: Mapped[str, tuple[float, str]]) -> list
 def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
     """Return the certain corrections of mounting, unit, sign and delay from the first minutes of a drive."""
     mapping, mounting = survey.mapping, survey.mounting
-    proposals: list[Proposal] = []
     if mounting is not None and mounting.confident and not mounting.is_as_named:
-        turned, said = mounting.turned(mapping), f"{mounting.text}: {mounting.evidence}"
-        proposals += [Proposal(n, said, s) for n, s in turned.items() if s != mapping.signals[n]]
+        proposals = _of_mounting(mapping, mounting)
     else:
-        factors = explained_factors(survey.measured)
-        proposals += _rescaled(mapping, factors) if factors else _of_a_turned_truth(survey)
+        proposals = _rescaled(mapping, explained_factors(survey.measured)) or _of_a_turned_truth(survey)
     sources = mapping.by_subject | {p.subject: p.source for p in proposals}
     for name, (delay_s, evidence) in _delays(survey).items():
         late = replace(sources[name], latency_s=round(sources[name].latency_s + delay_s, 4))
@@ -269,7 +252,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
 def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
     """Return the delay and the evidence of each late signal, from ground truth, otherwise from another sensor."""
     delays: dict[str, tuple[float, str]] = {}
-    latency = survey.latency
+    latency = survey.measured.latency
     if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:
         delays["yaw_rate_rad_s"] = latency.gyro_delay_s, latency.reason
     # The delay of a_y is not observable from another axis.
@@ -277,7 +260,7 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
     by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
     if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, 3.0 * by_truth[1]):
         delays["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against ground truth"
-    for sensor in survey.late:
+    for sensor in survey.measured.late:
         told_by_truth = sensor.names[0] == "yaw_rate_rad_s" and latency is not None and latency.reliable
         for name in sensor.names if sensor.exact and not told_by_truth else ():
             delays.setdefault(name, (sensor.delay_s, sensor.evidence))
@@ -287,7 +270,7 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
     """Return corrected ground-truth sources if the sideslip has a constant offset that a mapping can correct."""
     columns, truth = survey.measured.columns, survey.mapping.truth
-    check = None if survey.truth is None else offset_check(columns)
+    check = None if survey.measured.derived is None else offset_check(columns)
     if check is None or check.verdict != "failed":
         return []
     (offset, _), evidence = sideslip_offset(columns), check.evidence

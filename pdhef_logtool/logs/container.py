@@ -25,7 +25,7 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 #: Log times above this (unsigned in the file) do not fit int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
-#: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
+#: Kind of the note that a checksum of a file was not verified, as that would need all of a remote file.
 UNVERIFIED = "unverified"
 RecordT = TypeVar("RecordT", Attachment, Metadata)
 #: Losses of one file; further ones become one loss.
@@ -116,10 +116,10 @@ class Block:
         """Return some of the messages."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
-    def split(self, before_ns: float) -> tuple[Block | None, Block | None]:
-        """Return the messages before a time and the others, None without any; they ascend in log time."""
+    def split(self, before_ns: float) -> tuple[Block, Block]:
+        """Return the messages before a time and the others; they ascend in log time."""
         n = int(np.searchsorted(self.log_time_ns, before_ns))
-        return self.take(slice(n)) if n else None, self.take(slice(n, None)) if n < len(self) else None
+        return self.take(slice(n)), self.take(slice(n, None))
 
     @staticmethod
     def merged(parts: Sequence[Block], head: int = 0) -> Block:
@@ -216,29 +216,6 @@ def _copy(block: Block, buffer: NDArray[np.uint8], place: IntArray) -> None:
             items_at_bytes(buffer.data, size)[place[rows]] = items_at_bytes(block.buffer, size)[block.offset[rows]]
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """Topics and log times [start, end) that will be read; None: all.
-
-    A hint that does not change the result: of a remote file with more than ``above_bytes``, the other chunks are taken
-    from the index.
-    """
-
-    topics: frozenset[str] | None = None
-    start_ns: int | None = None
-    end_ns: int | None = None
-    above_bytes: int = 0
-
-    def has(self, topics: Iterable[str], span: Span) -> bool:
-        """Return whether messages of these topics in a span are wanted."""
-        is_wanted = self.topics is None or not self.topics.isdisjoint(topics)
-        return is_wanted and span.overlaps(self.start_ns, self.end_ns)
-
-
-#: Of a log that is read as a whole.
-EVERYTHING = Wanted()
-
-
 class SpanDamageError(Exception):
     """A span cannot be decoded. This package catches it and reports a loss."""
 
@@ -270,6 +247,7 @@ class Container(ABC):
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
+    damaged : spans that could not be read.
     size : bytes of the file. cut : whether the file is truncated. meter : resource limits.
     kind : of a log with this file only, as :class:`~.drive_log.DriveLog` has it.
     selective : whether a load can leave out the payloads of unwanted channels.
@@ -294,6 +272,7 @@ class Container(ABC):
         self.spans: list[Span] = []
         self.lost: list[Loss] = []
         self.undeclared: dict[int, int] = {}
+        self.damaged: set[int] = set()
         self.meter = file.meter
         self.size = size
         self.cut = False

@@ -93,7 +93,7 @@ def rate_clock(rows: int, rate_hz: float) -> Clock:
 def rescaled(clock: Clock, decades: int, note: str) -> Clock:
     """Return a clock of times since a start that last 10**decades as long."""
     has_time = clock.stamps_ns != NO_TIME
-    since = _scaled((clock.stamps_ns - RELATIVE_NS) * 10.0**decades, 1, 0, has_time)
+    since = scaled((clock.stamps_ns - RELATIVE_NS) * 10.0**decades, 1, 0, has_time)
     return replace(clock, stamps_ns=placed(since), notes=(*clock.notes, note))
 
 
@@ -116,7 +116,7 @@ def number_clock(
     """
     if values.dtype.kind == "M":
         factor = TIME_UNITS_NS[np.datetime_data(values.dtype)[0].lower()]
-        return Clock(placed(_scaled(values.astype(np.int64), factor, 0, ~np.isnat(values))))
+        return Clock(placed(scaled(values.astype(np.int64), factor, 0, ~np.isnat(values))))
     finite = np.isfinite(values)
     if (of_day := seconds_of_day(values[finite])) is not None:
         stamps = np.full(len(values), NO_TIME, np.int64)
@@ -124,7 +124,7 @@ def number_clock(
         return Clock(placed(stamps))
     stated = TIME_UNITS_NS.get(re.sub(r"[\s\[\](){}.]", "", unit).lower(), 0)
     factor, epoch, note = _reading(values[finite], stated, others, rate_hz)
-    stamps = placed(_scaled(values, factor, epoch, finite))
+    stamps = placed(scaled(values, factor, epoch, finite))
     clock = Clock(stamps, (f"{name}: {note}",) if note else (), bool(stated or epoch or rate_hz) or _is_dated(stamps))
     return clock if epoch else _of_gps(clock, name, others)
 
@@ -256,12 +256,13 @@ def _steps(values: NDArray[Any]) -> tuple[float, int]:
     return (float(np.median(steps)), len(steps)) if len(steps) else (0.0, 0)
 
 
-def _scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:
+def scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:
     """Return values [N] since an epoch in ns; those that do not fit into int64 have no time."""
     stamps = np.full(values.shape, NO_TIME, np.int64)
     size = np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch)
     has_time = has_time & (size < _CLOCKS["last_ns"] / factor)
     given = values[has_time]
+    given = given if given.dtype.kind in "iu" else given.astype(np.float64)
     # The fraction apart: a product would lose the last digits of a date.
     whole = given if given.dtype.kind in "iu" else np.floor(given)
     fraction = np.round((given - whole) * float(factor)).astype(np.int64)

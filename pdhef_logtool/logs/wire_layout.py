@@ -111,7 +111,14 @@ class WireLayout:
             for name, member in node.members.items():
                 self._place(member, (*steps, name))
         elif isinstance(node, Array):
-            self._place_items(node.item, steps, self._length_word() if node.length is None else node.length)
+            count = self._length_word() if node.length is None else node.length
+            if isinstance(node.item, Scalar) and node.item.kind != "string":
+                self._place_numbers(node.item, steps, count)
+            elif count > UNROLLED_ELEMENTS:
+                raise NoLayoutError("too many elements to unroll")
+            else:
+                for i in range(count):
+                    self._place(node.item, (*steps, i))
         elif isinstance(node, Unknown):
             raise NoLayoutError("the type is not known in full")
         elif node.code and node.kind == "string":
@@ -121,15 +128,6 @@ class WireLayout:
             self.size += length
         else:
             self._place_numbers(node, steps, None)
-
-    def _place_items(self, item: Node, steps: Steps, count: int) -> None:
-        if isinstance(item, Scalar) and item.kind != "string":
-            self._place_numbers(item, steps, count)
-            return
-        if count > UNROLLED_ELEMENTS:
-            raise NoLayoutError("too many elements to unroll")
-        for i in range(count):
-            self._place(item, (*steps, i))
 
     def _place_numbers(self, node: Scalar, steps: Steps, count: int | None) -> None:
         dtype = np.dtype("<" + node.code)

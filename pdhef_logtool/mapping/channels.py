@@ -153,7 +153,7 @@ def read_signals(
     gate = resolved.quality
     sources = (*resolved.signals.values(), *resolved.truth.values())
     requests = requests_of(log, sources)
-    columns = log.read(requests, start_ns, end_ns, stamps=stamps) if requests or stamps else {}
+    columns = log.read({**dict.fromkeys(stamps, ()), **requests}, start_ns, end_ns) if requests or stamps else {}
     reading = _Reading(log, clocks, columns)
     for source in sources:
         reading.times(source)

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
 from pdhef_logtool.logs.recording_span import STEP_BACK_NS, steps_back
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, scaled
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
 from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, IntArray
-
-NANOSECONDS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 #: A longer median delay is not a transport delay: the two clocks differ.
 MAX_CREDIBLE_DELAY_NS = NS_PER_S
@@ -298,19 +297,9 @@ def raw_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[I
 
 
 def _to_nanoseconds(parts: list[NDArray[np.generic]], units: tuple[str, ...]) -> tuple[IntArray, NDArray[np.bool_]]:
-    total = np.zeros(parts[0].shape[0], np.int64)
-    usable = np.ones(parts[0].shape[0], np.bool_)
-    for part, unit in zip(parts, units, strict=True):
-        if part.dtype.kind in "iu":
-            total += part.astype(np.int64) * np.int64(NANOSECONDS[unit])
-            continue
-        scale = NANOSECONDS[unit]
-        finite = np.isfinite(part.astype(np.float64)) & (np.abs(part.astype(np.float64)) < 9.2e18 / scale)
-        usable &= finite
-        number = np.where(finite, part.astype(np.float64), 0.0)
-        # Convert whole and fractional parts separately: float64 nanoseconds since 1970 have a resolution of 256 ns.
-        whole = np.floor(number)
-        total += whole.astype(np.int64) * np.int64(scale) + np.rint((number - whole) * scale).astype(np.int64)
+    stamps = [scaled(p, TIME_UNITS_NS[unit], 0, np.isfinite(p)) for p, unit in zip(parts, units, strict=True)]
+    usable = np.logical_and.reduce([ns != NO_TIME for ns in stamps])
+    total = np.where(usable, sum(stamps), 0)
     return total, usable & (total > 0)
 
 

@@ -237,7 +237,7 @@ def _repeated_groups(log: DriveLog, topics: list[TopicInfo]) -> list[TopicInfo]:
     fields = {t.name: [f.path for f in log.fields(t.name, quiet=True)] for t in topics} if "mdf" in log.kind else {}
     pairs = [(t, base) for t in topics for base, _, n in [t.name.rpartition("_")] if n.isdigit() and base in fields]
     pairs = [(t, base) for t, base in pairs if fields[t.name] == fields[base]]
-    times = log.read({}, stamps={name for t, base in pairs for name in (t.name, base)}) if pairs else {}
+    times = log.read({name: () for t, base in pairs for name in (t.name, base)}) if pairs else {}
     return [t for t, base in pairs if times[t.name].log_time_ns[:1] > times[base].log_time_ns[-1:]]
 
 

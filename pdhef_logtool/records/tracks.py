@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -177,22 +177,36 @@ def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
     return covariance
 
 
-def concatenate(tracks: list[StateTrack], *, single: Collection[str] = ()) -> StateTrack:
-    """Join the pieces of one track in time order; the list is emptied, so that each column is in memory once.
+def concatenate(pieces: Iterable[StateTrack], rows: int, *, single: Collection[str] = ()) -> StateTrack:
+    """Join the pieces of one track of ``rows`` stamps in time order, as they are made: each column is in memory once.
 
-    ``single`` : columns that are joined in single precision.
+    A column that is missing in all pieces (:func:`make_track`) takes no memory. ``single`` : columns that are joined in
+    single precision.
     """
-    name = tracks[0].name
-    columns = {f.name: [getattr(t, f.name) for t in tracks] for f in fields(StateTrack) if f.name != "name"}
-    tracks.clear()
-    return StateTrack(name=name, **{c: _joined(columns.pop(c), c in single) for c in [*columns]})
+    columns: dict[str, Any] = {}
+    end = 0
+    for piece in pieces:
+        start, end = end, end + len(piece)
+        for column in (f.name for f in fields(piece)):
+            part = getattr(piece, column)
+            if column != "name":
+                part = _joined(columns.get(column), part, slice(start, end), rows, column in single)
+            columns[column] = part
+    return StateTrack(**columns)
 
 
-def _joined(parts: Sequence[NDArray[Any]], is_single: bool) -> NDArray[Any]:
-    """Join the pieces of a column; a missing one (:func:`make_track`) takes no memory."""
-    if all(part.strides == (0,) and part[:1].tobytes() == parts[0][:1].tobytes() for part in parts):
-        return np.broadcast_to(parts[0][:1], sum(map(len, parts)))
-    return np.concatenate(parts, dtype=np.float32 if is_single else None, casting="same_kind")
+def _joined(whole: NDArray[Any] | None, part: NDArray[Any], place: slice, rows: int, is_single: bool) -> NDArray[Any]:
+    """Return a column [rows], or [0] if pieces lack it, with the part of a piece; ``whole`` : before, None at first."""
+    is_missing = part.strides == (0,)
+    if whole is None:
+        kind = np.float32 if is_single else part.dtype
+        count = rows if len(part) else 0
+        whole = np.broadcast_to(part[:1], count) if is_missing else np.empty((count, *part.shape[1:]), kind)
+    elif whole.strides == (0,) and not (is_missing and part[:1].tobytes() == whole[:1].tobytes()):
+        whole = whole.copy()
+    if whole.strides != (0,):
+        whole[place] = part
+    return whole
 
 
 def scaled_covariance(covariance: FloatArray, of_vy: FloatArray) -> FloatArray:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 
 from pdhef_logtool.car.car import Car
@@ -25,6 +27,7 @@ from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate
 from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segment_masks
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import DriveIntervals, drive_intervals, spread, widened
+from pdhef_logtool.records import processes
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.processes import release_memory
@@ -149,7 +152,9 @@ def estimate_drive(
     causality: CausalityCheck | None = None,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> Estimated:
-    """Run estimators over a drive.
+    """Run estimators over a drive, side by side in threads: compiled filters let other threads run.
+
+    A worker process uses one thread, the command itself ``NUMBA_NUM_THREADS``, by default all cores.
 
     Parameters
     ----------
@@ -161,33 +166,44 @@ def estimate_drive(
     """
     signals, vehicle = drive.signals, drive.plan.vehicle
     tracks: list[StateTrack] = []
-    computations = [_computation(e, corrected.of_estimator(e.name)) for e in estimators]
-    shared: dict[tuple[str, int], StateTrack] = {}
-    for number, (estimator, computation) in enumerate(zip(estimators, computations, strict=True)):
-        progress(number / len(estimators))
-        try:
-            given = corrected.of_estimator(estimator.name)
-            track = shared.pop(computation, None)
-            if track is None:
-                track = run_estimator(estimator, given, causality)
-                release_memory(len(track))
-            varied = _varied(estimator, given, drive.changes)
-        except EstimatorError as error:
-            if causality is None:
-                raise
-            causality.failed[estimator.name] = f"failed: {error}"
-            continue
-        if causality is not None and estimator.name in causality.failed:
-            continue
-        if computation in computations[number + 1 :]:
-            shared[computation] = track
-        track = without_impossible_states(replace(track, name=estimator.name))
-        track = watched_track(track, signals, vehicle, corrected.noise)
-        track = track if intervals is None else intervals.apply(track, signals)
-        if varied:
-            track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)
-        tracks.append(track.without_sideslip_below(vehicle.standstill_m_s))
+
+    def run(estimator: Estimator) -> tuple[StateTrack, list[FloatArray]]:
+        given = corrected.of_estimator(estimator.name)
+        track = run_estimator(estimator, given, causality)
         release_memory(len(track))
+        return track, _varied(estimator, given, drive.changes)
+
+    computations = [_computation(e, corrected.of_estimator(e.name)) for e in estimators]
+    first: dict[tuple[str, int], Estimator] = {}
+    for estimator, computation in zip(estimators, computations, strict=True):
+        first.setdefault(computation, estimator)
+    pool = ThreadPoolExecutor(1 if processes.worker_number else numba.config.NUMBA_NUM_THREADS)
+    try:
+        running = {computation: pool.submit(run, estimator) for computation, estimator in first.items()}
+        for number, (estimator, computation) in enumerate(zip(estimators, computations, strict=True)):
+            progress(number / len(estimators))
+            computed = running.pop(computation)
+            if computation in computations[number + 1 :]:
+                running[computation] = computed
+            try:
+                track, varied = computed.result()
+            except EstimatorError as error:
+                if causality is None:
+                    raise
+                causality.failed[estimator.name] = f"failed: {error}"
+                continue
+            if causality is not None and (reason := causality.failed.get(first[computation].name)):
+                causality.failed[estimator.name] = reason
+                continue
+            track = without_impossible_states(replace(track, name=estimator.name))
+            track = watched_track(track, signals, vehicle, corrected.noise)
+            track = track if intervals is None else intervals.apply(track, signals)
+            if varied:
+                track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)
+            tracks.append(track.without_sideslip_below(vehicle.standstill_m_s))
+            release_memory(len(track))
+    finally:
+        pool.shutdown(cancel_futures=True)
     return Estimated(drive, {t.name: t for t in tracks})
 
 

@@ -22,7 +22,6 @@ from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.requirement_blocks import requirement_blocks
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import ValidationPlan
-from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.open_log import open_log
@@ -97,8 +96,8 @@ def score_log(
     car = Car.load(config.car, network=NO_MODEL, sensors=config.sensor_profile)
     mapping = mapping_of(config.mapping)
     if mapping is not None and mapping.recorders:
-        reading, nothing = config.read_options, Wanted(frozenset())
-        with closing(open_log(log_input.path, reading.limits, reading.msgs, nothing, reading.tables)) as log:
+        reading = config.read_options
+        with closing(open_log(log_input.path, reading.limits, reading.msgs, reading.tables)) as log:
             mapping = mapping_for_recorder(log, mapping)
     plan = read_validation_plan(config.plan, junit)
     drive_outputs.check_places([log_input], output, config, mapping, junit)

@@ -9,7 +9,7 @@ import pytest
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.checks import delay_checks
 from pdhef_logtool.drive.correlation import CommonGrid, Shift, find_shift, on_common_grid, shift_error
-from pdhef_logtool.drive.delays import LatencyEstimate, late_sensors
+from pdhef_logtool.drive.delays import LatencyEstimate
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.plan import plan_drive
 from pdhef_logtool.drive.survey import mapping_proposals, survey_log
@@ -35,7 +35,7 @@ def delayed(found: MappedChannels, names: tuple[str, ...], delay_s: float) -> di
 
 @pytest.mark.parametrize("name", ["dlc", "sweep", "fishhook", "step"])
 def test_sound_sensors_are_not_late(sample_logs_dir, name):
-    assert late_sensors(measure(survey(sample_logs_dir / f"{name}.mcap").signals)) == ()
+    assert measure(survey(sample_logs_dir / f"{name}.mcap").signals).late == ()
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_sound_sensors_are_not_late(sample_logs_dir, name):
     ],
 )
 def test_a_late_sensor_is_named_with_its_delay_or_with_the_least_of_it(dlc, names, delay_s, exact):
-    (late,) = late_sensors(measure(delayed(dlc, names, delay_s)))
+    (late,) = measure(delayed(dlc, names, delay_s)).late
     assert (set(late.names), late.exact) == (set(names), exact)
     assert late.delay_s == pytest.approx(delay_s, abs=0.02) if exact else 0.0 < late.delay_s < delay_s
     checks = delay_checks([late])

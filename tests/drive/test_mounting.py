@@ -116,7 +116,7 @@ def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles):
     assert (plan.mapping == auto_map(turned).mapping) == upright
     failed = {c.name for c in plan.checks if c.verdict == "failed"}
     assert bool(failed) != upright, "what is turned has a failed check: the run ends with exit code 3"
-    assert failed <= {f"{n}.corrected" for n in IMU} and not plan.refused
+    assert failed <= {f"{n}.corrected" for n in (*IMU, "roll_rate_rad_s", "pitch_rate_rad_s")} and not plan.refused
     assert difference(signals_of(turned, plan), signals_of(log, planned(log))) < 1e-9
     if not upright:
         assert "the IMU is mounted with" in plan.mapping.notes[-1]

@@ -26,7 +26,9 @@ _HEAD, _TAIL = "module p { module msg { module A_Constants { ", " }; struct A { 
 def _schema(encoding: str, text: str | bytes, name: str = "p/msg/A", example: bytes | None = None) -> MessageSchema:
     data = text if isinstance(text, bytes) else text.encode()
     wire = {"ros1msg": "ros1", "jsonschema": "json", "": "json", "protobuf": "protobuf"}.get(encoding, "cdr")
-    return channel_schema(ChannelRecord(1, "/t", wire, name, encoding, data), example=example)
+    return channel_schema(
+        ChannelRecord(1, "/t", wire, name, encoding, data), examples=() if example is None else (example,)
+    )
 
 
 def _columns(schema: MessageSchema, path: str, *messages: bytes) -> tuple[np.ndarray, list[int]]:
