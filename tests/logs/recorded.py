@@ -80,18 +80,26 @@ def raw_channel(writer: McapLogWriter, topic: str, name: str = "", text: bytes =
     return writer.add_channel(ChannelRecord(-1, topic, message, name, "ros2msg" if name else "", text))
 
 
-def write_vectors(folder: Path, topic: str, count: int, storage: str = "sqlite3", compression: str = "") -> Path:
-    """Write a rosbag2 folder of vectors x = 0, 0.25, ... by the writer of another project."""
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+def write_vectors(path: Path, topic: str, count: int, storage: str = "sqlite3", compression: str = "") -> Path:
+    """Write a rosbag2 folder, or a ROS 1 ``bag``, of vectors x = 0, 0.25, ... by the writer of another project."""
+    from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
-    store, name = get_typestore(Stores.ROS2_HUMBLE), "geometry_msgs/msg/Vector3"
-    writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()])
-    if compression:
-        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    is_bag, name = storage == "bag", "geometry_msgs/msg/Vector3"
+    store = get_typestore(Stores.ROS1_NOETIC if is_bag else Stores.ROS2_HUMBLE)
+    serialize = store.serialize_ros1 if is_bag else store.serialize_cdr
+    writer: Any = (
+        rosbag1.Writer(path)
+        if is_bag
+        else rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+    )
+    if compression and is_bag:
+        writer.set_compression(writer.CompressionFormat[compression])
+    elif compression:
+        writer.set_compression(rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD)
     with writer:
         connection = writer.add_connection(topic, name, typestore=store)
         for i in range(count):
             message = store.types[name](x=0.25 * i, y=0.0, z=0.0)
-            writer.write(connection, 1_700_000_000_000_000_000 + i, store.serialize_cdr(message, name))
-    return folder
+            writer.write(connection, 1_700_000_000_000_000_000 + i, serialize(message, name))
+    return path

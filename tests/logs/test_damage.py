@@ -54,20 +54,7 @@ def _mcap_of_a_killed_recorder(folder: Path) -> bytes:
 
 
 def _bag(folder: Path) -> bytes:
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    name = "geometry_msgs/msg/Vector3"
-    path = folder / "good.bag"
-    writer = Writer(path)
-    writer.set_compression(writer.CompressionFormat.LZ4)
-    with writer:
-        connection = writer.add_connection("/v", name, typestore=store)
-        for i in range(N):
-            message = store.types[name](x=float(i), y=0.0, z=0.0)
-            writer.write(connection, T0 + i, store.serialize_ros1(message, name))
-    return path.read_bytes()
+    return write_vectors(folder / "good.bag", "/v", N, "bag", "LZ4").read_bytes()
 
 
 def _database(folder: Path) -> bytes:
