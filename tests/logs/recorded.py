@@ -6,13 +6,17 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.reader import make_reader
 from mcap.summary import Summary
 
 from pdhef_logtool.logs.container import ChannelRecord
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter
+from pdhef_logtool.records.signals import FloatArray
+
+T0 = 1_700_000_000_000_000_000
 
 
 def numeric_paths(log: DriveLog, topic: str) -> list[str]:
@@ -80,6 +84,17 @@ def raw_channel(writer: McapLogWriter, topic: str, name: str = "", text: bytes =
     return writer.add_channel(ChannelRecord(-1, topic, message, name, "ros2msg" if name else "", text))
 
 
+def write_imu(path: Path, values: FloatArray, chunk: int = 10**9) -> Path:
+    """Write an MCAP of an IMU with yaw rates at 100 Hz; a chunk has up to ``chunk`` messages."""
+    stamps = T0 + np.arange(len(values)) * 10_000_000
+    with McapLogWriter(path) as writer:
+        writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
+        for at in range(0, len(values), chunk):
+            part = slice(at, at + chunk)
+            writer.write([Columns("/imu", stamps[part], stamps[part], {"angular_velocity.z": values[part]})])
+    return path
+
+
 def write_vectors(path: Path, topic: str, count: int, storage: str = "sqlite3", compression: str = "") -> Path:
     """Write a rosbag2 folder, or a ROS 1 ``bag``, of vectors x = 0, 0.25, ... by the writer of another project."""
     from rosbags import rosbag1, rosbag2
@@ -101,5 +116,5 @@ def write_vectors(path: Path, topic: str, count: int, storage: str = "sqlite3", 
         connection = writer.add_connection(topic, name, typestore=store)
         for i in range(count):
             message = store.types[name](x=0.25 * i, y=0.0, z=0.0)
-            writer.write(connection, 1_700_000_000_000_000_000 + i, serialize(message, name))
+            writer.write(connection, T0 + i, serialize(message, name))
     return path
