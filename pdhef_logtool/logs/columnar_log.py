@@ -107,12 +107,9 @@ class ColumnarLog(DriveLog):
     @property
     def lost(self) -> tuple[Loss, ...]:
         """Losses so far."""
-        losses = [*self._opened_lost, *self.recording_span.losses]
-        for c, container in enumerate(self.containers):
-            losses.extend(container.lost)
-            for id_ in sorted(container.channels):
-                losses.extend(self._channels[c, id_].losses())
-        return tuple(losses)
+        of_containers = (loss for container in self.containers for loss in container.lost)
+        of_channels = (loss for channel in self._channels.values() for loss in channel.losses())
+        return (*self._opened_lost, *self.recording_span.losses, *of_containers, *of_channels)
 
     @property
     def messages(self) -> ColumnarLog | None:
@@ -344,17 +341,11 @@ class ColumnarLog(DriveLog):
             raise nearest(topic, sorted(self._by_topic), "a topic of the log", self.path)
         for channel in self._by_topic[topic] if paths else ():
             schema = self._schema(channel)
-            if isinstance(schema, SchemaError):
-                problems.append(
-                    MappingError(
-                        expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
-                        got=str(schema),
-                        where=topic,
-                        remedy="give its definition with --set msgs=DIR, or map another topic",
-                    )
-                )
-                continue
             try:
+                if isinstance(schema, SchemaError):
+                    expected = "messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses"
+                    remedy = "give its definition with --set msgs=DIR, or map another topic"
+                    raise MappingError(expected=expected, got=str(schema), where=topic, remedy=remedy)
                 selections = tuple(resolve(schema, topic, path) for path in paths)
                 decoders[channel] = ChannelDecoder(schema, selections)
             except MappingError as error:
