@@ -281,14 +281,15 @@ class ColumnarLog(DriveLog):
         container = self.containers[c]
         want = want if container.selective else None
         key = (c, span.index)
-        if span.index in container.damaged:
+        if span.index in container.damaged | container.late:
             return None
         kept = self._kept.get((*key, want))
         if kept is not None and (not kept.dropped if payloads is None else kept.dropped.isdisjoint(payloads)):
             return kept
-        extent = container.extent(span)
+        extent, unread = container.extent(span), container.late
         try:
             container.meter.check()
+            unread = container.damaged
             with container.meter.running(extent[1] - extent[0]):
                 block = container.load(span, want)
                 if container.zstd_messages:
@@ -298,7 +299,7 @@ class ColumnarLog(DriveLog):
             count = sum(span.counts.values()) or None
             what = f"{count_text(count)} lost at byte {extent[0]}: {text}"
             container.lose(kind, what, span.start_ns, span.end_ns, count)
-            container.damaged.add(span.index)
+            unread.add(span.index)
             return None
         if (*key, want) not in self._seen:
             self._seen.add((*key, want))

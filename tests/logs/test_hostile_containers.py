@@ -204,6 +204,7 @@ def test_a_log_that_takes_too_long_loses_its_rest(tmp_path, monkeypatch):
         assert {loss.kind for loss in log.lost} == {"over-budget"}
         assert sum(loss.count or 0 for loss in log.lost) == sum(sum(s.counts.values()) for s in container.spans[3:])
         assert all("--set budget" in loss.what for loss in log.lost)
+        assert sum(topic.messages for topic in log.topics) == 2 * N
 
 
 @pytest.mark.parametrize("chunked", [True, False])
