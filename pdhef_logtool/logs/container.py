@@ -254,7 +254,7 @@ class Container(ABC):
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : remedy for a file of another format.
     zstd_messages : whether each message is a zstd frame.
-    is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
+    is_remote : whether each read is a network request. by_index : whether an index names all messages.
     """
 
     kind = ""

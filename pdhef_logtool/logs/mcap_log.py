@@ -310,8 +310,7 @@ class McapContainer(FileContainer):
             self.lost.append(Loss("bad-summary-crc", what, str(self.path), severity="note"))
         self.drop_undeclared("channels {}")
         self.is_remote = self.source.is_remote
-        described = bool(self.chunks) and not self._opened_chunks and all(extent.is_chunk for extent in self.chunks)
-        self.by_index = described and all(loss.kind == UNVERIFIED for loss in self.lost)
+        self.by_index = bool(self.chunks) and not self._opened_chunks and all(chunk.is_chunk for chunk in self.chunks)
 
     def _resolve_channels(self) -> None:
         """Join channels and schemas once all are known."""
