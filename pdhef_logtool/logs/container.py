@@ -247,14 +247,14 @@ class Container(ABC):
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
-    damaged : spans that could not be read.
+    damaged : spans that could not be read. late : spans for which no time was left; their messages stay announced.
     size : bytes of the file. cut : whether the file is truncated. meter : resource limits.
     kind : of a log with this file only, as :class:`~.drive_log.DriveLog` has it.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : remedy for a file of another format.
     zstd_messages : whether each message is a zstd frame.
-    is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
+    is_remote : whether each read is a network request. by_index : whether an index names all messages.
     """
 
     kind = ""
@@ -273,6 +273,7 @@ class Container(ABC):
         self.lost: list[Loss] = []
         self.undeclared: dict[int, int] = {}
         self.damaged: set[int] = set()
+        self.late: set[int] = set()
         self.meter = file.meter
         self.size = size
         self.cut = False
