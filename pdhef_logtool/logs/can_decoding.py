@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.logs.container import rows_by_channel
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.resource_limits import MIB
 from pdhef_logtool.records.errors import MappingFileError
@@ -103,10 +104,10 @@ class Frames:
         bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids > _CAN["base_id_bits"])
         rows = np.flatnonzero((self.parts.get("is_error", zero) == 0) & (self.parts.get("is_remote", zero) == 0))
         keys = (2 * bus.astype(np.int64) + (extended > 0)) * _IDS + (ids & ID_BITS)
-        keys, inverse, counts = np.unique(keys[rows], return_inverse=True, return_counts=True)
-        parts = np.split(rows[np.argsort(inverse, kind="stable")], np.cumsum(counts)[:-1])
-        sources = (Source(key // (2 * _IDS), bool(key // _IDS & 1), key & ID_BITS) for key in keys.tolist())
-        return dict(zip(sources, parts, strict=False))
+        return {
+            Source(key // (2 * _IDS), bool(key // _IDS & 1), key & ID_BITS): rows[its]
+            for key, its in rows_by_channel(keys[rows]).items()
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
