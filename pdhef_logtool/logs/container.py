@@ -209,10 +209,8 @@ def items_at_bytes(buffer: bytes | memoryview, size: int, start: int = 0) -> NDA
 
 def _copy(block: Block, buffer: NDArray[np.uint8], place: IntArray) -> None:
     """Copy the payloads of a block to places [N] in a buffer, those of one length at once."""
-    order = np.argsort(block.length, kind="stable")
-    borders = np.flatnonzero(np.diff(block.length[order])) + 1
-    for rows in np.split(order, borders) if len(order) else ():
-        if size := int(block.length[rows[0]]):
+    for size, rows in rows_by_channel(block.length).items():
+        if size:
             items_at_bytes(buffer.data, size)[place[rows]] = items_at_bytes(block.buffer, size)[block.offset[rows]]
 
 
@@ -451,7 +449,7 @@ class FileContainer(Container):
 
 
 def rows_by_channel(channel: IntArray) -> dict[int, IntArray]:
-    """Return the rows of each channel, ascending, from the channels [N] of messages."""
+    """Return the rows of each channel, ascending, from the channels [N] of messages, or of another whole number."""
     if not len(channel):
         return {}
     # 16 bits, if enough, sort much faster.
