@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType
-from recorded import counts_of, numeric_paths, summary_of, write_vectors
+from recorded import T0, counts_of, numeric_paths, summary_of, write_imu, write_vectors
 
 from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.open_log import open_log
@@ -21,19 +21,11 @@ from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, PdhefError
 from tests.command_line import called
 from tests.mcap_files import mcap_writer
 
-T0 = 1_700_000_000_000_000_000
 N = 400
 
 
 def _mcap(folder: Path) -> bytes:
-    path = folder / "good.mcap"
-    stamps = T0 + np.arange(N) * 10_000_000
-    with McapLogWriter(path) as writer:
-        writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
-        for at in range(0, N, 100):  # a chunk a call
-            cut = slice(at, at + 100)
-            writer.write([Columns("/imu", stamps[cut], stamps[cut], {"angular_velocity.z": np.arange(N)[cut] * 0.5})])
-    return path.read_bytes()
+    return write_imu(folder / "good.mcap", np.arange(N) * 0.5, chunk=100).read_bytes()
 
 
 def _json_log(folder: Path, **options: Any) -> Path:
@@ -54,20 +46,7 @@ def _mcap_of_a_killed_recorder(folder: Path) -> bytes:
 
 
 def _bag(folder: Path) -> bytes:
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    name = "geometry_msgs/msg/Vector3"
-    path = folder / "good.bag"
-    writer = Writer(path)
-    writer.set_compression(writer.CompressionFormat.LZ4)
-    with writer:
-        connection = writer.add_connection("/v", name, typestore=store)
-        for i in range(N):
-            message = store.types[name](x=float(i), y=0.0, z=0.0)
-            writer.write(connection, T0 + i, store.serialize_ros1(message, name))
-    return path.read_bytes()
+    return write_vectors(folder / "good.bag", "/v", N, "bag", "LZ4").read_bytes()
 
 
 def _database(folder: Path) -> bytes:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded import fields_of
+from recorded import T0, fields_of
 from rosbags.typesys import Stores, get_typestore
 
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
@@ -109,9 +109,6 @@ def test_an_installed_ros_is_looked_in_and_named(tmp_path, variable, monkeypatch
     (note,) = log.lost
     assert (note.severity, note.where) == ("note", "/steer")
     assert f"read by {folder / 'DriverInput.msg'} of this machine, as the log does not define its type" in note.what
-
-
-T0 = 1_700_000_000_000_000_000
 
 
 def _write_raw(path: Path, payloads: Sequence[bytes], encoding: str, name: str, schema: str, text: str) -> None:

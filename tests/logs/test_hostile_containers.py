@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType
-from recorded import counts_of
+from recorded import T0, counts_of
 
 from pdhef_logtool.logs.compression import decompress, decompress_message
 from pdhef_logtool.logs.container import SpanDamageError
@@ -25,7 +25,6 @@ from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log
 from tests.mcap_files import mcap_writer
 
-T0 = 1_700_000_000_000_000_000
 N = 300
 _MAGIC = b"\x89MCAP0\r\n"
 

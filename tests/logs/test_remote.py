@@ -162,12 +162,10 @@ def test_other_formats_are_fetched_once_as_a_whole(tmp_path, sample_logs_dir):
         assert server.twice() == 0
 
 
-def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir):
-    file = sample_logs_dir / "dlc.mcap"
-    with serving(**{file.name: file.read_bytes()}) as server:
-        server.ranges = False
-        assert _read(_place(server, file.name)) == _read(file)
-        assert len(server.requests) == 1
+def test_a_server_without_ranges_gives_all_at_once(served, sample_logs_dir):
+    served.ranges = False
+    assert _read(_place(served, "dlc.mcap")) == _read(sample_logs_dir / "dlc.mcap")
+    assert len(served.requests) == 1
 
 
 def _copies() -> list[Path]:
