@@ -107,12 +107,9 @@ class ColumnarLog(DriveLog):
     @property
     def lost(self) -> tuple[Loss, ...]:
         """Losses so far."""
-        losses = [*self._opened_lost, *self.recording_span.losses]
-        for c, container in enumerate(self.containers):
-            losses.extend(container.lost)
-            for id_ in sorted(container.channels):
-                losses.extend(self._channels[c, id_].losses())
-        return tuple(losses)
+        of_containers = (loss for container in self.containers for loss in container.lost)
+        of_channels = (loss for channel in self._channels.values() for loss in channel.losses())
+        return (*self._opened_lost, *self.recording_span.losses, *of_containers, *of_channels)
 
     @property
     def messages(self) -> ColumnarLog | None:
@@ -284,14 +281,15 @@ class ColumnarLog(DriveLog):
         container = self.containers[c]
         want = want if container.selective else None
         key = (c, span.index)
-        if span.index in container.damaged:
+        if span.index in container.damaged | container.late:
             return None
         kept = self._kept.get((*key, want))
         if kept is not None and (not kept.dropped if payloads is None else kept.dropped.isdisjoint(payloads)):
             return kept
-        extent = container.extent(span)
+        extent, unread = container.extent(span), container.late
         try:
             container.meter.check()
+            unread = container.damaged
             with container.meter.running(extent[1] - extent[0]):
                 block = container.load(span, want)
                 if container.zstd_messages:
@@ -301,7 +299,7 @@ class ColumnarLog(DriveLog):
             count = sum(span.counts.values()) or None
             what = f"{count_text(count)} lost at byte {extent[0]}: {text}"
             container.lose(kind, what, span.start_ns, span.end_ns, count)
-            container.damaged.add(span.index)
+            unread.add(span.index)
             return None
         if (*key, want) not in self._seen:
             self._seen.add((*key, want))
@@ -344,17 +342,11 @@ class ColumnarLog(DriveLog):
             raise nearest(topic, sorted(self._by_topic), "a topic of the log", self.path)
         for channel in self._by_topic[topic] if paths else ():
             schema = self._schema(channel)
-            if isinstance(schema, SchemaError):
-                problems.append(
-                    MappingError(
-                        expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
-                        got=str(schema),
-                        where=topic,
-                        remedy="give its definition with --set msgs=DIR, or map another topic",
-                    )
-                )
-                continue
             try:
+                if isinstance(schema, SchemaError):
+                    expected = "messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses"
+                    remedy = "give its definition with --set msgs=DIR, or map another topic"
+                    raise MappingError(expected=expected, got=str(schema), where=topic, remedy=remedy)
                 selections = tuple(resolve(schema, topic, path) for path in paths)
                 decoders[channel] = ChannelDecoder(schema, selections)
             except MappingError as error:

@@ -209,10 +209,8 @@ def items_at_bytes(buffer: bytes | memoryview, size: int, start: int = 0) -> NDA
 
 def _copy(block: Block, buffer: NDArray[np.uint8], place: IntArray) -> None:
     """Copy the payloads of a block to places [N] in a buffer, those of one length at once."""
-    order = np.argsort(block.length, kind="stable")
-    borders = np.flatnonzero(np.diff(block.length[order])) + 1
-    for rows in np.split(order, borders) if len(order) else ():
-        if size := int(block.length[rows[0]]):
+    for size, rows in rows_by_channel(block.length).items():
+        if size:
             items_at_bytes(buffer.data, size)[place[rows]] = items_at_bytes(block.buffer, size)[block.offset[rows]]
 
 
@@ -247,14 +245,14 @@ class Container(ABC):
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
-    damaged : spans that could not be read.
+    damaged : spans that could not be read. late : spans for which no time was left; their messages stay announced.
     size : bytes of the file. cut : whether the file is truncated. meter : resource limits.
     kind : of a log with this file only, as :class:`~.drive_log.DriveLog` has it.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : remedy for a file of another format.
     zstd_messages : whether each message is a zstd frame.
-    is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
+    is_remote : whether each read is a network request. by_index : whether an index names all messages.
     """
 
     kind = ""
@@ -273,6 +271,7 @@ class Container(ABC):
         self.lost: list[Loss] = []
         self.undeclared: dict[int, int] = {}
         self.damaged: set[int] = set()
+        self.late: set[int] = set()
         self.meter = file.meter
         self.size = size
         self.cut = False
@@ -450,7 +449,7 @@ class FileContainer(Container):
 
 
 def rows_by_channel(channel: IntArray) -> dict[int, IntArray]:
-    """Return the rows of each channel, ascending, from the channels [N] of messages."""
+    """Return the rows of each channel, ascending, from the channels [N] of messages, or of another whole number."""
     if not len(channel):
         return {}
     # 16 bits, if enough, sort much faster.

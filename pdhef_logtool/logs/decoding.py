@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial as bind
 from typing import Any, TypeAlias
@@ -186,35 +186,31 @@ class ChannelDecoder:
         columns = [np.array([_number(value) for value in part], np.float64) for part in parts]
         return _column(selection, columns, len(messages))
 
-    def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> Any:
+    def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> NDArray[Any]:
         """Return the elements of an array; none if too wide."""
-        value = bytes_of_text(value, selection.text) if selection.text else value
-        if isinstance(value, Sized) and not isinstance(value, str) and len(value) > most:
-            self.undecodable.append(row)
-            value = None
-        return _numbers(value)
+        elements = _numbers(bytes_of_text(value, selection.text) if selection.text else value)
+        if len(elements) <= most:
+            return elements
+        self.undecodable.append(row)
+        return elements[:0]
 
     def single_decoder(self) -> Callable[[bytes], object]:
         """Return a decoder of one message; it returns None if the payload does not fit the type or is too large."""
-        schema = self.schema
+        schema, most = self.schema, _affordable_bytes(self.schema)
+        decode: Callable[[bytes], object] = json.loads
         if schema.wire == "protobuf":
-            return _tolerant(schema.message_class.FromString, schema)
-        if schema.store is None:
-            return _tolerant(json.loads, schema)
-        function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
-        return _tolerant(bind(function, typename=schema.type_name), schema)
+            decode = schema.message_class.FromString
+        elif schema.store is not None:
+            function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
+            decode = bind(function, typename=schema.type_name)
 
+        def tolerant(data: bytes) -> object:
+            try:
+                return decode(data) if len(data) <= most else None
+            except Exception:  # noqa: BLE001 (third-party data and decoder)
+                return None
 
-def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Callable[[bytes], object]:
-    most = _affordable_bytes(schema)
-
-    def tolerant(data: bytes) -> object:
-        try:
-            return decode(data) if len(data) <= most else None
-        except Exception:  # noqa: BLE001 (third-party data and decoder)
-            return None
-
-    return tolerant
+        return tolerant
 
 
 def _affordable_bytes(schema: MessageSchema) -> float:

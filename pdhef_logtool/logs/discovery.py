@@ -198,13 +198,10 @@ def _expand(argument: str, private_redirects: bool, settings: TableSettings) -> 
         yield from (
             _search_store(place) if place.scheme == "s3" and (not place.key or argument.endswith("/")) else (place,)
         )
-    elif place.is_dir():
-        yield from _search(place, set(), settings)
-    elif place.exists() or not glob.has_magic(argument):
-        yield place
     else:
         visited: set[str] = set()
-        for match in _matches(argument):
+        is_pattern = not place.exists() and glob.has_magic(argument)
+        for match in _matches(argument) if is_pattern else [place]:
             if match.is_dir():
                 yield from _search(match, visited, settings)
             else:

@@ -88,12 +88,14 @@ class McapContainer(FileContainer):
         self._data_end: int | None = None  # place of the record
         self._is_summary_damaged = False
         self._statistics: Statistics | None = None
+        self._has_end = False  # whether the file ends with its magic bytes
         self._opened_chunks = 0  # number of chunks that no index describes
         super().__init__(file, source)
 
     def _walk(self) -> None:
         source, size = self.source, self.source.size
         indexed = self._indexed_chunks()
+        self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
         places = [*sorted(indexed), size]
         self.position = self._read_header()
         for offset in self._places():
@@ -265,19 +267,20 @@ class McapContainer(FileContainer):
     def _add_chunk(self, extent: Extent, claimed: Span | None = None) -> int:
         """Add a chunk; return the end of its message indexes.
 
-        The message indexes describe it if they agree with the summary (``claimed``), else with the head of the chunk;
-        if they do not, or name unknown channels, its content does. A remote chunk is described by the summary alone.
+        The message indexes describe it if they agree with the summary (``claimed``), or in a file without an end with
+        the head of the chunk; otherwise its content does. A remote chunk is described by the summary alone.
         """
+        can_be_indexed = claimed is not None or not self._has_end
         named = claimed if self._is_partial else self._span_by_indexes(extent)
         if claimed is None:
             first, last, unpacked, *_ = _CHUNK.unpack(self.source.read(extent.start + RECORD.size, _CHUNK.size))
             fits = named is not None and sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked
             counts = named.counts if named is not None and fits else {}
             claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, counts)
-        if named is None or named.counts != claimed.counts:
+        if named is None or (claimed.counts and named.counts != claimed.counts):
             what = f"the message indexes of the chunk at byte {extent.start} are damaged"
             self.lose("bad-record", f"{what}: its messages are found without them")
-        elif _agree(named, claimed) and named.counts and named.counts.keys() <= self._raw_channels.keys():
+        elif can_be_indexed and _agree(named, claimed) and named.counts.keys() <= self._raw_channels.keys():
             self.add_span(extent, named)
             return extent.index_end
         self._opened_chunks += 1
@@ -307,8 +310,7 @@ class McapContainer(FileContainer):
             self.lost.append(Loss("bad-summary-crc", what, str(self.path), severity="note"))
         self.drop_undeclared("channels {}")
         self.is_remote = self.source.is_remote
-        described = bool(self.chunks) and not self._opened_chunks and all(extent.is_chunk for extent in self.chunks)
-        self.by_index = described and all(loss.kind == UNVERIFIED for loss in self.lost)
+        self.by_index = bool(self.chunks) and not self._opened_chunks and all(chunk.is_chunk for chunk in self.chunks)
 
     def _resolve_channels(self) -> None:
         """Join channels and schemas once all are known."""

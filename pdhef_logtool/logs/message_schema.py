@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.definitions import MESSAGE_SEPARATOR, SHIPPED, Definitions, referenced, with_contained_types
-from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
 if TYPE_CHECKING:
@@ -156,10 +156,6 @@ class NoSchemaError(SchemaError):
     """A channel has no schema of a supported kind; this is no loss."""
 
 
-class MissingDefinitionError(NoSchemaError):
-    """No definition of a type is available."""
-
-
 @contextmanager
 def parsing(what: str) -> Iterator[None]:
     """Turn any error of a parser into a :class:`SchemaError`."""
@@ -245,8 +241,9 @@ def ros_schema(
         text = definitions.text_of(name)
         limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
         if not text.strip():
-            what = f"the log contains no definition of {name.replace('/msg/', '/')}"
-            raise MissingDefinitionError(f"{what}; give its .msg file by --set msgs=DIR")
+            missing = f"the log contains no definition of {name.replace('/msg/', '/')}"
+            kind = SchemaError if has_text else NoSchemaError  # if the log's own text is not whole, messages are lost
+            raise kind(f"{missing}; give its .msg file by --set msgs=DIR")
         return text
 
     with parsing(what):
@@ -255,14 +252,10 @@ def ros_schema(
             text = _SEPARATOR.sub(MESSAGE_SEPARATOR, text)
             types = _idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
         if not has_text or referenced(types) - set(types):  # a distribution's types take long to load
-            base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
+            of_ros2 = getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST)
+            base = Stores.ROS1_NOETIC if wire == "ros1" else of_ros2
             distributed = get_typestore(base).fielddefs
-            try:
-                types = with_contained_types(types, distributed, text_of, "" if has_text else type_name)
-            except MissingDefinitionError as error:
-                if has_text:  # the log's own text is not whole: its messages are lost
-                    raise SchemaError(str(error)) from error
-                raise
+            types = with_contained_types(types, distributed, text_of, "" if has_text else type_name)
             if not has_text:
                 files = (definitions.installed(name) for name in sorted(set(types) - set(distributed)))
                 borrowed = tuple(file for file in files if file is not None)
@@ -298,12 +291,6 @@ def _idl_types(text: str) -> Any:
             return self.unary_expr(pos)
 
     return make_typesdict(QuickParser(text).specification())
-
-
-def _store_of(distro: str) -> Any:
-    from rosbags.typesys import Stores
-
-    return getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST) if distro else Stores.LATEST
 
 
 def _ros_root(defs: Mapping[str, Any], type_name: str, limits: ResourceLimits) -> Struct:
@@ -365,14 +352,15 @@ def json_schema(type_name: str, text: bytes, examples: Iterable[bytes], limits: 
         if text.strip():
             document = json.loads(text.decode("utf-8", errors="replace"))
             root = _json_node(document, document, Unfolding(limits, what), 1, (), 0)
-        first = islice(examples, 3)
-        while _is_open(root) and (example := next(first, None)) is not None:
-            try:
+    first = islice(examples, 3)
+    while _is_open(root) and (example := next(first, None)) is not None:
+        try:
+            with parsing(what):
                 limits.check("schema_bytes", len(example), what)
                 root = _filled(root, _example_node(json.loads(example), Unfolding(limits, what), 0))
-            except (ValueError, RecursionError, LimitError):
-                if isinstance(root, Unknown):
-                    raise
+        except SchemaError:
+            if isinstance(root, Unknown):
+                raise
     if isinstance(root, Unknown) and not text.strip():
         raise NoSchemaError("JSON without a schema and without a message")
     return MessageSchema(type_name, "json", root, limits=limits)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -266,14 +266,12 @@ def _storage_file(folder: Path, name: str) -> Path | None:
 
 
 def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
-    """Return the serialization format that metadata.yaml declares for each topic."""
-    encodings: dict[str, str] = {}
-    topics = information.get("topics_with_message_count")
-    for entry in topics if isinstance(topics, list) else ():
-        topic = entry.get("topic_metadata") if isinstance(entry, dict) else None
-        if isinstance(topic, dict) and topic.get("serialization_format"):
-            encodings[_text(topic.get("name"))] = _text(topic["serialization_format"])
-    return encodings
+    """Return the serialization format that metadata.yaml declares for each topic; nothing of a malformed list."""
+    with suppress(TypeError, KeyError):
+        topics = [entry["topic_metadata"] for entry in information["topics_with_message_count"]]
+        formats = {_text(topic["name"]): _text(topic["serialization_format"]) for topic in topics}
+        return {name: encoding for name, encoding in formats.items() if encoding}
+    return {}
 
 
 def _text(value: object) -> str:

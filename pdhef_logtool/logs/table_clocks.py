@@ -348,7 +348,7 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
         hour, minute, second = (np.where(short, *pair) for pair in ((minute, hour), (second, minute), (0, second)))
     hour, minute, second = (np.maximum(part, 0) for part in (hour, minute, second))
     half = parts["half"].str.to_lowercase().fill_null("").to_numpy()
-    hour = np.where(half == "", hour, hour_of_day(hour, half == "p"))
+    hour = np.where(half == "", hour, hour % _HALF_DAY_H + _HALF_DAY_H * (half == "p"))
     has_time = (second <= _MINUTE_S) & ((minute < _HOUR_MIN) | short & ~is_dated) & ((hour < _DAY_H) | ~is_dated)
     fraction = parts["fraction"].fill_null("").str.pad_end(9, "0").cast(int).to_numpy()
     of_day = hour * _HOUR_NS + minute * _MINUTE_NS + second * _SECONDS + fraction
@@ -366,12 +366,7 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
 
 
 _WORDS = frozenset({"mark", "half", "sign", "fraction"})
-_MONTHS = [names.replace(" ", "|") for names in CONSTANTS["asc"]["months"]]
-
-
-def hour_of_day(hour: Any, is_afternoon: Any) -> Any:
-    """Return hours from 0 to 23 of hours of a clock with twelve, numbers or [N]."""
-    return hour % _HALF_DAY_H + _HALF_DAY_H * is_afternoon
+_MONTHS = [names.replace(" ", "|") for names in _CLOCKS["months"]]
 
 
 def _numbered_months(texts: Series) -> Series:

@@ -34,10 +34,8 @@ NAMES = {part: tuple(names.split()) for part, names in VOCABULARY["can_fields"].
 #: Kinds of fields that contain a part; all others are flags.
 _KINDS = {"id": ("number",), "data": ("array", "string"), "length": ("number",)}
 
-#: Flags that SocketCAN and DBC files keep above the 29 bits of an identifier.
-EXTENDED_FLAG = 1 << 31
+#: Flags of frames without data that SocketCAN keeps above the 29 bits of an identifier.
 NO_DATA_FLAGS = (1 << 30) | (1 << 29)
-STANDARD_ID_BITS = (1 << 11) - 1
 
 
 def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
@@ -265,12 +263,12 @@ def _is_message(frames: Columns, view: _CanView, settings: CanSettings) -> BoolA
     fits = is_valid & ((ids & NO_DATA_FLAGS) == 0)
     bare = ids & dbc.ID_BITS
     fits &= (bare & settings.id_mask) == (view.message.frame_id & settings.id_mask)
-    flagged = (ids & EXTENDED_FLAG) != 0
+    flagged = (ids & dbc.EXTENDED_FLAG) != 0
     if "extended" in paths:
         flagged |= fields[paths["extended"]] > 0.0
     elif view.unflagged_may_be_extended and view.message.is_extended_frame:
         flagged[:] = True
-    flagged |= bare > STANDARD_ID_BITS
+    flagged |= bare > dbc.BASE_ID_BITS
     fits &= flagged == view.message.is_extended_frame
     for path in view.paths.no_data:
         fits &= ~(fields[path] > 0.0)

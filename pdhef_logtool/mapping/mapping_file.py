@@ -44,8 +44,10 @@ def _consistent(record: Record) -> Record:
 def problem_of(record: SignalSource | QualityGate | CanSettings) -> str:
     """Return which entries of a record contradict one another; empty without a contradiction."""
     if isinstance(record, CanSettings):
-        if not record.dbc or not 1 <= record.id_mask <= (most := CanSettings(()).id_mask):
-            return f"id_mask should be from 1 to {most}" if record.dbc else "dbc should name at least one file"
+        if not record.dbc or Path() in record.dbc:
+            return "dbc should name at least one file"
+        if not 1 <= record.id_mask <= (most := CanSettings(()).id_mask):
+            return f"id_mask should be from 1 to {most}"
         return "" if (record.bus is None) == (not record.bus_field) else "bus and bus_field belong together"
     if record.clock == "device" and record.stamp in RECORDER_STAMPS:
         return f'clock = "device" needs a stamp of the device, not "{record.stamp}"'
@@ -110,11 +112,13 @@ def load_mapping(path: Path | str) -> Mapping:
 
 
 def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path()) -> Mapping:
-    """Build a mapping from parsed TOML; every problem is reported in one line. DBC files are relative to ``folder``.
+    """Build a mapping from parsed TOML. DBC files are relative to ``folder``.
 
     Raises
     ------
-    MappingFileError : Entries are wrong, unknown, missing or contradict one another.
+    MappingFileError
+        Entries are wrong, unknown, missing or contradict one another. All are named in one line; contradictions between
+        sources once all of them are right.
     """
     problems: list[str] = []
     signals = _named(raw.get("signals", {}), "signals", TRUTH_UNITS.keys() - SIGNAL_UNITS.keys(), "truth", problems)

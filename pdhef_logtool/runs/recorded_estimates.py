@@ -199,7 +199,7 @@ def _score_drive(
     for track, s in zip(tracks, scored, strict=True):
         asked = [q for q in plan.requirements if q.estimator == track.name or (selected and q.estimator is None)]
         blocks += requirement_blocks(asked, selected, s.drive)
-    space = operating_space(together.signals, together.truth, together.read(selected or ""), drive.car.vehicle)
+    space = operating_space(together.signals, together.truth, together.tracks.get(selected or ""), drive.car.vehicle)
     stated = judge_drive(plan, drive, None, whole.rows, blocks, space)
     stated["estimators"] = [estimator_entry(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded]
     losses = merge_losses([drive.losses, lost])
@@ -261,9 +261,8 @@ def _reference(drive: Drive, model: DriveModel, config: RunConfig) -> DriveRefer
 def _drive_at(drive: Drive, truth: TruthTrack | None, stamps_ns: IntArray) -> WholeDrive:
     """Return the drive at stamps [N]: its sensors are interpolated between samples, never across gaps."""
     plan, recorded = drive.plan, drive.recorded()
-    read, columns = recorded.signals, dict[str, Any]()
-    for name in ALIGNED_SIGNALS:
-        columns[name] = _interpolated(read.stamps_ns, getattr(read, name), stamps_ns)
+    read = recorded.signals
+    columns: dict[str, Any] = {n: _interpolated(read.stamps_ns, getattr(read, n), stamps_ns) for n in ALIGNED_SIGNALS}
     wheels = np.full((len(stamps_ns), len(WHEELS)), np.nan)
     signals = Signals(stamps_ns, stamps_ns, wheel_speed_m_s=wheels, available=read.available, **columns)
     latency_s, standstill_m_s = plan.truth_latency_s, plan.vehicle.standstill_m_s

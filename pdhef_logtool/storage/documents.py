@@ -219,8 +219,8 @@ def _problems(error: ValidationError, model: type, raw: object, table: str) -> l
             text = "is missing"
         else:
             text = e["msg"].removeprefix("Value error, ")
-            text = text.replace("Input should", "should").replace("an instance of Path", "a path")
-            text = text.replace("a valid array", "a list").replace("an object", "a table")
+            for pydantic, ours in (("Input should", "should"), ("a valid array", "a list"), ("an object", "a table")):
+                text = text.replace(pydantic, ours)
             # The message of a table names its entries.
             text += f", got {value!r:.60}" if isinstance(value, str | int | float) else ""
         texts_by_entry.setdefault(entry, []).append(text)

@@ -145,9 +145,10 @@ def test_json_times_are_nanoseconds_and_missing_ones_are_marked(tmp_path):
 
 def test_places_that_a_json_schema_leaves_open_are_found_in_the_messages(tmp_path):
     messages = [{"m": {"v": [1, 2]}}, {"m": {"v": [3, 4]}}]
-    read = _read_json(tmp_path / "x.mcap", messages, {"type": "object"}, ["m.v", "m.v[1]"])
-    np.testing.assert_array_equal(read["m.v"], [[1, 2], [3, 4]])
-    np.testing.assert_array_equal(read["m.v[1]"], [2, 4])
+    for schema in ({"type": "object"}, {"properties": {"m": {"properties": {"v": {"type": "array"}}}}}):
+        read = _read_json(tmp_path / "x.mcap", messages, schema, ["m.v", "m.v[1]"])
+        np.testing.assert_array_equal(read["m.v"], [[1, 2], [3, 4]])
+        np.testing.assert_array_equal(read["m.v[1]"], [2, 4])
 
 
 def test_a_json_message_that_is_no_json_is_counted(tmp_path):

@@ -79,15 +79,17 @@ def test_a_flipped_bit_in_a_chunk_without_indexes_is_a_loss_that_names_it(tmp_pa
 
 
 @pytest.mark.parametrize(
-    "place", ["channel of an index", "kind of an index", "size", "huge size", "times of a chunk", "kind of a chunk"]
+    "place",
+    ["channel", "channel, no summary", "kind of an index", "size", "huge size", "times of a chunk", "kind of a chunk"],
 )
 def test_messages_that_an_index_or_a_header_hides_are_read_or_lost(tmp_path, place):
     path = _write(tmp_path / "a.mcap")
     data = bytearray(path.read_bytes())
     index = [at for op, at, _ in _records(data) if op == 7][2]
     chunk = [at for op, at, _ in _records(data) if op == 6][1]
-    if place == "channel of an index":
+    if place.startswith("channel"):
         struct.pack_into("<H", data, index + 9, 1 + data[index + 9] % 2)
+        data[-9] ^= "no summary" in place
     elif place == "kind of an index":
         data[index] = 0x87
     elif "size" in place:
@@ -201,6 +203,7 @@ def test_a_log_that_takes_too_long_loses_its_rest(tmp_path, monkeypatch):
         assert {loss.kind for loss in log.lost} == {"over-budget"}
         assert sum(loss.count or 0 for loss in log.lost) == sum(sum(s.counts.values()) for s in container.spans[3:])
         assert all("--set budget" in loss.what for loss in log.lost)
+        assert sum(topic.messages for topic in log.topics) == 2 * N
 
 
 @pytest.mark.parametrize("chunked", [True, False])

@@ -22,7 +22,7 @@ SLOW = {"Speed [km/h]": np.round(70.0 + 5.0 * np.sin(9.0 * TIME_S[::5]), 4)}
 #: Layouts with titles, rates or whole seconds of their own recorder.
 OTHERS = (
     "default csv-plain csv-tabs csv-dashboard csv-two-clocks csv-separate-millis csv-rated csv-messages csv-settings "
-    "csv-stamps csv-dots json-split txt-sentences txt-nmea txt-estimator"
+    "csv-stamps csv-dots csv-hash json-split txt-sentences txt-nmea txt-estimator"
 )
 #: Layouts of signals at the same times.
 ONE_CLOCK = "txt-kinds txt-aligned txt-positions vbo mat-pairs mat-quantities mat-names json-channels hdf5-frame"

@@ -97,16 +97,6 @@ class Steps:
             gap = float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * S_PER_NS
         return dict(zip(("largest_gap_s", "largest_gap_at_s"), gap, strict=True))
 
-    @property
-    def gap_limit_s(self) -> float:
-        """Steps above this limit are gaps."""
-        return max(MIN_GAP_S, GAP_PERIODS * self.median_s)
-
-    @property
-    def gaps(self) -> int:
-        """Number of gaps."""
-        return int(np.count_nonzero(self.steps_s > self.gap_limit_s))
-
 
 _NONE = np.empty(0, dtype=np.int64)
 
@@ -419,6 +409,7 @@ def _signal_report(
     quality: QualityGate | None,
 ) -> SignalReport:
     steps = Steps.of([c.stamps_ns for c in channels])
+    gap_s = max(MIN_GAP_S, GAP_PERIODS * steps.median_s)
     lengths = (c.values if c.values.ndim == 1 else np.linalg.norm(c.values, axis=1) for c in channels)
     values = np.concatenate([np.empty(0), *lengths])
     places = {f"{source.name} ({source.label})"}
@@ -438,8 +429,8 @@ def _signal_report(
         rate_hz=steps.rate_hz,
         latency_s=clock.median_delay_s + source.latency_s,
         **figures,
-        gaps=steps.gaps,
-        **steps.longest(log.start_ns, steps.gap_limit_s),
+        gaps=int(np.count_nonzero(steps.steps_s > gap_s)),
+        **steps.longest(log.start_ns, gap_s),
         dropped=dropped,
     )
 
