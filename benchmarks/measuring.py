@@ -72,31 +72,33 @@ def _processor_seconds() -> float:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Processor seconds and peak resident memory of a command."""
+    """Processor seconds, peak resident memory and elapsed seconds of a command."""
 
     seconds: float
     peak_bytes: int
+    elapsed_s: float
 
 
 def command_cost(*arguments: str | Path, tree: Path = ROOT, module: str = "pdhef_logtool") -> Cost:
-    """Return the cost of ``pdhef ARGUMENTS`` of a source tree on one thread; its exit code must be 0 or 3.
+    """Return the cost of ``pdhef ARGUMENTS`` of a source tree; its exit code must be 0 or 3.
 
     Linux counts the peak of a process from the size of its parent on, so a small one in between starts it.
     """
     code = (
-        "import json, resource, subprocess, sys; done = subprocess.run(sys.argv[1:], capture_output=True, text=True);"
+        "import json, resource, subprocess, sys, time; start = time.monotonic();"
+        "done = subprocess.run(sys.argv[1:], capture_output=True, text=True); elapsed_s = time.monotonic() - start;"
         "used = resource.getrusage(resource.RUSAGE_CHILDREN);"
-        "print(json.dumps([done.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss]))"
+        "print(json.dumps([done.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss, elapsed_s]))"
     )
     command = [sys.executable, "-c", code, sys.executable, "-m", module, *map(str, arguments)]
     # Byte code is kept, as in an installation.
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     environment |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(tree)}
     done = subprocess.run(command, cwd=tree, check=True, capture_output=True, text=True, env=environment)
-    code_of, seconds, peak = json.loads(done.stdout)
+    code_of, seconds, peak, elapsed_s = json.loads(done.stdout)
     if code_of not in (0, 3):
         raise SystemExit(f"{module} {' '.join(map(str, arguments))} ended with {code_of}")
-    return Cost(seconds, peak * _RSS_UNIT)
+    return Cost(seconds, peak * _RSS_UNIT, elapsed_s)
 
 
 def gauge_seconds() -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import zlib
+from contextlib import closing
 from pathlib import Path
 
 from benchmarks.measuring import ROUNDS, Row, best_seconds, command_cost
@@ -22,14 +23,11 @@ def read_mapped(path: Path) -> int:
     """Read the mapped fields with our reader; returns the number of messages."""
     from pdhef_logtool.logs.open_log import open_log
 
-    log = open_log(path)
-    try:
+    with closing(open_log(path)) as log:
         columns = log.read(MAPPED)
         if log.lost:
             raise SystemExit(f"{path.name} is damaged; delete it")
         return sum(len(c) for c in columns.values())
-    finally:
-        log.close()
 
 
 def decompress_all(path: Path) -> int:

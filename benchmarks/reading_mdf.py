@@ -6,6 +6,7 @@ get all columns and times; ours cleans the times and reads in windows of a minut
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +43,7 @@ def read_ours(path: Path) -> int:
     from pdhef_logtool.logs.drive_log import windows
     from pdhef_logtool.logs.open_log import open_log
 
-    log = open_log(path)
-    try:
+    with closing(open_log(path)) as log:
         requests = {t.name: [f.path for f in log.fields(t.name)] for t in log.topics}
         total = 0
         for start_ns, end_ns in windows(log.start_ns, log.end_ns, 60 * 10**9, log.recording_span):
@@ -51,8 +51,6 @@ def read_ours(path: Path) -> int:
         if log.lost:
             raise SystemExit(f"{path.name} is damaged; delete it")
         return total
-    finally:
-        log.close()
 
 
 def read_asammdf(path: Path) -> int:

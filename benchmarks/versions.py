@@ -1,7 +1,7 @@
 """The same commands by this version and an earlier one, in turns on one machine.
 
-Processor seconds are the best of two turns, memory the smallest peak of a process; code is compiled before. The last
-column: cost of the earlier version over that of this one.
+Processor and elapsed seconds are the best of two turns, memory the smallest peak of a process; code is compiled before.
+The last column: cost of the earlier version over that of this one.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ def rows(other: Path) -> list[Row]:
                 of_tree.append(command_cost(*words, tree=tree))
         for name, unit, figure in (
             (work, "s", lambda cost: cost.seconds),
+            ("elapsed time of it", "s", lambda cost: cost.elapsed_s),
             ("memory of it", "MB", lambda cost: cost.peak_bytes / 1e6),
         ):
             ours, theirs = (min(map(figure, of_tree)) for of_tree in costs.values())

@@ -56,15 +56,21 @@ def share_of_means(draw: Draw, drives: int, times: int, seed: int) -> float:
     return float(np.mean(other.mean(axis=1) / level.mean(axis=1) > 1.0 + LIMIT))
 
 
-def shares_of_days(shared: float, times: int, seed: int) -> tuple[float, float]:
+def ratios_of_days(
+    rng: np.random.Generator, days: int, drives: int, shared: float
+) -> tuple[FloatArray, dict[str, list[int]]]:
+    """Return log ratios without a change, with this share of their variance between days, and the day of each."""
+    day = np.repeat(np.arange(days), drives)
+    own, common = rng.normal(size=len(day)), rng.normal(size=days)[day]
+    return SPREAD * (math.sqrt(1.0 - shared) * own + math.sqrt(shared) * common), {"day": day.tolist()}
+
+
+def shares_of_days(shared: float, times: int, seed: int, drives: int = DRIVES_A_DAY) -> tuple[float, float]:
     """Return how often equal runs of :data:`DAYS` days are called worse: with independent drives, and by default."""
     rng = np.random.default_rng(seed)
-    day = np.repeat(np.arange(DAYS), DRIVES_A_DAY)
-    factors = {"day": day.tolist()}
     alone = together = 0
     for _ in range(times):
-        own, common = rng.normal(size=len(day)), rng.normal(size=DAYS)[day]
-        ratios = SPREAD * (math.sqrt(1.0 - shared) * own + math.sqrt(shared) * common)
+        ratios, factors = ratios_of_days(rng, DAYS, drives, shared)
         alone += paired_change(ratios).verdict() == "worse"
         together += paired_change(ratios, None, factors).verdict() == "worse"
     return alone / times, together / times

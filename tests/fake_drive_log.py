@@ -1,6 +1,6 @@
 """A log in memory with the reader's protocol, to test code that reads logs without files."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, Requests, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -67,12 +67,11 @@ class FakeLog(DriveLog):
     def first_messages(self, topic: str, most: int) -> list[object]:
         return list(self.contents[topic].examples[:most])
 
-    def _read(
-        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
+    def read(
+        self, requests: Requests, start_ns: int | None = None, end_ns: int | None = None, *, quiet: bool = False
     ) -> dict[str, Columns]:
         self.reads.append({t: list(p) for t, p in requests.items()})
-        wanted = {**dict.fromkeys(stamps, ()), **requests}
-        return {name: self._columns(name, paths, *window_ns) for name, paths in wanted.items()}
+        return {name: self._columns(name, paths, start_ns, end_ns) for name, paths in requests.items()}
 
     def close(self) -> None:
         pass

@@ -5,14 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pdhef_logtool.residual_model.bundle import (
-    LATERAL_VELOCITY,
-    NOMINAL_MODEL,
-    PHYSICS_MODEL,
-    RESIDUAL,
-    ModelBundle,
-    Normalisation,
-)
+from pdhef_logtool.residual_model import bundle
 from pdhef_logtool.residual_model.features import EVEN_COUNT, FEATURES, ODD_COUNT, PAPER_FEATURES
 from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.residual_model.linear_model import LinearModel
@@ -30,7 +23,7 @@ def random_network(
     scales: tuple[float, float] = (10.0, 1.0),
     constant: tuple[float, float] | None = None,
     **settings: str,
-) -> ModelBundle:
+) -> bundle.ModelBundle:
     """Return a network with random weights, scaled by an input and an output; or with a constant output."""
     torch.manual_seed(seed)
     size = len(names)
@@ -40,16 +33,18 @@ def random_network(
         last = max(k for k in weights if k.startswith("head") and k.endswith("bias"))
         weights[last.replace("bias", "weight")][:] = 0.0
         weights[last][:] = constant
-    normalisation = Normalisation((0.0,) * size, (scales[0],) * size, (scales[1],) * outputs)
-    return ModelBundle(names, hidden, layers, head, 0.01, normalisation, weights=weights, **settings)
+    normalisation = bundle.Normalisation((0.0,) * size, (scales[0],) * size, (scales[1],) * outputs)
+    return bundle.ModelBundle(names, hidden, layers, head, 0.01, normalisation, weights=weights, **settings)
 
 
-def full_network(seed: int = 1) -> ModelBundle:
+def full_network(seed: int = 1) -> bundle.ModelBundle:
     """Return a network with all baselines beside it: β = 0.9 v_y,phy / 22 m/s − 0.001 a_y, at 22 m/s."""
-    papers = random_network(seed, PAPER_FEATURES, scales=(5.0, 1.0), model=NOMINAL_MODEL)
-    lstm = random_network(seed, outputs=1, scales=(5.0, 1.0), target=LATERAL_VELOCITY, model=NOMINAL_MODEL)
+    papers = random_network(seed, PAPER_FEATURES, scales=(5.0, 1.0), model=bundle.NOMINAL_MODEL)
+    lstm = random_network(
+        seed, outputs=1, scales=(5.0, 1.0), target=bundle.LATERAL_VELOCITY, model=bundle.NOMINAL_MODEL
+    )
     regression = LinearModel(("ay_m_s2", "physics_vy_m_s"), (-0.001 * seed, 0.9 / 22.0), 0.0, 2.0)
-    physics = random_network(seed, scales=(5.0, 1.0), target=RESIDUAL, model=PHYSICS_MODEL)
+    physics = random_network(seed, scales=(5.0, 1.0), target=bundle.RESIDUAL, model=bundle.PHYSICS_MODEL)
     return replace(physics, pure_lstm=lstm, linear_regression=regression, paper_network=papers)
 
 

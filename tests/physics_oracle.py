@@ -27,6 +27,8 @@ from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, default_v
 TRACK_M, CG_HEIGHT_M, G = 1.57, 0.64, 9.80665
 BANK_TIME_S, FORCE_SCALE_TIME_S, KINEMATIC_TIME_S = 5.0, 2.0, 0.1
 BLEND_LOW_M_S, BLEND_HIGH_M_S = 1.5, 3.0
+RELAXATION_M, SENSITIVITY, SWING_M = 0.5, 0.15, 0.4
+ROLL_GRADIENT, ROLL_FREQUENCY, ROLL_DAMPING = 0.0105, 11.0, 0.35
 ALL_PARTS = tuple(PhysicsParts.model_fields)
 
 
@@ -58,28 +60,11 @@ class Oracle:
     """The ODE of a car with parts; without lag its forces are algebraic."""
 
     has: PhysicsParts
-    relaxation_m: float = 0.5
-    sensitivity: float = 0.15
-    roll_gradient: float = 0.0105
-    roll_frequency: float = 11.0
-    roll_damping: float = 0.35
-    swing_m: float = 0.4
     imu: tuple[float, float] = (0.0, 0.0)
 
     def as_vehicle(self, **changes) -> VehicleParameters:
-        return default_vehicle().model_copy(
-            update={
-                "physics": self.has,
-                "relaxation_length_m": self.relaxation_m,
-                "load_sensitivity": self.sensitivity,
-                "roll_gradient_rad_per_m_s2": self.roll_gradient,
-                "roll_frequency_rad_s": self.roll_frequency,
-                "roll_damping": self.roll_damping,
-                "cg_over_roll_axis_m": self.swing_m,
-                "imu_position_m": (*self.imu, 0.0),
-                **changes,
-            }
-        )
+        update = {"physics": self.has, "imu_position_m": (*self.imu, 0.0), **changes}
+        return default_vehicle().model_copy(update=update)
 
     def _named(self, x: np.ndarray) -> dict[str, float]:
         found = dict.fromkeys(names_of(parts(*ALL_PARTS)), 0.0)
@@ -89,9 +74,9 @@ class Oracle:
         """Return the steady forces over the mass; ``x`` contains the lateral acceleration."""
         s = self._named(x)
         v = max(s["vx"], BLEND_LOW_M_S)
-        vy = s["vy"] + (self.swing_m * s["phi_dot"] if self.has.roll else 0.0)
+        vy = s["vy"] + (SWING_M * s["phi_dot"] if self.has.roll else 0.0)
         alpha = steer - s["b_delta"] - math.atan((vy + FRONT_M * s["r"]) / v), -math.atan((vy - REAR_M * s["r"]) / v)
-        ay = s["phi"] / self.roll_gradient if self.has.roll else self.lateral(x, steer)
+        ay = s["phi"] / ROLL_GRADIENT if self.has.roll else self.lateral(x, steer)
         found = []
         for slip, front in zip(alpha, (True, False), strict=True):
             force = magic_tyre(slip, mu, front) / MASS_KG
@@ -107,7 +92,7 @@ class Oracle:
     def transfer(self, ay: float) -> float:
         """Two wheels, each with the share of the load that is left or gained (Eq 7)."""
         x = min(1.0, abs(2.0 * CG_HEIGHT_M * ay / (G * TRACK_M)))
-        return 0.5 * ((1 + x) * (1 - self.sensitivity * x) + (1 - x) * (1 + self.sensitivity * x))
+        return 0.5 * ((1 + x) * (1 - SENSITIVITY * x) + (1 - x) * (1 + SENSITIVITY * x))
 
     def share(self, vx: float) -> float:
         return min(1.0, max(0.0, (vx - BLEND_LOW_M_S) / (BLEND_HIGH_M_S - BLEND_LOW_M_S)))
@@ -131,7 +116,7 @@ class Oracle:
         front = s["ff"] * math.cos(steer)
         to_f, to_r = self.tyres(x, steer, ax, mu)
         rolling = s["vx"] * math.tan(steer) / WHEELBASE_M
-        rate = max(s["vx"], BLEND_LOW_M_S) / self.relaxation_m if self.has.lag else 0.0
+        rate = max(s["vx"], BLEND_LOW_M_S) / RELAXATION_M if self.has.lag else 0.0
         d = dict.fromkeys(s, 0.0)
         d["r"] = w * MASS_KG * (FRONT_M * front - REAR_M * s["fr"]) / YAW_INERTIA
         d["r"] += (1.0 - w) * (rolling - s["r"]) / KINEMATIC_TIME_S
@@ -140,23 +125,19 @@ class Oracle:
         d["vx"] = ax - s["b_ax"] + s["vy"] * s["r"] + d["r"] * self.imu[1] + s["r"] ** 2 * self.imu[0]
         d["ff"], d["fr"] = rate * (to_f - s["ff"]), rate * (to_r - s["fr"])
         d["phi"] = s["phi_dot"]
-        wanted = self.roll_gradient * self.lateral(x, steer)
-        d["phi_dot"] = self.roll_frequency**2 * (wanted - s["phi"])
-        d["phi_dot"] -= 2.0 * self.roll_damping * self.roll_frequency * s["phi_dot"]
+        wanted = ROLL_GRADIENT * self.lateral(x, steer)
+        d["phi_dot"] = ROLL_FREQUENCY**2 * (wanted - s["phi"])
+        d["phi_dot"] -= 2.0 * ROLL_DAMPING * ROLL_FREQUENCY * s["phi_dot"]
         d["bank"], d["s"] = -s["bank"] / BANK_TIME_S, -s["s"] / FORCE_SCALE_TIME_S
         return np.array([d[name] for name in names_of(self.has)])
 
     def after(self, x: np.ndarray, steer: float, ax: float, mu: float, duration_s: float) -> np.ndarray:
         """The state ``duration_s`` later with inputs that stay."""
-        found = solve_ivp(
-            lambda _t, y: self.derivative(y, steer, ax, mu),
-            (0.0, duration_s),
-            x,
-            method="DOP853",
-            rtol=1e-10,
-            atol=1e-13,
-        )
-        end = found.y[:, -1]
+
+        def f(_t: float, y: np.ndarray) -> np.ndarray:
+            return self.derivative(y, steer, ax, mu)
+
+        end = solve_ivp(f, (0.0, duration_s), x, method="DOP853", rtol=1e-10, atol=1e-13).y[:, -1]
         return end if self.has.lag else self.settled(end, steer, ax, mu)
 
     def sensed_ay(self, x: np.ndarray, steer: float) -> float:
@@ -166,7 +147,7 @@ class Oracle:
         front = s["ff"] * math.cos(steer)
         r_dot = w * MASS_KG * (FRONT_M * front - REAR_M * s["fr"]) / YAW_INERTIA
         ay = self.lateral(x, steer)
-        lean = s["phi"] if self.has.roll else self.roll_gradient * ay
+        lean = s["phi"] if self.has.roll else ROLL_GRADIENT * ay
         return ay + G * lean + r_dot * self.imu[0] - s["r"] ** 2 * self.imu[1] + s["b_ay"]
 
     def drive(self, steer: Callable[[float], float], duration_s: float, n: int = 4, **start: float) -> Drive:

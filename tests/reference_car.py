@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
 
 MASS_KG, YAW_INERTIA, FRONT_M, REAR_M = 1440.0, 1523.0, 1.16, 1.71
@@ -165,6 +166,12 @@ def rolling_drive(
     return Drive(signals, v, vy, r, ay)
 
 
+def on_axles(vehicle: VehicleParameters, front: float, rear: float) -> VehicleParameters:
+    """Return a vehicle file that states no tyres but the cornering stiffness of both axles, N/rad."""
+    front_tyre, rear_tyre = (AxleTyre(cornering_stiffness_n_per_rad=c) for c in (front, rear))
+    return vehicle.model_copy(update={"tyres": Tyres(front=front_tyre, rear=rear_tyre)})
+
+
 def slalom(amplitude: float = 0.03, frequency_hz: float = 0.4) -> Callable[[float], float]:
     return lambda t: amplitude * math.sin(2 * math.pi * frequency_hz * t)
 
@@ -185,6 +192,16 @@ def with_noise(signals: Signals, seed: int, scale: float = 1.0) -> Signals:
         yaw_rate_rad_s=noisy(signals.yaw_rate_rad_s, 0.004),
         speed_m_s=noisy(signals.speed_m_s, 0.08),
     )
+
+
+def rough_drive(seed: int, count: int, noise_seed: int) -> Signals:
+    """Return a noisy slalom on irregular stamps, with missing samples and messages that arrive late and bunched."""
+    rng = np.random.default_rng(seed)
+    driven = drive(slalom(0.035, 0.5), speed=22.0, step_s=rng.uniform(0.004, 0.022, count))
+    s = with_noise(driven.signals, noise_seed)
+    for column in (s.steer_rad, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s):
+        column[rng.random(len(s)) < 0.05] = np.nan
+    return replace(s, ready_ns=np.maximum.accumulate(s.stamps_ns + rng.integers(0, 45_000_000, len(s))))
 
 
 def keep(signals: Signals, mask: np.ndarray) -> Signals:

@@ -83,7 +83,8 @@ def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
     if function is None:
         return functools.partial(njit, cache=cache, **options)
     options.setdefault("no_cpython_wrapper", bool(options.get("forceinline")))
-    compiled = numba.njit(function, no_cfunc_wrapper=True, **options)
+    # Estimators run side by side in threads (runs/estimating.py).
+    compiled = numba.njit(function, no_cfunc_wrapper=True, nogil=True, **options)
     if cache and not config.DISABLE_JIT:
         # A call with a constant is one with a number: numba would compile the function for each value again.
         resolve = compiled.get_call_template

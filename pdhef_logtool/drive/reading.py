@@ -15,7 +15,6 @@ from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_s
 from pdhef_logtool.drive.plan import CLOCK_START_S, DrivePlan, Sensors, is_device_clock, plan_drive, with_earlier_drive
 from pdhef_logtool.drive.recorded import WholeDrive as WholeDrive
 from pdhef_logtool.drive.recorded import read_recorded
-from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, Logs, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
@@ -218,7 +217,7 @@ def read_drive(
 
     state = log_state(log_input.path)
     tables = tables_for(mapping, options.tables)
-    opened = open_log(log_input.path, options.limits, options.msgs, Wanted(frozenset()), tables)
+    opened = open_log(log_input.path, options.limits, options.msgs, tables)
     try:
         earlier = None
         if options.model not in (AUTO, OFF):
@@ -234,9 +233,8 @@ def read_drive(
         if opened.end_ns <= opened.start_ns:
             raise no_samples(log_input.path)
         slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
-        if not isinstance(log_input.path, Path):
-            opened = _reopened(opened, used, slice_ns, options)
-            slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
+        if opened.messages is not None:
+            opened.messages.prefetch({source.topic for source in used.sources()}, [slice_ns])
         given = None if options.model == AUTO and car.vehicle == default_vehicle() else car.vehicle
         plan = plan_drive(
             opened, used, given, *slice_ns, require_imu=require_sensors, sensors=earlier, waived=options.waived
@@ -255,15 +253,6 @@ def read_drive(
     return Drive(
         log_input.stem, opened, car, options, plan, chosen, notes, friction, earlier, tell, remarks, _state=state
     )
-
-
-def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], options: ReadOptions) -> DriveLog:
-    """Reopen a remote log with its mapped topics and slice; fetched bytes are not fetched again."""
-    whole = slice_ns == (log.start_ns, log.end_ns)
-    wanted = Wanted(frozenset(s.topic for s in mapping.sources()), *((None, None) if whole else slice_ns))
-    opened = open_log(log.path, options.limits, options.msgs, wanted)
-    log.close()
-    return opened
 
 
 def logs_of(arguments: Logs, options: ReadOptions) -> list[LogInput]:

@@ -9,6 +9,7 @@ A smoother (:class:`~.base.Smoother`) reads later samples: it has each estimate 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, cast
 
@@ -40,21 +41,25 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     """
     if isinstance(estimator, Smoother):
         return _smoothed(estimator, signals)
-    arrivals = release(signals.ready_ns, signals.stamps_ns)
-    tracks: list[StateTrack] = []
-    state = None
+    pieces = _pieces(cast("StepEstimator", estimator), signals, causality)
+    return replace(concatenate(pieces, len(signals), single=FILED_COLUMNS), stamps_ns=signals.stamps_ns)
+
+
+def _pieces(estimator: StepEstimator, signals: Signals, causality: CausalityCheck | None) -> Iterator[StateTrack]:
+    """Yield the track of an estimator piece by piece."""
+    arrivals, state = release(signals.ready_ns, signals.stamps_ns), None
     for first in range(0, max(len(signals), 1), PIECE_STEPS):
         # Numba compiles a kernel again for read-only arrays: the estimator gets a copy.
         piece = signals.rows(first, first + PIECE_STEPS).copy()
         due = slice(*np.searchsorted(arrivals.step, (first, first + PIECE_STEPS)).tolist())
         with contained(estimator.name, package_of(estimator)):
-            steps, state = _run_piece(cast("StepEstimator", estimator), piece, state, causality)
+            steps, state = _run_piece(estimator, piece, state, causality)
             if due.start == due.stop and len(signals):
                 continue
             stamps_ns = signals.stamps_ns[due].copy()
             ahead = extrapolation(piece.stamps_ns, arrivals.rows(due, first), steps.valid, stamps_ns)
-            tracks.append(predict_track(estimator, steps, ahead, stamps_ns))
-    return replace(concatenate(tracks, single=FILED_COLUMNS), stamps_ns=signals.stamps_ns)
+            track = predict_track(estimator, steps, ahead, stamps_ns)
+        yield track
 
 
 def _run_piece(

@@ -6,12 +6,15 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
+from threading import RLock
 from traceback import extract_tb
 from typing import Any
 
 from pdhef_logtool.records.errors import EstimatorError, PdhefError
 
 _PACKAGE = __name__.partition(".")[0]
+#: One plug-in runs at a time: standard output belongs to the whole process.
+_ONE_AT_A_TIME = RLock()
 
 
 def package_of(code: Any) -> str:
@@ -36,7 +39,7 @@ def contained(name: str, package: str) -> Iterator[None]:
         yield
         return
     try:
-        with redirect_stdout(sys.stderr):
+        with _ONE_AT_A_TIME, redirect_stdout(sys.stderr):
             yield
     except PdhefError:
         raise

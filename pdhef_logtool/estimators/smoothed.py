@@ -108,20 +108,23 @@ class SmoothedPhysics:
         self, physics: VehicleUkf, signals: Signals, rate: FloatArray, extra_r: FloatArray
     ) -> tuple[StateTrack, FloatArray, BoolArray]:
         """Filter a drive and smooth it block by block; return its track, log-likelihood and starts, [N]."""
-        before: FilterState | None = None
-        tracks, likelihood, starts = [], [], []
-        pending: LinkedSteps | None = None
-        for part in blocks(signals.stamps_ns, self.block_s):
-            given = (signals.rows(part.start, part.stop), before, rate[part], extra_r[part])
-            forward, before = physics.linked_steps(*given)
-            likelihood.append(forward.posterior.log_likelihood)
-            starts.append(~np.isfinite(forward.posterior.prior[:, 0]))
+        likelihood, starts = [], []
+
+        def pieces() -> Iterator[StateTrack]:
+            before: FilterState | None = None
+            pending: LinkedSteps | None = None
+            for part in blocks(signals.stamps_ns, self.block_s):
+                given = (signals.rows(part.start, part.stop), before, rate[part], extra_r[part])
+                forward, before = physics.linked_steps(*given)
+                likelihood.append(forward.posterior.log_likelihood)
+                starts.append(~np.isfinite(forward.posterior.prior[:, 0]))
+                if pending is not None:
+                    yield smoothed_track(physics, pending, forward)
+                pending = forward
             if pending is not None:
-                tracks.append(smoothed_track(physics, pending, forward))
-            pending = forward
-        if pending is not None:
-            tracks.append(smoothed_track(physics, pending, None))
-        return concatenate(tracks), np.concatenate(likelihood), np.concatenate(starts)
+                yield smoothed_track(physics, pending, None)
+
+        return concatenate(pieces(), len(signals)), np.concatenate(likelihood), np.concatenate(starts)
 
 
 def smoothed_track(physics: VehicleUkf, steps: LinkedSteps, following: LinkedSteps | None) -> StateTrack:

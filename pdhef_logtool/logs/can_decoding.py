@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.logs.container import rows_by_channel
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.resource_limits import MIB
 from pdhef_logtool.records.errors import MappingFileError
@@ -33,7 +34,7 @@ _MAX_DBC_BYTES = 32 * MIB
 #: Bits of a signal that become a number.
 MOST_BITS = 64
 _CAN = CONSTANTS["can"]
-ID_BITS, EXTENDED_FLAG = _CAN["id_bits"], _CAN["extended_flag"]
+ID_BITS, BASE_ID_BITS, EXTENDED_FLAG = _CAN["id_bits"], _CAN["base_id_bits"], _CAN["extended_flag"]
 _BYTE, BYTE_BITS = 0xFF, 8
 #: Identifiers in the number of a source.
 _IDS = 1 << 32
@@ -100,13 +101,13 @@ class Frames:
         """Return the rows of data frames by their source."""
         ids = self.parts["id"].astype(np.int64)
         zero = np.zeros(len(ids), np.int64)
-        bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids > _CAN["base_id_bits"])
+        bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids > BASE_ID_BITS)
         rows = np.flatnonzero((self.parts.get("is_error", zero) == 0) & (self.parts.get("is_remote", zero) == 0))
         keys = (2 * bus.astype(np.int64) + (extended > 0)) * _IDS + (ids & ID_BITS)
-        keys, inverse, counts = np.unique(keys[rows], return_inverse=True, return_counts=True)
-        parts = np.split(rows[np.argsort(inverse, kind="stable")], np.cumsum(counts)[:-1])
-        sources = (Source(key // (2 * _IDS), bool(key // _IDS & 1), key & ID_BITS) for key in keys.tolist())
-        return dict(zip(sources, parts, strict=False))
+        return {
+            Source(key // (2 * _IDS), bool(key // _IDS & 1), key & ID_BITS): rows[its]
+            for key, its in rows_by_channel(keys[rows]).items()
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.can_decoding import EXTENDED_FLAG, ID_BITS, Frames
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import LOSSES_OF_A_KIND, describe_damage
-from pdhef_logtool.logs.table_clocks import ascending_rows, hour_of_day, placed, to_ns
+from pdhef_logtool.logs.table_clocks import ascending_rows, placed, text_clock, to_ns
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import NS_PER_S, IntArray, Loss
+from pdhef_logtool.records.signals import NS_PER_S, IntArray, Loss, is_dated
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
 _ROW = struct.Struct(f"{len(_PARTS)}i")
@@ -230,8 +230,7 @@ def _unpacked(stored: bytes, size: int, *, is_cut: bool) -> bytes:
 # ASC: a line for each event, with its time in s.
 _BASE = re.compile(r"\s*base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.I)
 _BEGIN = re.compile(r"\s*(?:date|begin\s+triggerblock)\b\s*(.*)", re.I)
-_DATE = re.compile(r"\S+\s+(\S+)\s+(\d+)\.?\s+(\d+):(\d+):(\d+)(?:\.(\d+))?\s*([ap]m)?\s+(\d{4})", re.I)
-_MONTHS = {name: number for number, names in enumerate(CONSTANTS["asc"]["months"], 1) for name in names.split()}
+_MILLISECONDS = re.compile(r"(?<=:\d\d\.)\d{1,2}(?!\d)")
 _EVENT = re.compile(rb"\s*(\d{1,9}(?:\.\d{1,12})?)\s+(.*)", re.S)
 #: Bus, then an error frame, or identifier, remote frame, length and data.
 _CLASSIC = re.compile(
@@ -314,13 +313,7 @@ class _Asc:
             self._base = _HEX if match[1].lower() == "hex" else _DECIMAL
             self._is_relative = (match[2] or "").lower() == "relative"
         elif begin := _BEGIN.match(line):
-            if date := _DATE.match(begin[1]):
-                month, day, hour, minute, second, fraction, half, year = date.groups()
-                hours = hour_of_day(int(hour), half.lower() == "pm") if half else int(hour)
-                # Milliseconds; python-can does not pad them to three digits.
-                time = hours, int(minute), int(second), int((fraction or "0").zfill(3).ljust(6, "0")[:6])
-                self._begins_ns = _start_ns(int(year), _MONTHS.get(month.lower()[:3], 0), int(day), *time)
-            self._begins_ns = self._begins_ns or 0
+            self._begins_ns = _date_ns(begin[1]) or self._begins_ns or 0
 
     def read(self, line: bytes) -> _Frame | None:
         """Read a line."""
@@ -356,6 +349,18 @@ class _Asc:
         goes_on = not begins_ns if self._is_relative else time_ns >= self._now_ns
         if self._is_empty or not goes_on:
             self._start_ns, self._now_ns = begins_ns, 0
+
+
+def _date_ns(text: str) -> int:
+    """Return a date and time behind a weekday in ns since 1970; 0 for another text.
+
+    python-can does not pad milliseconds.
+    """
+    from polars import Series
+
+    padded = _MILLISECONDS.sub(lambda digits: digits[0].zfill(3), " ".join(text.split()[1:]).replace(". ", " "))
+    (stamp,) = text_clock(Series([padded])).stamps_ns.tolist()
+    return stamp if is_dated(stamp) else 0
 
 
 # candump: ``(1609459200.123456) can0 123#DEADBEEF`` of -l, ``(...)  can0  123   [4]  DE AD BE EF`` of -t.

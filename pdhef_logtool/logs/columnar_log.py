@@ -20,11 +20,10 @@ from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
 from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema, concatenate_columns, missing_column
 from pdhef_logtool.logs.definitions import SHIPPED
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, Requests, TopicInfo
 from pdhef_logtool.logs.message_schema import (
     FieldInfo,
     MessageSchema,
-    MissingDefinitionError,
     NoSchemaError,
     SchemaError,
     Selection,
@@ -41,8 +40,6 @@ from pdhef_logtool.storage.files import scratch_folder, write_bytes
 #: Loaded spans are kept up to this size, without payloads above ``_LARGE_BYTES`` (images, point clouds): the samples
 #: that recognition reads, and all of a short log, are decompressed once.
 _KEPT_BYTES, _LARGE_BYTES = 16 * MIB, 16 * KIB
-#: What of a span is lost: all of it.
-_ALL = ""
 #: A message in the text of a DBC file.
 _DBC = re.compile(r"^BO_ \d+ \w+ *:", re.MULTILINE)
 
@@ -84,8 +81,6 @@ class ColumnarLog(DriveLog):
                 channel = self._channels[c, record.id] = _Channel(c, record)
                 self._by_topic.setdefault(record.topic, []).append(channel)
         self._seen: set[tuple[int, int, frozenset[int] | None]] = set()  # what was loaded before
-        self._late: dict[int, dict[int, Span]] = {}  # spans for which no time was left, by container
-        self._found: dict[tuple[int, int, object], Loss] = {}  # in a container and span: of all of it, or of what
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -96,12 +91,11 @@ class ColumnarLog(DriveLog):
     def topics(self) -> tuple[TopicInfo, ...]:
         """All topics by name; ``messages`` does not count spans found damaged so far."""
         counts: Counter[str] = Counter()
-        for c, container in enumerate(self.containers):
-            names = {id_: channel.topic for id_, channel in container.channels.items()}
+        for container in self.containers:
             for span in container.spans:
-                if (c, span.index, _ALL) not in self._found:
+                if span.index not in container.damaged:
                     for id_, n in span.counts.items():
-                        counts[names[id_]] += n
+                        counts[container.channels[id_].topic] += n
         firsts = ((name, channels[0].record) for name, channels in sorted(self._by_topic.items()))
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
@@ -113,15 +107,9 @@ class ColumnarLog(DriveLog):
     @property
     def lost(self) -> tuple[Loss, ...]:
         """Losses so far."""
-        losses = [*self._opened_lost, *self.recording_span.losses]
-        for c, container in enumerate(self.containers):
-            losses.extend(container.lost)
-            losses.extend(loss for (of, _, _), loss in self._found.items() if of == c)
-            if c in self._late:
-                losses.append(_out_of_time(container, list(self._late[c].values())))
-            for id_ in sorted(container.channels):
-                losses.extend(self._channels[c, id_].losses())
-        return tuple(losses)
+        of_containers = (loss for container in self.containers for loss in container.lost)
+        of_channels = (loss for channel in self._channels.values() for loss in channel.losses())
+        return (*self._opened_lost, *self.recording_span.losses, *of_containers, *of_channels)
 
     @property
     def messages(self) -> ColumnarLog | None:
@@ -129,10 +117,10 @@ class ColumnarLog(DriveLog):
         return self
 
     @property
-    def index(self) -> ColumnarLog | None:
-        """The log itself if its index is complete and consistent; else None."""
+    def is_indexed(self) -> bool:
+        """Whether the index of the log is complete and consistent."""
         sound = all(container.by_index for container in self.containers)
-        return self if sound and all(loss.kind == UNVERIFIED for loss in self.lost) else None
+        return sound and all(loss.kind == UNVERIFIED for loss in self.lost)
 
     @property
     def databases(self) -> tuple[Path, ...]:
@@ -227,9 +215,6 @@ class ColumnarLog(DriveLog):
         schemas = [self._schema(channel) for channel in self._by_topic.get(topic, ())]
         if not schemas or any(isinstance(schema, MessageSchema) for schema in schemas):
             return ""
-        if isinstance(schemas[0], MissingDefinitionError):
-            missing = schemas[0].type_name.replace("/msg/", "/")
-            return f"the log contains no definition of {missing}; give its .msg file by --set msgs=DIR"
         return str(schemas[0])
 
     def first_messages(self, topic: str, most: int) -> list[object]:
@@ -253,20 +238,20 @@ class ColumnarLog(DriveLog):
             if block is not None:
                 yield from map(block.message, block.rows.get(id_, ()))
 
-    def _read(
-        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
+    def read(
+        self, requests: Requests, start_ns: int | None = None, end_ns: int | None = None, *, quiet: bool = False
     ) -> dict[str, Columns]:
+        """Read columns; see :class:`~.drive_log.DriveLog`."""
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         if not quiet:
-            for channel in (channel for topic in requests for channel in self._by_topic[topic]):
+            for channel in (channel for topic, paths in requests.items() if paths for channel in self._by_topic[topic]):
                 channel.asked = True
-        plans |= {topic: _Plan((), {}) for topic in stamps if topic not in plans}
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
         for c, container in enumerate(self.containers):
-            spans = tuple(self._to_read(plans, container, *window_ns))
+            spans = tuple(self._to_read(plans, container, start_ns, end_ns))
             container.prefetch(spans)
             with container.meter.running():
-                for columns in (columns for span in spans for columns in self._read_span(plans, c, span, window_ns)):
+                for columns in (its for span in spans for its in self._read_span(plans, c, span, start_ns, end_ns)):
                     parts[columns.topic].append(columns)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
@@ -284,7 +269,7 @@ class ColumnarLog(DriveLog):
     def load(
         self, c: int, span: Span, want: frozenset[int] | None = None, payloads: frozenset[int] | None = None
     ) -> Block | None:
-        """Read a span of the c-th container; None and a recorded loss if it is damaged.
+        """Read a span of the c-th container; None and a recorded loss if it is damaged, or if no time is left for it.
 
         Any error of a container's load is a loss of the span.
 
@@ -296,18 +281,15 @@ class ColumnarLog(DriveLog):
         container = self.containers[c]
         want = want if container.selective else None
         key = (c, span.index)
-        if (*key, _ALL) in self._found:
+        if span.index in container.damaged | container.late:
             return None
         kept = self._kept.get((*key, want))
         if kept is not None and (not kept.dropped if payloads is None else kept.dropped.isdisjoint(payloads)):
             return kept
-        extent = container.extent(span)
+        extent, unread = container.extent(span), container.late
         try:
             container.meter.check()
-        except LimitError:
-            self._late.setdefault(c, {})[span.index] = span
-            return None
-        try:
+            unread = container.damaged
             with container.meter.running(extent[1] - extent[0]):
                 block = container.load(span, want)
                 if container.zstd_messages:
@@ -316,43 +298,16 @@ class ColumnarLog(DriveLog):
             kind, text = describe_damage(error)
             count = sum(span.counts.values()) or None
             what = f"{count_text(count)} lost at byte {extent[0]}: {text}"
-            self._found[*key, _ALL] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
+            container.lose(kind, what, span.start_ns, span.end_ns, count)
+            unread.add(span.index)
             return None
         if (*key, want) not in self._seen:
             self._seen.add((*key, want))
-            self._correct_span(c, span, block, want)
+            _correct_span(container, span, block, want)
         if kept is None and self._kept_bytes < _KEPT_BYTES:
             self._kept[(*key, want)] = small = block.without_large(_LARGE_BYTES)
             self._kept_bytes += small.nbytes
         return block
-
-    def _correct_span(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
-        """Correct the counts of a span, which an index gave, by its content; missing messages are a loss."""
-        container = self.containers[c]
-        held = block.counts
-        declared = {id_: n for id_, n in held.items() if id_ in container.channels}
-        claimed = {id_: n for id_, n in span.counts.items() if want is None or id_ in want}
-        times = block.log_time_ns
-        undeclared = sum(held.values()) - sum(declared.values()) - container.undeclared.get(span.index, 0)
-        outside = 0
-        if len(times) and (times.min() < span.start_ns or times.max() >= span.end_ns):
-            outside = int(np.count_nonzero((times < span.start_ns) | (times >= span.end_ns)))
-        if declared == claimed and not outside and undeclared <= 0:
-            return
-        others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
-        actual = {id_: times[block.rows[id_]] for id_ in declared}
-        container.spans[span.index] = replace(span, counts=others | declared, times={**(span.times or {}), **actual})
-        missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
-        start, _ = container.extent(span)
-        for kind, count, text in (
-            ("missing-messages", missing, "that the index names are not there"),
-            ("unknown-channel", undeclared, "are on channels that no readable record declares"),
-            ("bad-times", outside, "have log times outside of those that the index names"),
-        ):
-            if count > 0:
-                what = f"{count} messages {text}, at byte {start}"
-                loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
-                self._found[c, span.index, (kind, want)] = loss
 
     def _schema(self, channel: _Channel) -> MessageSchema | SchemaError:
         """Return the schema of a channel, or the reason why it is unknown. It is parsed once, within the log's time.
@@ -362,14 +317,14 @@ class ColumnarLog(DriveLog):
         if channel.schema is not None:
             return channel.schema
         record, meter = channel.record, self.containers[channel.c].meter
-        is_in_message = record.encoding == "json" and not record.schema_data.strip()
-        example = next(self._payloads(channel), None) if is_in_message else None
         started = time.process_time()
         try:
             meter.check()
             meter.limits.check("seconds", self._schemas_s, "the time for all schemas")
             with meter.running():
-                channel.schema = channel_schema(record, self.distro, example, meter.limits, self.definitions)
+                channel.schema = channel_schema(
+                    record, self.distro, self._payloads(channel), meter.limits, self.definitions
+                )
         except SchemaError as error:
             channel.schema = error
         except LimitError as error:  # of time
@@ -387,17 +342,11 @@ class ColumnarLog(DriveLog):
             raise nearest(topic, sorted(self._by_topic), "a topic of the log", self.path)
         for channel in self._by_topic[topic] if paths else ():
             schema = self._schema(channel)
-            if isinstance(schema, SchemaError):
-                problems.append(
-                    MappingError(
-                        expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
-                        got=str(schema),
-                        where=topic,
-                        remedy="give its definition with --set msgs=DIR, or map another topic",
-                    )
-                )
-                continue
             try:
+                if isinstance(schema, SchemaError):
+                    expected = "messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses"
+                    remedy = "give its definition with --set msgs=DIR, or map another topic"
+                    raise MappingError(expected=expected, got=str(schema), where=topic, remedy=remedy)
                 selections = tuple(resolve(schema, topic, path) for path in paths)
                 decoders[channel] = ChannelDecoder(schema, selections)
             except MappingError as error:
@@ -419,7 +368,9 @@ class ColumnarLog(DriveLog):
             if not ids.isdisjoint(span.counts) and span.overlaps(start_ns, end_ns):
                 yield span
 
-    def _read_span(self, plans: Mapping[str, _Plan], c: int, span: Span, window_ns: Window) -> Iterator[Columns]:
+    def _read_span(
+        self, plans: Mapping[str, _Plan], c: int, span: Span, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[Columns]:
         """Yield the columns of the requested topics in a span, by channel."""
         channels = self.containers[c].channels
         wanted = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
@@ -427,7 +378,7 @@ class ColumnarLog(DriveLog):
         block = self.load(c, span, wanted, payloads)
         if block is None:
             return
-        keep = in_window(block.log_time_ns, *window_ns)
+        keep = in_window(block.log_time_ns, start_ns, end_ns)
         is_inside = bool(keep.all())
         # By the channels of the block: the counts of the span can be from a wrong index.
         for id_, rows in block.rows.items():
@@ -453,7 +404,7 @@ class ColumnarLog(DriveLog):
             kind, text = describe_damage(error)
             kind = "undecodable" if kind == "bad-chunk" else kind
             what = f"{len(rows)} messages cannot be decoded: {text}"
-            self._found[channel.c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
+            channel.failed[span.index] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
             return None
         if decoder is not None and decoder.undecodable:
             seen = channel.undecodable.get(span.index, np.empty(0, dtype=np.int64))
@@ -467,8 +418,8 @@ class ColumnarLog(DriveLog):
 class _Channel:
     """A channel of the c-th container, with what is known of its messages.
 
-    ``asked``: whether it was requested or listed. ``undecodable``: messages that do not decode, by span, as a repeated
-    read must not count them again.
+    ``asked``: whether it was requested or listed. ``undecodable``: messages that do not decode, by span, and
+    ``failed``: losses of whole spans, as a repeated read must not count them again.
     """
 
     c: int
@@ -476,9 +427,11 @@ class _Channel:
     schema: MessageSchema | SchemaError | None = None
     asked: bool = False
     undecodable: dict[int, IntArray] = field(default_factory=dict)
+    failed: dict[int, Loss] = field(default_factory=dict)
 
     def losses(self) -> Iterator[Loss]:
-        """Yield the losses and notes of its messages; none before it is asked for."""
+        """Yield the losses and notes of its messages; of its schema none before it is asked for."""
+        yield from self.failed.values()
         topic, schema = self.record.topic, self.schema if self.asked else None
         if self.asked and (undecodable := sum(map(len, self.undecodable.values()))):
             what = f"{undecodable} messages do not fit the type of their topic"
@@ -499,14 +452,31 @@ class _Plan:
     decoders: Mapping[_Channel, ChannelDecoder]
 
 
-def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
-    count = sum(sum(span.counts.values()) for span in spans)
-    start, end = min(s.start_ns for s in spans), max(s.end_ns for s in spans)
-    what = (
-        f"reading took longer than {container.meter.allowed_s:.3g} s: {count} messages of the rest are lost "
-        "(--set budget=FACTOR)"
-    )
-    return Loss("over-budget", what, str(container.path), start, end, count)
+def _correct_span(container: Container, span: Span, block: Block, want: frozenset[int] | None) -> None:
+    """Correct the counts of a span, which an index gave, by its content; missing messages are a loss."""
+    held = block.counts
+    declared = {id_: n for id_, n in held.items() if id_ in container.channels}
+    claimed = {id_: n for id_, n in span.counts.items() if want is None or id_ in want}
+    times = block.log_time_ns
+    undeclared = sum(held.values()) - sum(declared.values()) - container.undeclared.get(span.index, 0)
+    outside = 0
+    if len(times) and (times.min() < span.start_ns or times.max() >= span.end_ns):
+        outside = int(np.count_nonzero((times < span.start_ns) | (times >= span.end_ns)))
+    if declared == claimed and not outside and undeclared <= 0:
+        return
+    others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
+    actual = {id_: times[block.rows[id_]] for id_ in declared}
+    container.spans[span.index] = replace(span, counts=others | declared, times={**(span.times or {}), **actual})
+    missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
+    start, _ = container.extent(span)
+    for kind, count, text in (
+        ("missing-messages", missing, "that the index names are not there"),
+        ("unknown-channel", undeclared, "are on channels that no readable record declares"),
+        ("bad-times", outside, "have log times outside of those that the index names"),
+    ):
+        if count > 0:
+            what = f"{count} messages {text}, at byte {start}"
+            container.lose(kind, what, span.start_ns, span.end_ns, count)
 
 
 def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray:

@@ -25,7 +25,7 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 #: Log times above this (unsigned in the file) do not fit int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
-#: Kind of the note that a checksum of a file was not verified, as not all that it covers was read.
+#: Kind of the note that a checksum of a file was not verified, as that would need all of a remote file.
 UNVERIFIED = "unverified"
 RecordT = TypeVar("RecordT", Attachment, Metadata)
 #: Losses of one file; further ones become one loss.
@@ -116,10 +116,10 @@ class Block:
         """Return some of the messages."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
-    def split(self, before_ns: float) -> tuple[Block | None, Block | None]:
-        """Return the messages before a time and the others, None without any; they ascend in log time."""
+    def split(self, before_ns: float) -> tuple[Block, Block]:
+        """Return the messages before a time and the others; they ascend in log time."""
         n = int(np.searchsorted(self.log_time_ns, before_ns))
-        return self.take(slice(n)) if n else None, self.take(slice(n, None)) if n < len(self) else None
+        return self.take(slice(n)), self.take(slice(n, None))
 
     @staticmethod
     def merged(parts: Sequence[Block], head: int = 0) -> Block:
@@ -209,34 +209,9 @@ def items_at_bytes(buffer: bytes | memoryview, size: int, start: int = 0) -> NDA
 
 def _copy(block: Block, buffer: NDArray[np.uint8], place: IntArray) -> None:
     """Copy the payloads of a block to places [N] in a buffer, those of one length at once."""
-    order = np.argsort(block.length, kind="stable")
-    borders = np.flatnonzero(np.diff(block.length[order])) + 1
-    for rows in np.split(order, borders) if len(order) else ():
-        if size := int(block.length[rows[0]]):
+    for size, rows in rows_by_channel(block.length).items():
+        if size:
             items_at_bytes(buffer.data, size)[place[rows]] = items_at_bytes(block.buffer, size)[block.offset[rows]]
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """Topics and log times [start, end) that will be read; None: all.
-
-    A hint that does not change the result: of a remote file with more than ``above_bytes``, the other chunks are taken
-    from the index.
-    """
-
-    topics: frozenset[str] | None = None
-    start_ns: int | None = None
-    end_ns: int | None = None
-    above_bytes: int = 0
-
-    def has(self, topics: Iterable[str], span: Span) -> bool:
-        """Return whether messages of these topics in a span are wanted."""
-        is_wanted = self.topics is None or not self.topics.isdisjoint(topics)
-        return is_wanted and span.overlaps(self.start_ns, self.end_ns)
-
-
-#: Of a log that is read as a whole.
-EVERYTHING = Wanted()
 
 
 class SpanDamageError(Exception):
@@ -270,13 +245,14 @@ class Container(ABC):
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
+    damaged : spans that could not be read. late : spans for which no time was left; their messages stay announced.
     size : bytes of the file. cut : whether the file is truncated. meter : resource limits.
     kind : of a log with this file only, as :class:`~.drive_log.DriveLog` has it.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : remedy for a file of another format.
     zstd_messages : whether each message is a zstd frame.
-    is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
+    is_remote : whether each read is a network request. by_index : whether an index names all messages.
     """
 
     kind = ""
@@ -294,6 +270,8 @@ class Container(ABC):
         self.spans: list[Span] = []
         self.lost: list[Loss] = []
         self.undeclared: dict[int, int] = {}
+        self.damaged: set[int] = set()
+        self.late: set[int] = set()
         self.meter = file.meter
         self.size = size
         self.cut = False
@@ -471,7 +449,7 @@ class FileContainer(Container):
 
 
 def rows_by_channel(channel: IntArray) -> dict[int, IntArray]:
-    """Return the rows of each channel, ascending, from the channels [N] of messages."""
+    """Return the rows of each channel, ascending, from the channels [N] of messages, or of another whole number."""
     if not len(channel):
         return {}
     # 16 bits, if enough, sort much faster.

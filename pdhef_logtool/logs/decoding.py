@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial as bind
 from typing import Any, TypeAlias
@@ -31,14 +31,11 @@ from pdhef_logtool.logs.message_schema import (
     Struct,
     bytes_of_text,
     json_schema,
-    node_of_value,
     ros_schema,
-    select,
     values_at,
 )
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, MIB, LimitError, ResourceLimits
 from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout
-from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import NS_PER_S, IntArray
 
 #: Value of a time column if the message has no time (NaN of int64).
@@ -56,7 +53,7 @@ _Parts: TypeAlias = list[tuple[IntArray, dict[str, NDArray[Any]]]]
 def channel_schema(
     channel: ChannelRecord,
     distro: str = "",
-    example: bytes | None = None,
+    examples: Iterable[bytes] = (),
     limits: ResourceLimits = DEFAULT_LIMITS,
     definitions: Definitions = SHIPPED,
 ) -> MessageSchema:
@@ -66,7 +63,7 @@ def channel_schema(
     ----------
     channel : channel to decode.
     distro : ROS distribution for types without a definition.
-    example : first message, for JSON without a schema.
+    examples : first messages, for JSON without a complete schema.
     limits : resource limits of the schema.
     definitions : of ROS types that neither the channel nor the distribution has.
 
@@ -85,11 +82,8 @@ def channel_schema(
             channel.type_name, channel.schema_encoding, text, channel.encoding, distro, limits, definitions
         )
     if channel.encoding == "json":
-        if channel.schema_encoding == "jsonschema" and channel.schema_data.strip():
-            return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"), limits)
-        if example is not None:
-            return json_schema(channel.type_name, example, limits, is_message=True)
-        raise NoSchemaError("JSON without a schema and without a message")
+        data = channel.schema_data if channel.schema_encoding == "jsonschema" else b""
+        return json_schema(channel.type_name, data, examples, limits)
     if channel.encoding == "protobuf":
         if channel.schema_encoding != "protobuf":
             raise NoSchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
@@ -110,7 +104,6 @@ class ChannelDecoder:
     selections: tuple[Selection, ...]
     undecodable: list[int] = field(default_factory=list)
     _layouts: list[LayoutReader] = field(default_factory=list)
-    _by_value: dict[str, Selection] = field(default_factory=dict)  # of places that the schema leaves open
 
     def columns(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         """Decode the messages ``rows`` of a block: float64 [N] or [N, k], or int64 nanoseconds [N], by path."""
@@ -175,71 +168,49 @@ class ChannelDecoder:
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self.single_decoder()
-        parts_by_path: dict[str, list[list[Any]]] = {s.path: [[] for _ in s.components] for s in self.selections}
         most = min(self.schema.limits.array_width, _most_columns(len(rows)))
         batch = np.cumsum(block.length[rows]) // _BYTES_AT_ONCE
+        parts = []
         for its in np.split(rows, np.flatnonzero(np.diff(batch)) + 1):
             messages = [decode(block.message(row)) for row in its.tolist()]
             self.undecodable += [row for row, message in zip(its.tolist(), messages, strict=True) if message is None]
-            for s in self.selections:
-                parts = [values_at(messages, steps) for steps in s.components]
-                if s.shape in ("array", "dynamic"):
-                    parts = [[self._bounded(s, *item, most) for item in zip(its.tolist(), parts[0], strict=True)]]
-                for values, more in zip(parts_by_path[s.path], parts, strict=True):
-                    values += more
-        return {s.path: self._single_column(s, parts_by_path[s.path]) for s in self.selections}
+            parts.append({s.path: self._single_column(s, messages, its, most) for s in self.selections})
+        return {s.path: concatenate_columns([part[s.path] for part in parts]) for s in self.selections}
 
-    def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> Any:
-        """Return the elements of an array, or the value of a place that the schema leaves open; none if too wide."""
-        value = bytes_of_text(value, selection.text) if selection.text else value
-        if isinstance(value, Sized) and not isinstance(value, str) and len(value) > most:
-            self.undecodable.append(row)
-            value = None
-        return _numbers(value) if selection.shape == "array" else value
+    def _single_column(self, selection: Selection, messages: list[Any], rows: IntArray, most: int) -> NDArray[Any]:
+        """Return a column of decoded messages, the ``rows`` of a block; arrays have at most this many elements."""
+        parts = [values_at(messages, steps) for steps in selection.components]
+        if selection.shape == "array":
+            arrays = [self._bounded(selection, *item, most) for item in zip(rows.tolist(), parts[0], strict=True)]
+            return _padded(arrays, selection.length)
+        columns = [np.array([_number(value) for value in part], np.float64) for part in parts]
+        return _column(selection, columns, len(messages))
+
+    def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> NDArray[Any]:
+        """Return the elements of an array; none if too wide."""
+        elements = _numbers(bytes_of_text(value, selection.text) if selection.text else value)
+        if len(elements) <= most:
+            return elements
+        self.undecodable.append(row)
+        return elements[:0]
 
     def single_decoder(self) -> Callable[[bytes], object]:
         """Return a decoder of one message; it returns None if the payload does not fit the type or is too large."""
-        schema = self.schema
+        schema, most = self.schema, _affordable_bytes(self.schema)
+        decode: Callable[[bytes], object] = json.loads
         if schema.wire == "protobuf":
-            return _tolerant(schema.message_class.FromString, schema)
-        if schema.store is None:
-            return _tolerant(json.loads, schema)
-        function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
-        return _tolerant(bind(function, typename=schema.type_name), schema)
+            decode = schema.message_class.FromString
+        elif schema.store is not None:
+            function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
+            decode = bind(function, typename=schema.type_name)
 
-    def _single_column(self, selection: Selection, parts: Sequence[Sequence[Any]]) -> NDArray[Any]:
-        if selection.shape == "dynamic":
-            selection = self._as_found(selection, parts[0])
-            parts = [values_at(parts[0], steps) for steps in selection.components]
-        if selection.shape == "array":
-            return _padded([_numbers(value) for value in parts[0]], selection.length)
-        columns = [np.array([_number(value) for value in part], np.float64) for part in parts]
-        return _column(selection, columns, len(parts[0]))
-
-    def _as_found(self, selection: Selection, values: Sequence[object]) -> Selection:
-        """Return the selection inside of a place, by the first value that is there."""
-        path = selection.path
-        if path not in self._by_value:
-            first = next((value for value in values if value not in (None, [], {})), None)
-            if first is None:
-                return Selection(path, "scalar", ((),))
+        def tolerant(data: bytes) -> object:
             try:
-                self._by_value[path] = select(self.schema, "", path, node_of_value(first, self.schema.limits), ())
-            except MappingError:
-                self._by_value[path] = Selection(path, "scalar", ((),))
-        return self._by_value[path]
+                return decode(data) if len(data) <= most else None
+            except Exception:  # noqa: BLE001 (third-party data and decoder)
+                return None
 
-
-def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Callable[[bytes], object]:
-    most = _affordable_bytes(schema)
-
-    def tolerant(data: bytes) -> object:
-        try:
-            return decode(data) if len(data) <= most else None
-        except Exception:  # noqa: BLE001 (third-party data and decoder)
-            return None
-
-    return tolerant
+        return tolerant
 
 
 def _affordable_bytes(schema: MessageSchema) -> float:

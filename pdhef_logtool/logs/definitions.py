@@ -15,7 +15,6 @@ from typing import Any
 
 from pdhef_logtool.logs.resource_limits import MIB
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.storage.documents import read_text
 
 #: A workspace with more files is more than messages, and a longer text is no message.
 MOST_FILES = 50_000
@@ -33,12 +32,10 @@ _USUAL = (Path("/usr/local"), Path("/usr"))
 class Definitions:
     """Files of definitions by type name in ROS 2 form, and by bare name where a file lies in no package.
 
-    ``archive`` is the zip file or wheel with the files; None for plain files. ``folders`` are those of packages of an
-    installed ROS.
+    ``folders`` are those of packages of an installed ROS.
     """
 
-    files: Mapping[str, Path] = field(default_factory=dict)
-    archive: Path | None = None
+    files: Mapping[str, Path | zipfile.Path] = field(default_factory=dict)
     folders: tuple[Path, ...] = ()
 
     def text_of(self, type_name: str) -> str:
@@ -48,13 +45,11 @@ class Definitions:
         """
         package, _, name = type_name.partition("/msg/")
         path = self.files.get(type_name) or self.files.get(name if package else "")
+        path = path or self.installed(type_name)
         if path is None:
-            installed = self.installed(type_name)
-            return shipped_definition(type_name) if installed is None else read_text(installed)[:MOST_BYTES]
-        if self.archive is None:
-            return read_text(path)[:MOST_BYTES]
-        with zipfile.ZipFile(self.archive) as archive, archive.open(path.as_posix()) as file:
-            return file.read(MOST_BYTES).decode("utf-8", errors="replace")
+            return shipped_definition(type_name)
+        with path.open("rb") as file:
+            return file.read(MOST_BYTES).decode("utf-8-sig", errors="replace").replace("\r\n", "\n")
 
     def installed(self, type_name: str) -> Path | None:
         """Return the file of a type that only an installed ROS or a sourced workspace defines."""
@@ -107,22 +102,22 @@ def read_definitions(place: Path | str | None) -> Definitions:
     if place is None:
         return machine
     place = Path(place)
-    archive = place if place.is_file() and zipfile.is_zipfile(place) else None
-    if archive is None:
-        files = _named(sorted(place.rglob("*.msg")) if place.is_dir() else (), place)
-    else:
-        with zipfile.ZipFile(archive) as opened:
-            inside = sorted(n for n in opened.namelist() if n.endswith(".msg"))
-        files = _named(map(Path, inside), Path(), in_archive=True)
+    is_archive = place.is_file() and zipfile.is_zipfile(place)
+    files: dict[str, Path | zipfile.Path] = {}
+    if is_archive:
+        archive = zipfile.ZipFile(place)
+        inside = _named(map(Path, sorted(n for n in archive.namelist() if n.endswith(".msg"))), Path(), in_archive=True)
+        files |= {name: zipfile.Path(archive, path.as_posix()) for name, path in inside.items()}
+    elif place.is_dir():
+        files |= _named(sorted(place.rglob("*.msg")), place)
     if not files:
-        there = place.is_dir() or archive is not None
         raise UsageError(
             expected="a folder, zip file or wheel with .msg files, packages or a workspace",
-            got="one without any" if there else "neither folder nor archive",
+            got="one without any" if is_archive or place.is_dir() else "neither folder nor archive",
             where=str(place),
             remedy="give the package's source, or /opt/ros/DISTRO/share of the machine that recorded",
         )
-    return replace(machine, files=files, archive=archive)
+    return replace(machine, files=files)
 
 
 def _named(paths: Iterable[Path], root: Path, *, in_archive: bool = False) -> dict[str, Path]:

@@ -162,7 +162,7 @@ def hash_log(path: Path) -> str:
         require_regular(path)
         return file_sha256(path)
     total = hashlib.sha256()
-    for file_path in sorted(p for p in path.rglob("*") if p.is_file()):
+    for file_path in _files_of(path):
         total.update(file_path.relative_to(path).as_posix().encode() + b"\0")
         total.update(bytes.fromhex(file_sha256(file_path)))
     return total.hexdigest()
@@ -172,8 +172,13 @@ def log_state(path: LogPlace) -> tuple[tuple[int, int, int], ...]:
     """Return an identity that changes when a file of a local log is replaced or written: file number, size, time."""
     if isinstance(path, RemotePlace):
         return ()  # each request names the version of the object
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    return tuple((s.st_ino, s.st_size, s.st_mtime_ns) for s in (f.stat() for f in files if f.exists()))
+    files = (f.stat() for f in _files_of(path) if f.exists())
+    return tuple((s.st_ino, s.st_size, s.st_mtime_ns) for s in files)
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Return a file, or all files of a folder in order."""
+    return sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
 
 
 def check_unchanged(path: LogPlace, state: tuple[tuple[int, int, int], ...]) -> None:
@@ -193,13 +198,10 @@ def _expand(argument: str, private_redirects: bool, settings: TableSettings) -> 
         yield from (
             _search_store(place) if place.scheme == "s3" and (not place.key or argument.endswith("/")) else (place,)
         )
-    elif place.is_dir():
-        yield from _search(place, set(), settings)
-    elif place.exists() or not glob.has_magic(argument):
-        yield place
     else:
         visited: set[str] = set()
-        for match in _matches(argument):
+        is_pattern = not place.exists() and glob.has_magic(argument)
+        for match in _matches(argument) if is_pattern else [place]:
             if match.is_dir():
                 yield from _search(match, visited, settings)
             else:

@@ -1,14 +1,14 @@
 """The interface of log formats: topics, field types, and columns of the requested fields, in windows of log time.
 
 A format implements :class:`DriveLog`, or gives its columns to :class:`~pdhef_logtool.logs.table_log.TableLog`, and is
-listed in :mod:`~pdhef_logtool.logs.formats`. Features of some logs only (copies of messages, an index) are
+listed in :mod:`~pdhef_logtool.logs.formats`. Features of some logs only (copies of messages) are
 capabilities: properties that are None by default.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -23,8 +23,9 @@ from pdhef_logtool.records.signals import IntArray, Loss
 if TYPE_CHECKING:
     from pdhef_logtool.logs.columnar_log import ColumnarLog
 
-#: Log times [start, end); None: from the start, to the end.
-Window: TypeAlias = tuple[int | None, int | None]
+
+#: Fields to read by topic; without fields its times alone.
+Requests: TypeAlias = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,31 +95,19 @@ class DriveLog(ABC):
         With ``quiet`` a schema that does not parse is not reported as a loss.
         """
 
+    @abstractmethod
     def read(
-        self,
-        requests: Mapping[str, Sequence[str]],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        quiet: bool = False,
-        stamps: Collection[str] = (),
+        self, requests: Requests, start_ns: int | None = None, end_ns: int | None = None, *, quiet: bool = False
     ) -> dict[str, Columns]:
         """Read the requested fields of messages with log time in [start, end). No other topic is decoded.
 
-        With ``quiet`` messages that do not decode are not reported as a loss. ``stamps`` are further topics; only their
-        times are read.
+        Of a topic without fields the times alone are read. With ``quiet`` messages that do not decode are not reported
+        as a loss.
 
         Raises
         ------
         MappingError : the log has no such topic, no such field, or cannot decode the topic.
         """
-        return self._read(requests, (start_ns, end_ns), quiet, stamps)
-
-    @abstractmethod
-    def _read(
-        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
-    ) -> dict[str, Columns]:
-        """Read as :meth:`read`."""
 
     @abstractmethod
     def close(self) -> None:
@@ -137,11 +126,6 @@ class DriveLog(ABC):
     @property
     def messages(self) -> ColumnarLog | None:
         """The log as messages with bytes that can be copied to another file; None: it has columns only."""
-        return None
-
-    @property
-    def index(self) -> ColumnarLog | None:
-        """The log's index, None without a consistent one."""
         return None
 
     def metadata(self) -> dict[str, str]:

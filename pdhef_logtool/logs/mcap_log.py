@@ -12,7 +12,6 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from functools import cached_property
 from io import BytesIO
 from itertools import accumulate
@@ -29,7 +28,6 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
-    EVERYTHING,
     MAX_TIME_NS,
     MCAP_MAGIC,
     UNVERIFIED,
@@ -39,7 +37,6 @@ from pdhef_logtool.logs.container import (
     RecordT,
     Span,
     SpanDamageError,
-    Wanted,
     block_from_lists,
     describe_damage,
     items_at_bytes,
@@ -81,30 +78,29 @@ class McapContainer(FileContainer):
     remedy = "is it an MCAP 1.0 recording?"
     chunks: list[Extent]
 
-    def __init__(self, file: LogFile, source: ByteSource | None = None, wanted: Wanted = EVERYTHING) -> None:
+    def __init__(self, file: LogFile, source: ByteSource | None = None) -> None:
         self.profile = ""
-        self._wanted = wanted
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
         self._records_at: dict[type, list[tuple[int, int]]] = {Attachment: [], Metadata: []}
-        self._unread: dict[int, int] = {}  # start and end of the parts of a remote file that are not wanted
+        self._is_partial = False  # whether the chunks of a remote file are fetched when they are read
         self._closed = False
         self._data_end: int | None = None  # place of the record
         self._is_summary_damaged = False
         self._statistics: Statistics | None = None
         self._has_end = False  # whether the file ends with its magic bytes
-        self._opened_chunks = 0  # number of chunks that the summary does not describe
+        self._opened_chunks = 0  # number of chunks that no index describes
         super().__init__(file, source)
 
     def _walk(self) -> None:
         source, size = self.source, self.source.size
-        indexed = self._indexed_places()
+        indexed = self._indexed_chunks()
         self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
         places = [*sorted(indexed), size]
         self.position = self._read_header()
         for offset in self._places():
             if offset in indexed:
-                self.position = self._add_indexed(*indexed[offset])
+                self.position = self._add_chunk(*indexed[offset])
                 continue
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self._closed = True
@@ -135,47 +131,21 @@ class McapContainer(FileContainer):
         opcode, length = RECORD.unpack(self.source.read(offset, RECORD.size))
         return opcode, offset + RECORD.size + length
 
-    def _indexed_places(self) -> dict[int, tuple[Extent, Span | None]]:
-        """Return by their places the chunks, and attachments that are not read, that a sound summary describes.
-
-        All parts of a remote file that are read are requested. Its message indexes are not examined.
-        """
+    def _indexed_chunks(self) -> dict[int, tuple[Extent, Span]]:
+        """Return by their places the chunks that a sound summary describes; request all else of a remote file."""
         source = self.source
-        is_whole = not source.is_remote or self._wanted == EVERYTHING or source.size <= self._wanted.above_bytes
-        if is_whole:
-            source.prefetch([(0, source.size)])
         index, self._is_summary_damaged = read_index(source, self.meter.limits)
         if index is None or (source.is_remote and not index.in_order):
             source.prefetch([(0, source.size)])
             return {}
         self._schemas.update(index.schemas)
         self._raw_channels.update(index.channels)
-        places: dict[int, tuple[Extent, Span | None]] = {extent.start: (extent, span) for extent, span in index.chunks}
-        if not is_whole:
-            places |= {start: (Extent(start, end, end), None) for start, end in index.attachments}
-            topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
-            unread = dict(index.attachments)
-            for extent, span in index.chunks:
-                if not self._wanted.has([topics[id_] for id_ in span.counts], span):
-                    unread[extent.start] = extent.index_end
-            self._unread = dict(sorted(unread.items()))
-            source.prefetch(zip([0, *self._unread.values()], [*self._unread, source.size], strict=True))
-        return places
-
-    def _add_indexed(self, extent: Extent, span: Span | None) -> int:
-        """Add a chunk, or an attachment, by its entry in the summary; return the start of the next record."""
-        if span is None:
-            self._records_at[Attachment].append((extent.start, extent.end))
-            return extent.end
-        named = span if self.source.is_remote else self._span_by_indexes(extent)
-        if named is None or named.counts != span.counts:
-            self._lose_indexes(extent)
-        if named is not None and _agree(named, span):
-            self.add_span(extent, named)
-        else:
-            self._opened_chunks += 1
-            self.add_content(extent, span)
-        return extent.index_end
+        if source.is_remote:
+            self._is_partial = True
+            parts = sorted([*((extent.start, extent.index_end) for extent, _ in index.chunks), *index.attachments])
+            starts, ends = [start for start, _ in parts], [end for _, end in parts]
+            source.prefetch(zip([0, *ends], [*starts, source.size], strict=True))
+        return {extent.start: (extent, span) for extent, span in index.chunks}
 
     def _span_by_indexes(self, extent: Extent) -> Span | None:
         """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
@@ -189,10 +159,6 @@ class McapContainer(FileContainer):
         if falls.any():  # some writers sort an index by time
             times = times[np.lexsort((offsets, np.repeat(np.arange(len(parts)), [n for _, n in parts])))]
         return Span.of((id_, times[end - n : end]) for (id_, n), end in zip(parts, ends, strict=True))
-
-    def _lose_indexes(self, extent: Extent) -> None:
-        what = f"the message indexes of the chunk at byte {extent.start} are damaged"
-        self.lose("bad-record", f"{what}: its messages are found without them")
 
     def _read_header(self) -> int:
         """Read the header record, which is the first one; return its end."""
@@ -222,7 +188,7 @@ class McapContainer(FileContainer):
             self._declare(opcode, self._payload(start, end))
             return end
         if opcode == Opcode.CHUNK:
-            return self._add_chunk(start, end)
+            return self._add_chunk(self._extent_of(start, end))
         if opcode == Opcode.ATTACHMENT:
             self._check_attachment(start, end)
         elif opcode == Opcode.DATA_END:
@@ -288,39 +254,42 @@ class McapContainer(FileContainer):
         self.add_span(Extent(offset, base + place, base + place, is_chunk=False), span)
         return base + place
 
-    def _add_chunk(self, start: int, end: int) -> int:
-        """Add a chunk that no summary describes; return the end of its message indexes.
-
-        Its content describes it. In a file without an end, message indexes that agree with the head of the chunk do.
-        """
+    def _extent_of(self, start: int, end: int) -> Extent:
+        """Return the extent of the chunk record in bytes [start, end) and of the message indexes behind it."""
         index_end, size = end, self.source.size
         while index_end + INDEX_RECORD.size <= size:
             opcode, following = self._record_head(index_end)
             if opcode & ~_FIRST_PRIVATE != Opcode.MESSAGE_INDEX or following > size:
                 break  # one wrong bit makes an index a private record
             index_end = following
-        extent = Extent(start, end, index_end)
-        first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
-        claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, {})
-        named = self._span_by_indexes(extent)
-        if named is None:
-            self._lose_indexes(extent)
-        elif sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked:
-            claimed = replace(claimed, counts=named.counts)
-            is_known = bool(named.counts) and named.counts.keys() <= self._raw_channels.keys()
-            fits = _agree(named, claimed) and unpacked <= self.meter.limits.chunk_bytes
-            if not self._has_end and is_known and fits:
-                self.add_span(extent, named)
-                return index_end
+        return Extent(start, end, index_end)
+
+    def _add_chunk(self, extent: Extent, claimed: Span | None = None) -> int:
+        """Add a chunk; return the end of its message indexes.
+
+        The message indexes describe it if they agree with the summary (``claimed``), or in a file without an end with
+        the head of the chunk; otherwise its content does. A remote chunk is described by the summary alone.
+        """
+        can_be_indexed = claimed is not None or not self._has_end
+        named = claimed if self._is_partial else self._span_by_indexes(extent)
+        if claimed is None:
+            first, last, unpacked, *_ = _CHUNK.unpack(self.source.read(extent.start + RECORD.size, _CHUNK.size))
+            fits = named is not None and sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked
+            counts = named.counts if named is not None and fits else {}
+            claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, counts)
+        if named is None or (claimed.counts and named.counts != claimed.counts):
+            what = f"the message indexes of the chunk at byte {extent.start} are damaged"
+            self.lose("bad-record", f"{what}: its messages are found without them")
+        elif can_be_indexed and _agree(named, claimed) and named.counts.keys() <= self._raw_channels.keys():
+            self.add_span(extent, named)
+            return extent.index_end
         self._opened_chunks += 1
         block = self.add_content(extent, claimed)
-        if block is not None:
-            held = block.counts
-            missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
-            if missing:
-                what = f"{missing} messages that the index names are not in the chunk at byte {start}"
-                self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
-        return index_end
+        held = block.counts if block is not None else claimed.counts
+        if missing := sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items()):
+            what = f"{missing} messages that the index names are not in the chunk at byte {extent.start}"
+            self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
+        return extent.index_end
 
     def _finish(self) -> None:
         if self._closed and not self._data_end:
@@ -341,8 +310,7 @@ class McapContainer(FileContainer):
             self.lost.append(Loss("bad-summary-crc", what, str(self.path), severity="note"))
         self.drop_undeclared("channels {}")
         self.is_remote = self.source.is_remote
-        described = bool(self.chunks) and not self._opened_chunks and all(extent.is_chunk for extent in self.chunks)
-        self.by_index = described and all(loss.kind == UNVERIFIED for loss in self.lost)
+        self.by_index = bool(self.chunks) and not self._opened_chunks and all(chunk.is_chunk for chunk in self.chunks)
 
     def _resolve_channels(self) -> None:
         """Join channels and schemas once all are known."""
@@ -359,18 +327,18 @@ class McapContainer(FileContainer):
             )
 
     def _check_data(self) -> None:
-        """Check the CRC of the data section if no other checksum or count protects the messages.
+        """Check the CRC of the data section if no other checksum or count protects the messages, unless it is remote.
 
         After other damage, the check is skipped: it adds no information.
         """
         if self._data_end is None or self.lost:
             return
         (crc,) = _U32.unpack(self.source.read(self._data_end + RECORD.size, _U32.size))
-        read = [extent for extent in self.chunks if extent.start not in self._unread]
-        if not crc or (self._statistics is not None and all(map(self._has_crc, read))):
+        chunks = self.chunks[:1] if self._is_partial else self.chunks
+        if not crc or (self._statistics is not None and all(map(self._has_crc, chunks))):
             return
-        if self._unread:
-            what = "the CRC of the data section was not verified, as not all of the log was read"
+        if self._is_partial:
+            what = "the CRC of the data section was not verified, as the log is read in parts from its server"
             self.lost.append(Loss(UNVERIFIED, what, str(self.path), severity="note"))
         elif self._crc(0, self._data_end) != crc:
             what = (
@@ -467,7 +435,10 @@ class McapContainer(FileContainer):
             yield record
 
     def _check_attachment(self, start: int, end: int) -> None:
-        """Add an attachment record; check its CRC block by block."""
+        """Add an attachment record; check its CRC block by block, unless the file is remote."""
+        if self._is_partial:
+            self._records_at[Attachment].append((start, end))
+            return
         start += RECORD.size
         head = ReadDataStream(BytesIO(self.source.read(start, min(end - start, _ATTACHMENT_HEAD_BYTES))))
         head.read(2 * _U64.size)  # times

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.can_decoding import BYTE_BITS, EXTENDED_FLAG, Frames
+from pdhef_logtool.logs.can_decoding import BASE_ID_BITS, BYTE_BITS, EXTENDED_FLAG, ID_BITS, Frames
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.mdf_conversions import conversion_rule
@@ -362,12 +362,12 @@ class _Group:
             and (self._conversions[i] or not self._is(i, _VIRTUAL))
         }
         data = self._bytes(names.index("DataBytes"))[rows]
-        identifier = parts["ID"] & _CAN["id_bits"]
+        identifier = parts["ID"] & ID_BITS
         length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
         if np.isin(length, _CAN["only_codes"]).any() or ("DLC" in parts and "DataLength" not in parts):
             length = _LENGTHS[length.clip(0, len(_LENGTHS) - 1)]
         is_flagged = ((parts["ID"] & EXTENDED_FLAG) > 0) | (parts.get("IDE", np.zeros(1)) > 0)
-        extended = is_flagged | (identifier > _CAN["base_id_bits"])
+        extended = is_flagged | (identifier > BASE_ID_BITS)
         frames = {"id": identifier, "length": length.clip(0, data.shape[1]), "is_extended": extended}
         return Frames(stamps, frames | ({"bus": parts["BusChannel"]} if "BusChannel" in parts else {}), data)
 

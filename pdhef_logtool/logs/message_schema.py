@@ -8,9 +8,10 @@ import functools
 import inspect
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -92,7 +93,7 @@ class Array:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """A place that the schema leaves open; its type follows from the messages."""
+    """A place that the schema leaves open, and so do the first messages."""
 
 
 Node: TypeAlias = Scalar | Struct | Array | Unknown
@@ -128,12 +129,12 @@ class Selection:
     """A path resolved against a schema.
 
     ``components`` are the places to read, as steps (member name or index): one for a scalar or an array, one a
-    column for a vector, seconds and nanoseconds for a time; ``dynamic`` places are judged by their first value.
+    column for a vector, seconds and nanoseconds for a time.
     ``text`` is the encoding of an array of bytes that is a text: ``hex``, ``base64`` or empty.
     """
 
     path: str
-    shape: Literal["scalar", "array", "vector", "time", "dynamic"]
+    shape: Literal["scalar", "array", "vector", "time"]
     components: tuple[tuple[Step, ...], ...]
     length: int | None = None  # columns of an array of fixed length
     text: str = ""
@@ -153,14 +154,6 @@ class SchemaError(Exception):
 
 class NoSchemaError(SchemaError):
     """A channel has no schema of a supported kind; this is no loss."""
-
-
-class MissingDefinitionError(NoSchemaError):
-    """No definition of a type is available."""
-
-    def __init__(self, type_name: str) -> None:
-        super().__init__(f"no definition of {type_name}")
-        self.type_name = type_name
 
 
 @contextmanager
@@ -248,7 +241,9 @@ def ros_schema(
         text = definitions.text_of(name)
         limits.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
         if not text.strip():
-            raise MissingDefinitionError(name)
+            missing = f"the log contains no definition of {name.replace('/msg/', '/')}"
+            kind = SchemaError if has_text else NoSchemaError  # if the log's own text is not whole, messages are lost
+            raise kind(f"{missing}; give its .msg file by --set msgs=DIR")
         return text
 
     with parsing(what):
@@ -257,14 +252,10 @@ def ros_schema(
             text = _SEPARATOR.sub(MESSAGE_SEPARATOR, text)
             types = _idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
         if not has_text or referenced(types) - set(types):  # a distribution's types take long to load
-            base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
+            of_ros2 = getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST)
+            base = Stores.ROS1_NOETIC if wire == "ros1" else of_ros2
             distributed = get_typestore(base).fielddefs
-            try:
-                types = with_contained_types(types, distributed, text_of, "" if has_text else type_name)
-            except MissingDefinitionError as error:
-                if has_text:  # the log's own text is not whole: its messages are lost
-                    raise SchemaError(str(error)) from error
-                raise
+            types = with_contained_types(types, distributed, text_of, "" if has_text else type_name)
             if not has_text:
                 files = (definitions.installed(name) for name in sorted(set(types) - set(distributed)))
                 borrowed = tuple(file for file in files if file is not None)
@@ -302,12 +293,6 @@ def _idl_types(text: str) -> Any:
     return make_typesdict(QuickParser(text).specification())
 
 
-def _store_of(distro: str) -> Any:
-    from rosbags.typesys import Stores
-
-    return getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST) if distro else Stores.LATEST
-
-
 def _ros_root(defs: Mapping[str, Any], type_name: str, limits: ResourceLimits) -> Struct:
     if type_name not in defs:
         raise SchemaError(f"no definition of {type_name}")
@@ -343,7 +328,7 @@ def _field_node(defs: Mapping[str, Any], desc: Any, above: tuple[str, ...], time
     if length is not None and length < 0:
         raise SchemaError(f"an array of {length} elements")
     item = _field_node(defs, args[0], above, times * _listed(length), unfolding)
-    if length is not None and not (isinstance(item, Scalar) and item.kind != "string"):
+    if length is not None and (_is_text(item) or not isinstance(item, Scalar)):
         unfolding.enter(length * _PLACES_AN_ELEMENT, len(above))
     return Array(item, length)
 
@@ -353,17 +338,50 @@ def _listed(length: int | None) -> int:
     return length if length is not None and length <= LISTED_ELEMENTS else 1
 
 
-def json_schema(
-    type_name: str, text: str | bytes, limits: ResourceLimits = DEFAULT_LIMITS, *, is_message: bool = False
-) -> MessageSchema:
-    """Parse a JSON Schema, or derive the schema from a JSON message; raises :class:`SchemaError`."""
-    what = "the first message" if is_message else f"the JSON Schema of {type_name}"
+def json_schema(type_name: str, text: bytes, examples: Iterable[bytes], limits: ResourceLimits) -> MessageSchema:
+    """Parse a JSON Schema; the first three messages define the places that it leaves open, without a text all.
+
+    Raises
+    ------
+    SchemaError : the schema does not parse or exceeds a limit; without a text, the first message.
+    """
+    what = f"the JSON Schema of {type_name}" if text.strip() else "the first message"
+    root: Node = Unknown()
     with parsing(what):
         limits.check("schema_bytes", len(text), what)
-        document = json.loads(text)
-        unfolding = Unfolding(limits, what)
-        root = node_of_value(document, limits) if is_message else _json_node(document, document, unfolding, 1, (), 0)
+        if text.strip():
+            document = json.loads(text.decode("utf-8", errors="replace"))
+            root = _json_node(document, document, Unfolding(limits, what), 1, (), 0)
+    first = islice(examples, 3)
+    while _is_open(root) and (example := next(first, None)) is not None:
+        try:
+            with parsing(what):
+                limits.check("schema_bytes", len(example), what)
+                root = _filled(root, _example_node(json.loads(example), Unfolding(limits, what), 0))
+        except SchemaError:
+            if isinstance(root, Unknown):
+                raise
+    if isinstance(root, Unknown) and not text.strip():
+        raise NoSchemaError("JSON without a schema and without a message")
     return MessageSchema(type_name, "json", root, limits=limits)
+
+
+def _is_open(node: Node) -> bool:
+    """Return whether a schema leaves a place open."""
+    if isinstance(node, Struct):
+        return any(map(_is_open, node.members.values()))
+    return isinstance(node, Unknown) or (isinstance(node, Array) and _is_open(node.item))
+
+
+def _filled(node: Node, other: Node) -> Node:
+    """Return a tree with its open places as another tree has them."""
+    if isinstance(node, Unknown):
+        return other
+    if isinstance(node, Struct) and isinstance(other, Struct):
+        return Struct({k: _filled(member, other.members.get(k, member)) for k, member in node.members.items()})
+    if isinstance(node, Array) and isinstance(other, Array):
+        return Array(_filled(node.item, other.item), node.length)
+    return node
 
 
 #: Scalars of JSON Schema by their type.
@@ -414,12 +432,8 @@ def _json_type(declared: object) -> str | None:
     return str(types[0]) if len(types) == 1 and types[0] is not None else None
 
 
-def node_of_value(value: object, limits: ResourceLimits) -> Node:
-    """Return the tree of a JSON value; raises LimitError."""
-    return _example_node(value, Unfolding(limits, "a JSON value"), 0)
-
-
 def _example_node(value: object, unfolding: Unfolding, depth: int) -> Node:
+    """Return the tree of a JSON value; raises LimitError."""
     unfolding.enter(1, depth)
     if isinstance(value, dict):
         return Struct({k: _example_node(v, unfolding, depth + 1) for k, v in value.items()})
@@ -515,39 +529,29 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
     steps = parse_path(path.removesuffix(ending))
     node: Node | None = schema.root
     for step in steps:
-        if isinstance(node, Unknown):
-            return Selection(path, "dynamic", (steps,))
         node = _part(node, step)
     if node is None:
         raise nearest(
             path, [leaf.path for leaf in schema.fields], f"a field of {schema.type_name or 'the message'}", topic
         )
-    if ending:
-        # Records of ROS messages are read without their texts.
-        is_text = isinstance(node, Unknown) or (isinstance(node, Scalar) and node.kind == "string")
-        if not is_text or schema.wire not in ("json", "protobuf"):
-            raise MappingError(
-                expected=f"a text of {TEXT_ENDINGS[ending]} digits in a JSON or protobuf message",
-                got=repr(path),
-                where=topic,
-                remedy=f"drop the ending {ending}",
-            )
+    # Records of ROS messages are read without their texts.
+    has_texts = schema.wire in ("json", "protobuf")
+    if ending and has_texts and (isinstance(node, Unknown) or _is_text(node)):
         return Selection(path, "array", (steps,), None, TEXT_ENDINGS[ending])
-    return select(schema, topic, path, node, steps)
+    if ending:
+        expected = f"a text of {TEXT_ENDINGS[ending]} digits in a JSON or protobuf message"
+        raise MappingError(expected=expected, got=repr(path), where=topic, remedy=f"drop the ending {ending}")
+    return _number_selection(schema, topic, path, node, steps)
 
 
-def select(schema: MessageSchema, topic: str, path: str, node: Node, steps: tuple[Step, ...]) -> Selection:
+def _number_selection(schema: MessageSchema, topic: str, path: str, node: Node, steps: tuple[Step, ...]) -> Selection:
     """Return how the node at some steps becomes a column; raises MappingError for one that is no number."""
-    if isinstance(node, Unknown):
-        return Selection(path, "dynamic", (steps,))
-    if isinstance(node, Scalar):
-        if node.kind == "string":
-            raise _no_number(schema, topic, path, "a text")
+    if _is_text(node):
+        raise _no_number(schema, topic, path, "a text")
+    if isinstance(node, Unknown | Scalar):
         return Selection(path, "scalar", (steps,))
     if isinstance(node, Array):
-        if isinstance(node.item, Unknown):
-            return Selection(path, "dynamic", (steps,))
-        if not isinstance(node.item, Scalar) or node.item.kind == "string":
+        if isinstance(node.item, Struct | Array) or _is_text(node.item):
             raise _no_number(schema, topic, path, "an array of structs or texts")
         if node.length is not None and node.length > schema.limits.array_width:
             raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
@@ -559,8 +563,14 @@ def select(schema: MessageSchema, topic: str, path: str, node: Node, steps: tupl
     raise _no_number(schema, topic, path, "a struct")
 
 
+def _is_text(node: Node) -> bool:
+    return isinstance(node, Scalar) and node.kind == "string"
+
+
 def _part(node: Node | None, step: Step) -> Node | None:
-    """Return a member of a struct or an element of an array, or None."""
+    """Return a member of a struct or an element of an array, or None; below an open place all is open."""
+    if isinstance(node, Unknown):
+        return node
     if isinstance(node, Struct) and isinstance(step, str):
         return node.members.get(step)
     is_element = isinstance(node, Array) and isinstance(step, int) and (node.length is None or step < node.length)

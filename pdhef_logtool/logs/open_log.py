@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from pdhef_logtool.logs.byte_source import raise_source_error, require_regular, unreadable
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.compression import decompress_file
-from pdhef_logtool.logs.container import EVERYTHING, MCAP_MAGIC, Container, Wanted, describe_damage
+from pdhef_logtool.logs.container import MCAP_MAGIC, Container, describe_damage
 from pdhef_logtool.logs.definitions import dbc_files, read_definitions
 from pdhef_logtool.logs.discovery import names_of_logs
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -40,7 +40,6 @@ def open_log(
     path: LogPlace | str,
     limits: ResourceLimits = DEFAULT_LIMITS,
     msgs: Path | str | None = None,
-    wanted: Wanted = EVERYTHING,
     settings: TableSettings = NO_SETTINGS,
 ) -> DriveLog:
     """Open a log, recognised by its content.
@@ -55,7 +54,7 @@ def open_log(
     limits : resource limits of reading; data beyond them are a loss.
     msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`);
         or a DBC file, or a folder of them, that defines the CAN frames of a log of tables.
-    wanted : the parts of a remote log that will be read. settings : for logs of tables.
+    settings : for logs of tables.
 
     Raises
     ------
@@ -66,7 +65,7 @@ def open_log(
     definitions = read_definitions(None if databases else msgs)
     place = place_of(path) if isinstance(path, str) else path
     local = place if isinstance(place, Path) else Path()
-    log = _opened(LogFile(local, place, Meter(limits), settings=settings), wanted)
+    log = _opened(LogFile(local, place, Meter(limits), settings=settings))
     if log.messages is not None:
         log.messages.definitions = definitions
     log.given_databases = databases
@@ -79,11 +78,11 @@ def open_log(
     return log
 
 
-def _opened(file: LogFile, wanted: Wanted) -> DriveLog:
+def _opened(file: LogFile) -> DriveLog:
     path = file.place
     try:
         if isinstance(path, RemotePlace):
-            opened = _open_remote(file, path, wanted)
+            opened = _open_remote(file, path)
         elif path.is_dir():
             return _open_folder(file)
         elif not path.exists():
@@ -113,17 +112,27 @@ def log_metadata(path: LogPlace, limits: ResourceLimits = DEFAULT_LIMITS) -> dic
     ------
     LogError : as for :func:`open_log`.
     """
-    with closing(open_log(path, limits, wanted=Wanted(frozenset()))) as log:
+    with closing(open_log(path, limits)) as log:
         return log.metadata()
 
 
 def _open_file(file: LogFile) -> Container | DriveLog:
-    """Open one file."""
-    is_compressed = _head_of(file.path).startswith(ZSTD_MAGIC)
-    return _open_compressed(file) if is_compressed else _open_plain(file)
+    """Open one file; a compressed one is decompressed to a temporary one first."""
+    if not _head_of(file.path).startswith(ZSTD_MAGIC):
+        return _open_plain(file)
+    stack = ExitStack()
+    stack.callback(file.release)
+    try:
+        copy = Path(stack.enter_context(scratch_folder())) / file.path.stem
+        with file.meter.running(file.path.stat().st_size):
+            cut = decompress_file(file.path, copy, file.meter)
+        return _open_plain(replace(file, path=copy, release=stack.close, cut=cut))
+    except BaseException:
+        stack.close()
+        raise
 
 
-def _open_remote(file: LogFile, place: RemotePlace, wanted: Wanted) -> Container | DriveLog:
+def _open_remote(file: LogFile, place: RemotePlace) -> Container | DriveLog:
     """Open an object; a log without an index, or of a format that needs the whole file, is copied once."""
     from pdhef_logtool.logs.remote_source import RemoteSource
 
@@ -133,7 +142,7 @@ def _open_remote(file: LogFile, place: RemotePlace, wanted: Wanted) -> Container
         if head.startswith(MCAP_MAGIC):
             from pdhef_logtool.logs.mcap_log import McapContainer
 
-            return McapContainer(file, source, wanted)
+            return McapContainer(file, source)
         file = replace(file, path=source.path, release=source.close)
         if head.startswith(ZSTD_MAGIC) or recognised_format(head, source.path.name) is not None:
             source.fetch_whole()
@@ -166,20 +175,6 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
     return opened
 
 
-def _open_compressed(file: LogFile) -> Container | DriveLog:
-    """Decompress a file to a temporary one and open that."""
-    stack = ExitStack()
-    stack.callback(file.release)
-    try:
-        copy = Path(stack.enter_context(scratch_folder())) / file.path.stem
-        with file.meter.running(file.path.stat().st_size):
-            cut = decompress_file(file.path, copy, file.meter)
-        return _open_plain(replace(file, path=copy, release=stack.close, cut=cut))
-    except BaseException:
-        stack.close()
-        raise
-
-
 def _open_folder(file: LogFile) -> DriveLog:
     from pdhef_logtool.logs.recording_folder import open_recording
 
@@ -192,7 +187,7 @@ def _open_folder(file: LogFile) -> DriveLog:
     if len(logs) != 1:
         got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
         raise LogError(expected=what_is_a_log(), got=got, where=str(path), remedy=_ONE_RECORDING if logs else _REMEDY)
-    return _opened(replace(file, path=logs[0], place=logs[0]), EVERYTHING)
+    return _opened(replace(file, path=logs[0], place=logs[0]))
 
 
 def _read_metadata(path: Path, limits: ResourceLimits) -> Mapping[str, Any]:
@@ -271,14 +266,12 @@ def _storage_file(folder: Path, name: str) -> Path | None:
 
 
 def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
-    """Return the serialization format that metadata.yaml declares for each topic."""
-    encodings: dict[str, str] = {}
-    topics = information.get("topics_with_message_count")
-    for entry in topics if isinstance(topics, list) else ():
-        topic = entry.get("topic_metadata") if isinstance(entry, dict) else None
-        if isinstance(topic, dict) and topic.get("serialization_format"):
-            encodings[_text(topic.get("name"))] = _text(topic["serialization_format"])
-    return encodings
+    """Return the serialization format that metadata.yaml declares for each topic; nothing of a malformed list."""
+    with suppress(TypeError, KeyError):
+        topics = [entry["topic_metadata"] for entry in information["topics_with_message_count"]]
+        formats = {_text(topic["name"]): _text(topic["serialization_format"]) for topic in topics}
+        return {name: encoding for name, encoding in formats.items() if encoding}
+    return {}
 
 
 def _text(value: object) -> str:

@@ -258,8 +258,6 @@ def _repeated(times_ns: Mapping[_Lane, IntArray], intervals: Sequence[tuple[int,
 
 def _groups(start_ns: IntArray, end_ns: IntArray, silence_ns: int) -> IntArray:
     """Number the groups of intervals [K], ascending by start, that a longer silence keeps apart."""
-    if start_ns.shape[0] == 0:
-        return np.empty(0, np.int64)
     reach = np.maximum.accumulate(end_ns)[:-1]
     # As floats: the difference of two times need not fit into int64.
     apart = start_ns[1:].astype(np.float64) - reach.astype(np.float64) > silence_ns

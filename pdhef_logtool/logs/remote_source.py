@@ -159,12 +159,8 @@ class RemoteSource(ByteSource):
         """The copy: fetched blocks are valid, all of it after :meth:`fetch_whole`."""
         return self._copy.path
 
-    @property
-    def identity(self) -> str:
-        """Hash of the URL without access tokens, of the size, and of ETag or time of modification."""
-        return self._identity(self.size)
-
-    def _identity(self, size: int) -> str:
+    def identity(self, size: int) -> str:
+        """Return the hash of the URL without access tokens, of the size, and of ETag or time of modification."""
         return hashlib.sha256("\0".join((self._place.identity, str(size), self._version)).encode()).hexdigest()
 
     def fetch(self, offset: int, size: int) -> bytes:
@@ -268,7 +264,7 @@ class RemoteSource(ByteSource):
         size, version = None if length is None else int(length), head.get("ETag") or head.get("Last-Modified") or ""
         if self._size is None:
             self._version = version
-            self._copy = RemoteCopy(self._place.name, self._identity(size) if version and size else "")
+            self._copy = RemoteCopy(self._place.name, self.identity(size) if version and size else "")
         elif version not in ("", self._version) or size not in (None, self._size):
             raise ChangedError(
                 expected="the object that was opened",
@@ -283,7 +279,7 @@ def identity_of_object(place: RemotePlace) -> str:
     """Return the hash of URL, size and version of an object; raises SourceError."""
     source = RemoteSource(place)
     source.close()
-    return source.identity
+    return source.identity(source.size)
 
 
 def keys_below(prefix: RemotePlace) -> list[str]:

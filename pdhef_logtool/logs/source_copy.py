@@ -6,7 +6,6 @@ metadata records are copied too. Bags and rosbag2 databases keep their bytes and
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
@@ -68,7 +67,8 @@ def iterate_copy(
 ) -> Iterator[Block]:
     """Yield the messages of a log with log time in [start, end) in log-time order, with the ``ids`` of the copy.
 
-    Messages of equal log time are in file order. Spans that overlap in time are merged; only these are in memory.
+    Messages of equal log time are in the order of their spans. Spans that overlap in time are merged; only these are in
+    memory.
     Damaged spans are left out and reported by ``log.lost``.
     """
     spans = [
@@ -80,13 +80,15 @@ def iterate_copy(
     spans.sort(key=lambda item: item[1].start_ns)
     for c, container in enumerate(log.containers):
         container.prefetch(span for of, span in spans if of == c)
-    pending: dict[_Key, Block] = {}
+    pending = Block.merged([])
     for c, span in spans:
-        yield from _taken(pending, span.start_ns)
+        ready, pending = pending.split(span.start_ns)
+        yield ready
         block = log.load(c, span)
         if block is not None:
-            pending[c, span.index] = _copied(block, c, ids, start_ns, end_ns)
-    yield from _taken(pending, math.inf)
+            copied = _copied(block, c, ids, start_ns, end_ns)
+            pending = Block.merged([pending, copied]) if len(pending) else copied
+    yield pending
 
 
 def _copied(block: Block, c: int, ids: Mapping[_Key, int], start_ns: int | None, end_ns: int | None) -> Block:
@@ -99,18 +101,6 @@ def _copied(block: Block, c: int, ids: Mapping[_Key, int], start_ns: int | None,
         channel[rows] = ids.get((c, id_), -1)
     keep = np.flatnonzero((channel >= 0) & in_window(block.log_time_ns, max(start_ns or 0, 0), end_ns))
     return replace(block, channel=channel).take(keep[np.argsort(block.log_time_ns[keep], kind="stable")])
-
-
-def _taken(pending: dict[tuple[int, int], Block], before_ns: float) -> Iterator[Block]:
-    """Yield the messages before a time as a block; the others stay."""
-    taken: list[Block] = []
-    for place in sorted(pending):
-        ready, rest = pending.pop(place).split(before_ns)
-        taken += [ready] if ready is not None else []
-        if rest is not None:
-            pending[place] = rest
-    if taken:
-        yield Block.merged(taken) if len(taken) > 1 else taken[0]
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:

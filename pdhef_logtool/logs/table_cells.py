@@ -60,7 +60,11 @@ def read_cells(texts: Series, decimal: str = "") -> Cells:
     One decimal mark applies to the whole column: the one that more of its cells need; if no cell decides, ``decimal``,
     or else the only mark that the cells contain. A cell that fits only the other mark is read with that one.
     """
-    texts = texts.fill_null("").str.strip_chars()
+    texts = texts.str.strip_chars()
+    plain = texts.cast(pl.Float64, strict=False).to_numpy()
+    if decimal == "." and np.count_nonzero(np.isfinite(plain)) == len(texts) - texts.null_count():
+        return Cells(plain, texts.null_count())
+    texts = texts.fill_null("")
     point, comma = _numbers(texts, "."), _numbers(texts, ",")
     rest = np.isnan(point) & np.isnan(comma)
     cleaned = _cleaned(texts.filter(rest))

@@ -93,7 +93,7 @@ def rate_clock(rows: int, rate_hz: float) -> Clock:
 def rescaled(clock: Clock, decades: int, note: str) -> Clock:
     """Return a clock of times since a start that last 10**decades as long."""
     has_time = clock.stamps_ns != NO_TIME
-    since = _scaled((clock.stamps_ns - RELATIVE_NS) * 10.0**decades, 1, 0, has_time)
+    since = scaled((clock.stamps_ns - RELATIVE_NS) * 10.0**decades, 1, 0, has_time)
     return replace(clock, stamps_ns=placed(since), notes=(*clock.notes, note))
 
 
@@ -116,7 +116,7 @@ def number_clock(
     """
     if values.dtype.kind == "M":
         factor = TIME_UNITS_NS[np.datetime_data(values.dtype)[0].lower()]
-        return Clock(placed(_scaled(values.astype(np.int64), factor, 0, ~np.isnat(values))))
+        return Clock(placed(scaled(values.astype(np.int64), factor, 0, ~np.isnat(values))))
     finite = np.isfinite(values)
     if (of_day := seconds_of_day(values[finite])) is not None:
         stamps = np.full(len(values), NO_TIME, np.int64)
@@ -124,7 +124,7 @@ def number_clock(
         return Clock(placed(stamps))
     stated = TIME_UNITS_NS.get(re.sub(r"[\s\[\](){}.]", "", unit).lower(), 0)
     factor, epoch, note = _reading(values[finite], stated, others, rate_hz)
-    stamps = placed(_scaled(values, factor, epoch, finite))
+    stamps = placed(scaled(values, factor, epoch, finite))
     clock = Clock(stamps, (f"{name}: {note}",) if note else (), bool(stated or epoch or rate_hz) or _is_dated(stamps))
     return clock if epoch else _of_gps(clock, name, others)
 
@@ -256,12 +256,13 @@ def _steps(values: NDArray[Any]) -> tuple[float, int]:
     return (float(np.median(steps)), len(steps)) if len(steps) else (0.0, 0)
 
 
-def _scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:
+def scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:
     """Return values [N] since an epoch in ns; those that do not fit into int64 have no time."""
     stamps = np.full(values.shape, NO_TIME, np.int64)
     size = np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch)
     has_time = has_time & (size < _CLOCKS["last_ns"] / factor)
     given = values[has_time]
+    given = given if given.dtype.kind in "iu" else given.astype(np.float64)
     # The fraction apart: a product would lose the last digits of a date.
     whole = given if given.dtype.kind in "iu" else np.floor(given)
     fraction = np.round((given - whole) * float(factor)).astype(np.int64)
@@ -347,7 +348,7 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
         hour, minute, second = (np.where(short, *pair) for pair in ((minute, hour), (second, minute), (0, second)))
     hour, minute, second = (np.maximum(part, 0) for part in (hour, minute, second))
     half = parts["half"].str.to_lowercase().fill_null("").to_numpy()
-    hour = np.where(half == "", hour, hour_of_day(hour, half == "p"))
+    hour = np.where(half == "", hour, hour % _HALF_DAY_H + _HALF_DAY_H * (half == "p"))
     has_time = (second <= _MINUTE_S) & ((minute < _HOUR_MIN) | short & ~is_dated) & ((hour < _DAY_H) | ~is_dated)
     fraction = parts["fraction"].fill_null("").str.pad_end(9, "0").cast(int).to_numpy()
     of_day = hour * _HOUR_NS + minute * _MINUTE_NS + second * _SECONDS + fraction
@@ -365,12 +366,7 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
 
 
 _WORDS = frozenset({"mark", "half", "sign", "fraction"})
-_MONTHS = [names.replace(" ", "|") for names in CONSTANTS["asc"]["months"]]
-
-
-def hour_of_day(hour: Any, is_afternoon: Any) -> Any:
-    """Return hours from 0 to 23 of hours of a clock with twelve, numbers or [N]."""
-    return hour % _HALF_DAY_H + _HALF_DAY_H * is_afternoon
+_MONTHS = [names.replace(" ", "|") for names in _CLOCKS["months"]]
 
 
 def _numbered_months(texts: Series) -> Series:

@@ -217,7 +217,7 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     if not isinstance(column, np.ndarray):
         given = column.drop_nulls().head(20)
         named = _TIME_LIKE.search(text) or PATTERNS["date"].fullmatch(text)
-        grade, others = (0, 0) if is_time else (1, 1) if named else (2, max(1, len(given) - 1))
+        grade, others = (0, 0) if is_time else (1, 1) if named else (2, max(1, len(given) // 2 - 1))
         return grade if len({*table_clocks.text_clock(given).stamps_ns.tolist()} - {NO_TIME}) > others else None
     if column.dtype.kind not in "iufM":
         return None
@@ -296,9 +296,6 @@ def tables_of(
             unusable.append(name)
             continue
         if not np.isfinite(column).any():  # its cells are empty
-            continue
-        if len(column) != len(stamps):
-            losses.append(Loss("bad-column", f"{name}: {len(column)} values for {len(stamps)} times", where))
             continue
         values = column[rows]
         there = _own_rows(np.isfinite(values), times)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, Requests, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo, nearest
 from pdhef_logtool.logs.recording_span import survey_stamps
 from pdhef_logtool.logs.table_clocks import unlike_lengths
@@ -118,16 +118,15 @@ class TableLog(DriveLog):
         del quiet
         return self._tables[topic].fields if topic in self._tables else ()
 
-    def _read(
-        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
+    def read(
+        self, requests: Requests, start_ns: int | None = None, end_ns: int | None = None, *, quiet: bool = False
     ) -> dict[str, Columns]:
+        """Read columns; see :class:`~.drive_log.DriveLog`."""
         for topic, paths in requests.items():
             self._check(topic, paths)
-        start_ns, end_ns = window_ns
         window = (self.start_ns if start_ns is None else start_ns, self.end_ns if end_ns is None else end_ns)
         with self._file.meter.running():
-            wanted = {**dict.fromkeys(stamps, ()), **requests}
-            return {topic: self._columns(self._tables[topic], paths, window, quiet) for topic, paths in wanted.items()}
+            return {topic: self._columns(self._tables[topic], its, window, quiet) for topic, its in requests.items()}
 
     def close(self) -> None:
         """Release the file."""

@@ -28,7 +28,7 @@ from polars import Series
 
 from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
 from pdhef_logtool.logs.mat_log import tables_of_variables
-from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
+from pdhef_logtool.logs.table_cells import EMPTY, read_cells
 from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, of_digits, placed, to_ns, whole_days
 from pdhef_logtool.logs.table_columns import Sheet, by_times, field_name, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
@@ -342,12 +342,8 @@ def _columns(
         part = pl.read_csv(
             data, has_header=False, separator=_CELL_END, quote_char=None, infer_schema=False, columns=places
         )
-        plain = part.select(pl.all().str.strip_chars().cast(pl.Float64, strict=False))
-        for name, column, numbers in zip(names[start:], part.iter_columns(), plain.iter_columns(), strict=False):
-            values = numbers.to_numpy()
-            empty = column.null_count()
-            is_plain = decimal == "." and np.count_nonzero(np.isfinite(values)) == len(values) - empty
-            cells = Cells(values, empty) if is_plain else read_cells(column, decimal)
+        for name, column in zip(names[start:], part.iter_columns(), strict=False):
+            cells = read_cells(column, decimal)
             if cells.is_text and (unit := _unit_of_cells(column)):
                 cells, units[name] = read_cells(column.str.strip_suffix(unit), decimal), unit
             columns[name] = column.str.strip_chars() if cells.is_text else cells.values

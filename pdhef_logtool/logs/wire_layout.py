@@ -7,7 +7,6 @@ size counted from after the 4-byte encapsulation header. ROS 1 packs without ali
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -92,15 +91,12 @@ class WireLayout:
 
     def _length_word(self) -> int:
         self._align(_WORD.itemsize)
-        try:
-            (length,) = struct.unpack_from("<I", self._message, self.size)
-        except struct.error as error:
-            raise NoLayoutError("the message ends early") from error
+        length = int.from_bytes(self._message[self.size : self.size + _WORD.itemsize], "little")
         if length > len(self._message):
             raise NoLayoutError("a length exceeds the message")
         self.lengths.append((self.size, length))
         self.size += _WORD.itemsize
-        return int(length)
+        return length
 
     def _place(self, node: Node, steps: Steps) -> None:
         # Arrays in arrays multiply.
@@ -111,25 +107,21 @@ class WireLayout:
             for name, member in node.members.items():
                 self._place(member, (*steps, name))
         elif isinstance(node, Array):
-            self._place_items(node.item, steps, self._length_word() if node.length is None else node.length)
-        elif isinstance(node, Unknown):
-            raise NoLayoutError("the type is not known in full")
-        elif node.code and node.kind == "string":
-            raise NoLayoutError("wide strings have no layout here")
+            count = self._length_word() if node.length is None else node.length
+            if isinstance(node.item, Scalar) and node.item.kind != "string":
+                self._place_numbers(node.item, steps, count)
+            elif count > UNROLLED_ELEMENTS:
+                raise NoLayoutError("too many elements to unroll")
+            else:
+                for i in range(count):
+                    self._place(node.item, (*steps, i))
+        elif isinstance(node, Unknown) or (node.code and node.kind == "string"):
+            raise NoLayoutError("open places and wide strings have no layout here")
         elif node.kind == "string":
             length = self._length_word()
             self.size += length
         else:
             self._place_numbers(node, steps, None)
-
-    def _place_items(self, item: Node, steps: Steps, count: int) -> None:
-        if isinstance(item, Scalar) and item.kind != "string":
-            self._place_numbers(item, steps, count)
-            return
-        if count > UNROLLED_ELEMENTS:
-            raise NoLayoutError("too many elements to unroll")
-        for i in range(count):
-            self._place(item, (*steps, i))
 
     def _place_numbers(self, node: Scalar, steps: Steps, count: int | None) -> None:
         dtype = np.dtype("<" + node.code)

@@ -161,9 +161,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         for raw in raws:
             group += [raw] if len(raw) else []
             if sum(int((part.length + MESSAGE_HEAD.itemsize).sum()) for part in group) >= CHUNK_BYTES:
-                before = int(np.searchsorted(ours.log_time_ns, group[-1].log_time_ns[-1]))
-                self._emit_messages(self._records([*group, ours.take(slice(before))]))
-                group, ours = [], ours.take(slice(before, None))
+                before, ours = ours.split(group[-1].log_time_ns[-1])
+                self._emit_messages(self._records([*group, before]))
+                group = []
         self._emit_messages(self._records([*group, ours]) if group else ours)
 
     @staticmethod

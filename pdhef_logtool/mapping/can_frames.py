@@ -8,7 +8,7 @@ attached to the log.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs import can_decoding as dbc
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, Requests, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.evidence import Pieces
 from pdhef_logtool.mapping.naming import VOCABULARY
@@ -34,10 +34,8 @@ NAMES = {part: tuple(names.split()) for part, names in VOCABULARY["can_fields"].
 #: Kinds of fields that contain a part; all others are flags.
 _KINDS = {"id": ("number",), "data": ("array", "string"), "length": ("number",)}
 
-#: Flags that SocketCAN and DBC files keep above the 29 bits of an identifier.
-EXTENDED_FLAG = 1 << 31
+#: Flags of frames without data that SocketCAN keeps above the 29 bits of an identifier.
 NO_DATA_FLAGS = (1 << 30) | (1 << 29)
-STANDARD_ID_BITS = (1 << 11) - 1
 
 
 def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
@@ -209,8 +207,8 @@ class CanSignalLog(DriveLog):
         """Return the first messages of a topic whole."""
         return self._log.first_messages(self._views[topic].topic if topic in self._views else topic, most)
 
-    def _read(
-        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
+    def read(
+        self, requests: Requests, start_ns: int | None = None, end_ns: int | None = None, *, quiet: bool = False
     ) -> dict[str, Columns]:
         """Read fields; each topic of frames is read once for all of its signals."""
         raw: dict[str, list[str]] = {}
@@ -219,9 +217,9 @@ class CanSignalLog(DriveLog):
             wanted = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.signals))
             merged = raw.setdefault(topic if view is None else view.topic, [])
             merged += [p for p in wanted if p not in merged]
-        read = self._log.read(raw, *window_ns, quiet=quiet, stamps=stamps) if raw or stamps else {}
+        read = self._log.read(raw, start_ns, end_ns, quiet=quiet) if raw else {}
         short: dict[str, Loss] = {}
-        matches = {topic: read[topic] for topic in stamps}
+        matches = {}
         for topic, paths in requests.items():
             view = self._views.get(topic)
             matches[topic] = read[topic] if view is None else self._view_columns(view, read, topic, paths, short)
@@ -265,12 +263,12 @@ def _is_message(frames: Columns, view: _CanView, settings: CanSettings) -> BoolA
     fits = is_valid & ((ids & NO_DATA_FLAGS) == 0)
     bare = ids & dbc.ID_BITS
     fits &= (bare & settings.id_mask) == (view.message.frame_id & settings.id_mask)
-    flagged = (ids & EXTENDED_FLAG) != 0
+    flagged = (ids & dbc.EXTENDED_FLAG) != 0
     if "extended" in paths:
         flagged |= fields[paths["extended"]] > 0.0
     elif view.unflagged_may_be_extended and view.message.is_extended_frame:
         flagged[:] = True
-    flagged |= bare > STANDARD_ID_BITS
+    flagged |= bare > dbc.BASE_ID_BITS
     fits &= flagged == view.message.is_extended_frame
     for path in view.paths.no_data:
         fits &= ~(fields[path] > 0.0)

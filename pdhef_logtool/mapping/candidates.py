@@ -29,8 +29,8 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: Kind of data in a field, according to the names around it.
 Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command"]
-#: A field with a meaning from its name or documented type. The last entry is True for a documented type.
-Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
+#: A field with a meaning from its name, or from its documented type, which is the last entry.
+Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, VendorType | None]
 
 #: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset(VOCABULARY["words"]["car_axes"].split())
@@ -201,15 +201,15 @@ class Field:
 
 
 def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendors: Vendors) -> list[Named]:
-    """Return the fields with a meaning from their name or documented type (last entry True)."""
-    results = []
+    """Return the fields with a meaning from their name or documented type."""
+    results: list[Named] = []
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
-        if len(fields) > _NAMES["most_fields"] or vendors.of(topic.type_name).left_out:
+        if len(fields) > _NAMES["most_fields"]:
             continue
         if is_joints(topic):
             joints = () if role == "command" else joint_meanings(log, topic)
-            results += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
+            results += [(topic, role, FieldInfo(path, "number"), meaning, None) for path, meaning in joints]
             continue
         documented = vendors.of(topic.type_name)
         there = {f.path for f in fields}
@@ -218,10 +218,12 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             if not is_column(info) or is_command(info.path):
                 continue
             if its := documented.entries(info.path):
-                results += [(topic, role, replace(info, path=p), meaning_of_source(s), True) for p, s in its.items()]
+                results += [
+                    (topic, role, replace(info, path=p), meaning_of_source(s), documented) for p, s in its.items()
+                ]
             elif not documented.fields or info.path.count(".") or documented.has:
                 meaning = naming.meaning_among(topic.name, topic.type_name, info.path, info.unit, there)
-                results += [] if meaning is None else [(topic, role, info, meaning, False)]
+                results += [] if meaning is None else [(topic, role, info, meaning, None)]
     return results
 
 
@@ -243,13 +245,13 @@ def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
 
 
 def look(
-    log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
+    log: DriveLog, named: Sequence[Named], sources: Sequence[SignalSource]
 ) -> tuple[Pieces, list[Field], dict[str, Field]]:
     """Read the named fields and the mapped sources in a few pieces of the log.
 
     Fields without a number are excluded, as are fields that exceed a car's range in every unit.
     """
-    named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[: _NAMES["most_read"]]
+    named = sorted(named, key=lambda n: (n[4] is None, -n[3].strength))[: _NAMES["most_read"]]
     fields = [(topic.name, info.path.removesuffix("[]")) for topic, _, info, _, _ in named]
     of_topics = {t: _signs_of({f.path for f in log.fields(t, quiet=True)}) for t in dict.fromkeys(t for t, _ in fields)}
     signs = {(t, p): of_topics[t][p] for t, p in fields if p in of_topics[t]}
@@ -262,15 +264,13 @@ def look(
             size, its = samples[key], samples[key[0], sign]
             values, cells = signed(size.values, its.values), signed(size.cells, its.cells)
             samples[key] = Seen.of(values, cells, size.rate_hz)
-    weighable = [item for entry in named for item in _weighable(log, entry, samples, vendors) if item.factors]
+    weighable = [item for entry in named for item in _weighable(log, entry, samples) if item.factors]
     for item in weighable:
         item.sign_path = signs.get((item.topic.name, item.path), "")
     return pieces, weighable, anchors_of(log, sources, samples)
 
 
-def _weighable(
-    log: DriveLog, named: Named, samples: Mapping[tuple[str, str], Seen], vendors: Vendors
-) -> Iterator[Field]:
+def _weighable(log: DriveLog, named: Named, samples: Mapping[tuple[str, str], Seen]) -> Iterator[Field]:
     """Yield a field, or each element of an array that has a meaning."""
     topic, role, info, meaning, documented = named
     fields = log.fields(topic.name, quiet=True)
@@ -284,8 +284,7 @@ def _weighable(
             continue
         if role == "sensor" and (words := set(words_of(name))) & (_TRUTH_WORDS | _RECEIVERS):
             role = "truth" if words & _TRUTH_WORDS else "navigation"
-        kind = vendors.of(topic.type_name) if documented else None
-        yield field_of(fields, topic, role, replace(info, path=name), its, seen, kind)
+        yield field_of(fields, topic, role, replace(info, path=name), its, seen, documented)
 
 
 def field_of(

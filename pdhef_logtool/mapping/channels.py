@@ -153,7 +153,7 @@ def read_signals(
     gate = resolved.quality
     sources = (*resolved.signals.values(), *resolved.truth.values())
     requests = requests_of(log, sources)
-    columns = log.read(requests, start_ns, end_ns, stamps=stamps) if requests or stamps else {}
+    columns = log.read({**dict.fromkeys(stamps, ()), **requests}, start_ns, end_ns) if requests or stamps else {}
     reading = _Reading(log, clocks, columns)
     for source in sources:
         reading.times(source)
@@ -306,13 +306,11 @@ def si_of(source: SignalSource, parts: Sequence[FloatArray]) -> FloatArray:
     if width == 1 and len(parts) > 1 and raw.ndim == 2:
         # Summed one by one: a matrix product may round differently with the number of rows.
         scales = np.broadcast_to(np.asarray(source.scale), len(parts))
+        power = 2 if source.combine == "norm" else 1
+        total = sum((s * raw[:, i]) ** power for i, s in enumerate(scales))
         if source.combine == "signed":
-            return np.asarray(scales[0] * signed(raw[:, 0], raw[:, 1]) + source.offset, dtype=np.float64)
-        if source.combine == "norm":
-            squares = sum((s * raw[:, i]) ** 2 for i, s in enumerate(scales))
-            return np.asarray(np.sqrt(squares) + source.offset, dtype=np.float64)
-        total = sum(s * raw[:, i] for i, s in enumerate(scales))
-        if source.combine == "root":
+            total = scales[0] * signed(raw[:, 0], raw[:, 1])
+        elif source.combine != "sum":
             total = np.sqrt(np.maximum(total, 0.0))
         return np.asarray(total + source.offset, dtype=np.float64)
     shape = (len(raw), width) if width > 1 else (len(raw),)

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
 from pdhef_logtool.logs.recording_span import STEP_BACK_NS, steps_back
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, scaled
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
 from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, IntArray
-
-NANOSECONDS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, IntArray
 
 #: A longer median delay is not a transport delay: the two clocks differ.
 MAX_CREDIBLE_DELAY_NS = NS_PER_S
@@ -52,7 +51,7 @@ class ClockModel:
     Attributes
     ----------
     delay_known : False where log time − stamp is systematically negative or above 1 s; the stamp then is the arrival.
-    median_delay_s, p95_delay_s, min_delay_s : of log time − stamp on the log's clock; NaN without samples.
+    median_delay_s, p95_delay_s : of log time − stamp on the log's clock; NaN without samples.
     residual_s : largest deviation of the envelope from the fitted line; large if the clock stepped.
     median_period_s : median step between stamps; NaN with fewer than two.
     samples : number of messages in the survey.
@@ -65,7 +64,6 @@ class ClockModel:
     delay_known: bool = True
     median_delay_s: float = float("nan")
     p95_delay_s: float = float("nan")
-    min_delay_s: float = float("nan")
     residual_s: float = 0.0
     median_period_s: float = float("nan")
     samples: int = 0
@@ -163,11 +161,10 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
 
 
 class _Stamps(NamedTuple):
-    """Usable stamps of a clock, their log times, the steps between stamps, and the log times of all messages."""
+    """Usable stamps of a clock, their log times, and the log times of all messages."""
 
     stamps_ns: IntArray
     log_time_ns: IntArray
-    steps_s: FloatArray
     recorded_ns: IntArray
 
 
@@ -198,16 +195,14 @@ def _survey(
     log: DriveLog, wanted: Mapped[str, SignalSource], spans: Iterable[tuple[int, int]]
 ) -> dict[str, list[_Stamps]]:
     """Read the stamps of each clock, window by window."""
-    none = _Stamps(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
     requests = requests_of(log, wanted.values(), values=False)
-    parts: dict[str, list[_Stamps]] = {key: [none] for key in wanted}
+    parts: dict[str, list[_Stamps]] = {key: [_Stamps(*[np.empty(0, np.int64)] * 3)] for key in wanted}
     for start_ns, end_ns in spans:
         columns = log.read(requests, start_ns, end_ns)
         for key, source in wanted.items():
             if (topic := columns.get(source.read_topic)) is not None:
                 raw, usable = raw_stamps(log, topic, source)
-                steps = np.diff(np.unique(raw[usable])).astype(np.float64) * S_PER_NS
-                parts[key].append(_Stamps(raw[usable], topic.log_time_ns[usable], steps, topic.log_time_ns))
+                parts[key].append(_Stamps(raw[usable], topic.log_time_ns[usable], topic.log_time_ns))
     return parts
 
 
@@ -298,19 +293,9 @@ def raw_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[I
 
 
 def _to_nanoseconds(parts: list[NDArray[np.generic]], units: tuple[str, ...]) -> tuple[IntArray, NDArray[np.bool_]]:
-    total = np.zeros(parts[0].shape[0], np.int64)
-    usable = np.ones(parts[0].shape[0], np.bool_)
-    for part, unit in zip(parts, units, strict=True):
-        if part.dtype.kind in "iu":
-            total += part.astype(np.int64) * np.int64(NANOSECONDS[unit])
-            continue
-        scale = NANOSECONDS[unit]
-        finite = np.isfinite(part.astype(np.float64)) & (np.abs(part.astype(np.float64)) < 9.2e18 / scale)
-        usable &= finite
-        number = np.where(finite, part.astype(np.float64), 0.0)
-        # Convert whole and fractional parts separately: float64 nanoseconds since 1970 have a resolution of 256 ns.
-        whole = np.floor(number)
-        total += whole.astype(np.int64) * np.int64(scale) + np.rint((number - whole) * scale).astype(np.int64)
+    stamps = [scaled(p, TIME_UNITS_NS[unit], 0, np.isfinite(p)) for p, unit in zip(parts, units, strict=True)]
+    usable = np.logical_and.reduce([ns != NO_TIME for ns in stamps])
+    total = np.where(usable, sum(stamps), 0)
     return total, usable & (total > 0)
 
 
@@ -323,12 +308,13 @@ def survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
 
 
 def _clock_of(source: SignalSource, stamps: _Stamps, unusable: str) -> ClockModel:
-    stamps_ns, log_time_ns, steps_s, recorded_ns = stamps
+    stamps_ns, log_time_ns, recorded_ns = stamps
     if unusable:  # log time replaces the stamps; they do not show the period either
         source, stamps_ns, log_time_ns = replace(source, clock="utc"), recorded_ns, recorded_ns
-        steps_s = np.diff(recorded_ns) * S_PER_NS
     n = int(stamps_ns.shape[0])
-    period_s = float(np.median(steps_s)) if steps_s.shape[0] else float("nan")
+    steps_ns = np.diff(np.unique(stamps_ns))
+    steps_ns = steps_ns[steps_ns <= SURVEY_WINDOW_NS]  # larger ones are between the windows of a survey
+    period_s = float(np.median(steps_ns)) * S_PER_NS if steps_ns.shape[0] else float("nan")
     if n == 0:
         if source.clock == "device":
             expected, got = "stamps of the device clock", "no usable stamp in the span that is read"
@@ -341,14 +327,12 @@ def _clock_of(source: SignalSource, stamps: _Stamps, unusable: str) -> ClockMode
         line = ClockModel(reference, reference_log, drift, residual_s=residual_s)
     delays_ns = log_time_ns - apply_clock(stamps_ns, line)
     median_ns = float(np.median(delays_ns))
-    low_ns, high_ns = (float(q) for q in np.quantile(delays_ns, [0.0, 0.95]))
     is_known = source.clock == "device" or 0.0 <= median_ns <= MAX_CREDIBLE_DELAY_NS
     return replace(
         line,
         delay_known=is_known,
         median_delay_s=median_ns * S_PER_NS,
-        p95_delay_s=high_ns * S_PER_NS,
-        min_delay_s=low_ns * S_PER_NS,
+        p95_delay_s=float(np.quantile(delays_ns, 0.95)) * S_PER_NS,
         median_period_s=period_s,
         samples=n,
         unusable=unusable,

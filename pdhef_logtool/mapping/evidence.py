@@ -33,6 +33,8 @@ MOST_COLUMNS = 16
 EVIDENCE: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 LOG_ODDS: dict[str, float] = EVIDENCE["log_odds"]
 CLEAR: float = EVIDENCE["relations"]["clear"]
+#: Quantiles between which values are usual; a sensor's code for "invalid" is outside.
+_USUAL = (0.005, 0.995)
 #: Smallest number of cells that gives information.
 FEWEST_CELLS = 40
 
@@ -85,7 +87,7 @@ class Seen:
     def largest(self) -> float:
         """Largest magnitude without a few outliers; NaN without a number."""
         finite = np.abs(self.values[np.isfinite(self.values)])
-        return float(np.quantile(finite, 0.995)) if finite.shape[0] else float("nan")
+        return float(np.quantile(finite, _USUAL[1])) if finite.shape[0] else float("nan")
 
     @property
     def changes(self) -> bool:
@@ -118,20 +120,21 @@ class Pieces:
         requests: dict[str, list[str]] = {}
         for topic, path in dict.fromkeys(fields):
             requests.setdefault(topic, []).append(path)
-        parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
+        parts: dict[tuple[str, str], list[tuple[IntArray, FloatArray]]] = {}
         for number, start in enumerate(self.starts if requests else ()):
             for topic, columns in self._columns(requests, start).items():
-                cell = (columns.log_time_ns - start) // CELL_NS
+                cells = (columns.log_time_ns - start) // CELL_NS
+                is_inside = (cells >= 0) & (cells < self.cells_a_piece)
+                cells = np.where(is_inside, cells + number * self.cells_a_piece, -1)
                 for path in requests[topic]:
                     values = np.asarray(columns.fields[path], dtype=np.float64)
                     values = np.where(np.abs(values) < LARGEST, values, np.nan)
-                    if values.ndim == 1:
-                        parts.setdefault((topic, path), []).append((number, cell, values))
-                        continue
-                    for i, column in enumerate(values.T[:MOST_COLUMNS]):
-                        parts.setdefault((topic, f"{path}[{i}]"), []).append((number, cell, column))
-        whole = {key: np.concatenate([column for _, _, column in samples]) for key, samples in parts.items()}
-        return {key: Seen(values, partial(self._on_grid, values, parts[key])) for key, values in whole.items()}
+                    elements = enumerate(values.T[:MOST_COLUMNS])
+                    its = {path: values} if values.ndim == 1 else {f"{path}[{i}]": v for i, v in elements}
+                    for name, column in its.items():
+                        parts.setdefault((topic, name), []).append((cells, column))
+        whole = {key: [*map(np.concatenate, zip(*samples, strict=True))] for key, samples in parts.items()}
+        return {key: Seen(values, partial(self._on_grid, values, cells)) for key, (cells, values) in whole.items()}
 
     def _columns(self, requests: Mapping[str, Sequence[str]], start: int) -> dict[str, Columns]:
         try:
@@ -140,27 +143,21 @@ class Pieces:
             alone = requests.items() if len(requests) > 1 else ()
             return {t: c for topic, paths in alone for t, c in self._columns({topic: paths}, start).items()}
 
-    def _on_grid(self, values: FloatArray, samples: list[tuple[int, IntArray, FloatArray]]) -> tuple[FloatArray, float]:
+    def _on_grid(self, values: FloatArray, cells: IntArray) -> tuple[FloatArray, float]:
         """Return the means of the usual values on the grid [M], and the sample rate."""
-        total = np.zeros(len(self.starts) * self.cells_a_piece)
-        count = np.zeros_like(total)
         low, high = _usual(values)
-        for number, cell, column in samples:
-            use = (column >= low) & (column <= high)
-            use &= (cell >= 0) & (cell < self.cells_a_piece)
-            where = number * self.cells_a_piece + cell[use]
-            np.add.at(total, where, column[use])
-            np.add.at(count, where, 1.0)
+        use, size = (values >= low) & (values <= high) & (cells >= 0), len(self.starts) * self.cells_a_piece
+        total, count = np.bincount(cells[use], values[use], size), np.bincount(cells[use], minlength=size)
         with np.errstate(invalid="ignore", divide="ignore"):
-            cells = _filled((total / count).reshape(len(self.starts), -1)).ravel()
+            means = _filled((total / count).reshape(len(self.starts), -1)).ravel()
         busy = max(1, int(np.count_nonzero(count)))
-        return cells, float(values.shape[0]) / (busy * CELL_S)
+        return means, float(values.shape[0]) / (busy * CELL_S)
 
-    def rate_of(self, cells: NDArray[Any]) -> NDArray[Any]:
-        """Return the time derivative of values on the grid [M], real or complex, within each piece."""
+    def rate_of(self, cells: NDArray[Any], half: int = 2) -> NDArray[Any]:
+        """Return the time derivative of values on the grid [M], real or complex, over ``half`` cells to each side."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
-        out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_S)
+        out[:, half:-half] = (rows[:, 2 * half :] - rows[:, : -2 * half]) / (2 * half * CELL_S)
         return out.ravel()
 
     def turning(self, direction: NDArray[np.complex128]) -> FloatArray:
@@ -168,11 +165,12 @@ class Pieces:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray((self.rate_of(direction) / direction).imag)
 
-    def smooth(self, cells: FloatArray) -> FloatArray:
-        """Return the mean of five neighbouring cells [M], to match the bandwidth of :meth:`rate_of`."""
+    def smooth(self, cells: FloatArray, half: int = 2) -> FloatArray:
+        """Return the mean over ``half`` cells to each side [M], to match the bandwidth of :meth:`rate_of`."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
-        out[:, 2:-2] = sum(rows[:, i : rows.shape[1] - 4 + i] for i in range(5)) / 5.0
+        width, inner = 2 * half + 1, rows.shape[1] - 2 * half
+        out[:, half:-half] = sum(rows[:, i : i + inner] for i in range(width)) / width
         return out.ravel()
 
 
@@ -198,7 +196,7 @@ def _usual(values: FloatArray) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     if finite.shape[0] == 0:
         return 0.0, 0.0
-    low, high = np.quantile(finite, [0.005, 0.995])
+    low, high = np.quantile(finite, _USUAL)
     room = 3.0 * max(float(high - low), 1e-9)
     return float(low) - room, float(high) + room
 
@@ -216,8 +214,7 @@ def fit(y: FloatArray, x: FloatArray) -> Fit:
     use = np.isfinite(y) & np.isfinite(x)
     if np.count_nonzero(use) < FEWEST_CELLS:
         return Fit()
-    # Exclude a few outliers, such as a sensor's "invalid".
-    a, b = (np.clip(values, *np.quantile(values, [0.005, 0.995])) for values in (y[use], x[use]))
+    a, b = (np.clip(values, *np.quantile(values, _USUAL)) for values in (y[use], x[use]))
     da, db = a - a.mean(), b - b.mean()
     sa, sb = float(np.sqrt(np.mean(da * da))), float(np.sqrt(np.mean(db * db)))
     if not (sa > 1e-12 and sb > 1e-12):

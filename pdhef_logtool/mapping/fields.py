@@ -14,19 +14,17 @@ from typing import NamedTuple
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import Field, leaf_group, place_of, triad_of
-from pdhef_logtool.mapping.evidence import CELL_S, EVIDENCE, Fit, Pieces, fit, ratio, spread
+from pdhef_logtool.mapping.evidence import EVIDENCE, Fit, Pieces, fit, ratio, spread
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
 
-_RELATIONS, _UNITS, _GRAVITY = EVIDENCE["relations"], EVIDENCE["units"], EVIDENCE["gravity"]
+_RELATIONS, _UNITS, _GRAVITY, _GROUND = (EVIDENCE[name] for name in ("relations", "units", "gravity", "ground"))
 SLOW_M_S: float = _RELATIONS["slow_m_s"]
 SAME: float = _RELATIONS["same"]
 BY_DRIVING: float = _RELATIONS["driving"]
 #: Usual lengths that convert curvature to an angle: a wheelbase, times a steering ratio for the steering wheel.
 USUAL_LENGTH_M: dict[str, float] = _RELATIONS["wheelbase_m"]
-#: Half of the window for a course from positions, in cells.
-_HALF: int = EVIDENCE["ground"]["half_window"]
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
 
@@ -102,21 +100,13 @@ def path_velocity(pieces: Pieces, positions: Sequence[Field]) -> tuple[FloatArra
         east = same[0] if same else others[0] if len(others) == 1 else None
         if east is None or not (north.seen.changes or east.seen.changes):
             continue
-        up, right = _over_seconds(pieces, north.si), _over_seconds(pieces, east.si)
+        # Over a time that is long against the resolution of positions.
+        up, right = (pieces.rate_of(f.si, _GROUND["half_window"]) for f in (north, east))
         if north.meaning.quantity == "latitude":
             up, right = up * DEGREE_M, right * DEGREE_M * math.cos(math.radians(float(np.nanmean(north.si))))
         if np.isfinite(up).any():
             return up, right
     return None
-
-
-def _over_seconds(pieces: Pieces, cells: FloatArray) -> FloatArray:
-    """Return the time derivative [M] over a window that is long against the resolution of positions."""
-    rows = cells.reshape(len(pieces.starts), -1)
-    out = np.full_like(rows, np.nan)
-    seconds = 2 * _HALF * CELL_S
-    out[:, _HALF:-_HALF] = (rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]) / seconds
-    return out.ravel()
 
 
 # ------------------------------------------------------------------------------------------------ units

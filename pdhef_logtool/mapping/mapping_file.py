@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import math
+from collections.abc import Collection, Sequence
 from collections.abc import Mapping as MappingABC
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import ConfigDict
-from pydantic.dataclasses import dataclass
+from pydantic import AfterValidator, BaseModel, ConfigDict, PositiveFloat
 
 from pdhef_logtool.mapping.naming import UNITS, plain_unit, unit_of
 from pdhef_logtool.mapping.records import CAN_PREFIX, RECORDER_STAMPS, CanSettings, Mapping, QualityGate, SignalSource
-from pdhef_logtool.records.errors import MappingError, MappingFileError
+from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
-from pdhef_logtool.storage.documents import checked, read_toml, unknown
+from pdhef_logtool.storage.documents import checked, one_of, read_toml
+from pdhef_logtool.storage.toml_text import toml_value
 
 if TYPE_CHECKING:
     from pdhef_logtool.mapping.candidates import Candidate
@@ -28,39 +26,26 @@ _STEERING = ("steer_rad", "steering_wheel_rad")
 #: Table names that are not available for estimators.
 RESERVED_NAMES = ("truth", "sensors", "reference")
 
+#: SI units by signal, ground truth and estimate.
+_UNITS = SIGNAL_UNITS | TRUTH_UNITS | ESTIMATE_UNITS
 #: Kind of unit of a quantity by its SI unit.
 _KINDS = {"rad": "angle", "rad/s": "rate", "m/s": "speed", "m/s^2": "acceleration", "m": "position"}
 
-Kind = TypeVar("Kind", SignalSource, QualityGate, CanSettings)
-#: Classes that check the entries of a record.
-_CHECKED: dict[type, Any] = {
-    kind: dataclass(
-        kind,
-        frozen=True,
-        config=ConfigDict(extra="forbid", strict=True, str_min_length=1, allow_inf_nan=False, defer_build=True),
-    )
-    for kind in (SignalSource, QualityGate, CanSettings)
-}
+Record = TypeVar("Record", SignalSource, QualityGate, CanSettings)
 
 
-def _record(kind: type[Kind], raw: object, where: str, problems: list[str], **more: object) -> Kind | None:
-    """Return the record of a table with ``more`` entries; None after adding to ``problems``."""
-    if not isinstance(raw, dict):
-        checked(_CHECKED[kind], raw, where, problems)
-        return None
-    problems += [unknown(name, [f.name for f in fields(kind)], where) for name in more.keys() & raw.keys()]
-    table = {key: tuple(v) if isinstance(v, list) else v for key, v in raw.items()}
-    entries = checked(_CHECKED[kind], {**table, **more}, where, problems)
-    record = None if entries is None else kind(**{f.name: getattr(entries, f.name) for f in fields(kind)})
-    if record is not None and (problem := _problem_of(record)):
-        problems.append(f"{where}: {problem}")
-        return None
+def _consistent(record: Record) -> Record:
+    """Return a record. Raises ValueError if its entries contradict one another."""
+    if problem := problem_of(record):
+        raise ValueError(problem)
     return record
 
 
-def _problem_of(record: SignalSource | QualityGate | CanSettings) -> str:
+def problem_of(record: SignalSource | QualityGate | CanSettings) -> str:
     """Return which entries of a record contradict one another; empty without a contradiction."""
     if isinstance(record, CanSettings):
+        if not record.dbc or Path() in record.dbc:
+            return "dbc should name at least one file"
         if not 1 <= record.id_mask <= (most := CanSettings(()).id_mask):
             return f"id_mask should be from 1 to {most}"
         return "" if (record.bus is None) == (not record.bus_field) else "bus and bus_field belong together"
@@ -73,6 +58,34 @@ def _problem_of(record: SignalSource | QualityGate | CanSettings) -> str:
     if record.min is not None and record.max is not None and record.min > record.max:
         return "min must not be above max"
     return "" if (record.min, record.max, record.values) != (None, None, ()) else "give min, max or values"
+
+
+def _estimator(name: str) -> str:
+    """Return the name of an estimator. Raises ValueError if it may not be called so."""
+    if name in ESTIMATE_UNITS:
+        raise ValueError(f"name the estimator too: [estimates.NAME.{name}]")
+    if not name or name in RESERVED_NAMES:
+        raise ValueError(f"an estimator may not be called {name!r}")
+    return name
+
+
+_Source = Annotated[SignalSource, AfterValidator(_consistent)]
+
+
+class _File(BaseModel):
+    """The entries of a mapping file; each source has its name as an entry, too."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, str_min_length=1, allow_inf_nan=False, defer_build=True)
+
+    signals: dict[Annotated[str, one_of(SIGNAL_UNITS)], _Source] = {}
+    truth: dict[Annotated[str, one_of(TRUTH_UNITS)], _Source] = {}
+    truth_quality: Annotated[QualityGate, AfterValidator(_consistent)] | None = None
+    estimates: dict[Annotated[str, AfterValidator(_estimator)], dict[Annotated[str, one_of(ESTIMATE_UNITS)], _Source]]
+    can: Annotated[CanSettings, AfterValidator(_consistent)] | None = None
+    fill_recognised: bool = False
+    recorder: dict[str, str] = {}
+    rate_hz: PositiveFloat | None = None
+    group: str = ""
 
 
 def mapping_of(given: Mapping | Path | str | None) -> Mapping | None:
@@ -99,112 +112,66 @@ def load_mapping(path: Path | str) -> Mapping:
 
 
 def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path()) -> Mapping:
-    """Build a mapping from parsed TOML; every problem is reported in one line. DBC files are relative to ``folder``.
+    """Build a mapping from parsed TOML. DBC files are relative to ``folder``.
 
     Raises
     ------
-    MappingFileError : Entries are wrong, unknown, missing or contradict one another.
+    MappingFileError
+        Entries are wrong, unknown, missing or contradict one another. All are named in one line; contradictions between
+        sources once all of them are right.
     """
-    sections = (
-        "signals", "truth", "truth_quality", "estimates", "can", "fill_recognised", "recorder", "rate_hz", "group",
-    )  # fmt: skip
-    problems = [unknown(key, sections) for key in raw if key not in sections]
-    signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
-    truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
-    quality = _record(QualityGate, raw["truth_quality"], "truth_quality", problems) if "truth_quality" in raw else None
-    estimates = _read_estimates(raw.get("estimates", {}), problems)
-    can = _read_can(raw["can"], folder, problems) if "can" in raw else None
-    fill = raw.get("fill_recognised", False)
-    if not isinstance(fill, bool):
-        problems.append("fill_recognised: should be true or false")
-        fill = False
-    recorder = _read_recorder(raw.get("recorder", {}), problems)
-    rate_hz, group = raw.get("rate_hz"), raw.get("group", "")
-    if not isinstance(group, str) or not (rate_hz is None or (isinstance(rate_hz, int | float) and rate_hz > 0)):
-        problems.append("rate_hz: should be rows per second, group: a name")
-    mapping = Mapping(
-        signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill, recorder=recorder,
-        rate_hz=rate_hz, group=group,
-    )  # fmt: skip
-    if "can" not in raw:
-        # Other programs read the estimates: their sources are checked as well.
-        every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
-        names = [s.name for s in every if s.can_signal is not None]
-        problems += [f"{name}: field = {CAN_PREFIX}... needs [can] with a dbc" for name in names]
-    problems += contradictions(mapping)
-    if problems:
+    problems: list[str] = []
+    signals = _named(raw.get("signals", {}), "signals", TRUTH_UNITS.keys() - SIGNAL_UNITS.keys(), "truth", problems)
+    truth = _named(raw.get("truth", {}), "truth", SIGNAL_UNITS.keys() - TRUTH_UNITS.keys(), "signals", problems)
+    estimates = raw.get("estimates", {})
+    if isinstance(estimates, dict):
+        estimates = {n: _named(tables, f"estimates.{n}", (), "", problems) for n, tables in estimates.items()}
+    can = raw.get("can")
+    if isinstance(can, dict) and isinstance(can.get("dbc"), str):
+        can = can | {"dbc": [can["dbc"]]}
+    given = {"signals": signals, "truth": truth, "estimates": estimates} | ({} if can is None else {"can": can})
+    file = checked(_File, raw | given, "", problems)
+    if file is not None:
+        entries: dict[str, Any] = dict(file)
+        entries |= {"quality": entries.pop("truth_quality"), "recorder": tuple(file.recorder.items())}
+        if file.can is not None:
+            entries["can"] = replace(file.can, dbc=tuple(folder / path for path in file.can.dbc))
+        mapping = Mapping(**entries)
+        problems += contradictions(mapping)
+    if file is None or problems:
         expected, remedy = "the entries of mapping.toml", "see docs/formats.md for every entry and its unit"
         raise MappingFileError(expected=expected, got="; ".join(problems), where=where, remedy=remedy)
     return mapping
 
 
-def _read_section(
-    raw: object, section: str, allowed: tuple[str, ...], other: tuple[str, ...], problems: list[str]
-) -> dict[str, SignalSource]:
-    if not isinstance(raw, dict):
-        problems.append(f"{section}: must be a table of tables, one a signal")
-        return {}
-    out: dict[str, SignalSource] = {}
-    for name, table in raw.items():
-        where = f"{section}.{name}"
-        if name not in allowed:
-            if name in other:
-                problems.append(f"{where}: belongs under [{'truth' if section == 'signals' else 'signals'}.{name}]")
-            else:
-                problems.append(unknown(name, allowed, section))
-            continue
-        table, problem = _in_si(name, table)
-        problems += [f"{where}: {problem}"] if problem else []
-        source = None if problem else _record(SignalSource, table, where, problems, name=name)
-        if source is not None:
-            out[name] = source
-    return out
+def _named(tables: object, section: str, others: Collection[str], other: str, problems: list[str]) -> object:
+    """Return the tables of sources with their names and scales to SI; ``others`` belong to the section ``other``."""
+    if not isinstance(tables, dict):
+        return tables
+    problems += [f"{section}.{name}: belongs under [{other}.{name}]" for name in tables if name in others]
+    return {name: _complete(name, t, f"{section}.{name}", problems) for name, t in tables.items() if name not in others}
 
 
-def _read_estimates(raw: object, problems: list[str]) -> dict[str, dict[str, SignalSource]]:
-    if not isinstance(raw, dict):
-        problems.append("estimates: must be a table of estimators, each a table of signals")
-        return {}
-    out: dict[str, dict[str, SignalSource]] = {}
-    for name, tables in raw.items():
-        if not name or name in RESERVED_NAMES:
-            problems.append(f"estimates.{name}: an estimator may not be called {name!r}")
-        elif isinstance(tables, dict) and "topic" in tables and not isinstance(tables["topic"], dict):
-            problems.append(f"estimates.{name}: name the estimator too: [estimates.NAME.{name}]")
-        else:
-            out[name] = _read_section(tables, f"estimates.{name}", tuple(ESTIMATE_UNITS), (), problems)
-    return out
-
-
-def _read_recorder(raw: object, problems: list[str]) -> tuple[tuple[str, str], ...]:
-    if isinstance(raw, dict) and all(isinstance(kind, str) for kind in raw.values()):
-        return tuple(raw.items())
-    problems.append('recorder: should be a type by topic, such as "/imu/data" = "sensor_msgs/msg/Imu"')
-    return ()
-
-
-def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | None:
-    files = raw.get("dbc") if isinstance(raw, dict) else None
-    files = [files] if isinstance(files, str) else files
-    if isinstance(raw, dict) and isinstance(files, list) and all(f and isinstance(f, str) for f in files):
-        raw = {**raw, "dbc": tuple(folder / f for f in files) or None}
-    return _record(CanSettings, raw, "can", problems)
-
-
-def _in_si(name: str, table: object) -> tuple[object, str]:
-    """Return the table of a source with the scale to SI in place of a unit, and a problem of the unit."""
-    if not isinstance(table, dict) or "unit" not in table:
-        return table, ""
-    unit, scale = table["unit"], table.get("scale", 1.0)
-    si = (SIGNAL_UNITS | TRUTH_UNITS | ESTIMATE_UNITS)[name]
+def _complete(name: str, table: object, where: str, problems: list[str]) -> object:
+    """Return the table of a source with its name, and with its scale to SI in place of a unit."""
+    if not isinstance(table, dict):
+        return table
+    problems += [f"{where}.name: unknown"] if "name" in table else []
+    named = table | {"name": name}
+    if (unit := named.pop("unit", None)) is None:
+        return named
+    scale = table.get("scale", 1.0)
+    si = _UNITS.get(name, "")
     kind = "wheel rate" if si == "rad/s" and name.startswith("wheel") else _KINDS.get(si, "")
     units = UNITS.get(kind, {})
     factor = unit_of(f"x_{plain_unit(unit)}", kind)[1] if units and isinstance(unit, str) else None
     if factor is None:
-        return table, f'unit = "{unit}" is unknown for {si}, known are {", ".join(units) or si}'
+        problems.append(f'{where}: unit = "{unit}" is unknown for {si}, known are {", ".join(units) or si}')
+        return named
     if scale not in (1.0, -1.0):
-        return table, "give unit or scale, not both; scale = -1 reverses the sign"
-    return {**{k: v for k, v in table.items() if k != "unit"}, "scale": factor * scale}, ""
+        problems.append(f"{where}: give unit or scale, not both; scale = -1 reverses the sign")
+        return named
+    return named | {"scale": factor * scale}
 
 
 def _shape_problem(source: SignalSource) -> str:
@@ -253,6 +220,8 @@ def contradictions(mapping: Mapping) -> list[str]:
     ]
     estimates = [(f"estimates.{name}", sources) for name, sources in mapping.estimates.items()]
     for section, sources in (("signals", mapping.signals), ("truth", mapping.truth), *estimates):
+        can = [n for n, source in sources.items() if mapping.can is None and source.can_signal is not None]
+        problems += [f"{section}.{name}: field = {CAN_PREFIX}... needs [can] with a dbc" for name in can]
         first: dict[tuple[object, ...], str] = {}
         for name, source in sources.items():
             summed = len(source.paths) > source.columns
@@ -293,20 +262,17 @@ def mapping_to_toml(
     ]
     lines += _comment("\n".join([notes.get("", ""), *mapping.notes]))
     if mapping.rate_hz or mapping.group:
-        lines += ["", *(f"{n} = {_toml(v)}" for n in ("rate_hz", "group") if (v := getattr(mapping, n)))]
+        lines += ["", *(f"{n} = {toml_value(v)}" for n in ("rate_hz", "group") if (v := getattr(mapping, n)))]
     if mapping.recorder:
-        lines += ["", "[recorder]", *(f"{_toml(topic)} = {_toml(kind)}" for topic, kind in mapping.recorder)]
+        lines += ["", "[recorder]", *(f"{toml_value(topic)} = {toml_value(kind)}" for topic, kind in mapping.recorder)]
     if mapping.can is not None:
         lines += ["", "[can]", *_lines(mapping.can)]
-    for section, sources, units in (("signals", mapping.signals, SIGNAL_UNITS), ("truth", mapping.truth, TRUTH_UNITS)):
-        for name in (n for n in units if n in sources):
+    tables = {"signals": mapping.signals, "truth": mapping.truth}
+    tables |= {f"estimates.{toml_value(name)}": sources for name, sources in mapping.estimates.items()}
+    for section, sources in tables.items():
+        for name in (n for n in _UNITS if n in sources):
             lines += ["", *_comment(notes.get(f"{section}.{name}", notes.get(name, "")))]
-            lines += [_header(section, name, 32), *_lines(sources[name])]
-            lines += _alternative_lines(section, name, alternatives)
-    for estimator, sources in mapping.estimates.items():
-        for name in (n for n in ESTIMATE_UNITS if n in sources):
-            lines += ["", f"[estimates.{_toml(estimator)}.{name}]  # {ESTIMATE_UNITS[name]}"]
-            lines += _lines(sources[name])
+            lines += [*_table(section, sources[name]), *_alternative_lines(section, name, alternatives)]
     if mapping.quality is not None:
         lines += ["", *_comment(notes.get("truth_quality", "Ground truth is used where this condition is met."))]
         lines += ["[truth_quality]", *_lines(mapping.quality)]
@@ -319,88 +285,68 @@ def _missing_lines(mapping: Mapping, notes: MappingABC[str, str], alternatives: 
     lines: list[str] = []
     missing = missing_signals(mapping)
     if missing:
-        lines += ["", "# Not mapped. To add one, remove the # and name its topic and field:"]
-    for name in missing:
-        lines += _alternative_lines("signals", name, alternatives) or [
-            *_example("signals", name),
-            *_comment(notes.get(name, "")),
+        lines += ["", "# Not mapped. To add one, remove the # and name its topic and field (a dotted path, [3] indexes"]
+        lines += [
+            "# an array); scale is to SI and ISO 8855: 0.017453292519943295 for deg, 0.2777777777777778 for km/h."
         ]
+    for name in missing:
+        alternative = _alternative_lines("signals", name, alternatives)
+        lines += alternative or [*_example("signals", name), *_comment(notes.get(name, ""))]
     if not mapping.truth:
         lines += ["", "# No ground truth is mapped. For a comparison name at least a body velocity, for example:"]
-        lines += [line for name in TRUTH_UNITS for line in _alternative_lines("truth", name, alternatives)] or [
-            line for name in ("vx_m_s", "vy_m_s") for line in _example("truth", name)
-        ]
+        alternative = [line for name in TRUTH_UNITS for line in _alternative_lines("truth", name, alternatives)]
+        lines += alternative or [line for name in ("vx_m_s", "vy_m_s") for line in _example("truth", name)]
     return lines
 
 
-def _header(section: str, name: str, width: int) -> str:
-    return f"{f'[{section}.{name}]':{width}} # {(SIGNAL_UNITS | TRUTH_UNITS)[name]}"
+def _table(section: str, source: SignalSource) -> list[str]:
+    return [f"[{section}.{source.name}]  # {_UNITS[source.name]}", *_lines(source)]
 
 
 def _example(section: str, name: str) -> list[str]:
     """Return a commented table for a missing signal."""
-    return [
-        "#",
-        f"# {_header(section, name, 30)}",
-        '# topic = "/..."',
-        '# field = "..."          # dotted path, [3] indexes an array',
-        "# scale = 1.0            # to SI and ISO 8855: 0.017453292519943295 for deg, 0.2777777777777778 for km/h",
-    ]
+    return ["#", *(f"# {line}" for line in _table(section, SignalSource(name, "/...", "...")))]
 
 
 def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate]) -> list[str]:
     """Return commented tables of the best candidates that are not taken."""
-    names = {"steer_rad": _STEERING, "steering_wheel_rad": _STEERING}.get(name, (name,))
+    names = _STEERING if name in _STEERING else (name,)
     mine = [c for c in candidates if c.section == section and c.source.name in names and not c.taken]
     lines: list[str] = []
     for candidate in mine[:ALTERNATIVES]:
-        unit = (SIGNAL_UNITS | TRUTH_UNITS)[candidate.source.name]
         doubt = f"; unsure: {candidate.doubt}" if candidate.doubt else ""
         lines += ["#", *_comment(f"Instead, score {candidate.score:.2f}: {candidate.reason}{doubt}")]
-        lines += [
-            f"# [{section}.{candidate.source.name}]  # {unit}",
-            *(f"# {x}" for x in _lines(candidate.source)),
-        ]
+        lines += [f"# {line}" for line in _table(section, candidate.source)]
     return lines
 
 
 def missing_signals(mapping: Mapping) -> tuple[str, ...]:
     """Return the missing signals that an estimator can use; the speed may come from any wheel."""
-    have = set(mapping.signals)
-    out = []
-    if not have & {"steer_rad", "steering_wheel_rad"}:
-        out.append("steer_rad")
-    out += [name for name in ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s") if name not in have]
-    if "speed_m_s" not in have and not any(name.startswith("wheel_speed_") for name in have):
-        out.append("speed_m_s")
-    return tuple(out)
+    have = mapping.signals.keys()
+    given = {
+        "steer_rad": bool(have & {*_STEERING}),
+        **{name: name in have for name in ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")},
+        "speed_m_s": any(name.startswith(("speed_m_s", "wheel_speed_")) for name in have),
+    }
+    return tuple(name for name, is_given in given.items() if not is_given)
 
 
 def _lines(record: SignalSource | QualityGate | CanSettings) -> list[str]:
     """Return the entries of a table that differ from the defaults, and the scale."""
     entries = ((f.name, getattr(record, f.name), f.default) for f in fields(record) if f.name != "name")
-    return [f"{name} = {_toml(value)}" for name, value, default in entries if value != default or name == "scale"]
+    given = {name: value for name, value, default in entries if value != default or name == "scale"}
+    if isinstance(record, CanSettings):
+        given["dbc"] = [*map(_path_text, record.dbc)]
+    return [f"{name} = {toml_value(value)}" for name, value in given.items()]
 
 
 def entries_of(source: SignalSource, *names: str) -> str:
     """Return entries of a source's table in one line, for a remedy."""
-    return ", ".join(f"{name} = {_toml(getattr(source, name))}" for name in names)
+    return ", ".join(f"{name} = {toml_value(getattr(source, name))}" for name in names)
 
 
-def _toml(value: str | float | Path | tuple[str, ...] | tuple[float, ...] | tuple[Path, ...]) -> str:
-    if isinstance(value, Path):
-        value = value.absolute().as_posix() if value.exists() else value.name
-    if isinstance(value, str):
-        # A JSON string is a TOML basic string, except that TOML requires DEL to be escaped.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    if isinstance(value, int):
-        return str(value)
-    number = float(value)
-    if not math.isfinite(number):
-        raise MappingError(expected="finite numbers in a mapping", got=repr(value), where="mapping")
-    return repr(number)
+def _path_text(path: Path) -> str:
+    return path.absolute().as_posix() if path.exists() else path.name
 
 
 def _comment(text: str) -> list[str]:

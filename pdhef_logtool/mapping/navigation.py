@@ -101,18 +101,15 @@ def gnss_signals(signals: Mapping[str, SignalSource], truth: Mapping[str, Signal
     if has_heading(truth):
         return {}
     if (velocity := truth.get("enu_velocity_m_s")) is not None:
-        return {name: component(velocity, name, i) for i, name in enumerate((_EAST, _NORTH))}
+        return {name: _component(velocity, name, i) for i, name in enumerate((_EAST, _NORTH))}
     course = truth.get("course_rad")
-    speeds = [s for s in (signals.get("speed_m_s"), truth.get("vx_m_s")) if s is not None]
-    if course is None or not any(s.topic == course.topic for s in speeds):
-        return {}
-    speed = next(s for s in speeds if s.topic == course.topic)
-    return {
-        name: replace(source, name=name) for name, source in (("gnss_speed_m_s", speed), ("gnss_course_rad", course))
-    }
+    for speed in (signals.get("speed_m_s"), truth.get("vx_m_s")):
+        if speed is not None and course is not None and speed.topic == course.topic:
+            return {s.name: s for s in (replace(speed, name="gnss_speed_m_s"), replace(course, name="gnss_course_rad"))}
+    return {}
 
 
-def component(vector: SignalSource, name: str, column: int) -> SignalSource:
+def _component(vector: SignalSource, name: str, column: int) -> SignalSource:
     """Return one column of a vector as a separate signal."""
     scale, offset = (value[column] if isinstance(value, tuple) else value for value in (vector.scale, vector.offset))
     return replace(vector, name=name, field=vector.paths[column], scale=scale, offset=offset)

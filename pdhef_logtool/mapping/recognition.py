@@ -177,13 +177,14 @@ def auto_map(
         if t.messages > 0 and not (t.name.startswith(OWN_PREFIX) or type_of(t).startswith("pdhef_msgs/"))
     ]
     there = [vendors.typed(t, log.fields(t.name, quiet=True)) for t in there]
-    unlike = [t for t in there if not _has_its_fields(log, t)]
-    topics = [t for t in there if t not in unlike]
     draft = _Draft(log)
+    reasons: dict[str, list[str]] = {}
+    for topic in there:
+        reasons.setdefault(_why_unused(log, topic, vendors), []).append(topic.name)
+    used = {*reasons.pop("", ())}
+    topics = [t for t in there if t.name in used]
+    draft.notes += [f"{', '.join(names)} is not used: {why}" for why, names in reasons.items()]
     _probe(draft, topics)
-    why = {t.name: log.unreadable(t.name) or f"its fields differ from {t.type_name}" for t in unlike}
-    draft.notes += [f"{name} is not used: {reason}" for name, reason in why.items()]
-    draft.notes += _what_cannot_be_read(log, [t for t in topics if not type_of(t).startswith(NO_SENSORS)])
     draft.notes += [
         f"{t.name} ({type_of(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
@@ -193,8 +194,6 @@ def auto_map(
     _map_truth(draft, topics, prefer_truth)
     _map_truth_friction(draft, topics, prefer_truth)
     _map_documented_truth(draft, topics, vendors)
-    unusable = ((t, vendors.of(t.type_name).left_out) for t in topics)
-    draft.notes += [f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {why}" for t, why in unusable if why]
     weighed = _weigh_the_rest(draft, topics, vendors)
     _map_navigation(draft, topics, vendors, weighed.fields)
     _map_yaw_rate_of_twist(draft, topics)
@@ -237,7 +236,7 @@ def _repeated_groups(log: DriveLog, topics: list[TopicInfo]) -> list[TopicInfo]:
     fields = {t.name: [f.path for f in log.fields(t.name, quiet=True)] for t in topics} if "mdf" in log.kind else {}
     pairs = [(t, base) for t in topics for base, _, n in [t.name.rpartition("_")] if n.isdigit() and base in fields]
     pairs = [(t, base) for t, base in pairs if fields[t.name] == fields[base]]
-    times = log.read({}, stamps={name for t, base in pairs for name in (t.name, base)}) if pairs else {}
+    times = log.read({name: () for t, base in pairs for name in (t.name, base)}) if pairs else {}
     return [t for t, base in pairs if times[t.name].log_time_ns[:1] > times[base].log_time_ns[-1:]]
 
 
@@ -264,14 +263,15 @@ def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], Ca
     return topics, decoded
 
 
-def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
-    """Return notes on the topics without readable fields, grouped by reason."""
-    by_reason: dict[str, list[str]] = {}
-    for topic in topics:
-        reason = "" if log.fields(topic.name, quiet=True) else log.unreadable(topic.name)
-        if reason:
-            by_reason.setdefault(reason, []).append(topic.name)
-    return [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()]
+def _why_unused(log: DriveLog, topic: TopicInfo, vendors: Vendors) -> str:
+    """Return why a topic is not used; empty if it may be. The name of a type alone is no proof of its fields."""
+    needed = _TYPES["fields"].get(type_of(topic), ())
+    fields = log.fields(topic.name, quiet=not needed)
+    if not fields and (needed or not type_of(topic).startswith(NO_SENSORS)) and (why := log.unreadable(topic.name)):
+        return why
+    if not all(any(has_path(fields, path) for path in either.split()) for either in needed):
+        return f"its fields differ from {topic.type_name}"
+    return vendors.of(topic.type_name).left_out
 
 
 # ------------------------------------------------------------------------------------------------ candidates
@@ -455,13 +455,6 @@ def type_of(topic: TopicInfo) -> str:
     return plain_type(topic.type_name)
 
 
-def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
-    """Return whether a topic has the fields of its type; the name of the type alone is no proof."""
-    needed = _TYPES["fields"].get(type_of(topic), ())
-    fields = log.fields(topic.name) if needed else ()
-    return all(any(has_path(fields, path) for path in either.split()) for either in needed)
-
-
 def _named(topic: TopicInfo, kind: str) -> bool:
     """Return whether the name of a topic contains a word of a kind."""
     return not _TOPICS[kind].isdisjoint(words_of(topic.name))
@@ -511,8 +504,7 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         is_level = np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
         in_g = bool(is_level and abs(abs(means[2]) - 1.0) < EVIDENCE["gravity"]["in_g"])
     if in_g:
-        fast = np.abs(draft.values(gyro, "yaw_rate_rad_s"))
-        in_deg = fast.shape[0] > 0 and float(np.quantile(fast, 0.995)) > MOST["rate"]
+        in_deg = Seen.of(draft.values(gyro, "yaw_rate_rad_s"), np.empty(0), 0.0).largest > MOST["rate"]
         also = ", its rates in deg/s, as no car turns so fast in rad/s" if in_deg else ""
         reason = f"its accelerations are in g, as gravity is 1{also}; its type's unit is m/s²"
         draft.doubt("imu", (imu.name,), imu.name, reason)

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdhef_logtool.logs.drive_log import TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
+from pdhef_logtool.mapping.mapping_file import problem_of
 from pdhef_logtool.mapping.naming import VOCABULARY, Meaning
-from pdhef_logtool.mapping.records import VECTOR_COLUMNS, SignalSource
+from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, WHEELS
-from pdhef_logtool.storage.documents import checked, read_toml
+from pdhef_logtool.storage.documents import read_toml, validated
 
 #: Environment variable with the path of a user file, which has priority over the shipped types.
 USERS_FILE = "PDHEF_VENDORS"
@@ -33,49 +34,57 @@ class _Entry(BaseModel):
 
 
 class _FieldTable(_Entry):
-    field: Annotated[str, Field(min_length=1)] | list[str]
+    field: Annotated[str, Field(min_length=1)] | tuple[str, ...]
     signal: str = ""
     truth: str = ""
-    scale: float | list[float] = 1.0
+    scale: float | tuple[float, ...] = 1.0
     offset: float = 0.0
+
+    @property
+    def source(self) -> SignalSource:
+        return SignalSource(self.signal or self.truth, "", self.field, scale=self.scale, offset=self.offset)
 
     @model_validator(mode="after")
     def _is_one_quantity(self) -> _FieldTable:
-        scales = self.scale if isinstance(self.scale, list) else [self.scale]
-        fields, columns = len(self.field) if isinstance(self.field, list) else 0, VECTOR_COLUMNS.get(self.truth, 1)
-        wrong = {
-            "give either signal or ground truth": bool(self.signal) == bool(self.truth),
-            f"{self.signal!r} is no signal": self.signal not in {"", *SIGNAL_UNITS},
-            f"{self.truth!r} is no ground-truth quantity": self.truth not in {"", *TRUTH_UNITS},
-            "scale must not be 0": 0.0 in scales,
-            "one field has one scale": isinstance(self.scale, list) and not fields,
-            f"{self.truth or self.signal} is made of {columns} fields": fields != (columns if columns > 1 else 0),
-        }
-        if why := next((why for why, is_wrong in wrong.items() if is_wrong), ""):
-            raise ValueError(why)
+        source = self.source
+        problem = problem_of(source)
+        if bool(self.signal) == bool(self.truth):
+            problem = "give either signal or ground truth"
+        elif source.name not in (SIGNAL_UNITS if self.signal else TRUTH_UNITS):
+            problem = f"{source.name!r} is no {'signal' if self.signal else 'ground-truth quantity'}"
+        elif isinstance(self.field, tuple) != (source.columns > 1):
+            problem = f"{source.name} is made of {source.columns} fields"
+        if problem:
+            raise ValueError(problem)
         return self
 
 
-class _TypeTable(_Entry):
-    type: list[str]
-    vendor: str
+class _Table(_Entry):
     page: str
+    has: frozenset[str] = frozenset()
+    fields: tuple[_FieldTable, ...]
+
+    def documented(self, page: str, left_out: str = "", without: frozenset[str] = frozenset()) -> VendorType:
+        signals, truth = (tuple(f.source for f in self.fields if getattr(f, of)) for of in ("signal", "truth"))
+        return VendorType(signals, truth, page, left_out, self.has, without)
+
+
+class _TypeTable(_Table):
+    type: tuple[str, ...]
+    vendor: str
     read: str
     note: str = ""
     leave_out: str = ""
-    has: list[str] = []
-    fields: list[_FieldTable]
 
 
-class _ReceiverTable(_Entry):
+class _ReceiverTable(_Table):
     message: str
-    page: str
-    has: list[str]
-    without: list[str] = []
-    fields: list[_FieldTable]
+    without: frozenset[str] = frozenset()
 
 
-_Table = TypeVar("_Table", _TypeTable, _ReceiverTable)
+class _File(_Entry):
+    types: tuple[_TypeTable, ...] = ()
+    receivers: tuple[_ReceiverTable, ...] = ()
 
 
 def meaning_of_source(source: SignalSource) -> Meaning:
@@ -168,39 +177,8 @@ def _shipped() -> Vendors:
 
 def _read(path: Path) -> Vendors:
     raw = read_toml(path, "a TOML file of vendors' types", MappingFileError)
-    problems = [
-        f"{key}: not known, expected [[types]] or [[receivers]]" for key in raw if key not in ("types", "receivers")
-    ]
-    types: dict[str, VendorType] = {}
-    for model in _tables(raw, "types", _TypeTable, problems):
-        page = f"{model.page}, read {model.read}"
-        kind = VendorType(*_sources(model.fields), page, model.leave_out, frozenset(model.has))
-        types |= {plain_type(name): kind for name in model.type}
-    receivers = tuple(
-        VendorType(*_sources(m.fields), m.page, has=frozenset(m.has), without=frozenset(m.without))
-        for m in _tables(raw, "receivers", _ReceiverTable, problems)
-    )
-    if problems:
-        expected, remedy = "entries as in docs/formats.md", "see docs/formats.md for every entry"
-        raise MappingFileError(expected=expected, got="; ".join(problems), where=str(path), remedy=remedy)
-    return Vendors(types, receivers)
-
-
-def _tables(raw: Mapping[str, Any], key: str, kind: type[_Table], problems: list[str]) -> Iterator[_Table]:
-    """Yield the valid tables of a key; the errors of the others are added to ``problems``."""
-    entries = raw.get(key, [])
-    for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
-        if (model := checked(kind, table, f"{key}[{number}]", problems)) is not None:
-            yield model
-
-
-def _sources(tables: Iterable[_FieldTable]) -> tuple[tuple[SignalSource, ...], tuple[SignalSource, ...]]:
-    """Return the sources of signals and of ground truth."""
-    signals: list[SignalSource] = []
-    truth: list[SignalSource] = []
-    for table in tables:
-        path = tuple(table.field) if isinstance(table.field, list) else table.field
-        scale = tuple(table.scale) if isinstance(table.scale, list) else table.scale
-        its = signals if table.signal else truth
-        its.append(SignalSource(table.signal or table.truth, "", path, scale=scale, offset=table.offset))
-    return tuple(signals), tuple(truth)
+    expected, remedy = "entries as in docs/formats.md", "see docs/formats.md for every entry"
+    file = validated(_File, raw, path, MappingFileError, expected=expected, remedy=remedy)
+    of_types = [(t.type, t.documented(f"{t.page}, read {t.read}", t.leave_out)) for t in file.types]
+    types = {plain_type(name): kind for names, kind in of_types for name in names}
+    return Vendors(types, tuple(r.documented(r.page, without=r.without) for r in file.receivers))

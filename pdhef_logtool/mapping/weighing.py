@@ -87,7 +87,7 @@ def weigh(
         return Weighing(Fields(Pieces(log), {}, [], []))
     named = named_fields(log, topics, vendors)
     true = [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m", "vx_m_s")]
-    pieces, candidates, anchors = look(log, named, vendors, [*signals.values(), *true])
+    pieces, candidates, anchors = look(log, named, [*signals.values(), *true])
     places = [f for f in (*candidates, *anchors.values()) if f.meaning.quantity in PLACES]
     fields = Fields(pieces, {n: f for n, f in anchors.items() if n in signals}, candidates, places)
     fields.candidates += proposed_fields(log, topics, named, fields)

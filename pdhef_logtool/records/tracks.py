@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
@@ -127,10 +126,9 @@ class StateTrack:
         columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
         return StateTrack(name=self.name, **{c: v[start:end] if len(v) == n else v for c, v in columns.items()})
 
-    def between(self, start_ns: int | None, end_ns: int) -> StateTrack:
-        """Return the stamps in [start_ns, end_ns); ``start_ns`` None includes the first one."""
-        first = 0 if start_ns is None else int(np.searchsorted(self.stamps_ns, start_ns))
-        return self.rows(first, int(np.searchsorted(self.stamps_ns, end_ns)))
+    def between(self, start_ns: int, end_ns: int) -> StateTrack:
+        """Return the stamps in [start_ns, end_ns)."""
+        return self.rows(*np.searchsorted(self.stamps_ns, (start_ns, end_ns)).tolist())
 
     def without_sideslip_below(self, speed_m_s: float) -> StateTrack:
         """Return the track with sideslip NaN where its speed is lower and has no direction."""
@@ -146,10 +144,6 @@ class StateTrack:
         """Mask of the stamps with any finite quantity, [N]."""
         finite = np.isfinite(self.vx_m_s) | np.isfinite(self.vy_m_s) | np.isfinite(self.yaw_rate_rad_s)
         return np.asarray(finite | np.isfinite(self.sideslip_rad) | np.isfinite(self.ay_m_s2), dtype=np.bool_)
-
-    def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
-        """Return a copy with another pose."""
-        return replace(self, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad)
 
 
 def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | IntArray | BoolArray) -> StateTrack:
@@ -177,22 +171,25 @@ def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
     return covariance
 
 
-def concatenate(tracks: list[StateTrack], *, single: Collection[str] = ()) -> StateTrack:
-    """Join the pieces of one track in time order; the list is emptied, so that each column is in memory once.
+def concatenate(pieces: Iterable[StateTrack], rows: int, *, single: Collection[str] = ()) -> StateTrack:
+    """Join the pieces of one track of ``rows`` stamps in time order, as they are made: each column is in memory once.
 
-    ``single`` : columns that are joined in single precision.
+    All pieces have the same columns; a missing one (:func:`make_track`) takes no memory. ``single`` : columns that are
+    joined in single precision.
     """
-    name = tracks[0].name
-    columns = {f.name: [getattr(t, f.name) for t in tracks] for f in fields(StateTrack) if f.name != "name"}
-    tracks.clear()
-    return StateTrack(name=name, **{c: _joined(columns.pop(c), c in single) for c in [*columns]})
-
-
-def _joined(parts: Sequence[NDArray[Any]], is_single: bool) -> NDArray[Any]:
-    """Join the pieces of a column; a missing one (:func:`make_track`) takes no memory."""
-    if all(part.strides == (0,) and part[:1].tobytes() == parts[0][:1].tobytes() for part in parts):
-        return np.broadcast_to(parts[0][:1], sum(map(len, parts)))
-    return np.concatenate(parts, dtype=np.float32 if is_single else None, casting="same_kind")
+    columns: dict[str, Any] = {}
+    end = 0
+    for piece in pieces:
+        start, end, columns["name"] = end, end + len(piece), piece.name
+        for name, part in ((f.name, getattr(piece, f.name)) for f in fields(piece) if f.name != "name"):
+            shape = (rows if len(part) else 0, *part.shape[1:])
+            if part.strides == (0,):
+                columns.setdefault(name, np.broadcast_to(part[:1], shape))
+                continue
+            if name not in columns:
+                columns[name] = np.empty(shape, np.float32 if name in single else part.dtype)
+            columns[name][start:end] = part
+    return StateTrack(**columns)
 
 
 def scaled_covariance(covariance: FloatArray, of_vy: FloatArray) -> FloatArray:

@@ -108,7 +108,7 @@ class ModelBundle(NetworkDesign):
     linear_regression: LinearModel | None = None
     paper_network: ModelBundle | None = None
 
-    @property
+    @cached_property
     def sha256(self) -> str:
         """Hash of everything that decides the outputs."""
         total = hashlib.sha256(json.dumps(self._document(), sort_keys=True).encode())

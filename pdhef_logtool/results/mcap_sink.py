@@ -245,9 +245,8 @@ def _until(raws: Iterator[Block], waiting: list[Block], end_ns: float) -> Iterat
     """Yield the messages up to the first one at or after a time, which waits for the next call."""
     while (raw := waiting.pop() if waiting else next(raws, None)) is not None:
         ready, rest = raw.split(end_ns)
-        if ready is not None:
-            yield ready
-        if rest is not None:
+        yield ready
+        if len(rest):
             waiting.append(rest)
             return
 

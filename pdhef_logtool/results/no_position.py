@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
@@ -41,7 +42,7 @@ _T = TypeVar("_T")
 def without_pose(track: StateTrack) -> StateTrack:
     """Return a track without position and heading."""
     unknown = np.full(len(track), np.nan)
-    return track.with_pose(unknown, unknown, unknown)
+    return replace(track, x_m=unknown, y_m=unknown, yaw_rad=unknown)
 
 
 def topics_with_position(log: DriveLog, mapping: SignalMapping) -> frozenset[str]:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ def load_schema(name: str) -> dict[str, Any]:
     return document
 
 
+@cache
 def arrow_schema(name: str) -> pa.Schema:
     """Return the Arrow schema that ``schemas/<name>`` describes.
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 
+import numba
 import numpy as np
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.car import SHOWN_DIGITS, Car
+from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.drive.sensor_changes import SensorChange
 from pdhef_logtool.drive.truth import valid_as_a_whole
@@ -25,13 +28,14 @@ from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate
 from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segment_masks
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import DriveIntervals, drive_intervals, spread, widened
+from pdhef_logtool.records import processes
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.processes import release_memory
 from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.sink import TRUTH, Event
+from pdhef_logtool.results.sink import Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.selection import default_names
@@ -103,10 +107,11 @@ def choose(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimated:
-    """A drive with the tracks of all estimators by name, in their order."""
+    """A drive with the tracks of all estimators by name, in order, and the algorithms of those that ran."""
 
     drive: WholeDrive
     tracks: dict[str, StateTrack]
+    algorithms: Mapping[str, Algorithm] = field(default_factory=dict)
 
     @property
     def signals(self) -> Signals:
@@ -132,12 +137,8 @@ class Estimated:
         vx, vy = track.vx_m_s, track.vy_m_s
         if not np.isfinite(vy).any():
             vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
-        start = _first_pose(self.truth)
-        return track.with_pose(*dead_reckon(track.stamps_ns, vx, vy, track.yaw_rate_rad_s, start))
-
-    def read(self, name: str) -> StateTrack | None:
-        """Return the track of a name (:data:`TRUTH`: ground truth), or None."""
-        return self.truth if name == TRUTH else self.tracks.get(name)
+        x, y, yaw = dead_reckon(track.stamps_ns, vx, vy, track.yaw_rate_rad_s, _first_pose(self.truth))
+        return replace(track, x_m=x, y_m=y, yaw_rad=yaw)
 
 
 def estimate_drive(
@@ -149,7 +150,9 @@ def estimate_drive(
     causality: CausalityCheck | None = None,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> Estimated:
-    """Run estimators over a drive.
+    """Run estimators over a drive, side by side in threads: compiled filters let other threads run.
+
+    A worker process uses one thread, the command itself ``NUMBA_NUM_THREADS``, by default all cores.
 
     Parameters
     ----------
@@ -161,39 +164,48 @@ def estimate_drive(
     """
     signals, vehicle = drive.signals, drive.plan.vehicle
     tracks: list[StateTrack] = []
-    computations = [_computation(e, corrected.of_estimator(e.name)) for e in estimators]
-    shared: dict[tuple[str, int], StateTrack] = {}
-    for number, (estimator, computation) in enumerate(zip(estimators, computations, strict=True)):
-        progress(number / len(estimators))
-        try:
-            given = corrected.of_estimator(estimator.name)
-            track = shared.pop(computation, None)
-            if track is None:
-                track = run_estimator(estimator, given, causality)
-                release_memory(len(track))
-            varied = _varied(estimator, given, drive.changes)
-        except EstimatorError as error:
-            if causality is None:
-                raise
-            causality.failed[estimator.name] = f"failed: {error}"
-            continue
-        if causality is not None and estimator.name in causality.failed:
-            continue
-        if computation in computations[number + 1 :]:
-            shared[computation] = track
-        track = without_impossible_states(replace(track, name=estimator.name))
-        track = watched_track(track, signals, vehicle, corrected.noise)
-        track = track if intervals is None else intervals.apply(track, signals)
-        if varied:
-            track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)
-        tracks.append(track.without_sideslip_below(vehicle.standstill_m_s))
+
+    def run(estimator: Estimator) -> tuple[StateTrack, list[FloatArray]]:
+        given = corrected.of_estimator(estimator.name)
+        track = run_estimator(estimator, given, causality)
         release_memory(len(track))
-    return Estimated(drive, {t.name: t for t in tracks})
+        return track, _varied(estimator, given, drive.changes)
 
-
-def _computation(estimator: Estimator, signals: Signals) -> tuple[str, int]:
-    """Return a key that estimators share which compute the same: without a network ``pd-hef`` is ``physics``."""
-    return (estimator.name if package_of(estimator) else resolve(estimator).sha256), id(signals)
+    algorithms = {e.name: resolve(e) for e in estimators}
+    # Estimators that compute the same have the same key: without a network ``pd-hef`` is ``physics``.
+    keys = (e.name if package_of(e) else algorithms[e.name].sha256 for e in estimators)
+    computations = [(key, id(corrected.of_estimator(e.name))) for key, e in zip(keys, estimators, strict=True)]
+    first: dict[tuple[str, int], Estimator] = {}
+    for estimator, computation in zip(estimators, computations, strict=True):
+        first.setdefault(computation, estimator)
+    pool = ThreadPoolExecutor(1 if processes.worker_number else numba.config.NUMBA_NUM_THREADS)
+    try:
+        running = {computation: pool.submit(run, estimator) for computation, estimator in first.items()}
+        for number, (estimator, computation) in enumerate(zip(estimators, computations, strict=True)):
+            progress(number / len(estimators))
+            computed = running.pop(computation)
+            if computation in computations[number + 1 :]:
+                running[computation] = computed
+            try:
+                track, varied = computed.result()
+            except EstimatorError as error:
+                if causality is None:
+                    raise
+                causality.failed[estimator.name] = f"failed: {error}"
+                continue
+            if causality is not None and (reason := causality.failed.get(first[computation].name)):
+                causality.failed[estimator.name] = reason
+                continue
+            track = without_impossible_states(replace(track, name=estimator.name))
+            track = watched_track(track, signals, vehicle, corrected.noise)
+            track = track if intervals is None else intervals.apply(track, signals)
+            if varied:
+                track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)
+            tracks.append(track.without_sideslip_below(vehicle.standstill_m_s))
+            release_memory(len(track))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return Estimated(drive, {t.name: t for t in tracks}, {t.name: algorithms[t.name] for t in tracks})
 
 
 def _varied(estimator: Estimator, given: Signals, changes: Sequence[SensorChange]) -> list[FloatArray]:
@@ -240,7 +252,8 @@ def evaluate(
     moving = moving_mask(signals, truth, vehicle)
     tracks, slow, calibrated = estimated.tracks, vehicle.low_speed_blend_m_s, model.calibrated(signals)
     dependent = drive.plan.dependent if dependent is None else dependent
-    scored = EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent)
+    digests = {name: algorithm.sha256[:SHOWN_DIGITS] for name, algorithm in estimated.algorithms.items()}
+    scored = EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent, digests)
     # The whole drive and ``linear`` are no events.
     spans = (s for s in find_intervals(signals, masks) if s.name not in ("all", "linear", *MANOEUVRES))
     events = in_order([*spans, *manoeuvres, *divergences(tracks.values())])

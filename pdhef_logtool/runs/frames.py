@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.table import Skipped
 from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
@@ -40,7 +39,7 @@ class Estimates:
     model: DriveModel
     estimated: Estimated
     tracks: dict[str, StateTrack]
-    algorithms: dict[str, Algorithm]
+    algorithms: Mapping[str, Algorithm]
     skipped: tuple[Skipped, ...]
 
     def __repr__(self) -> str:
@@ -113,7 +112,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     intervals = drive_intervals(model.car, estimators)
     estimated = estimate_drive(whole, model.apply(whole.signals), estimators, intervals=intervals)
     tracks = {track.name: track for track in estimated.drawn}
-    return Estimates(drive, model, estimated, tracks, {e.name: resolve(e) for e in estimators}, tuple(skipped))
+    return Estimates(drive, model, estimated, tracks, estimated.algorithms, tuple(skipped))
 
 
 def score(estimates: Estimates) -> pl.DataFrame:

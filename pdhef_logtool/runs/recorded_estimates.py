@@ -22,7 +22,6 @@ from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.requirement_blocks import requirement_blocks
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import ValidationPlan
-from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.open_log import open_log
@@ -97,8 +96,8 @@ def score_log(
     car = Car.load(config.car, network=NO_MODEL, sensors=config.sensor_profile)
     mapping = mapping_of(config.mapping)
     if mapping is not None and mapping.recorders:
-        reading, nothing = config.read_options, Wanted(frozenset())
-        with closing(open_log(log_input.path, reading.limits, reading.msgs, nothing, reading.tables)) as log:
+        reading = config.read_options
+        with closing(open_log(log_input.path, reading.limits, reading.msgs, reading.tables)) as log:
             mapping = mapping_for_recorder(log, mapping)
     plan = read_validation_plan(config.plan, junit)
     drive_outputs.check_places([log_input], output, config, mapping, junit)
@@ -200,7 +199,7 @@ def _score_drive(
     for track, s in zip(tracks, scored, strict=True):
         asked = [q for q in plan.requirements if q.estimator == track.name or (selected and q.estimator is None)]
         blocks += requirement_blocks(asked, selected, s.drive)
-    space = operating_space(together.signals, together.truth, together.read(selected or ""), drive.car.vehicle)
+    space = operating_space(together.signals, together.truth, together.tracks.get(selected or ""), drive.car.vehicle)
     stated = judge_drive(plan, drive, None, whole.rows, blocks, space)
     stated["estimators"] = [estimator_entry(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded]
     losses = merge_losses([drive.losses, lost])
@@ -262,9 +261,8 @@ def _reference(drive: Drive, model: DriveModel, config: RunConfig) -> DriveRefer
 def _drive_at(drive: Drive, truth: TruthTrack | None, stamps_ns: IntArray) -> WholeDrive:
     """Return the drive at stamps [N]: its sensors are interpolated between samples, never across gaps."""
     plan, recorded = drive.plan, drive.recorded()
-    read, columns = recorded.signals, dict[str, Any]()
-    for name in ALIGNED_SIGNALS:
-        columns[name] = _interpolated(read.stamps_ns, getattr(read, name), stamps_ns)
+    read = recorded.signals
+    columns: dict[str, Any] = {n: _interpolated(read.stamps_ns, getattr(read, n), stamps_ns) for n in ALIGNED_SIGNALS}
     wheels = np.full((len(stamps_ns), len(WHEELS)), np.nan)
     signals = Signals(stamps_ns, stamps_ns, wheel_speed_m_s=wheels, available=read.available, **columns)
     latency_s, standstill_m_s = plan.truth_latency_s, plan.vehicle.standstill_m_s

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
-from pdhef_logtool.car.parts import PHYSICS
+from pdhef_logtool.car.parts import PHYSICS, Algorithm
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
-from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.plug_ins import package_of
@@ -84,7 +83,7 @@ def run_log(
             named = run.config.estimators is not None
             main = choose_main(run.names, scored.rows, proven=drive.car.has_evidence, named=named)
             blocks = requirement_blocks([*validation.requirements, SIDESLIP], main.name, scored.drive)
-            space = operating_space(estimated.signals, estimated.truth, estimated.read(main.name), run.car.vehicle)
+            space = operating_space(estimated.signals, estimated.truth, estimated.tracks[main.name], run.car.vehicle)
             judged = judge_drive(validation, drive, main.name, scored.rows, blocks, space)
             files = DriveOutputs((change, outputs.path), run, estimated, main)
             with files.annotated() as annotated:
@@ -105,7 +104,7 @@ def run_log(
             neutral=config.no_position,
             car=car_entry(drive.car),
             main=main.name,
-            algorithms={e.name: resolve(e).identity for e in run.estimators},
+            algorithms={name: algorithm.identity for name, algorithm in estimated.algorithms.items()},
             files=files_of(change.target),
             failed_checks=sum(c.verdict == "failed" and not c.waived for c in drive.checks),
             failed=_ALL_SILENT.format("; ".join(dict.fromkeys(scored.silent.values()))) if all_silent else None,
@@ -147,9 +146,7 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     drive = run.drive
     scored = evaluate(drive, estimated, run.model)
     release_memory(len(estimated.signals))
-    digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
-    scored = replace(scored, rows=[replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows])
-    truth, reference = estimated.truth, estimated.read(REFERENCE)
+    truth, reference = estimated.truth, estimated.tracks.get(REFERENCE)
     if truth is not None and reference is not None and run.reference is not None:
         contradictions = audit_truth(truth, reference, drive.car.vehicle.low_speed_blend_m_s)
         run.reference.document["ground_truth"] = list(contradictions)
@@ -185,17 +182,17 @@ def report_drive(
     """
     drive, config, truth, track = run.drive, run.config, estimated.truth, estimated.tracks.get(selected or "")
     preferred = dict.fromkeys((REFERENCE, PHYSICS, *run.names))
-    others = [t for n in preferred if n != selected and (t := estimated.read(n)) is not None]
+    others = [t for n in preferred if n != selected and (t := estimated.tracks.get(n)) is not None]
     slow = run.car.vehicle.low_speed_blend_m_s
     content = _drive_entries(drive, run.car, scored.rows, losses) | {
-        "estimators": [*_estimator_entries(run)],
+        "estimators": [*_estimator_entries(run, estimated.algorithms)],
         "metrics": scored.rows,
         "segments": scored.events,
         "friction": run.model.friction.to_dict(),
         "self_calibration": None if run.model.posterior is None else run.model.posterior.to_dict(),
         "reference": None if run.reference is None else run.reference.document,
         "largest_errors": [] if track is None else largest_errors(track, truth, others, slow),
-        "faults": _faults(run, selected, estimated.read),
+        "faults": _faults(run, selected, estimated.tracks),
         "path_drift": None if truth is None or track is None else path_drift(estimated.posed(track), truth),
         "metadata": {} if config.no_position else _metadata(drive),
         **stated,
@@ -204,11 +201,11 @@ def report_drive(
     return without_names(report, drive.path, drive.name) if config.no_position else report
 
 
-def _estimator_entries(run: PreparedDrive) -> Iterator[dict[str, Any]]:
+def _estimator_entries(run: PreparedDrive, algorithms: Mapping[str, Algorithm]) -> Iterator[dict[str, Any]]:
     """Yield the entries of the estimators that ran, failed or were skipped."""
     not_causal = run.drive.not_causal
     for e in run.estimators:
-        algorithm, calibration = resolve(e), calibration_of(e.name, run.car)
+        algorithm, calibration = algorithms[e.name], calibration_of(e.name, run.car)
         yield estimator_entry(
             e.name,
             causal=e.causal and not not_causal,
@@ -223,15 +220,12 @@ def _estimator_entries(run: PreparedDrive) -> Iterator[dict[str, Any]]:
             yield estimator_entry(s.name, causal=s.spec.causal, outcome="skipped", reason=s.reason)
 
 
-def _faults(
-    run: PreparedDrive, selected: str | None, read: Callable[[str], StateTrack | None]
-) -> list[dict[str, Any]] | None:
+def _faults(run: PreparedDrive, selected: str | None, tracks: Mapping[str, StateTrack]) -> list[dict[str, Any]] | None:
     """Return the changes of the sensors, and the faults that the selected estimate detects, or else physics.
 
     None without changes where neither detects any.
     """
-    tracks = [read(name) for name in dict.fromkeys((selected, PHYSICS)) if name in run.names]
-    detected = (sensor_faults(track) for track in tracks if track is not None)
+    detected = (sensor_faults(tracks[name]) for name in dict.fromkeys((selected or "", PHYSICS)) if name in tracks)
     faults = next((faults for faults in detected if faults is not None), None)
     of_drive = run.drive.recorded().changes
     changes = [sensor_fault(c.sensor, c.kind, [Interval(c.start_ns, c.end_ns)]) for c in of_drive]

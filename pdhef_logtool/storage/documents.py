@@ -163,16 +163,11 @@ def validated(
 
 def checked(model: type[ModelT], raw: object, table: str, problems: list[str]) -> ModelT | None:
     """Return the record of a parsed table at ``table`` in its document; None after adding to ``problems``."""
-    from pydantic import BaseModel, ValidationError
-    from pydantic_core import ArgsKwargs
+    from pydantic import ValidationError
 
-    validate = model.__pydantic_validator__.validate_python  # type: ignore[attr-defined]
     try:
-        if isinstance(raw, dict) and not issubclass(model, BaseModel):
-            # A strict dataclass takes its entries as arguments of a new one only.
-            record: ModelT = validate(ArgsKwargs((), raw), self_instance=object.__new__(model))
-        else:
-            record = validate(raw)
+        # As JSON, whose lists are tuples and whose texts are paths to a strict model, too.
+        record: ModelT = model.__pydantic_validator__.validate_json(json.dumps(raw, default=str))  # type: ignore[attr-defined]
     except ValidationError as error:
         problems += _problems(error, model, raw, table)
         return None
@@ -224,8 +219,8 @@ def _problems(error: ValidationError, model: type, raw: object, table: str) -> l
             text = "is missing"
         else:
             text = e["msg"].removeprefix("Value error, ")
-            text = text.replace("Input should", "should").replace("an instance of Path", "a path")
-            text = text.replace("a valid tuple", "a list")
+            for pydantic, ours in (("Input should", "should"), ("a valid array", "a list"), ("an object", "a table")):
+                text = text.replace(pydantic, ours)
             # The message of a table names its entries.
             text += f", got {value!r:.60}" if isinstance(value, str | int | float) else ""
         texts_by_entry.setdefault(entry, []).append(text)
@@ -254,6 +249,8 @@ def _entries(annotation: Any, place: Sequence[str]) -> tuple[str, ...]:
         if not place:
             return tuple(fields)
         return _entries(fields[place[0]].annotation, place[1:]) if place[0] in fields else ()
+    if isinstance(annotation, type) and is_dataclass(annotation):
+        return () if place else tuple(annotation.__dataclass_fields__)
     # The items of a container are one level deeper, the alternatives of a union on the same level.
     inner = place[1:] if get_origin(annotation) in (dict, list, tuple) else place
     return next((names for member in get_args(annotation) if (names := _entries(member, inner))), ())

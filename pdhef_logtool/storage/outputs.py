@@ -179,21 +179,20 @@ class FolderLock:
     def _try(self) -> bool:
         if WINDOWS:  # which opens no folders
             return self._try_file()
-        descriptor = os.open(self.path, os.O_RDONLY)
+        descriptor, is_held = os.open(self.path, os.O_RDONLY), False
         try:
-            if not take_lock(descriptor):
-                os.close(descriptor)
-                return False
-            if not os.path.samestat(os.fstat(descriptor), self.path.stat()):
-                os.close(descriptor)  # exchanged since it was opened: the lock is on the old one
-                return False
+            # A folder that was exchanged since it was opened: the lock is on the old one.
+            is_held = take_lock(descriptor) and os.path.samestat(os.fstat(descriptor), self.path.stat())
         except OSError as error:
-            os.close(descriptor)
             if error.errno not in _NO_LOCK:
                 raise
             return self._try_file()
-        self._descriptors.append(descriptor)
-        return True
+        finally:
+            if is_held:
+                self._descriptors.append(descriptor)
+            else:
+                os.close(descriptor)
+        return is_held
 
     def _try_file(self) -> bool:
         """Create the complete lock file; remove a dead process's first."""

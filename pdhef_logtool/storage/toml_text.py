@@ -23,8 +23,8 @@ def _table(name: tuple[str, ...], entries: Mapping[str, Any]) -> Iterator[str]:
         yield ""
         yield f"[{'.'.join(map(_key, name))}]"
     for key, value in sorted(plain.items(), key=lambda item: _has_lines(item[1])):
-        text = "[\n" + "".join(f"    {_value(v)},\n" for v in value) + "]" if _has_lines(value) else _value(value)
-        yield f"{_key(key)} = {text}"
+        items = "".join(f"    {toml_value(v)},\n" for v in value) if _has_lines(value) else ""
+        yield f"{_key(key)} = " + (f"[\n{items}]" if items else toml_value(value))
     for key, value in entries.items():
         if isinstance(value, Mapping):
             yield from _table((*name, key), value)
@@ -35,18 +35,19 @@ def _has_lines(value: Any) -> bool:
 
 
 def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
 
 
-def _value(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """Return a value in one line of TOML. Raises TypeError for anything but mappings, lists, texts and numbers."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + "}"
+        return "{" + ", ".join(f"{_key(k)} = {toml_value(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
+        return f"[{', '.join(map(toml_value, value))}]"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool):
         return json.dumps(value)
     if isinstance(value, int | float):
-        return repr(value)
+        return repr(value if isinstance(value, int) else float(value))  # numpy's repr names its type
     raise TypeError(f"TOML has no {type(value).__name__}")

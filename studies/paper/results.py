@@ -15,23 +15,11 @@ from pdhef_logtool.learning.network.train_command import HISTORY_FILE
 from pdhef_logtool.residual_model.bundle import PAPER_FOLDER
 from pdhef_logtool.results.run_report import tool_versions
 from studies.gates.tool import Tool
-from studies.paper.experiment import (
-    BURST,
-    BURST_S,
-    FIGURES,
-    A,
-    B,
-    Experiment,
-    improvement,
-    on_the_road,
-    read_log,
-    run_experiment,
-    spread,
-)  # fmt: skip
+from studies.paper import experiment as paper
 from studies.paper.probes import ResidualFit, TrustCurve, inflation, residual_fit, step_times, trust_curve
 from studies.paper.schemes import ESP, HYBRID, PAIRS, PAPER, SCHEMES
 
-SCENARIOS = (A, B, BURST)
+SCENARIOS = (paper.A, paper.B, paper.BURST)
 #: Schemes with a variable factor on R; that of the paper also has a variable gain.
 ADAPTIVE = (PAPER, HYBRID)
 
@@ -46,7 +34,7 @@ class Results:
     inflations, times : of R, and processor times, by scheme.
     """
 
-    experiment: Experiment
+    experiment: paper.Experiment
     car: Car
     fits: Mapping[str, ResidualFit]
     curves: Mapping[str, TrustCurve]
@@ -62,13 +50,14 @@ class Results:
 
 def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> Results:
     """Run the whole experiment."""
-    experiment = run_experiment(tool, scenarios=SCENARIOS, noise_seeds=noise_seeds)
-    drives = {s.name: read_log(experiment.logs[s.name], on_the_road(car, s.friction)) for s in (A, B)}
+    experiment = paper.run_experiment(tool, scenarios=SCENARIOS, noise_seeds=noise_seeds)
+    pair = paper.SCENARIO_PAIR
+    drives = {s.name: paper.read_log(experiment.logs[s.name], paper.on_the_road(car, s.friction)) for s in pair}
     fits = {name: residual_fit(whole, car) for name, whole in drives.items()}
-    curves = {s.name: trust_curve(experiment, s.name, PAPER) for s in (A, B)}
-    inflations = {name: inflation(experiment, name, BURST_S) for name in ADAPTIVE}
+    curves = {s.name: trust_curve(experiment, s.name, PAPER) for s in pair}
+    inflations = {name: inflation(experiment, name, paper.BURST_S) for name in ADAPTIVE}
     names = [n for n in SCHEMES if not n.endswith(ESP)]
-    times = step_times(drives[B.name], on_the_road(car, B.friction), names)
+    times = step_times(drives[paper.B.name], paper.on_the_road(car, paper.B.friction), names)
     return Results(experiment, car, fits, curves, inflations, times)
 
 
@@ -88,13 +77,13 @@ def document(r: Results) -> dict[str, Any]:
     metrics, scenarios, network = r.experiment.metrics, [s.name for s in SCENARIOS], r.car.network
     summary = {
         scenario: {
-            scheme: {f: of for f in FIGURES if (of := spread(metrics, scenario, scheme, f)) is not None}
+            scheme: {f: of for f in paper.FIGURES if (of := paper.spread(metrics, scenario, scheme, f)) is not None}
             for scheme in SCHEMES
         }
         for scenario in scenarios
     }
     gains = [
-        {"scenario": scenario, "scheme": s, "baseline": b, **improvement(metrics, scenario, s, b)}
+        {"scenario": scenario, "scheme": s, "baseline": b, **paper.improvement(metrics, scenario, s, b)}
         for scenario, (s, b) in product(scenarios, PAIRS)
     ]
     residuals = {

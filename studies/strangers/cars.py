@@ -69,7 +69,8 @@ class Car:
     steer, steering_wheel : road-wheel angle and angle of the steering wheel, rad, left positive.
     wheels, wheel_rates : of fl, fr, rl, rr, m/s and rad/s, [N, 4]. speed : mean of the rear wheels, m/s.
     position, velocity, attitude : of GNSS/INS: east, north, up (m); east, north (m/s); roll, pitch, yaw (rad, ENU).
-    east, north, ground_speed : of the velocity, m/s. course, signed_course, heading : clockwise from north, degrees.
+    east, north, ground_speed, velocity_enu : of the velocity, m/s, the last with a vertical one of 0, [N, 3].
+    course, signed_course, heading : clockwise from north, degrees. course_enu : counter-clockwise from east, rad.
     body_velocity : forward and left, m/s, [N, 2]. yaw_rate : rad/s. fix : latitude, longitude (deg), height (m).
     sideslip : of the GNSS/INS, rad; 0 where the car hardly moves. roll, pitch, yaw, lat, lon, alt : as above.
     """
@@ -118,6 +119,8 @@ def drive(name: str, imu_x_m: float = 0.0) -> Car:
     course = np.arctan2(east, north) / np.radians(1.0)
     of_body = {
         "velocity": np.stack([east, north], axis=1),
+        "velocity_enu": np.stack([east, north, np.zeros_like(east)], axis=1),
+        "course_enu": np.arctan2(north, east),
         "east": east,
         "north": north,
         "ground_speed": np.hypot(east, north),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.records.signals import WHEELS, FloatArray
+from pdhef_logtool.records.signals import FloatArray
 from studies.pages import read_toml
 from studies.strangers.cars import Car, Series
 from studies.strangers.containers import Topic
@@ -55,48 +55,11 @@ class Recording:
 
 
 def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
-    """Return the right channels of the parts of a log.
-
-    ``parts`` of ``imu``, ``yaw rate``, ``steer``, ``steering wheel``, ``speed``, ``wheels`` (rims in m/s),
-    ``wheel rates`` (rad/s), ``truth``, ``truth rate``, ``position``, ``course``, ``heading``.
-    """
-    east_north_up = Series(
-        car.velocity.stamps_ns,
-        car.velocity.arrival_ns,
-        np.column_stack([car.velocity.values, car.speed.along(car.velocity).values * 0]),
-    )
-    yaw_rates = (car.rate[2], car.yaw_rate)
-    # All quantities accepted as speed: rims, the body's forward velocity, the speed over ground.
-    speeds = (car.speed, car.body_velocity[0], car.ground_speed)
-    course = Series(car.velocity.stamps_ns, car.velocity.arrival_ns, np.arctan2(*car.velocity.values.T[::-1]))
-    by_part: dict[str, dict[str, tuple[Series, ...]]] = {
-        "imu": {"ax_m_s2": (car.force[0],), "ay_m_s2": (car.force[1],), "yaw_rate_rad_s": yaw_rates},
-        "yaw rate": {"yaw_rate_rad_s": yaw_rates},
-        "steer": {"steer_rad": (car.steer,)},
-        "steering wheel": {"steering_wheel_rad": (car.steering_wheel,)},
-        "speed": {"speed_m_s": speeds},
-        "wheels": {f"wheel_speed_{w}_m_s": (car.wheels[i],) for i, w in enumerate(WHEELS)},
-        "wheel rates": {f"wheel_speed_{w}_rad_s": (car.wheel_rates[i],) for i, w in enumerate(WHEELS)},
-        "truth": {
-            "truth.vx_m_s": speeds,
-            "truth.vy_m_s": (car.body_velocity[1],),
-            "truth.sideslip_rad": (car.sideslip,),
-            "truth.enu_velocity_m_s": (east_north_up,),
-        },
-        "truth rate": {"truth.yaw_rate_rad_s": yaw_rates},
-        "position": {
-            f"{name}_deg": (car.fix[i],)
-            for i, names in enumerate((("truth.lat", "gnss_latitude"), ("truth.lon", "gnss_longitude")))
-            for name in names
-        },
-        "course": {
-            **dict.fromkeys(("truth.course_rad", "gnss_course_rad"), (course,)),
-            "gnss_velocity_east_m_s": (car.velocity[0],),
-            "gnss_velocity_north_m_s": (car.velocity[1],),
-        },
-        "heading": dict.fromkeys(("truth.yaw_rad", "gnss_heading_rad"), (car.attitude[2],)),
-    }
-    return {name: series for part in parts for name, series in by_part[part].items()}
+    """Return the right channels of the parts of a log (``answers`` in ``scoring.toml``)."""
+    by_channel: dict[str, list[str]] = {}
+    for part in parts:
+        by_channel |= SCORING["answers"][part]
+    return {name: tuple(eval(each, {}, car.sensors) for each in right) for name, right in by_channel.items()}
 
 
 def message(

@@ -10,15 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference_car import drive, slalom, with_noise
 
+from pdhef_logtool.car import vehicle
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import (
-    SENSOR_PROFILES,
-    Sensors,
-    VehicleParameters,
-    correct_signals,
-    corrected_anew,
-    default_vehicle,
-)
 from pdhef_logtool.drive.sensor_faults import without_faults
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.pass_through import PassThrough
@@ -33,8 +26,8 @@ from pdhef_logtool.runs.fleet import run_logs
 SAMPLES = Path(__file__).parents[2] / "sample_logs"
 
 
-def vehicle(**sensors: float) -> VehicleParameters:
-    return default_vehicle().model_copy(update={"sensors": Sensors(**sensors)})
+def car_with(**sensors: float) -> vehicle.VehicleParameters:
+    return vehicle.default_vehicle().model_copy(update={"sensors": vehicle.Sensors(**sensors)})
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +40,7 @@ def seconds(signals: Signals) -> np.ndarray:
 
 
 def reasons_of(signals: Signals, **sensors: float) -> int:
-    return int(np.bitwise_or.reduce(without_faults(signals, vehicle(**sensors)).faults.astype(int)))
+    return int(np.bitwise_or.reduce(without_faults(signals, car_with(**sensors)).faults.astype(int)))
 
 
 def masked(signals: Signals, column: str, gone: np.ndarray, value: float = np.nan) -> Signals:
@@ -58,11 +51,12 @@ def test_a_profile_replaces_the_sensors_and_makes_what_belongs_to_others_stale(t
     file = tmp_path / "imu.toml"
     file.write_text("[sensors]\nay_std_m_s2 = 0.3\nimu_rate_hz = 200.0\n")
     car = Car.load("saloon", sensors=file)
-    assert car.vehicle.sensors == Sensors(ay_std_m_s2=0.3, imu_rate_hz=200.0)
+    assert car.vehicle.sensors == vehicle.Sensors(ay_std_m_s2=0.3, imu_rate_hz=200.0)
     assert car.vehicle.mass_kg == Car.load("saloon").vehicle.mass_kg
     assert car.notes and car.physics_sha256 != Car.load("saloon").physics_sha256
     named = Car.load(None, sensors="production")
-    assert (named.vehicle.sensors, named.physics_sha256) == (SENSOR_PROFILES["production"], Car.load().physics_sha256)
+    assert named.vehicle.sensors == vehicle.SENSOR_PROFILES["production"]
+    assert named.physics_sha256 == Car.load().physics_sha256
 
 
 @pytest.mark.parametrize(
@@ -101,17 +95,17 @@ def test_speed_and_steering_are_kept_for_the_times_of_the_profile(clean):
     dark = masked(clean, "speed_m_s", t > 4.0)
 
     def lost_s(**sensors: float) -> float:
-        values = PassThrough(vehicle(**sensors), "zero").run(dark, None)[0].values[:, 0]
+        values = PassThrough(car_with(**sensors), "zero").run(dark, None)[0].values[:, 0]
         return float(t[np.isfinite(values)].max())
 
     assert lost_s() == pytest.approx(4.5, abs=0.02)
     assert lost_s(speed_hold_s=1.5) == pytest.approx(5.5, abs=0.02)
-    kinematic = Kinematic(vehicle(speed_hold_s=1.5)).run(dark, None)[0].valid
+    kinematic = Kinematic(car_with(speed_hold_s=1.5)).run(dark, None)[0].valid
     assert float(t[kinematic].max()) == pytest.approx(5.5, abs=0.02)
     lost = masked(clean, "steer_rad", t > 4.0)
 
     def steered_s(**sensors: float) -> float:
-        steps, _ = nominal_filter(vehicle(**sensors)).run(lost, None)
+        steps, _ = nominal_filter(car_with(**sensors)).run(lost, None)
         return float(t[steps.valid].max())
 
     assert steered_s() == pytest.approx(4.2, abs=0.02)
@@ -123,8 +117,8 @@ def test_the_lowest_speed_of_wheels_with_few_pulses_is_no_slip():
     t = seconds(rolling)
     gone = (t > 3.0) & (t < 4.0)
     silent = masked(rolling, "speed_m_s", gone, 0.0)
-    assert believable(silent, Sensors(), None)[0] is not silent
-    assert believable(silent, Sensors(speed_least_m_s=2.0), None)[0] is silent
+    assert believable(silent, vehicle.Sensors(), None)[0] is not silent
+    assert believable(silent, vehicle.Sensors(speed_least_m_s=2.0), None)[0] is silent
 
 
 def test_a_standstill_has_the_speed_and_the_yaw_rate_of_the_profile():
@@ -132,7 +126,7 @@ def test_a_standstill_has_the_speed_and_the_yaw_rate_of_the_profile():
     offset = replace(parked, yaw_rate_rad_s=parked.yaw_rate_rad_s + 0.08)
 
     def still(signals: Signals, **sensors: float) -> bool:
-        steps, _ = nominal_filter(vehicle(**sensors)).run(signals, None)
+        steps, _ = nominal_filter(car_with(**sensors)).run(signals, None)
         return bool((steps.x[-100:, 0] == 0.0).any())
 
     assert not still(parked)
@@ -154,10 +148,10 @@ def test_a_run_records_the_profile(tmp_path):
 
 #: Sensor bias per signal; all values differ, so that a swapped bias is detected.
 TOO_MUCH = {"steer_rad": 0.011, "ax_m_s2": 0.21, "ay_m_s2": -0.37, "yaw_rate_rad_s": 0.0053}
-CAR = default_vehicle().model_copy(
+CAR = vehicle.default_vehicle().model_copy(
     update={
         "steer_offset_rad": TOO_MUCH["steer_rad"],
-        "sensors": Sensors(
+        "sensors": vehicle.Sensors(
             ax_bias_m_s2=TOO_MUCH["ax_m_s2"],
             ay_bias_m_s2=TOO_MUCH["ay_m_s2"],
             yaw_rate_bias_rad_s=TOO_MUCH["yaw_rate_rad_s"],
@@ -169,7 +163,7 @@ CAR = default_vehicle().model_copy(
 def test_what_the_sensors_read_too_much_is_taken_off_and_nothing_else():
     true = drive(slalom(0.03, 0.5), speed=20.0, step_s=np.full(299, 0.01)).signals
     read = replace(true, **{name: getattr(true, name) + bias for name, bias in TOO_MUCH.items()})
-    corrected = correct_signals(read, CAR)
+    corrected = vehicle.correct_signals(read, CAR)
     for f in fields(Signals):
         if f.name in TOO_MUCH:
             np.testing.assert_allclose(getattr(corrected, f.name), getattr(true, f.name), atol=1e-12, err_msg=f.name)
@@ -178,10 +172,10 @@ def test_what_the_sensors_read_too_much_is_taken_off_and_nothing_else():
     assert corrected.available == true.available
 
 
-def biased(offset: float, ratio: float, *biases: float) -> VehicleParameters:
+def biased(offset: float, ratio: float, *biases: float) -> vehicle.VehicleParameters:
     names = ("ax_bias_m_s2", "ay_bias_m_s2", "yaw_rate_bias_rad_s")
-    sensors = Sensors(**dict(zip(names, biases, strict=True)))
-    return default_vehicle().model_copy(
+    sensors = vehicle.Sensors(**dict(zip(names, biases, strict=True)))
+    return vehicle.default_vehicle().model_copy(
         update={"steer_offset_rad": offset, "steering_ratio": ratio, "sensors": sensors}
     )
 
@@ -197,9 +191,9 @@ def test_correction_anew_is_that_of_what_the_sensors_read(was, other):
     raw = drive(slalom(0.03, 0.5), speed=20.0, step_s=np.full(9, 0.01)).signals
     raw.ay_m_s2[3] = np.nan
     by_other = replace(raw, steer_rad=raw.steer_rad * was.steering_ratio / other.steering_ratio)
-    before, wanted = correct_signals(raw, was), correct_signals(by_other, other)
-    found = corrected_anew(before, was, other)
-    back = corrected_anew(found, other, was)
+    before, wanted = vehicle.correct_signals(raw, was), vehicle.correct_signals(by_other, other)
+    found = vehicle.corrected_anew(before, was, other)
+    back = vehicle.corrected_anew(found, other, was)
     for f in fields(Signals):
         if f.name in SIGNAL_COLUMNS:
             for one, two in ((found, wanted), (back, before)):
@@ -208,7 +202,7 @@ def test_correction_anew_is_that_of_what_the_sensors_read(was, other):
 
 
 def test_signals_that_need_no_other_correction_are_left_as_they_are():
-    signals = correct_signals(drive(slalom(0.03, 0.5), step_s=np.full(9, 0.01)).signals, CAR)
+    signals = vehicle.correct_signals(drive(slalom(0.03, 0.5), step_s=np.full(9, 0.01)).signals, CAR)
     heavier = CAR.model_copy(update={"mass_kg": 1500.0, "roll_gradient_rad_per_m_s2": 0.01})
-    assert corrected_anew(signals, CAR, heavier) is signals
-    assert corrected_anew(signals, CAR, CAR.model_copy(update={"steering_ratio": 15.0})) is not signals
+    assert vehicle.corrected_anew(signals, CAR, heavier) is signals
+    assert vehicle.corrected_anew(signals, CAR, CAR.model_copy(update={"steering_ratio": 15.0})) is not signals

@@ -172,13 +172,6 @@ def test_the_files_of_the_project_are_taken(path):
     read_vehicle_file(path)
 
 
-@pytest.mark.parametrize("content", ["mass_kg = ", "just words\n", b"\xff\xfe\x00", b"\x89MCAP0\r\n"])
-def test_what_is_no_vehicle_file_is_one_line(tmp_path, content):
-    problem(write(tmp_path, content))
-    problem(tmp_path)
-    assert "no such file" in problem(tmp_path / "nowhere.toml")
-
-
 def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
     said = problem(write(tmp_path, EXAMPLE.replace("mass_kg = 1440.0", "mass_kg = 1.44")))
     assert "mass_kg, yaw_inertia_kg_m2, cg_to_front_axle_m, cg_to_rear_axle_m contradict one another" in said

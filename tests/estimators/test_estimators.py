@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_models import full_network, linear_residual
-from reference_car import drive, keep, rolling_drive, slalom, with_noise
+from reference_car import drive, keep, on_axles, rolling_drive, rough_drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.posterior import Posterior
-from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators import latency_compensation
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_estimator
@@ -40,14 +40,7 @@ NETWORKS = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")
 FILTERS = ("phy-ukf", "physics", "phy-ukf:tuned")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
 MODEL = full_network()
-STIFFNESS_VEHICLE = VEHICLE.model_copy(
-    update={
-        "tyres": Tyres(
-            front=AxleTyre(cornering_stiffness_n_per_rad=105_000.0),
-            rear=AxleTyre(cornering_stiffness_n_per_rad=96_000.0),
-        )
-    }
-)
+STIFFNESS_VEHICLE = on_axles(VEHICLE, 105_000.0, 96_000.0)
 SIGNS = {"steer_rad": -1, "ay_m_s2": -1, "yaw_rate_rad_s": -1}
 MIRRORED = ("vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")
 
@@ -75,16 +68,11 @@ def worst(error: np.ndarray, mask: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def rough():
-    """Noisy, on irregular stamps, with missing samples, a gap of 0.8 s and messages that arrive late and bunched."""
-    rng = np.random.default_rng(11)
-    dt = rng.uniform(0.004, 0.022, 500)
-    s = with_noise(drive(slalom(0.035, 0.5), speed=22.0, step_s=dt).signals, seed=5)
-    for column in (s.steer_rad, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s):
-        column[rng.random(len(s)) < 0.05] = np.nan
+    """A rough drive with a gap of 0.8 s and another friction for a while."""
+    s = rough_drive(11, 500, 5)
     s.friction[100:350] = 0.8
-    ready = np.maximum.accumulate(s.stamps_ns + rng.integers(0, 45_000_000, len(s)))
     t = (s.stamps_ns - s.stamps_ns[0]) * 1e-9
-    return keep(replace(s, ready_ns=ready), (t < 3.0) | (t > 3.8))
+    return keep(s, (t < 3.0) | (t > 3.8))
 
 
 # --- pieces, causality, symmetry -------------------------------------------------------------------------------------

@@ -4,25 +4,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference_car import FRONT_M, FRONT_TYRE, MASS_KG, REAR_M, REAR_TYRE, WHEELBASE_M, derivative, forces
+from reference_car import FRONT_M, FRONT_TYRE, MASS_KG, REAR_M, REAR_TYRE, WHEELBASE_M, derivative, forces, on_axles
 
 from pdhef_logtool.car import nominal_model
 from pdhef_logtool.car.nominal_model import model_parameters
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, default_vehicle
+from pdhef_logtool.car.vehicle import Tyres, default_vehicle
 from pdhef_logtool.compiled.cache import njit
 
 SEDAN = default_vehicle()
 P = model_parameters(SEDAN)
 BLEND_HIGH = 3.0
 STIFFNESS = (105_000.0, 96_000.0)
-STIFFNESS_CAR = SEDAN.model_copy(
-    update={
-        "tyres": Tyres(
-            front=AxleTyre(cornering_stiffness_n_per_rad=STIFFNESS[0]),
-            rear=AxleTyre(cornering_stiffness_n_per_rad=STIFFNESS[1]),
-        )
-    }
-)
+STIFFNESS_CAR = on_axles(SEDAN, *STIFFNESS)
 
 speeds = st.floats(BLEND_HIGH, 70.0)
 lateral = st.floats(-10.0, 10.0)

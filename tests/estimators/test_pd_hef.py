@@ -40,13 +40,8 @@ def signals():
     return replace(noisy, ready_ns=noisy.stamps_ns + 10_000_000, available=frozenset(ALIGNED_SIGNALS))
 
 
-def _same(a: StateTrack, b: StateTrack) -> bool:
-    return all(np.array_equal(getattr(a, c), getattr(b, c), equal_nan=True) for c in COMPARED)
-
-
 def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) -> AdaptivePhysics:
-    vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(parts, True))})
-    return AdaptivePhysics(VehicleUkf(vehicle), network or random_network(), trust)
+    return AdaptivePhysics(VehicleUkf(vehicle(*parts)), network or random_network(), trust)
 
 
 @pytest.mark.parametrize("parts", [(), ("lag", "roll", "biases", "bank"), tuple(PhysicsParts.model_fields)])
@@ -58,7 +53,7 @@ def test_without_trust_it_is_physics_to_the_bit(parts, signals):
         for f in fields(StateTrack):
             if f.name not in ("name", "network_trust"):
                 np.testing.assert_array_equal(getattr(track, f.name), getattr(physics, f.name), err_msg=f.name)
-    assert not _same(run_estimator(trusted, signals), physics)
+    assert not same(run_estimator(trusted, signals), physics, COMPARED)
 
 
 def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none(signals):

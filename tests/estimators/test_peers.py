@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reference_car import on_axles, signals_at
 from scipy.integrate import solve_ivp
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.peers.single_track import single_track
 from pdhef_logtool.estimators.table import PEERS, all_names, make_estimator
-from pdhef_logtool.records.signals import Signals
 
 pytestmark = pytest.mark.slow
 
@@ -30,9 +30,7 @@ def linear_sedan() -> VehicleParameters:
     """Return the default sedan with the peak forces so high that its tyres are linear."""
     sedan = default_vehicle()
     car = single_track(sedan)
-    stiffness = (car.front_stiffness, car.rear_stiffness)
-    front, rear = (AxleTyre(cornering_stiffness_n_per_rad=c) for c in stiffness)
-    return sedan.model_copy(update={"tyres": Tyres(front=front, rear=rear), "friction": 2.0})
+    return on_axles(sedan, car.front_stiffness, car.rear_stiffness).model_copy(update={"friction": 2.0})
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +52,9 @@ def simulated():
     times = np.arange(0.0, SECONDS, STEP_S)
     vy, r = solve_ivp(rates, (0.0, SECONDS), [0.0, 0.0], t_eval=times, rtol=1e-9, atol=1e-12).y
     front, rear = forces(times, np.array([vy, r]))
-    stamps, missing = np.round(times * 1e9).astype(np.int64), np.full(len(times), np.nan)
-    inputs = steer(times), np.zeros_like(times), (front + rear) / car.mass, r, np.full(len(times), SPEED_M_S), missing
-    return Signals(stamps, stamps, *inputs, np.full((len(times), 4), np.nan)), np.arctan2(vy, SPEED_M_S)
+    sensed = {"steer_rad": steer(times), "ay_m_s2": (front + rear) / car.mass, "yaw_rate_rad_s": r}
+    signals = signals_at(np.round(times * 1e9).astype(np.int64), ax_m_s2=0.0, speed_m_s=SPEED_M_S, **sensed)
+    return signals, np.arctan2(vy, SPEED_M_S)
 
 
 @pytest.mark.parametrize("name", all_names(Car(default_vehicle()), PEERS))

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 import test_estimators as properties
 from made_models import random_network
-from reference_car import drive, keep, slalom, with_noise
+from physics_oracle import vehicle
+from reference_car import drive, keep, rough_drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Smoother
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.smoothed import BLOCK_S, SmoothedPhysics
 from pdhef_logtool.estimators.table import SPECS, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.signals import Signals
 
 pytestmark = pytest.mark.slow
 
@@ -26,18 +27,12 @@ BUNDLE = random_network(2)
 
 
 def smoother(block_s: float = ALL, *, trust: float = 1.0, parts: tuple[str, ...] = ("lag", "biases")):
-    vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(parts, True))})
-    return SmoothedPhysics(AdaptivePhysics(VehicleUkf(vehicle), BUNDLE, trust), block_s=block_s)
+    return SmoothedPhysics(AdaptivePhysics(VehicleUkf(vehicle(*parts)), BUNDLE, trust), block_s=block_s)
 
 
 def flat_smoother(*parts: str) -> SmoothedPhysics:
     """For the reference car, which does not roll, without network."""
-    update = {"roll_gradient_rad_per_m_s2": 0.0, "physics": PhysicsParts(**dict.fromkeys(parts, True))}
-    return SmoothedPhysics(AdaptivePhysics(VehicleUkf(VEHICLE.model_copy(update=update))))
-
-
-def times(signals: Signals) -> FloatArray:
-    return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+    return SmoothedPhysics(AdaptivePhysics(VehicleUkf(vehicle(*parts, roll_gradient_rad_per_m_s2=0.0))))
 
 
 def on_time(signals: Signals) -> Signals:
@@ -45,22 +40,16 @@ def on_time(signals: Signals) -> Signals:
     return replace(signals, ready_ns=signals.stamps_ns)
 
 
-# --- against another smoother ----------------------------------------------------------------------------------------
-
 # --- the estimator ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def rough():
-    """Noise, irregular stamps, missing samples, a gap that restarts the filter, messages late, a gyro that jumps."""
-    rng = np.random.default_rng(12)
-    s = with_noise(drive(slalom(0.035, 0.5), speed=22.0, step_s=rng.uniform(0.004, 0.022, 700)).signals, seed=6)
-    for column in (s.steer_rad, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s):
-        column[rng.random(len(s)) < 0.05] = np.nan
-    t = times(s)
+    """A rough drive with a gap that restarts the filter and a gyro that jumps."""
+    s = rough_drive(12, 700, 6)
+    t = (s.stamps_ns - s.stamps_ns[0]) * 1e-9
     s.yaw_rate_rad_s[(t > 5.0) & (t < 5.6)] += 0.5
-    ready = np.maximum.accumulate(s.stamps_ns + rng.integers(0, 45_000_000, len(s)))
-    return keep(replace(s, ready_ns=ready), (t < 3.0) | (t > 3.8))
+    return keep(s, (t < 3.0) | (t > 3.8))
 
 
 def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):

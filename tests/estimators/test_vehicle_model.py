@@ -8,29 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physics_oracle import ALL_PARTS, Oracle, names_of, parts, vehicle
-from reference_car import FRICTION
+from reference_car import FRICTION, on_axles
 
 from pdhef_logtool.car import nominal_model
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.vehicle_model import (
-    AX_BIAS,
-    LANES,
-    NOMINAL,
-    PLACES,
-    VX,
-    VY,
-    WIDTH,
-    YAW_RATE,
-    Layout,
-    advance,
-    layout_of,
-    physics_parameters,
-    push,
-    read_ay,
-    step_count,
-)
+from pdhef_logtool.estimators import vehicle_model as model
 from pdhef_logtool.estimators.vehicle_ukf import HeldInputs
 
 pytestmark = pytest.mark.slow
@@ -54,13 +38,13 @@ def state_of(oracle: Oracle, steer: float, ax: float, mu: float, **changes: floa
     return x if oracle.has.lag else oracle.settled(x, steer, ax, mu)
 
 
-def models(v: VehicleParameters) -> tuple[Layout, Any, Any]:
-    return layout_of(v), model_parameters(v), physics_parameters(v)
+def models(v: VehicleParameters) -> tuple[model.Layout, Any, Any]:
+    return model.layout_of(v), model_parameters(v), model.physics_parameters(v)
 
 
-def block_of(layout: Layout, states: np.ndarray) -> np.ndarray:
+def block_of(layout: model.Layout, states: np.ndarray) -> np.ndarray:
     """Return a block [PLACES, WIDTH] with states [k, n] in its first columns, and the first state in the rest."""
-    block = np.zeros((PLACES, WIDTH))
+    block = np.zeros((model.PLACES, model.WIDTH))
     block[layout.places] = states[0][:, None]
     block[layout.places, : len(states)] = states.T
     return block
@@ -71,17 +55,17 @@ def moved(v: VehicleParameters, x: np.ndarray, over: HeldInputs, dt: float) -> n
     layout, p, f = models(v)
     x = np.append(x, np.zeros(layout.size - len(x)))
     block = block_of(layout, x[None])
-    advance(block.ravel(), LANES, over, dt, layout, p, f)
+    model.advance(block.ravel(), model.LANES, over, dt, layout, p, f)
     states = block[layout.places]
-    np.testing.assert_array_equal(states[:, :LANES], np.tile(states[:, :1], LANES))
-    np.testing.assert_array_equal(states[:, LANES], x)
+    np.testing.assert_array_equal(states[:, : model.LANES], np.tile(states[:, :1], model.LANES))
+    np.testing.assert_array_equal(states[:, model.LANES], x)
     return states[:, 0]
 
 
 def ay_of(v: VehicleParameters, x: np.ndarray, steer: float) -> float:
     layout, p, f = models(v)
-    reading = np.zeros(WIDTH)
-    read_ay(block_of(layout, x[None]).ravel(), 1, steer, FRICTION, 0.0, layout, p, f, reading)
+    reading = np.zeros(model.WIDTH)
+    model.read_ay(block_of(layout, x[None]).ravel(), 1, steer, FRICTION, 0.0, layout, p, f, reading)
     return float(reading[0])
 
 
@@ -90,12 +74,12 @@ def ay_of(v: VehicleParameters, x: np.ndarray, steer: float) -> float:
 SEDAN = default_vehicle().model_copy(
     update={"imu_position_m": (0.4, -0.3, 0.0), "roll_gradient_rad_per_m_s2": 0.009, "low_speed_blend_m_s": 4.0}
 )
-STIFF = AxleTyre(cornering_stiffness_n_per_rad=105_000.0), AxleTyre(cornering_stiffness_n_per_rad=96_000.0)
 ONE_FRICTION = (
     AxleTyre(B=11.1, C=1.05, D_n=7991.0, E=-0.51, reference_friction=0.85),
     AxleTyre(B=10.6, C=1.65, D_n=5708.0, E=0.34, reference_friction=1.0),
 )
-CARS = [SEDAN, *(SEDAN.model_copy(update={"tyres": Tyres(front=a, rear=b)}) for a, b in (STIFF, ONE_FRICTION))]
+OTHER = SEDAN.model_copy(update={"tyres": Tyres(front=ONE_FRICTION[0], rear=ONE_FRICTION[1])})
+CARS = [SEDAN, on_axles(SEDAN, 105_000.0, 96_000.0), OTHER]
 
 
 @pytest.mark.parametrize("car", CARS, ids=["magic formula", "cornering stiffness", "formula of one friction"])
@@ -109,29 +93,34 @@ CARS = [SEDAN, *(SEDAN.model_copy(update={"tyres": Tyres(front=a, rear=b)}) for 
 )
 def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(car, seed, mu, dt, steer, fast):
     """Also with a residual, at any speed and with wheels across the car."""
-    p, f, rng = model_parameters(car, roll_correction=True), physics_parameters(car), np.random.default_rng(seed)
-    vx = rng.uniform(0.0, 60.0 if fast else 6.0, LANES)
-    states = np.column_stack([vx, *(rng.normal(0.0, s, LANES) for s in (2.0, 0.7, 0.3))])
+    p, f, rng = model_parameters(car, roll_correction=True), model.physics_parameters(car), np.random.default_rng(seed)
+    vx = rng.uniform(0.0, 60.0 if fast else 6.0, model.LANES)
+    states = np.column_stack([vx, *(rng.normal(0.0, s, model.LANES) for s in (2.0, 0.7, 0.3))])
     ax, rate = rng.normal(0.0, 4.0), (rng.normal(), rng.normal())
     if nominal_model.substeps(vx.min(), dt, mu, p) > nominal_model.substeps(vx[0], dt, mu, p):
         dt = 1e-3  # the first state determines the substeps: slow states beside it would grow without bound
     n, share = nominal_model.substeps(vx[0], dt, mu, p), nominal_model.dynamic_share(vx[0], p)
-    block, reading = block_of(NOMINAL, states), np.zeros(WIDTH)
-    read_ay(block.ravel(), LANES, steer, mu, rate[0], NOMINAL, p, f, reading)
-    push(block.ravel(), LANES, vx[0], rate, 0.5 * dt, p)
-    advance(block.ravel(), LANES, HeldInputs(steer, ax, True, mu), dt, NOMINAL, p, f)
-    push(block.ravel(), LANES, vx[0], rate, 0.5 * dt, p)
-    want, want_reading = states.copy(), np.zeros(LANES)
+    block, reading = block_of(model.NOMINAL, states), np.zeros(model.WIDTH)
+    model.read_ay(block.ravel(), model.LANES, steer, mu, rate[0], model.NOMINAL, p, f, reading)
+    model.push(block.ravel(), model.LANES, vx[0], rate, 0.5 * dt, p)
+    model.advance(block.ravel(), model.LANES, HeldInputs(steer, ax, True, mu), dt, model.NOMINAL, p, f)
+    model.push(block.ravel(), model.LANES, vx[0], rate, 0.5 * dt, p)
+    want, want_reading = states.copy(), np.zeros(model.LANES)
     for i, state in enumerate(states):
         half = 0.5 * share * dt * np.array(rate)
-        end = nominal_model.rk4_steps(state[0], *(state[1:3] + half), steer, ax - state[AX_BIAS], mu, dt, n, p)
+        end = nominal_model.rk4_steps(state[0], *(state[1:3] + half), steer, ax - state[model.AX_BIAS], mu, dt, n, p)
         want[i, :3] = end[0], *(end[1:] + half)
         w = nominal_model.dynamic_share(state[0], p)
         ay = nominal_model.planar_lateral_acceleration(*state[:3], steer, mu, p) + w * rate[0]
         _, yaw = accelerations(*state[:3], steer, mu, p)
         want_reading[i] = (1.0 + p.ay_roll_gain) * ay + w * yaw * p.imu_x_m - state[2] ** 2 * p.imu_y_m
-    np.testing.assert_allclose(reading[:LANES], want_reading, rtol=TOLERANCE, atol=TOLERANCE)
-    np.testing.assert_allclose(block[[VX, VY, YAW_RATE, AX_BIAS], :LANES].T, want, rtol=TOLERANCE, atol=TOLERANCE)
+    np.testing.assert_allclose(reading[: model.LANES], want_reading, rtol=TOLERANCE, atol=TOLERANCE)
+    np.testing.assert_allclose(
+        block[[model.VX, model.VY, model.YAW_RATE, model.AX_BIAS], : model.LANES].T,
+        want,
+        rtol=TOLERANCE,
+        atol=TOLERANCE,
+    )
 
 
 # --- with axle forces and parts --------------------------------------------------------------------------------------
@@ -153,7 +142,7 @@ def test_a_step_is_that_of_the_equations_to_the_second_order(names, ax):
     late = np.array(errors)
     assert (late[1] < 2.5e-3).all()
     assert (np.max(late[:-1], axis=1) / np.max(late[1:], axis=1) > 3.4).all()
-    end, count = x, step_count(x[VX], whole_s, mu, *models(v))
+    end, count = x, model.step_count(x[model.VX], whole_s, mu, *models(v))
     for _ in range(count):
         end = moved(v, end, HeldInputs(steer, ax, True, mu), whole_s / count)
     np.testing.assert_allclose(moved(v, x, HeldInputs(steer, ax, True, mu), whole_s), end, atol=5e-3)

@@ -6,20 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import reference_car as car
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from physics_oracle import ALL_PARTS, G, Oracle, parts, vehicle
-from reference_car import (
-    FRICTION,
-    REAR_M,
-    Drive,
-    drive,
-    forces,
-    rolling_drive,
-    runge_kutta,
-    slalom,
-    tanh_tyre,
-    with_noise,
-)
 from scipy.stats import multivariate_normal
 
 from pdhef_logtool.car.car import Car
@@ -67,9 +56,9 @@ Sensor = Callable[[np.ndarray, float, float], float]
 def nominal_models() -> tuple[VehicleUkf, Motion, Sensor]:
     def motion(x, _, dt, u):
         steer, ax, mu = u
-        return np.append(runge_kutta(x[:3], steer, ax - x[3], mu, dt), x[3])
+        return np.append(car.runge_kutta(x[:3], steer, ax - x[3], mu, dt), x[3])
 
-    return UKF, motion, lambda x, steer, mu: forces(x[0], x[1], x[2], steer, mu)[0]
+    return UKF, motion, lambda x, steer, mu: car.forces(x[0], x[1], x[2], steer, mu)[0]
 
 
 def force_models(*names: str) -> tuple[VehicleUkf, Motion, Sensor]:
@@ -156,8 +145,8 @@ def irregular():
     """Drive to 0.6 g on irregular stamps, with missing samples and a change of friction."""
     rng = np.random.default_rng(7)
     dt = rng.uniform(0.002, 0.03, 400)
-    made = drive(lambda t: 0.045 * np.sin(2.4 * t), speed=24.0, step_s=dt, acceleration=lambda t: np.cos(0.7 * t))
-    s = with_noise(made.signals, seed=3)
+    made = car.drive(lambda t: 0.045 * np.sin(2.4 * t), speed=24.0, step_s=dt, acceleration=lambda t: np.cos(0.7 * t))
+    s = car.with_noise(made.signals, seed=3)
     s.ay_m_s2[rng.random(len(s)) < 0.1] = np.nan
     s.yaw_rate_rad_s[1:][rng.random(len(s) - 1) < 0.1] = np.nan
     s.ay_m_s2[77::50] = s.yaw_rate_rad_s[77::50] = np.nan
@@ -181,7 +170,7 @@ def test_it_is_the_unscented_kalman_filter_of_filterpy(made, irregular):
     links, _ = estimator.linked_steps(irregular, None, rate, extra_r)
     steps = links.posterior
     assert steps.x[0, :3] == pytest.approx(
-        [irregular.speed_m_s[0], *(irregular.yaw_rate_rad_s[0] * np.array([REAR_M, 1]))]
+        [irregular.speed_m_s[0], *(irregular.yaw_rate_rad_s[0] * np.array([car.REAR_M, 1]))]
     )
     want, free = filterpy_run(irregular, estimator, motion, sensor, rate, extra_r)
     assert np.nanmax(want["nis"]) < 36.0, "the drive must stay inside the gate, which filterpy does not have"
@@ -201,8 +190,8 @@ def test_it_is_the_unscented_kalman_filter_of_filterpy(made, irregular):
 
 @pytest.fixture(scope="module")
 def good():
-    made = drive(slalom(0.03, 0.5), 8.0)
-    return replace(made, signals=with_noise(made.signals, 4))
+    made = car.drive(car.slalom(0.03, 0.5), 8.0)
+    return replace(made, signals=car.with_noise(made.signals, 4))
 
 
 # --- gate ------------------------------------------------------------------------------------------------------------
@@ -245,17 +234,17 @@ def test_the_gate_holds_for_a_fifth_of_a_second_and_never_longer(column, offset,
 # --- standstill ------------------------------------------------------------------------------------------------------
 
 
-def stop_and_go(steer: float = 0.15) -> Drive:
+def stop_and_go(steer: float = 0.15) -> car.Drive:
     """Drive at 6 m/s, stand from 5 to 9 s with the wheels turned, drive on."""
 
     def speed(t):
         return np.clip(6.0 - 2.0 * np.clip(t - 2.0, 0, None), 0.0, None) + np.clip(1.5 * (t - 9.0), 0.0, 6.0)
 
-    return rolling_drive(speed, lambda t: np.full_like(t, steer), 14.0)
+    return car.rolling_drive(speed, lambda t: np.full_like(t, steer), 14.0)
 
 
 def still_noise(signals: Signals, still: np.ndarray) -> Signals:
-    noisy = with_noise(signals, 8)
+    noisy = car.with_noise(signals, 8)
     wheels = np.where(still & np.isfinite(noisy.speed_m_s), 0.0, noisy.speed_m_s)  # wheel pulses: exactly zero
     return replace(noisy, speed_m_s=wheels)
 
@@ -293,7 +282,7 @@ def test_esp_suite_ignores_the_speed_after_the_start(good):
 
 
 def test_friction_comes_from_the_log_where_it_is_known():
-    made = drive(slalom(0.03, 0.5), 6.0, mu=0.4)
+    made = car.drive(car.slalom(0.03, 0.5), 6.0, mu=0.4)
     known = replace(made.signals, friction=np.full(len(made.signals), 0.4))
     settled = made.time_s > 1
 
@@ -306,7 +295,7 @@ def test_friction_comes_from_the_log_where_it_is_known():
     sparse = edited(known, "friction", np.arange(len(known)) % 100 != 0, np.nan)  # the last value is kept
     assert error(sparse) < 0.02 * DEGREE
     assert (run_estimator(UKF, sparse).friction[1:] == 0.4).all()
-    assert (run_estimator(UKF, made.signals).friction == FRICTION).all()
+    assert (run_estimator(UKF, made.signals).friction == car.FRICTION).all()
 
 
 # --- divergence and consistency --------------------------------------------------------------------------------------
@@ -314,15 +303,15 @@ def test_friction_comes_from_the_log_where_it_is_known():
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.03, 0.05])
 def test_a_good_drive_is_not_flagged(amplitude):
-    made = drive(slalom(amplitude, 0.5), 10.0, tyre=tanh_tyre)
-    track = run_estimator(UKF, with_noise(made.signals, 6))
+    made = car.drive(car.slalom(amplitude, 0.5), 10.0, tyre=car.tanh_tyre)
+    track = run_estimator(UKF, car.with_noise(made.signals, 6))
     assert not track.diverged.any()
 
 
 @pytest.mark.parametrize("column", ["steer_rad", "yaw_rate_rad_s"])
 def test_a_hopelessly_wrong_model_is_flagged(column):
-    made = drive(slalom(0.05, 0.5), 10.0)
-    signals = with_noise(made.signals, 6)
+    made = car.drive(car.slalom(0.05, 0.5), 10.0)
+    signals = car.with_noise(made.signals, 6)
     track = run_estimator(UKF, replace(signals, **{column: -getattr(signals, column)}))
     assert track.diverged[300:].mean() > 0.6
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from pdhef_logtool.evaluation.statistics import decided, dependence, deviate, holm, paired_change, quantile
+from studies.comparing import ratios_of_days, shares_of_days
 
 
 def test_bounds_are_those_of_resampled_medians():
@@ -51,31 +52,16 @@ def test_an_interval_decides(interval, bound, least, outcome):
     assert decided(*interval, bound, least) == outcome
 
 
-def _of_days(rng: np.random.Generator, days: int, each: int, shared: float) -> tuple[np.ndarray, dict[str, list[int]]]:
-    """Return log ratios without a change, with this share of their variance between days."""
-    day = np.repeat(np.arange(days), each)
-    ratios = math.sqrt(1.0 - shared) * rng.normal(size=days * each) + math.sqrt(shared) * rng.normal(size=days)[day]
-    return 0.2 * ratios, {"day": day.tolist(), "car": [0] * len(day)}
-
-
 @pytest.mark.parametrize(("shared", "each"), [(0.1, 20), (0.9, 10)])
 def test_equal_runs_with_drives_of_six_days_are_seldom_called_worse(shared, each):
-    rng = np.random.default_rng(11)
-    alone = together = 0
-    for _ in range(2000):
-        ratios, factors = _of_days(rng, 6, each, shared)
-        alone += paired_change(ratios).verdict() == "worse"
-        together += paired_change(ratios, None, factors).verdict() == "worse"
-    assert together <= 140  # of 2000, nominal 100
-    assert alone >= 200  # the result of treating the drives as independent
+    alone, together = shares_of_days(shared, 2000, 11, each)
+    assert together <= 0.07  # nominal 0.05
+    assert alone >= 0.10  # the result of treating the drives as independent
 
 
 def test_the_design_effect_is_that_of_the_simulated_correlation():
     rng = np.random.default_rng(12)
-    effects = []
-    for _ in range(200):
-        ratios, factors = _of_days(rng, 20, 10, 0.3)
-        effects.append(dependence(ratios, factors).design_effect)
+    effects = [dependence(*ratios_of_days(rng, 20, 10, 0.3)).design_effect for _ in range(200)]
     assert np.mean(effects) == pytest.approx(1.0 + 0.3 * 9, abs=0.25)
     assert deviate(0.975, 1e15) == pytest.approx(deviate(0.975, math.inf))  # in no time
 

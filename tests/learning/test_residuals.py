@@ -13,17 +13,8 @@ from residual_car import truth_of, weaving
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter
+from pdhef_logtool.learning.network import train_command as training
 from pdhef_logtool.learning.network.residuals import ResidualRows, residual_rows
-from pdhef_logtool.learning.network.train_command import (
-    LEAD_STEPS,
-    FeatureSequence,
-    Recipe,
-    gap_free_runs,
-    make_recipe,
-    normalisation_of,
-    steering_offset,
-    weights_of,
-)
 from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -117,19 +108,10 @@ def test_an_offset_of_the_steering_angle_is_no_residual():
     off = made.signals.steer_rad + 0.002
     rows = residual_rows(*oracle_window(made, steer_rad=off), VehicleUkf(oracle.as_vehicle()), period_s=0.01)
     use = rows.weight > 0
-    arrays = ResidualRows(
-        rows.stamps_ns[use],
-        rows.features[use].astype(np.float32),
-        rows.targets[use].astype(np.float32),
-        rows.step_s[use],
-        rows.weight[use].astype(np.float32),
-        rows.segment[use],
-        rows.truth_velocity[use].astype(np.float32),
-        rows.chosen[use],
-    )
+    arrays = ResidualRows(**{name: getattr(rows, name)[use] for name in ResidualRows.__slots__})
     mean = (arrays.targets / arrays.step_s[:, None]).mean(axis=0)
     assert np.abs(mean).min() > 0.05
-    assert np.abs(mean - steering_offset(arrays, oracle.as_vehicle())).max() < 0.2 * np.abs(mean).max()
+    assert np.abs(mean - training.steering_offset(arrays, oracle.as_vehicle())).max() < 0.2 * np.abs(mean).max()
 
 
 def arrays(count: int = 200, **changes: Any) -> ResidualRows:
@@ -147,24 +129,24 @@ def arrays(count: int = 200, **changes: Any) -> ResidualRows:
     return ResidualRows(**{**columns, **changes})
 
 
-def sequence(count: int, value: float = 1.0) -> FeatureSequence:
+def sequence(count: int, value: float = 1.0) -> training.FeatureSequence:
     features = np.zeros((count, len(FEATURES)))
     features[:, 0] = np.arange(count) % 5
     features[:, 1] = value
-    return FeatureSequence(features, np.tile([value, -2.0 * value], (count, 1)), np.ones(count))
+    return training.FeatureSequence(features, np.tile([value, -2.0 * value], (count, 1)), np.ones(count))
 
 
 def test_normalisation_is_by_weight_and_keeps_the_targets_zero():
     one = sequence(4, 3.0)
     one.weight[3] = 0.0
-    found = normalisation_of([one, sequence(1, 1.0)], FEATURES[:2])
+    found = training.normalisation_of([one, sequence(1, 1.0)], FEATURES[:2])
     assert found.feature_mean == pytest.approx(((0 + 1 + 2 + 0) / 4, (3 + 3 + 3 + 1) / 4))
     assert found.feature_std == pytest.approx((np.std([0, 1, 2, 0]), np.std([3, 3, 3, 1])))
     assert found.target_std == pytest.approx((math.sqrt(28 / 4), math.sqrt(4 * 28 / 4)))
-    flat = normalisation_of([sequence(3, 0.0)], FEATURES[1:2])
+    flat = training.normalisation_of([sequence(3, 0.0)], FEATURES[1:2])
     assert (flat.feature_std, flat.target_std) == ((1e-6,), (1e-6, 1e-6))
     with pytest.raises(ModelError, match="none"):
-        normalisation_of([replace(one, weight=np.zeros(4))], FEATURES[:2])
+        training.normalisation_of([replace(one, weight=np.zeros(4))], FEATURES[:2])
 
 
 def test_runs_end_at_new_segments_and_short_or_worthless_ones_are_left_out():
@@ -172,20 +154,20 @@ def test_runs_end_at_new_segments_and_short_or_worthless_ones_are_left_out():
     weight = np.ones(200, dtype=np.float32)
     weight[150:] = 0.0
     drive = arrays(segment=segment, weight=weight)
-    assert list(gap_free_runs(drive)) == [slice(0, 50), slice(99, 150)]
+    assert list(training.gap_free_runs(drive)) == [slice(0, 50), slice(99, 150)]
     drive.features[120, 3] = np.nan
-    assert list(gap_free_runs(drive)) == [slice(0, 50)]
+    assert list(training.gap_free_runs(drive)) == [slice(0, 50)]
 
 
 def test_a_recipe_is_the_papers_or_methods_with_the_callers_seed_and_epochs():
-    own, paper = (make_recipe(paper=p, seed=5, epochs=None, device="cpu") for p in (False, True))
-    assert own == Recipe(seed=5) and (paper.hidden, paper.seed, paper.epochs) == (128, 5, 200)
-    assert make_recipe(paper=False, seed=0, epochs=1, device="cpu").epochs == 1
+    own, paper = (training.make_recipe(paper=p, seed=5, epochs=None, device="cpu") for p in (False, True))
+    assert own == training.Recipe(seed=5) and (paper.hidden, paper.seed, paper.epochs) == (128, 5, 200)
+    assert training.make_recipe(paper=False, seed=0, epochs=1, device="cpu").epochs == 1
     with pytest.raises(UsageError, match="epoch"):
-        make_recipe(paper=False, seed=0, epochs=0, device="cpu")
+        training.make_recipe(paper=False, seed=0, epochs=0, device="cpu")
     if not torch.cuda.is_available():
         with pytest.raises(UsageError, match="--device"):
-            make_recipe(paper=False, seed=0, epochs=None, device="cuda")
+            training.make_recipe(paper=False, seed=0, epochs=None, device="cuda")
 
 
 def test_what_is_not_chosen_teaches_nothing_and_only_what_leads_to_the_chosen_is_run():
@@ -195,8 +177,10 @@ def test_what_is_not_chosen_teaches_nothing_and_only_what_leads_to_the_chosen_is
     weight = np.ones(2000, dtype=np.float32)
     weight[1500] = 0.0  # chosen, but of no use
     rows = arrays(2000, chosen=chosen, weight=weight)
-    (run,) = gap_free_runs(rows)
-    assert run == slice(700 - LEAD_STEPS, 741)
-    assert weights_of(rows, run).sum() == 2.0
+    (run,) = training.gap_free_runs(rows)
+    assert run == slice(700 - training.LEAD_STEPS, 741)
+    assert training.weights_of(rows, run).sum() == 2.0
     cut = replace(rows, segment=np.where(np.arange(2000) < 720, 0, 1))
-    assert list(gap_free_runs(cut)) == [slice(700 - LEAD_STEPS, 720)], "what is left behind the cut is too short"
+    assert list(training.gap_free_runs(cut)) == [slice(700 - training.LEAD_STEPS, 720)], (
+        "what is left behind the cut is too short"
+    )

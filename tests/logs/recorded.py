@@ -6,13 +6,17 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.reader import make_reader
 from mcap.summary import Summary
 
 from pdhef_logtool.logs.container import ChannelRecord
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter
+from pdhef_logtool.records.signals import FloatArray
+
+T0 = 1_700_000_000_000_000_000
 
 
 def numeric_paths(log: DriveLog, topic: str) -> list[str]:
@@ -48,7 +52,7 @@ def attribute(message: Any, path: str) -> Any:
 
 def counts_of(log: DriveLog) -> dict[str, int]:
     """Number of messages of each topic that are read."""
-    return {topic: len(columns) for topic, columns in log.read({}, stamps=[t.name for t in log.topics]).items()}
+    return {topic: len(columns) for topic, columns in log.read({t.name: () for t in log.topics}).items()}
 
 
 def fields_of(path: Path, topic: str, *fields: str) -> dict[str, Any]:
@@ -80,18 +84,37 @@ def raw_channel(writer: McapLogWriter, topic: str, name: str = "", text: bytes =
     return writer.add_channel(ChannelRecord(-1, topic, message, name, "ros2msg" if name else "", text))
 
 
-def write_vectors(folder: Path, topic: str, count: int, storage: str = "sqlite3", compression: str = "") -> Path:
-    """Write a rosbag2 folder of vectors x = 0, 0.25, ... by the writer of another project."""
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+def write_imu(path: Path, values: FloatArray, chunk: int = 10**9) -> Path:
+    """Write an MCAP of an IMU with yaw rates at 100 Hz; a chunk has up to ``chunk`` messages."""
+    stamps = T0 + np.arange(len(values)) * 10_000_000
+    with McapLogWriter(path) as writer:
+        writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
+        for at in range(0, len(values), chunk):
+            part = slice(at, at + chunk)
+            writer.write([Columns("/imu", stamps[part], stamps[part], {"angular_velocity.z": values[part]})])
+    return path
+
+
+def write_vectors(path: Path, topic: str, count: int, storage: str = "sqlite3", compression: str = "") -> Path:
+    """Write a rosbag2 folder, or a ROS 1 ``bag``, of vectors x = 0, 0.25, ... by the writer of another project."""
+    from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
-    store, name = get_typestore(Stores.ROS2_HUMBLE), "geometry_msgs/msg/Vector3"
-    writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()])
-    if compression:
-        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    is_bag, name = storage == "bag", "geometry_msgs/msg/Vector3"
+    store = get_typestore(Stores.ROS1_NOETIC if is_bag else Stores.ROS2_HUMBLE)
+    serialize = store.serialize_ros1 if is_bag else store.serialize_cdr
+    writer: Any = (
+        rosbag1.Writer(path)
+        if is_bag
+        else rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
+    )
+    if compression and is_bag:
+        writer.set_compression(writer.CompressionFormat[compression])
+    elif compression:
+        writer.set_compression(rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD)
     with writer:
         connection = writer.add_connection(topic, name, typestore=store)
         for i in range(count):
             message = store.types[name](x=0.25 * i, y=0.0, z=0.0)
-            writer.write(connection, 1_700_000_000_000_000_000 + i, store.serialize_cdr(message, name))
-    return folder
+            writer.write(connection, T0 + i, serialize(message, name))
+    return path

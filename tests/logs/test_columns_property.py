@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
-from recorded import attribute, raw_channel
+from recorded import T0, attribute, raw_channel
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pdhef_logtool.logs.container import RawMessage, block_of
@@ -23,7 +23,6 @@ from pdhef_logtool.logs.writer import McapLogWriter
 
 pytestmark = pytest.mark.slow
 
-T0 = 1_700_000_000_000_000_000
 SEPARATOR = "\n" + "=" * 80 + "\nMSG: "
 NUMBERS = {
     "bool": np.bool_, "int8": np.int8, "uint8": np.uint8, "int16": np.int16, "uint16": np.uint16,

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType
-from recorded import counts_of, numeric_paths, summary_of, write_vectors
+from recorded import T0, counts_of, numeric_paths, summary_of, write_imu, write_vectors
 
-from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
@@ -22,19 +21,11 @@ from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, PdhefError
 from tests.command_line import called
 from tests.mcap_files import mcap_writer
 
-T0 = 1_700_000_000_000_000_000
 N = 400
 
 
 def _mcap(folder: Path) -> bytes:
-    path = folder / "good.mcap"
-    stamps = T0 + np.arange(N) * 10_000_000
-    with McapLogWriter(path) as writer:
-        writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
-        for at in range(0, N, 100):  # a chunk a call
-            cut = slice(at, at + 100)
-            writer.write([Columns("/imu", stamps[cut], stamps[cut], {"angular_velocity.z": np.arange(N)[cut] * 0.5})])
-    return path.read_bytes()
+    return write_imu(folder / "good.mcap", np.arange(N) * 0.5, chunk=100).read_bytes()
 
 
 def _json_log(folder: Path, **options: Any) -> Path:
@@ -55,20 +46,7 @@ def _mcap_of_a_killed_recorder(folder: Path) -> bytes:
 
 
 def _bag(folder: Path) -> bytes:
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    name = "geometry_msgs/msg/Vector3"
-    path = folder / "good.bag"
-    writer = Writer(path)
-    writer.set_compression(writer.CompressionFormat.LZ4)
-    with writer:
-        connection = writer.add_connection("/v", name, typestore=store)
-        for i in range(N):
-            message = store.types[name](x=float(i), y=0.0, z=0.0)
-            writer.write(connection, T0 + i, store.serialize_ros1(message, name))
-    return path.read_bytes()
+    return write_vectors(folder / "good.bag", "/v", N, "bag", "LZ4").read_bytes()
 
 
 def _database(folder: Path) -> bytes:
@@ -233,7 +211,7 @@ def test_a_sound_log_whose_data_has_a_crc_is_covered_by_it(tmp_path, chunked):
     assert called("inspect", path).returncode == EXIT_OK
 
 
-def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp_path):
+def test_a_log_on_a_server_says_what_was_not_verified(tmp_path):
     pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
     from tests.counting_server import serving
 
@@ -247,13 +225,11 @@ def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp
             writer.add_message(channels[i // N], T0 + i * 10_000_000, b'{"a": %d}' % i, T0 + i * 10_000_000)
     with serving(**{"log.mcap": path.read_bytes()}) as server:
         place = RemotePlace(server.place("log.mcap"))
-        with closing(open_log(place, wanted=Wanted(frozenset({"/a"})))) as log:
+        with closing(open_log(place)) as log:
             assert [(loss.kind, loss.severity) for loss in log.lost] == [("unverified", "note")]
-            assert log.index is not None
+            assert log.messages is not None
+            assert log.messages.is_indexed
             assert len(log.read({"/a": ["a"]})["/a"]) == N
-        with closing(open_log(place)) as log:  # all of it
-            log.read({"/a": ["a"], "/b": ["a"]})
-            assert log.lost == ()
 
 
 def test_damage_of_a_summary_is_a_note(tmp_path):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded import fields_of
+from recorded import T0, fields_of
 from rosbags.typesys import Stores, get_typestore
 
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
@@ -111,9 +111,6 @@ def test_an_installed_ros_is_looked_in_and_named(tmp_path, variable, monkeypatch
     assert f"read by {folder / 'DriverInput.msg'} of this machine, as the log does not define its type" in note.what
 
 
-T0 = 1_700_000_000_000_000_000
-
-
 def _write_raw(path: Path, payloads: Sequence[bytes], encoding: str, name: str, schema: str, text: str) -> None:
     with McapLogWriter(path, profile="") as writer:
         channel = writer.add_channel(ChannelRecord(-1, "/t", encoding, name, schema, text.encode()))
@@ -148,9 +145,10 @@ def test_json_times_are_nanoseconds_and_missing_ones_are_marked(tmp_path):
 
 def test_places_that_a_json_schema_leaves_open_are_found_in_the_messages(tmp_path):
     messages = [{"m": {"v": [1, 2]}}, {"m": {"v": [3, 4]}}]
-    read = _read_json(tmp_path / "x.mcap", messages, {"type": "object"}, ["m.v", "m.v[1]"])
-    np.testing.assert_array_equal(read["m.v"], [[1, 2], [3, 4]])
-    np.testing.assert_array_equal(read["m.v[1]"], [2, 4])
+    for schema in ({"type": "object"}, {"properties": {"m": {"properties": {"v": {"type": "array"}}}}}):
+        read = _read_json(tmp_path / "x.mcap", messages, schema, ["m.v", "m.v[1]"])
+        np.testing.assert_array_equal(read["m.v"], [[1, 2], [3, 4]])
+        np.testing.assert_array_equal(read["m.v[1]"], [2, 4])
 
 
 def test_a_json_message_that_is_no_json_is_counted(tmp_path):

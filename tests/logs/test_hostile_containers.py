@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType
-from recorded import counts_of
+from recorded import T0, counts_of
 
 from pdhef_logtool.logs.compression import decompress, decompress_message
 from pdhef_logtool.logs.container import SpanDamageError
@@ -25,7 +25,6 @@ from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log
 from tests.mcap_files import mcap_writer
 
-T0 = 1_700_000_000_000_000_000
 N = 300
 _MAGIC = b"\x89MCAP0\r\n"
 
@@ -80,15 +79,17 @@ def test_a_flipped_bit_in_a_chunk_without_indexes_is_a_loss_that_names_it(tmp_pa
 
 
 @pytest.mark.parametrize(
-    "place", ["channel of an index", "kind of an index", "size", "huge size", "times of a chunk", "kind of a chunk"]
+    "place",
+    ["channel", "channel, no summary", "kind of an index", "size", "huge size", "times of a chunk", "kind of a chunk"],
 )
 def test_messages_that_an_index_or_a_header_hides_are_read_or_lost(tmp_path, place):
     path = _write(tmp_path / "a.mcap")
     data = bytearray(path.read_bytes())
     index = [at for op, at, _ in _records(data) if op == 7][2]
     chunk = [at for op, at, _ in _records(data) if op == 6][1]
-    if place == "channel of an index":
+    if place.startswith("channel"):
         struct.pack_into("<H", data, index + 9, 1 + data[index + 9] % 2)
+        data[-9] ^= "no summary" in place
     elif place == "kind of an index":
         data[index] = 0x87
     elif "size" in place:
@@ -198,10 +199,11 @@ def test_a_log_that_takes_too_long_loses_its_rest(tmp_path, monkeypatch):
             return load(span, want)
 
         monkeypatch.setattr(container, "load", slow)
-        log.read({}, stamps=[t.name for t in log.topics])
-        (loss,) = log.lost
-        assert (loss.kind, loss.count) == ("over-budget", sum(sum(s.counts.values()) for s in container.spans[3:]))
-        assert "--set budget" in loss.what
+        log.read({t.name: () for t in log.topics})
+        assert {loss.kind for loss in log.lost} == {"over-budget"}
+        assert sum(loss.count or 0 for loss in log.lost) == sum(sum(s.counts.values()) for s in container.spans[3:])
+        assert all("--set budget" in loss.what for loss in log.lost)
+        assert sum(topic.messages for topic in log.topics) == 2 * N
 
 
 @pytest.mark.parametrize("chunked", [True, False])

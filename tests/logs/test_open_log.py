@@ -16,7 +16,7 @@ import pytest
 import zstandard
 from mcap.records import Message, Statistics
 from mcap.stream_reader import StreamReader
-from recorded import write_vectors
+from recorded import T0, write_imu, write_vectors
 
 from pdhef_logtool import Car, inspect_log, load_mapping, read_drive
 from pdhef_logtool.logs import formats, mcap_log
@@ -32,16 +32,7 @@ from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
 from studies import mcap_logs
 
-T0 = 1_700_000_000_000_000_000
 VALUES = np.arange(40) * 0.25
-
-
-def _mcap(path: Path, values: np.ndarray = VALUES, start_ns: int = T0) -> Path:
-    stamps = start_ns + np.arange(len(values)) * 10_000_000
-    with McapLogWriter(path) as writer:
-        writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
-        writer.write([Columns("/imu", stamps, stamps, {"angular_velocity.z": values})])
-    return path
 
 
 def _values(path: Path, topic: str, field: str) -> np.ndarray:
@@ -82,8 +73,8 @@ def test_missing_paths_folders_without_one_log_and_other_databases_are_refused(t
         open_log(tmp_path / "missing.mcap")
     with pytest.raises(LogError, match="folder without a log"):
         open_log(tmp_path)
-    _mcap(tmp_path / "a.mcap")
-    _mcap(tmp_path / "b.mcap")
+    write_imu(tmp_path / "a.mcap", VALUES)
+    write_imu(tmp_path / "b.mcap", VALUES)
     with pytest.raises(LogError, match="2 logs"):
         open_log(tmp_path)
     with sqlite3.connect(tmp_path / "notes.db3") as db:
@@ -104,7 +95,7 @@ def test_rosbag2_folders_of_another_writer_read_right(tmp_path, storage, compres
 
 @pytest.mark.parametrize("name", ["a.mcap.zstd", "a.mcap.zst"])
 def test_a_compressed_file_opens_and_a_cut_one_gives_its_beginning(tmp_path, name):
-    plain = _mcap(tmp_path / "a.mcap", np.random.default_rng(0).normal(size=20_000))
+    plain = write_imu(tmp_path / "a.mcap", np.random.default_rng(0).normal(size=20_000))
     compressed = zstandard.ZstdCompressor().compress(plain.read_bytes())
     path = tmp_path / name
     path.write_bytes(compressed)

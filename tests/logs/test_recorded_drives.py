@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import CompressionType
-from recorded import attribute, counts_of, decoded_by_rosbags, messages_of, numeric_paths, raw_channel, summary_of
+from recorded import T0, attribute, counts_of, decoded_by_rosbags, messages_of, numeric_paths, raw_channel, summary_of
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import RawMessage, block_of
@@ -146,7 +146,6 @@ def test_definitions_behind_a_short_separator_are_read(shared_dir):
         assert {"header.sec", "header.nanosec", "value"} <= {f.path for f in log.fields("/stamped/value")}
 
 
-T0 = 1_700_000_000_000_000_000
 TEXT = b"float64 x\n"
 
 

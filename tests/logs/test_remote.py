@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from pdhef_logtool import Car, ReadOptions, read_drive
 from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.byte_source import SourceError
-from pdhef_logtool.logs.container import ChannelRecord, RawMessage, Wanted, block_of
+from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import log_metadata, open_log
@@ -33,8 +33,6 @@ from tests.command_line import called
 from tests.counting_server import CountingServer, Fault, cutting, serving, stalling, status
 
 aiohttp = pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
-
-NOTHING_YET = Wanted(frozenset())
 
 
 @pytest.fixture(scope="module")
@@ -147,9 +145,7 @@ def test_a_damaged_log_loses_the_same(tmp_path, sample_logs_dir, spoil):
     file = tmp_path / "damaged.mcap"
     file.write_bytes(spoil((sample_logs_dir / "dlc.mcap").read_bytes()))
     with serving(**{file.name: file.read_bytes()}) as server:
-        with closing(open_log(_place(server, file.name), wanted=NOTHING_YET)):
-            log = open_log(_place(server, file.name), wanted=Wanted(frozenset({"/imu/data"})))
-        with closing(log), closing(open_log(file)) as local:
+        with closing(open_log(_place(server, file.name))) as log, closing(open_log(file)) as local:
             assert _all_of(log) == _all_of(local)
             assert local.lost
         assert server.twice() == 0
@@ -166,12 +162,10 @@ def test_other_formats_are_fetched_once_as_a_whole(tmp_path, sample_logs_dir):
         assert server.twice() == 0
 
 
-def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir):
-    file = sample_logs_dir / "dlc.mcap"
-    with serving(**{file.name: file.read_bytes()}) as server:
-        server.ranges = False
-        assert _read(_place(server, file.name)) == _read(file)
-        assert len(server.requests) == 1
+def test_a_server_without_ranges_gives_all_at_once(served, sample_logs_dir):
+    served.ranges = False
+    assert _read(_place(served, "dlc.mcap")) == _read(sample_logs_dir / "dlc.mcap")
+    assert len(served.requests) == 1
 
 
 def _copies() -> list[Path]:
@@ -266,7 +260,7 @@ def test_a_changed_object_is_an_error(tmp_path, sample_logs_dir, without_headers
     data = with_camera(sample_logs_dir / "dlc.mcap", tmp_path / "apart.mcap").read_bytes()
     with serving(**{"apart.mcap": data}) as server:
         server.without = frozenset(without_headers)
-        with closing(open_log(_place(server, "apart.mcap"), wanted=NOTHING_YET)) as log:
+        with closing(open_log(_place(server, "apart.mcap"))) as log:
             server.files["apart.mcap"] = data[:-1000]
             with pytest.raises(SourceError, match=r"expected the object that was opened, got another one"):
                 log.read({"/camera": ["data"]})

@@ -10,6 +10,7 @@ from google.protobuf import descriptor_pb2
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema
 from pdhef_logtool.logs.definitions import message_definition
@@ -23,10 +24,10 @@ _NEXT = "=" * 80 + "\n"
 _HEAD, _TAIL = "module p { module msg { module A_Constants { ", " }; struct A { long x; }; }; };"
 
 
-def _schema(encoding: str, text: str | bytes, name: str = "p/msg/A", example: bytes | None = None) -> MessageSchema:
+def _schema(encoding: str, text: str | bytes, name: str = "p/msg/A", *examples: bytes) -> MessageSchema:
     data = text if isinstance(text, bytes) else text.encode()
     wire = {"ros1msg": "ros1", "jsonschema": "json", "": "json", "protobuf": "protobuf"}.get(encoding, "cdr")
-    return channel_schema(ChannelRecord(1, "/t", wire, name, encoding, data), example=example)
+    return channel_schema(ChannelRecord(1, "/t", wire, name, encoding, data), examples=examples)
 
 
 def _columns(schema: MessageSchema, path: str, *messages: bytes) -> tuple[np.ndarray, list[int]]:
@@ -137,7 +138,7 @@ def test_a_hostile_json_message_is_one_that_does_not_decode(message):
     assert set(undecodable) <= {1}
     if message.startswith((b"[", b"{")) and message.count(b"9") == 0:
         with pytest.raises(SchemaError):
-            _schema("", b"", example=message)
+            _schema("", b"", "", message)
 
 
 @pytest.mark.parametrize(("wire", "head"), [("ros2msg", b"\0\1\0\0"), ("ros2msg", b"\0\0\0\0"), ("ros1msg", b"")])
@@ -181,9 +182,18 @@ def test_a_type_name_becomes_no_path(name):
         message_definition(name)
 
 
+def test_a_server_that_fails_is_no_bad_schema():
+    def messages():
+        raise SourceError(expected="an answer", got="none", where="/t")
+        yield b""
+
+    with pytest.raises(SourceError):
+        channel_schema(ChannelRecord(1, "/t", "json", "", "", b""), examples=messages())
+
+
 def test_a_type_without_a_definition_is_no_loss():
     with pytest.raises(NoSchemaError):
-        _schema("", b"", "p/msg/Nowhere", None)
+        _schema("", b"", "p/msg/Nowhere")
     with pytest.raises(NoSchemaError):
         channel_schema(ChannelRecord(1, "/t", "cdr", "p/msg/Nowhere", "", b""))
 

@@ -451,7 +451,7 @@ def test_a_users_file_comes_first(tmp_path, monkeypatch):
     monkeypatch.setenv("PDHEF_VENDORS", str(tmp_path / "mine.toml"))
     assert taken(found(a=topic(q7=RATE))) == {"yaw_rate_rad_s": ("/a.q7", -0.5)}
     (tmp_path / "mine.toml").write_text(entry.replace("yaw_rate_rad_s", "yaw"))
-    with pytest.raises(MappingFileError, match="no signal"):
+    with pytest.raises(MappingFileError, match="'yaw' is no signal"):
         load_vendors()
 
 

@@ -40,28 +40,6 @@ for name in names:
 print(len(names), "modules", *failed, sep="\\n  ")
 sys.exit(bool(failed) or len(names) < 100)
 """
-#: Copies 4 s of a log; the name of the library in its header makes each copy another log.
-COPIES = """
-import sys
-from pathlib import Path
-from mcap.reader import make_reader
-from mcap.writer import Writer
-
-source, folder = Path(sys.argv[1]), Path(sys.argv[2])
-with source.open("rb") as file:
-    messages = list(make_reader(file).iter_messages())
-messages = [m for m in messages if m[2].log_time - messages[0][2].log_time < 4_000_000_000]
-for n in range(int(sys.argv[3])):
-    with (folder / f"drive{n:02}.mcap").open("wb") as file:
-        writer, ids = Writer(file), {}
-        writer.start("ros2", f"copy {n}")
-        for schema, channel, message in messages:
-            if channel.id not in ids:
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                ids[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
-            writer.add_message(ids[channel.id], message.log_time, message.data, message.publish_time, message.sequence)
-        writer.finish()
-"""
 RUN = ("-e", "zero", "--car", "saloon", "--annotate", "none", "--keep", "metrics", "--no-report")
 MANY = 51
 
@@ -86,7 +64,6 @@ def main() -> None:
         source, logs = folder / "source", folder / "logs"
         ignored = shutil.ignore_patterns(".*", "__pycache__", "build", "dist", "out", "*.egg-info", "sample_logs")
         shutil.copytree(ROOT, source, ignore=ignored)
-        logs.mkdir()
         python = folder / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
         pip = (sys.executable, "-m", "pip", "--quiet", "--python", python)
         _do("new environment", sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
@@ -99,11 +76,11 @@ def main() -> None:
         if (ROOT / compiled).is_dir():
             (installed,) = (folder / "venv").glob("[Ll]ib/**/site-packages/pdhef_logtool")
             shutil.copytree(ROOT / compiled, installed.parent / compiled, dirs_exist_ok=True)
-        _do("logs", python, "-c", COPIES, ROOT / "sample_logs" / "step.mcap", logs, str(MANY), cwd=folder)
-        pdhef = (python, "-m", "pdhef_logtool", "run")
-        two = [logs / f"drive{n:02}.mcap" for n in range(2)]
-        _do("run of 2 logs with --jobs 2", *pdhef, *two, "-o", folder / "two", *RUN, "--jobs", "2", cwd=folder)
-        _do(f"run of {MANY} logs", *pdhef, logs, "-o", folder / "many", *RUN, cwd=folder)
+        pdhef = (python, "-m", "pdhef_logtool")
+        _do("logs", *pdhef, "simulate", "suite", "--count", str(MANY), "--duration", "3", "-o", logs, cwd=folder)
+        two = sorted(logs.glob("*.mcap"))[:2]
+        _do("run of 2 logs with --jobs 2", *pdhef, "run", *two, "-o", folder / "two", *RUN, "--jobs", "2", cwd=folder)
+        _do(f"run of {MANY} logs", *pdhef, "run", logs, "-o", folder / "many", *RUN, cwd=folder)
         for number, extra in enumerate(extras, start=1):
             _do(f"extra {extra}", *install, f"{wheel}[{extra}]", cwd=folder)
             _do("import of all modules", python, "-c", IMPORTS, *extras[:number], cwd=folder)

@@ -19,17 +19,7 @@ from pdhef_logtool.estimators.vehicle_model import FRONT, REAR
 from pdhef_logtool.estimators.vehicle_ukf import U_FRICTION, U_STEER, VehicleUkf, no_posterior
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.residual_model.bundle import (
-    DOCUMENT_FILE,
-    LINEAR_REGRESSION_FILE,
-    OUTPUT_COUNT,
-    PURE_LSTM_FOLDER,
-    SHIPPED_FOLDERS,
-    WEIGHTS_FILE,
-    ModelBundle,
-    load_bundle,
-    network_folder,
-)
+from pdhef_logtool.residual_model import bundle as bundles
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.interface import LIMITS
 from pdhef_logtool.residual_model.linear_model import LinearModel
@@ -80,10 +70,10 @@ def test_an_odd_network_is_odd_to_the_last_digits():
 def test_bundle_round_trip_and_hash(tmp_path):
     bundle = replace(make_bundle(), provenance={"seed": 0})
     bundle.save(tmp_path / "model")
-    back = load_bundle(tmp_path / "model")
+    back = bundles.load_bundle(tmp_path / "model")
     assert back.sha256 == bundle.sha256
     assert back.provenance == bundle.provenance
-    assert {p.name for p in (tmp_path / "model").iterdir()} == {DOCUMENT_FILE, WEIGHTS_FILE}
+    assert {p.name for p in (tmp_path / "model").iterdir()} == {bundles.DOCUMENT_FILE, bundles.WEIGHTS_FILE}
     assert make_bundle(seed=1).sha256 != bundle.sha256
 
 
@@ -95,13 +85,13 @@ def saved(tmp_path):
     """Return a folder with a network and its baselines."""
     network = full_network()
     network.save(tmp_path)
-    network.pure_lstm.save(tmp_path / PURE_LSTM_FOLDER)
-    (tmp_path / LINEAR_REGRESSION_FILE).write_text(BASELINE.to_json())
+    network.pure_lstm.save(tmp_path / bundles.PURE_LSTM_FOLDER)
+    (tmp_path / bundles.LINEAR_REGRESSION_FILE).write_text(BASELINE.to_json())
     return tmp_path
 
 
 def test_baselines_come_with_the_model(saved):
-    bundle = load_bundle(saved)
+    bundle = bundles.load_bundle(saved)
     assert bundle.pure_lstm.sha256 == full_network().pure_lstm.sha256
     assert (bundle.linear_regression, bundle.linear_regression.provenance) == (BASELINE, BASELINE.provenance)
     assert replace(bundle, pure_lstm=None, linear_regression=None).sha256 == bundle.sha256  # the network's own
@@ -111,19 +101,19 @@ def test_baselines_come_with_the_model(saved):
     ("file", "damage"),
     [
         *(
-            (f"{folder}{WEIGHTS_FILE}", how)
-            for folder in ("", f"{PURE_LSTM_FOLDER}/")
+            (f"{folder}{bundles.WEIGHTS_FILE}", how)
+            for folder in ("", f"{bundles.PURE_LSTM_FOLDER}/")
             for how in ("missing", "another's")
         ),
-        (DOCUMENT_FILE, "cut"),
-        (DOCUMENT_FILE, {"version": 99}),
-        (DOCUMENT_FILE, {"features": ["truth"] * 8}),
-        (f"{PURE_LSTM_FOLDER}/{DOCUMENT_FILE}", {"target": None}),
-        (f"{PURE_LSTM_FOLDER}/{DOCUMENT_FILE}", {"normalisation": {"target_std": []}}),
-        (LINEAR_REGRESSION_FILE, {"version": 99}),
-        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1, 0.2, 0.3, 0.5]}),
-        (LINEAR_REGRESSION_FILE, {"features": ["truth", *FEATURES[1:4]]}),
-        (LINEAR_REGRESSION_FILE, {"coefficients": [0.1]}),
+        (bundles.DOCUMENT_FILE, "cut"),
+        (bundles.DOCUMENT_FILE, {"version": 99}),
+        (bundles.DOCUMENT_FILE, {"features": ["truth"] * 8}),
+        (f"{bundles.PURE_LSTM_FOLDER}/{bundles.DOCUMENT_FILE}", {"target": None}),
+        (f"{bundles.PURE_LSTM_FOLDER}/{bundles.DOCUMENT_FILE}", {"normalisation": {"target_std": []}}),
+        (bundles.LINEAR_REGRESSION_FILE, {"version": 99}),
+        (bundles.LINEAR_REGRESSION_FILE, {"coefficients": [0.1, 0.2, 0.3, 0.5]}),
+        (bundles.LINEAR_REGRESSION_FILE, {"features": ["truth", *FEATURES[1:4]]}),
+        (bundles.LINEAR_REGRESSION_FILE, {"coefficients": [0.1]}),
     ],
 )
 def test_a_damaged_network_or_baseline_is_one_clear_error(saved, file, damage):
@@ -134,18 +124,18 @@ def test_a_damaged_network_or_baseline_is_one_clear_error(saved, file, damage):
         path.write_text("{")
     elif damage == "another's":
         random_network(9).save(saved / "other")
-        shutil.copy(saved / "other" / WEIGHTS_FILE, path)
+        shutil.copy(saved / "other" / bundles.WEIGHTS_FILE, path)
     else:
         document = json.loads(path.read_text())
         changed = {k: {**document[k], **v} if isinstance(v, dict) else v for k, v in damage.items()}
         path.write_text(json.dumps({k: v for k, v in (document | changed).items() if v is not None}))
     with pytest.raises(ModelError, match=file.partition("/")[0] if "/" in file else saved.name):
-        load_bundle(saved)
+        bundles.load_bundle(saved)
 
 
-def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
+def said_by_torch(bundle: bundles.ModelBundle, features: FloatArray) -> FloatArray:
     """Run PyTorch's own network, the oracle, over normalised features [N, k]; returns normalised outputs [N, o]."""
-    head, outputs = bundle.head, OUTPUT_COUNT[bundle.target]
+    head, outputs = bundle.head, bundles.OUTPUT_COUNT[bundle.target]
     network = ResidualNetwork(len(bundle.feature_names), bundle.hidden, bundle.layers, head, outputs=outputs)
     network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in bundle.weights.items()})
     with torch.inference_mode():
@@ -166,7 +156,7 @@ def test_weights_of_another_shape_are_refused(tmp_path):
     # Compiled code would read beyond them.
     replace(make_bundle(), hidden=32).save(tmp_path)
     with pytest.raises(ModelError, match="architecture"):
-        load_bundle(tmp_path)
+        bundles.load_bundle(tmp_path)
 
 
 def test_a_restart_forgets_and_unknown_rows_give_nothing():
@@ -198,22 +188,22 @@ def test_causality_and_limits():
 
 
 def test_models_are_found_by_name():
-    default = load_bundle(SHIPPED_FOLDERS["default"])
+    default = bundles.load_bundle(bundles.SHIPPED_FOLDERS["default"])
     assert default.feature_names == FEATURES
     assert None not in (default.pure_lstm, default.linear_regression, default.paper_network)
-    folders = [network_folder(Path(name)) for name in ("default", "none", "elsewhere")]
-    assert folders == [SHIPPED_FOLDERS["default"], None, Path("elsewhere")]
+    folders = [bundles.network_folder(Path(name)) for name in ("default", "none", "elsewhere")]
+    assert folders == [bundles.SHIPPED_FOLDERS["default"], None, Path("elsewhere")]
     with pytest.raises(ModelError):
-        load_bundle(Path("elsewhere"))
+        bundles.load_bundle(Path("elsewhere"))
 
 
 def test_all_of_it_is_below_three_megabytes():
-    folder = SHIPPED_FOLDERS["default"].parents[1]
+    folder = bundles.SHIPPED_FOLDERS["default"].parents[1]
     assert sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) < 3_000_000
 
 
 def test_noise_evidence_and_calibration_are_of_the_shipped_network():
-    model, car = load_bundle(SHIPPED_FOLDERS["default"]), Car.load("saloon")
+    model, car = bundles.load_bundle(bundles.SHIPPED_FOLDERS["default"]), Car.load("saloon")
     assert car.network is not None and car.network.sha256 == model.sha256
     assert (car.residual_gain, model.physics_sha256) == (0.75, physics_sha256(car.physics_vehicle))
     assert car.notes == ()

@@ -9,7 +9,6 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from foxglove import layouts as fl
-from mcap.reader import make_reader
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.alias_generators import to_camel
 from rosbags.typesys import get_types_from_msg
@@ -18,6 +17,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.layouts import write_layouts
 from pdhef_logtool.results.mcap_sink import AnnotatedMcap
 from pdhef_logtool.results.sink import Event
+from tests.logs.recorded import summary_of
 from tests.run_report import report
 
 
@@ -41,8 +41,7 @@ def written(tmp_path, circle):
 def fields_by_topic(path: Path) -> dict[str, set[str]]:
     """Return the fields of the messages of every topic that has messages, by the schemas in the file."""
     topics = {}
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
+    summary = summary_of(path)
     for channel in summary.channels.values():
         schema = summary.schemas[channel.schema_id]
         _, fields = get_types_from_msg(schema.data.decode(), schema.name)[schema.name]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from mcap.reader import NonSeekingReader, make_reader
 from rerun.chunk import McapReader
-from rosbags.highlevel import AnyReader
 from source_log import write_source
 from written import as_written
 
@@ -16,6 +15,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
 from pdhef_logtool.results.sink import Event
 from studies import mcap_logs
+from tests.logs.recorded import decoded_by_rosbags, summary_of
 
 STATE = "pdhef_msgs/msg/VehicleStateEstimate"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -101,14 +101,11 @@ def messages(path: Path, topic: str | None = None):
 
 
 def decoded(path: Path, topic: str) -> list:
-    with AnyReader([path]) as reader:
-        connections = [c for c in reader.connections if c.topic == topic]
-        return [(t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages(connections)]
+    return decoded_by_rosbags([path], [topic])[topic]
 
 
 def test_every_topic_is_there_with_all_messages_in_indexed_chunks(annotated):
-    with annotated.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
+    summary = summary_of(annotated)
     counts = {
         c.topic: (
             summary.schemas[c.schema_id].name if c.schema_id else None,
@@ -132,8 +129,7 @@ def test_source_is_kept_bit_for_bit(annotated, source):
         assert len(messages(source, topic)) == SOURCE_TOPICS[topic][2]
 
     def channels(path):
-        with path.open("rb") as stream:
-            summary = make_reader(stream).get_summary()
+        summary = summary_of(path)
         schemas = {id_: (s.name, s.encoding, s.data) for id_, s in summary.schemas.items()}
         return {
             c.topic: (c.message_encoding, c.metadata, schemas.get(c.schema_id))
@@ -153,9 +149,8 @@ def test_source_is_kept_bit_for_bit(annotated, source):
 def test_messages_are_merged_by_log_time(annotated):
     times = [t for _, t, *_ in messages(annotated)]
     assert times == sorted(times)
+    starts = [c.message_start_time for c in summary_of(annotated).chunk_indexes]
     with annotated.open("rb") as stream:
-        starts = [c.message_start_time for c in make_reader(stream).get_summary().chunk_indexes]
-        stream.seek(0)
         sequential = [m.log_time for _, _, m in NonSeekingReader(stream).iter_messages(log_time_order=False)]
     assert starts[:-1] == sorted(starts[:-1])  # the maps, which are known at the end, are of the start
     assert sorted(sequential) == times

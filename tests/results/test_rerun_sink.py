@@ -289,7 +289,7 @@ def test_of_a_long_drive_ten_rows_a_second_are_drawn_with_the_largest_nis_and_fi
     path = tmp_path / "recording.rrd"
     speed = np.full(n, 20.0)
     tracks = [
-        make_track(name, stamps, vx_m_s=speed, vy_m_s=0 * speed, nis=nis).with_pose(speed, speed, 0 * speed)
+        make_track(name, stamps, vx_m_s=speed, vy_m_s=0 * speed, nis=nis, x_m=speed, y_m=speed, yaw_rad=0 * speed)
         for name in ("zero", "zero:no-lateral")
     ]
     record(path, tracks, shown=["zero"], end_ns=int(stamps[-1]) + 1)

@@ -47,20 +47,24 @@ NO_TRUTH_MAPPING = "".join(
 )
 
 
-def _config(sample_logs_dir: Path, **changes: Any) -> RunConfig:
-    values: dict[str, Any] = {"car": sample_logs_dir / "vehicle.toml", "keep": "estimates", **changes}
-    return RunConfig(**values)
+def run(log: Path, out: Path, *, summary: bool = False, ends: int | None = None, **changes: Any) -> dict[str, Any]:
+    """Run a log with its folder's vehicle file, and return its report; ``ends`` is the expected exit code."""
+    values: dict[str, Any] = {"car": log.parent / "vehicle.toml", "keep": "estimates", "estimators": ("phy-ukf",)}
+    result = run_logs([str(log)], out, RunConfig(**{**values, **changes}), report=summary)
+    assert ends in (None, result.exit_code)
+    return json.loads((out / "logs" / log.stem / "report.json").read_text())
+
+
+def estimates(out: Path) -> pl.DataFrame:
+    """Return the estimates of phy-ukf of the only log of a run."""
+    (table,) = out.glob("logs/*/estimates.parquet")
+    return pl.read_parquet(table).filter(pl.col("estimator") == "phy-ukf").drop("estimator")
 
 
 @pytest.fixture(scope="module")
 def dlc_run(sample_logs_dir, tmp_path_factory):
     out = tmp_path_factory.mktemp("dlc")
-    result = run_logs(
-        [str(sample_logs_dir / "dlc.mcap")],
-        out,
-        _config(sample_logs_dir, keep="full", annotate="full", estimators=("all",)),
-    )
-    assert result.exit_code == 0
+    run(sample_logs_dir / "dlc.mcap", out, keep="full", annotate="full", estimators=("all",), summary=True, ends=0)
     return out
 
 
@@ -72,29 +76,24 @@ def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run):
 
 
 def test_documents_follow_their_schemas(dlc_run, sample_logs_dir):
-
     report = json.loads((dlc_run / "logs/dlc/report.json").read_text())
-    run = json.loads((dlc_run / "run.json").read_text())
+    of_run = json.loads((dlc_run / "run.json").read_text())
     follows(report)
-    follows(run, "run.schema.json")
-    assert run["logs"][0]["outcome"] == "ok"
+    follows(of_run, "run.schema.json")
+    assert of_run["logs"][0]["outcome"] == "ok"
     assert [e["name"] for e in report["estimators"]] == list(all_names(Car.load(sample_logs_dir / "vehicle.toml")))
 
 
 def test_same_input_gives_the_same_bytes(sample_logs_dir, tmp_path):
-    config = _config(sample_logs_dir, keep="full", annotate="full", estimators=("zero", "physics"), end="4")
+    options = {"keep": "full", "annotate": "full", "estimators": ("zero", "physics"), "end": "4", "summary": True}
     for folder in ("a", "b"):
-        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / folder, config)
+        run(sample_logs_dir / "dlc.mcap", tmp_path / folder, **options)
     for name in ("run.json", "report.html", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
 def test_slice_scores_the_slice_alone(sample_logs_dir, tmp_path):
-    log = sample_logs_dir / "dlc.mcap"
-    run_logs(
-        [str(log)], tmp_path, _config(sample_logs_dir, start="2", end="end-3s", estimators=("phy-ukf",)), report=False
-    )
-    report = json.loads((tmp_path / "logs/dlc/report.json").read_text())
+    report = run(sample_logs_dir / "dlc.mcap", tmp_path, start="2", end="end-3s")
     stamps = pl.read_parquet(tmp_path / "logs/dlc/estimates.parquet")["stamp_ns"]
     assert report["log"]["duration_s"] == pytest.approx(9.5 - 5.0, abs=0.1)
     assert report["log"]["start_ns"] - 20_000_000 <= stamps.min() <= stamps.max() < report["log"]["end_ns"]
@@ -102,29 +101,31 @@ def test_slice_scores_the_slice_alone(sample_logs_dir, tmp_path):
 
 def test_estimates_do_not_depend_on_whether_truth_is_mapped(sample_logs_dir, tmp_path, dlc_run):
     (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("kinematic", "phy-ukf"))
-    full_wheels = pl.read_parquet(dlc_run / "logs/dlc/estimates.parquet").filter(pl.col("estimator") == "phy-ukf")
-    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "a", config, report=False)
-    without = pl.read_parquet(tmp_path / "a/logs/dlc/estimates.parquet").filter(pl.col("estimator") == "phy-ukf")
-    assert json.loads((tmp_path / "a/logs/dlc/report.json").read_text())["truth"]["available"] is False
+    log, options = (
+        sample_logs_dir / "dlc.mcap",
+        {"mapping": tmp_path / "m.toml", "estimators": ("kinematic", "phy-ukf")},
+    )
+    assert run(log, tmp_path / "a", **options)["truth"]["available"] is False
     figures = set(pl.read_parquet(tmp_path / "a/metrics.parquet")["metric"])
     assert {"nis", "disagreement_rms", "nis_autocorrelation"} <= figures and "rmse" not in figures
     truth = '[truth.vy_m_s]\ntopic = "/truth/perfect/odometry"\nfield = "twist.twist.linear.y"\n'
     truth += '[truth.vx_m_s]\ntopic = "/truth/perfect/odometry"\nfield = "twist.twist.linear.x"\n'
     (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING + truth)
-    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "b", config, report=False)
-    with_truth = pl.read_parquet(tmp_path / "b/logs/dlc/estimates.parquet").filter(pl.col("estimator") == "phy-ukf")
-    pose = ["x_m", "y_m", "yaw_rad"]
-    assert without.drop(pose).equals(with_truth.drop(pose), null_equal=True)
-    assert not without.drop(pose).equals(full_wheels.drop(pose), null_equal=True)  # four wheels are not two
+    assert run(log, tmp_path / "b", **options)["truth"]["available"]
+    without, with_truth, four_wheels = (
+        estimates(out).drop("x_m", "y_m", "yaw_rad") for out in (tmp_path / "a", tmp_path / "b", dlc_run)
+    )
+    assert without.equals(with_truth, null_equal=True)
+    assert not without.equals(four_wheels, null_equal=True)  # four wheels are not two
 
 
 def test_all_logs_bad_is_a_failure(sample_logs_dir, tmp_path):
     for name in ("a.mcap", "b.mcap"):
         (tmp_path / name).write_bytes(b"no log")
-    assert run_logs([str(tmp_path)], tmp_path / "out", _config(sample_logs_dir)).exit_code == 1
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", keep="estimates")
+    assert run_logs([str(tmp_path)], tmp_path / "out", config).exit_code == 1
     with pytest.raises(LogError):
-        run_logs([str(tmp_path / "a.mcap")], tmp_path / "out1", _config(sample_logs_dir))
+        run_logs([str(tmp_path / "a.mcap")], tmp_path / "out1", config)
 
 
 def test_what_ran_under_a_name_stands_in_every_record(dlc_run):
@@ -163,15 +164,6 @@ def files(sample_logs_dir, tmp_path_factory):
     return folder
 
 
-def run(log: Path, out: Path, **changes: Any) -> tuple[dict[str, Any], pl.DataFrame]:
-    values: dict[str, Any] = {"keep": "estimates", "network": Path("none"), "estimators": ("phy-ukf",), **changes}
-    result = run_logs([str(log)], out, RunConfig(**values), report=False)
-    report = result.results[0].report
-    assert report is not None
-    table = pl.read_parquet(out / "logs" / log.stem / "estimates.parquet")
-    return report, table.with_columns(pl.col("estimator").cast(pl.String))
-
-
 @pytest.mark.parametrize(
     ("choice", "with_topic", "car", "source", "value"),
     [
@@ -188,11 +180,12 @@ def test_what_is_asked_for_is_told_to_the_estimators(
 ):
     file = {"sample": sample_logs_dir / "vehicle.toml", "car": files / "car.toml", None: None}[car]
     mapping = files / "told.toml" if with_topic else None
-    report, track = run(sample_logs_dir / "sweep.mcap", tmp_path, car=file, mapping=mapping, friction=choice, end="+3s")
+    options = {"car": file, "mapping": mapping, "network": Path("none"), "friction": choice, "end": "+3s"}
+    report = run(sample_logs_dir / "sweep.mcap", tmp_path, **options)
     assert report["friction"]["source"] == source
     assert report["friction"]["given"] is (source not in ("no value given", "default sedan"))
     assert report["friction"]["topic"] == ("/truth/perfect/state.friction" if source == "topic" else None)
-    friction = track.filter(pl.col("estimator") != "truth")["friction"].drop_nulls().drop_nans().to_numpy()
+    friction = estimates(tmp_path)["friction"].drop_nulls().drop_nans().to_numpy()
     assert friction.size
     np.testing.assert_allclose(friction, value, atol=1e-6)
 
@@ -252,17 +245,15 @@ def test_the_terminal_says_it_in_one_line(result):
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 
 
-def _run(log: Path, out: Path) -> tuple[pl.DataFrame, int]:
-    mapping, car = (REFERENCE / folder / "revs_250lm.toml" for folder in ("mappings", "vehicles"))
-    config = RunConfig(mapping=mapping, car=car, estimators=("phy-ukf",), keep="estimates", model="off", end="200")
-    result = run_logs([str(log)], out, config, report=False)
-    folder = out / "logs" / result.results[0].outcome.log
-    return pl.read_parquet(folder / "estimates.parquet"), result.exit_code
+MAPPING, CAR = (REFERENCE / folder / "revs_250lm.toml" for folder in ("mappings", "vehicles"))
+RACE = {"mapping": MAPPING, "car": CAR, "model": "off", "end": "200"}
 
 
 @pytest.fixture(scope="module")
-def whole(shared_dir, tmp_path_factory):
-    return _run(shared_dir / "data/drives/revs_250lm_a.mcap", tmp_path_factory.mktemp("intact"))[0]
+def sound(shared_dir, tmp_path_factory):
+    out = tmp_path_factory.mktemp("intact")
+    run(shared_dir / "data/drives/revs_250lm_a.mcap", out, **RACE)
+    return estimates(out)
 
 
 #: First loss and end of the last gap, s from the first stamp, by file (README of the faulty drives).
@@ -270,12 +261,11 @@ FAULTY = {"revs_250lm_a_flipped_byte.mcap": (146.2, 154.8), "revs_250lm_a_disord
 
 
 @pytest.mark.parametrize("name", FAULTY)
-def test_damage_costs_what_it_hit_and_nothing_else(shared_dir, tmp_path, whole, name):
-    hurt, code = _run(shared_dir / "data/drives/faulty" / name, tmp_path)
-    assert code == 3
+def test_damage_costs_what_it_hit_and_nothing_else(shared_dir, tmp_path, sound, name):
+    report = run(shared_dir / "data/drives/faulty" / name, tmp_path, ends=3, **RACE)
+    hurt = estimates(tmp_path)
     first_loss_s, last_gap_s = FAULTY[name]
-    elapsed = (pl.col("stamp_ns") - whole["stamp_ns"].min()) / 1e9
-    hurt, sound = (f.filter(pl.col("estimator") == "phy-ukf").drop("estimator") for f in (hurt, whole))
+    elapsed = (pl.col("stamp_ns") - sound["stamp_ns"].min()) / 1e9
     before = elapsed < first_loss_s - 0.05
     assert hurt.filter(before).equals(sound.filter(before), null_equal=True)
     both = hurt.join(sound, on="stamp_ns").filter(elapsed >= last_gap_s + 5.0)
@@ -291,7 +281,6 @@ def test_damage_costs_what_it_hit_and_nothing_else(shared_dir, tmp_path, whole, 
     # is 1e-4 degrees long by then decides it, and some hundredths of a second show it.
     assert np.mean(difference_deg >= 0.01) < 0.0005
     assert np.nanmax(difference_deg) < 0.02
-    report = json.loads((tmp_path / "logs" / Path(name).stem / "report.json").read_text())
     start_ns = report["log"]["start_ns"]
     gaps = {
         x["where"]: (x["start_ns"] - start_ns, x["end_ns"] - start_ns) for x in report["losses"] if x["kind"] == "gap"
@@ -314,16 +303,10 @@ def wrong_car(bare_vehicle, tmp_path_factory):
     return path
 
 
-def run_with(log: Path, car: Path, out: Path, **changes: Any) -> dict[str, Any]:
-    values: dict[str, Any] = {"car": car, "keep": "estimates", "estimators": NAMES, "end": END, **changes}
-    run_logs([str(log)], out, RunConfig(**values), report=False)
-    return json.loads((out / "logs" / log.stem / "report.json").read_text())
-
-
 @pytest.fixture(scope="module")
 def calibrated(sample_logs_dir, wrong_car, tmp_path_factory):
     out = tmp_path_factory.mktemp("log")
-    run_with(sample_logs_dir / "road.mcap", wrong_car, out)
+    run(sample_logs_dir / "road.mcap", out, car=wrong_car, estimators=NAMES, end=END)
     return out
 
 
@@ -359,14 +342,15 @@ def test_a_wrong_file_is_mended(calibrated):
 
 
 def test_off_is_the_prior_about_the_file_and_causal(sample_logs_dir, wrong_car, tmp_path):
-    report = run_with(sample_logs_dir / "road.mcap", wrong_car, tmp_path, model="off", end="30", estimators=NAMES[:2])
+    options = {"car": wrong_car, "model": "off", "end": "30", "estimators": NAMES[:2]}
+    report = run(sample_logs_dir / "road.mcap", tmp_path, **options)
     assert (report["self_calibration"]["parameters"], report["self_calibration"]["refused"]) == ([], None)
     assert all(e["causal"] for e in report["estimators"])
 
 
 def test_a_model_of_an_earlier_drive_is_causal_and_mends_the_file(sample_logs_dir, wrong_car, calibrated, tmp_path):
     model = calibrated / "logs/road/model.toml"
-    report = run_with(sample_logs_dir / "dlc.mcap", wrong_car, tmp_path, model=model, end=None)
+    report = run(sample_logs_dir / "dlc.mcap", tmp_path, car=wrong_car, model=model, estimators=NAMES)
     follows(report)
     assert all(e["causal"] for e in report["estimators"] if e["name"] != "open-loop:calibrated")
     assert report["model"]["source"] == "file"
@@ -393,7 +377,7 @@ def test_no_truth_is_read(sample_logs_dir, wrong_car):
 
 
 def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir, wrong_car, tmp_path):
-    report = run_with(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, end="4")
+    report = run(sample_logs_dir / "sweep.mcap", tmp_path, car=wrong_car, estimators=NAMES, end="4")
     assert "are needed" in report["self_calibration"]["refused"]
     told = {e["name"]: e for e in report["estimators"]}
     assert told["open-loop:calibrated"]["outcome"] == "skipped"
@@ -407,8 +391,8 @@ def test_a_car_that_slides_has_the_friction_that_it_reaches_if_none_is_given(
     monkeypatch.setattr(fit, "SLIDING_RAD", 0.001)
     car = tmp_path / "vehicle.toml"
     car.write_text("\n".join(x for x in wrong_car.read_text().splitlines() if not x.startswith("friction =")))
-    friction = {} if given is None else {"friction": given}
-    report = run_with(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "physics"), **friction)
+    options = {"car": car, "estimators": ("phy-ukf", "physics"), "end": END, "friction": given or "auto"}
+    report = run(sample_logs_dir / "sweep.mcap", tmp_path, **options)
     assert "slides" in report["self_calibration"]["refused"]
     causal = {e["name"]: e["causal"] for e in report["estimators"]}
     assert (causal["phy-ukf"], causal["physics"]) == (True, given is not None)
@@ -434,7 +418,7 @@ def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_
         pytest.skip("no network is shipped, without which there is no pd-hef")
     monkeypatch.setattr(selection, "FACTOR", 0.0)
     names = ("zero", "phy-ukf", "pd-hef", "physics")
-    report = run_with(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, estimators=names, end=None)
+    report = run(sample_logs_dir / "sweep.mcap", tmp_path, car=wrong_car, estimators=names)
     follows(report)
     assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
     assert report["selected_estimate"] == "physics"

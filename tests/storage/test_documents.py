@@ -20,16 +20,7 @@ from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, 
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 from pdhef_logtool.runs.config import load_config
 from pdhef_logtool.runs.journal import digest_of
-from pdhef_logtool.storage.documents import (
-    MAX_BYTES,
-    MAX_DEPTH,
-    digest,
-    read_json,
-    read_sealed,
-    read_toml,
-    seal,
-    unknown,
-)
+from pdhef_logtool.storage import documents as sealing
 from pdhef_logtool.storage.toml_text import toml_text
 
 SHIPPED, CAR = SHIPPED_FOLDERS["default"], SHIPPED_CARS["saloon"]
@@ -180,10 +171,10 @@ def test_what_cannot_be_read_is_one_line(loader, tmp_path):
     assert "utf-8" in outcome(loader, path)
     entry = '{"format": %s}' if path.suffix == ".json" else "a = %s\n"
     endless = [entry % number for number in ("1" + "0" * 5000, "0x" + "f" * 5000, "1" + "0" * 30)]
-    for text in ("= ][", "\0" * 100, "#" + "x" * MAX_BYTES, *endless):
+    for text in ("= ][", "\0" * 100, "#" + "x" * sealing.MAX_BYTES, *endless):
         path.write_text(text)
         assert outcome(loader, path)
-    for depth in (MAX_DEPTH + 1, 100_000):
+    for depth in (sealing.MAX_DEPTH + 1, 100_000):
         path.write_text(entry % ("[" * depth + "]" * depth))
         assert "too deeply" in outcome(loader, path)
     if path.suffix == ".json":
@@ -196,40 +187,40 @@ def test_what_cannot_be_read_is_one_line(loader, tmp_path):
 
 
 def test_nesting_up_to_the_limit_is_read(tmp_path):
-    depth = MAX_DEPTH - 1
+    depth = sealing.MAX_DEPTH - 1
     nested = "[" * depth + "]" * depth
     (tmp_path / "a.toml").write_text(f"a = {nested}")
     (tmp_path / "a.json").write_text(f'{{"a": {nested}, "n": {2**64 - 1}}}')
-    assert list(read_toml(tmp_path / "a.toml", "a file", UsageError)) == ["a"]
-    assert read_json(tmp_path / "a.json", "a file", UsageError)["n"] == 2**64 - 1
+    assert list(sealing.read_toml(tmp_path / "a.toml", "a file", UsageError)) == ["a"]
+    assert sealing.read_json(tmp_path / "a.json", "a file", UsageError)["n"] == 2**64 - 1
 
 
 def test_a_sealed_document_is_read_as_it_was_written_or_not_at_all(tmp_path):
     path, document = tmp_path / "own.json", {"a": [1, 0.1, None, "é"], "b": {"c": True}}
-    data = json.dumps(seal(document)).encode()
+    data = json.dumps(sealing.seal(document)).encode()
     path.write_bytes(data)
-    assert read_sealed(path, "ours", UsageError) == document
+    assert sealing.read_sealed(path, "ours", UsageError) == document
     for at in range(len(data)):
         for damaged in (data[:at], data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]):
             path.write_bytes(damaged)
             with pytest.raises(UsageError, match=r"own\.json: expected ours"):
-                read_sealed(path, "ours", UsageError)
+                sealing.read_sealed(path, "ours", UsageError)
     path.write_text(json.dumps(document))
     with pytest.raises(UsageError, match="not as it was written"):
-        read_sealed(path, "ours", UsageError)
+        sealing.read_sealed(path, "ours", UsageError)
 
 
 def test_errors_say_what_was_wanted_where_and_what_to_do(tmp_path):
     with pytest.raises(VehicleError, match=r"none\.toml: expected a car, got no such file; write one"):
-        read_toml(tmp_path / "none.toml", "a car", VehicleError, "write one")
+        sealing.read_toml(tmp_path / "none.toml", "a car", VehicleError, "write one")
 
 
 def test_the_nearest_name_is_told():
     known = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
-    assert unknown("ay", known, "r_std") == "r_std.ay: unknown, did you mean r_std.ay_m_s2?"
-    assert unknown("yaw_rate_rads", known) == "yaw_rate_rads: unknown, did you mean yaw_rate_rad_s?"
-    assert unknown("", known, "r_std") == "r_std: unknown, known are ay_m_s2, yaw_rate_rad_s, speed_m_s"
-    assert unknown("zzz", known).endswith("known are ay_m_s2, yaw_rate_rad_s, speed_m_s")
+    assert sealing.unknown("ay", known, "r_std") == "r_std.ay: unknown, did you mean r_std.ay_m_s2?"
+    assert sealing.unknown("yaw_rate_rads", known) == "yaw_rate_rads: unknown, did you mean yaw_rate_rad_s?"
+    assert sealing.unknown("", known, "r_std") == "r_std: unknown, known are ay_m_s2, yaw_rate_rad_s, speed_m_s"
+    assert sealing.unknown("zzz", known).endswith("known are ay_m_s2, yaw_rate_rad_s, speed_m_s")
 
 
 @pytest.mark.parametrize(
@@ -252,7 +243,7 @@ def test_misspelt_entries_are_told_with_the_nearest_name(loader, line, wrong, ri
 def test_hashes_that_stand_in_files_stay_what_they_were():
     """Hashes of version 0.2.0. Journals, caches, datasets and cars identify their sources by these hashes."""
     document = {"b": [1, 2.5, None, True], "a": {"ü\udc80": "/", "": (1e-9, 1e22)}}
-    assert digest(document) == "67b92e78790c0c9feafdf6c5b26ff7e18525bc442921e21ed792a5d1dbcc28d6"
+    assert sealing.digest(document) == "67b92e78790c0c9feafdf6c5b26ff7e18525bc442921e21ed792a5d1dbcc28d6"
     assert digest_of(document) == "67b92e78790c0c9f"
     mapping = Mapping({"speed_m_s": SignalSource("speed_m_s", "/can", "speed", scale=0.5)})
     assert mapping.sha256 == "95bc15effd8048a668853de7ce24f1e84c771acd8e1692d120c193d57d689937"

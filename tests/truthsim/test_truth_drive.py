@@ -4,25 +4,17 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.records.errors import SimulationError
+from truthsim import manoeuvres
 from truthsim.drive import reference_steer_rad, simulate_drive
-from truthsim.manoeuvres import (
-    ISO_3888_1_M,
-    MANOEUVRES,
-    Request,
-    fishhook,
-    iso_3888_2_corridor_m,
-    iso_3888_2_start_m,
-    sine_with_dwell,
-)
 from truthsim.vehicle import Vehicle
 
 G = 9.80665
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", MANOEUVRES)
+@pytest.mark.parametrize("name", manoeuvres.MANOEUVRES)
 def test_every_manoeuvre_reaches_what_it_is_for_without_a_spin(name):
-    manoeuvre = MANOEUVRES[name]
+    manoeuvre = manoeuvres.MANOEUVRES[name]
     drive = simulate_drive(name, duration_s=40.0 if name == "road" else None)
     assert not drive.spun and not drive.lifted
     assert drive.peak_ay_m_s2 >= manoeuvre.least_share * manoeuvre.friction * G
@@ -34,8 +26,8 @@ def test_every_manoeuvre_reaches_what_it_is_for_without_a_spin(name):
 def test_lane_change_is_the_standard_s_course_and_peaks_near_0_7_g():
     lane_change = simulate_drive("dlc", seed=1)
     assert 0.65 <= lane_change.peak_ay_m_s2 / G <= 0.75
-    assert ISO_3888_1_M == (15.0, 30.0, 25.0, 25.0, 15.0, 15.0)
-    plan = MANOEUVRES["dlc"].plan(Request(100.0 / 3.6, 0.85, 0, 9.5, 1.0))
+    assert manoeuvres.ISO_3888_1_M == (15.0, 30.0, 25.0, 25.0, 15.0, 15.0)
+    plan = manoeuvres.MANOEUVRES["dlc"].plan(manoeuvres.Request(100.0 / 3.6, 0.85, 0, 9.5, 1.0))
     x, y = plan.path[:, 0], plan.path[:, 1]
     start = 2.0 * 100.0 / 3.6 + 15.0
     side = (x >= start + 30.0) & (x <= start + 55.0)
@@ -50,9 +42,9 @@ def test_lane_change_is_the_standard_s_course_and_peaks_near_0_7_g():
 def test_sine_with_dwell_is_fmvss_126_s():
     period = 1.0 / 0.7
     t = np.array([-0.1, 0.0, 0.25 * period, 0.5 * period, 0.75 * period, 0.75 * period + 0.25, 0.75 * period + 0.5])
-    assert sine_with_dwell(t) == pytest.approx([0.0, 0.0, 1.0, 0.0, -1.0, -1.0, -1.0], abs=1e-12)
+    assert manoeuvres.sine_with_dwell(t) == pytest.approx([0.0, 0.0, 1.0, 0.0, -1.0, -1.0, -1.0], abs=1e-12)
     late = 0.75 * period + 0.5 + np.array([0.125 * period, 0.25 * period - 1e-9, 0.25 * period + 1e-3, 3.0])
-    assert sine_with_dwell(late) == pytest.approx([-np.sqrt(0.5), 0.0, 0.0, 0.0], abs=1e-6)
+    assert manoeuvres.sine_with_dwell(late) == pytest.approx([-np.sqrt(0.5), 0.0, 0.0, 0.0], abs=1e-6)
     drive = simulate_drive("sine-with-dwell")
     assert drive.speed_km_h == 80.0
     steer = drive.truth["steer_rad"]
@@ -69,8 +61,10 @@ def test_fishhook_is_nhtsa_s():
     top, rate = 0.2, np.deg2rad(720.0) / 16.0
     ramp = top / rate
     t = np.array([0.0, 0.5 * ramp, ramp, ramp + 0.25, ramp + 0.25 + ramp, ramp + 0.25 + 2 * ramp, 3 * ramp + 3.25])
-    assert fishhook(t, top) == pytest.approx([0.0, 0.1, 0.2, 0.2, 0.0, -0.2, -0.2])
-    assert fishhook(np.array([3 * ramp + 4.25, 3 * ramp + 5.25, 60.0]), top) == pytest.approx([-0.1, 0.0, 0.0])
+    assert manoeuvres.fishhook(t, top) == pytest.approx([0.0, 0.1, 0.2, 0.2, 0.0, -0.2, -0.2])
+    assert manoeuvres.fishhook(np.array([3 * ramp + 4.25, 3 * ramp + 5.25, 60.0]), top) == pytest.approx(
+        [-0.1, 0.0, 0.0]
+    )
     drive = simulate_drive("fishhook", keep_spins=True)
     reference = reference_steer_rad(80.0 / 3.6, 0.85, Vehicle())
     assert np.abs(drive.truth["steer_rad"]).max() == pytest.approx(6.5 * reference, rel=1e-3)
@@ -79,7 +73,7 @@ def test_fishhook_is_nhtsa_s():
 @pytest.mark.parametrize("speed_km_h", [40.0, 60.0])
 def test_severe_lane_change_stays_between_the_cones(speed_km_h):
     drive = simulate_drive("dlc-3888-2", speed_km_h=speed_km_h)
-    low, high = iso_3888_2_corridor_m(drive.truth["x_m"] - iso_3888_2_start_m(speed_km_h / 3.6))
+    low, high = manoeuvres.iso_3888_2_corridor_m(drive.truth["x_m"] - manoeuvres.iso_3888_2_start_m(speed_km_h / 3.6))
     assert np.isfinite(low).sum() > 100
     assert np.all(drive.truth["y_m"] >= low - 0.1) and np.all(drive.truth["y_m"] <= high + 0.1)
     # Coasting through, and faster than the standard's course can be driven is refused.

@@ -12,12 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from truthsim.linear_theory import (
-    axle_stiffness_n_per_rad,
-    frequency_response,
-    steady_roll,
-    understeer_gradient_rad_per_m_s2,
-)
+from truthsim import linear_theory
 from truthsim.manoeuvres import MANOEUVRES, Plan, Request
 from truthsim.motion import Motion, simulate_motion
 from truthsim.vehicle import OBSERVED, Vehicle
@@ -116,7 +111,7 @@ def forces_lag_by_the_relaxation_length(simulate: Simulate, car: Vehicle) -> Non
         assert np.isfinite(force).all()
         basis = np.stack([alpha, -np.gradient(force, 1e-3)], axis=1)[300:-2]
         (stiffness, tau), *_ = np.linalg.lstsq(basis, force[300:-2], rcond=None)
-        near(stiffness, axle_stiffness_n_per_rad(CAR, DRY)[0], rel=0.01)
+        near(stiffness, linear_theory.axle_stiffness_n_per_rad(CAR, DRY)[0], rel=0.01)
         near(tau * speed, 0.65, rel=0.02)
 
 
@@ -151,7 +146,7 @@ def load_moves_as_statics_say(simulate: Simulate, car: Vehicle) -> None:
     rear = slope(motion, linear, 0.5 * (motion.column("fz_rr_n") - motion.column("fz_rl_n")))
     roll = slope(motion, linear, motion.column("roll_rad"))
     near((front + rear) * TRACK, M * H_CG + SPRUNG * ARM * G * roll, rel=2e-3)
-    _, (front_theory, rear_theory) = steady_roll(CAR)
+    _, (front_theory, rear_theory) = linear_theory.steady_roll(CAR)
     near(front, front_theory, rel=2e-3)
     near(rear, rear_theory, rel=2e-3)
 
@@ -160,7 +155,7 @@ def body_rolls_by_the_closed_form(simulate: Simulate, car: Vehicle) -> None:
     """Springs and bars in series with the tyres; between 3 and 6 degrees per g."""
     motion, linear = slow_ramp(simulate, car)
     gradient = slope(motion, linear, motion.column("roll_rad"))
-    near(gradient, steady_roll(CAR)[0], rel=3e-3)
+    near(gradient, linear_theory.steady_roll(CAR)[0], rel=3e-3)
     assert 3.0 < np.degrees(gradient) * G < 6.0
 
 
@@ -169,7 +164,7 @@ def understeer_is_linear_theory_s(simulate: Simulate, car: Vehicle) -> None:
     motion, linear = slow_ramp(simulate, car)
     beyond = motion.column("steer_rad") - L * motion.column("yaw_rate_rad_s") / motion.column("vx_m_s")
     gradient = slope(motion, linear, beyond)
-    near(gradient, understeer_gradient_rad_per_m_s2(CAR, DRY), rel=0.01)
+    near(gradient, linear_theory.understeer_gradient_rad_per_m_s2(CAR, DRY), rel=0.01)
     assert 1.5 < np.degrees(gradient) * G < 4.0
 
 
@@ -184,7 +179,7 @@ def responses_are_linear_theory_s(simulate: Simulate, car: Vehicle) -> None:
         basis = np.stack([np.sin(turn), np.cos(turn)], axis=1)
         speed = float(motion.column("vx_m_s")[rows].mean())
         assert np.isfinite(speed)
-        theory = frequency_response(frictionless(CAR), frequency, speed, DRY)
+        theory = linear_theory.frequency_response(frictionless(CAR), frequency, speed, DRY)
         for name, response in zip(("yaw_rate_rad_s", "ay_m_s2", "roll_rad"), theory, strict=True):
             (sine, cosine), *_ = np.linalg.lstsq(basis, motion.column(name)[rows], rcond=None)
             ratio = complex(sine, cosine) / 0.002 / response
@@ -200,12 +195,12 @@ def a_bank_is_felt(simulate: Simulate, car: Vehicle) -> None:
     near(last["ay_m_s2"], 0.0, within=1e-3)
     near(last["yaw_rate_rad_s"], 0.0, within=1e-4)
     body = last["roll_rad"] - bank
-    near(body, steady_roll(CAR)[0] * G * np.sin(bank), rel=0.01)
+    near(body, linear_theory.steady_roll(CAR)[0] * G * np.sin(bank), rel=0.01)
     near(last["specific_force_y_m_s2"], G * np.sin(bank + body), rel=2e-3)
     near(last["specific_force_z_m_s2"], G * np.cos(bank + body), rel=2e-3)
     near(sum(last[f"fy_{w}_n"] for w in WHEELS), M * G * np.sin(bank), rel=5e-3)
     near(sum(last[f"fz_{w}_n"] for w in WHEELS), M * G * np.cos(bank), rel=1e-4)
-    near(last["steer_rad"], understeer_gradient_rad_per_m_s2(CAR, DRY) * G * np.sin(bank), rel=0.1)
+    near(last["steer_rad"], linear_theory.understeer_gradient_rad_per_m_s2(CAR, DRY) * G * np.sin(bank), rel=0.1)
 
 
 def a_banked_bend_presses(simulate: Simulate, car: Vehicle) -> None:

@@ -92,14 +92,13 @@ def _lag_of_start(_: FloatArray, since_start_ns: IntArray, estimate: FloatArray,
 
 
 def _rms_aligned(
-    _: FloatArray, since_start_ns: IntArray, estimate: FloatArray, truth: FloatArray, straight: BoolArray
+    _: FloatArray, since_start_ns: IntArray, estimate: FloatArray, truth: FloatArray, straight: BoolArray, lag: float
 ) -> float | None:
     """Return the RMS error [N] without the lag and without the ground truth's mean on straights.
 
     A lag that is not clear is 0. None without straights: an offset of ground truth is an error elsewhere.
     """
-    lag = np.nan_to_num(_lag_of_start(_, since_start_ns, estimate, truth))
-    then_ns = since_start_ns - lag * NS_PER_S
+    then_ns = since_start_ns - np.nan_to_num(lag) * NS_PER_S
     covered = (then_ns >= since_start_ns[0]) & (then_ns <= since_start_ns[-1])
     if not straight.any() or not covered.any():
         return None
@@ -118,5 +117,5 @@ METRICS = described(
     rmse_relative=(lambda e, truth: rms(e) / rms(truth) if truth.any() else float("nan"), "error", "truth"),
     coverage95=(lambda std, e: float(np.mean(np.abs(e) <= NORMAL_95 * std)), "std", "error"),
     lag_s=(_lag_of_start, "error", "since_start_ns", "estimate", "truth"),
-    rmse_aligned=(_rms_aligned, "error", "since_start_ns", "estimate", "truth", "straight"),
+    rmse_aligned=(_rms_aligned, "error", "since_start_ns", "estimate", "truth", "straight", "lag_s"),
 )

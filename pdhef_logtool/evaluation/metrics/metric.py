@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -67,7 +67,7 @@ class EvaluatedDrive:
     ----------
     masks : bool [N] by segment. truth, signals : None omits the metrics that need them.
     low_speed_m_s : sideslip is scored above this ground-truth speed. calibrated : None omits the consistencies.
-    dependent : signals with an estimator input as their ground truth.
+    dependent : signals with an estimator input as their ground truth. algorithms : digests by estimator.
     """
 
     log: str
@@ -78,6 +78,7 @@ class EvaluatedDrive:
     low_speed_m_s: float
     calibrated: CalibratedSignals | None = None
     dependent: Collection[str] = ()
+    algorithms: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +110,8 @@ class Metric:
     definition : one or two sentences for the documentation and for pages.
     columns : returns the columns of a drive; metrics with the same function share its columns.
     formula : returns the value for a segment from the values of its columns, or None.
-    over : names of these columns; stamps at which the first one is finite are used. Empty: the name of the metric.
+    over : names of these columns; stamps at which the first one is finite are used. Empty: the name of the metric. A
+        later name may be that of a metric before it with the same function: its value.
     best : ``lower``, ``higher``, the best value, or None if no value is better than another.
     unit : of its values; None for the unit of the signal.
     whole : only segment ``all`` has a value. of_truth : it compares with ground truth.
@@ -196,16 +198,20 @@ def _rows(
     def where_known(name: str, first: str) -> NDArray[Any]:
         return selected(columns.values[name][place], known(first))
 
+    of_family: dict[str, float] = {}
+    estimator, signal = columns.estimator, columns.signal
+    digest = drive.algorithms.get(estimator, "")
     for metric in family:
         over = metric.over or (metric.name,)
-        if not columns.values.keys() >= {*over} or (metric.whole and segment != ALL):
+        if not {*columns.values, *of_family} >= {*over} or (metric.whole and segment != ALL):
             continue
-        values, signal = [where_known(name, over[0]) for name in over], columns.signal
+        values: list[Any] = [of_family[n] if n in of_family else where_known(n, over[0]) for n in over]
         n = len(values[0])
         value = metric.formula(*values) if n else None
         if value is not None:
+            of_family[metric.name] = value
             unit, independent = metric.unit_of(signal), not (metric.of_truth and signal in drive.dependent)
-            yield MetricRow(drive.log, columns.estimator, signal, segment, metric.name, value, unit, n, independent)
+            yield MetricRow(drive.log, estimator, signal, segment, metric.name, value, unit, n, independent, digest)
 
 
 #: Modules of this package that export ``METRICS``. Add the name of a new one here.

@@ -11,7 +11,6 @@ import numpy as np
 
 from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.evaluation.statistics import gathered
-from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -42,7 +41,7 @@ def fields_of_log(
     LogError : The file is no log.
     UsageError : The log has no such topic.
     """
-    with closing(open_log(path, options.limits, options.msgs, Wanted(frozenset()), options.tables)) as log:
+    with closing(open_log(path, options.limits, options.msgs, options.tables)) as log:
         topics = [t for t in log.topics if topic in (None, t.name)]
         if topic is not None and not topics:
             names = ", ".join(t.name for t in log.topics) or "none"

@@ -19,7 +19,6 @@ from pdhef_logtool.drive.survey import Proposal, apply_proposals, mapping_propos
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import all_specs
 from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
@@ -97,16 +96,6 @@ class Steps:
         if (self.steps_s[i : i + 1] > above_s).any():
             gap = float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * S_PER_NS
         return dict(zip(("largest_gap_s", "largest_gap_at_s"), gap, strict=True))
-
-    @property
-    def gap_limit_s(self) -> float:
-        """Steps above this limit are gaps."""
-        return max(MIN_GAP_S, GAP_PERIODS * self.median_s)
-
-    @property
-    def gaps(self) -> int:
-        """Number of gaps."""
-        return int(np.count_nonzero(self.steps_s > self.gap_limit_s))
 
 
 _NONE = np.empty(0, dtype=np.int64)
@@ -294,13 +283,15 @@ def inspect_log(
     MappingError : The mapping names a topic or field that the log does not contain.
     """
     mapping = mapping_of(mapping)
-    wanted = Wanted() if whole else Wanted(frozenset(), above_bytes=WHOLE_BYTES)
-    with closing(open_log(path, options.limits, options.msgs, wanted, tables_for(mapping, options.tables))) as log:
-        index = None if whole else log.index
+    with closing(open_log(path, options.limits, options.msgs, tables_for(mapping, options.tables))) as log:
+        source = log.messages
+        index = source if source is not None and source.is_indexed and not whole else None
         # Most of a shorter one is read anyway.
         long = index is not None and (index.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS)
         if index is not None and not (long and index.size > WHOLE_BYTES):
             index = None
+        if index is None and source is not None:
+            source.prefetch({topic.name for topic in log.topics}, [(log.start_ns, log.end_ns)])
         inspection = inspect_drive_log(log, mapping, prefer_truth=options.prefer_truth, index=index)
         sample, damaged = inspection.sample, any(loss.severity == "lost" for loss in log.lost)
         if sample is None or not (damaged or sample.chunks > MOST_SAMPLED * sample.of_chunks):
@@ -418,6 +409,7 @@ def _signal_report(
     quality: QualityGate | None,
 ) -> SignalReport:
     steps = Steps.of([c.stamps_ns for c in channels])
+    gap_s = max(MIN_GAP_S, GAP_PERIODS * steps.median_s)
     lengths = (c.values if c.values.ndim == 1 else np.linalg.norm(c.values, axis=1) for c in channels)
     values = np.concatenate([np.empty(0), *lengths])
     places = {f"{source.name} ({source.label})"}
@@ -437,8 +429,8 @@ def _signal_report(
         rate_hz=steps.rate_hz,
         latency_s=clock.median_delay_s + source.latency_s,
         **figures,
-        gaps=steps.gaps,
-        **steps.longest(log.start_ns, steps.gap_limit_s),
+        gaps=int(np.count_nonzero(steps.steps_s > gap_s)),
+        **steps.longest(log.start_ns, gap_s),
         dropped=dropped,
     )
 

@@ -1,4 +1,4 @@
-"""The scores and the page of ``studies.peers``."""
+"""Scores, rows and pages of the studies; pages equal those of the stored results."""
 
 import json
 import math
@@ -11,12 +11,14 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool import Car
+from pdhef_logtool import Car, inspect_log
 from pdhef_logtool.records.tracks import make_track
-from studies import conditions
+from studies import conditions, reference
 from studies.calibration import coverage_table
 from studies.drawn_cars import fit_vehicle
-from studies.pages import DOCS, RESULTS, ROOT
+from studies.gates import __main__ as gates
+from studies.gates.rows import GateRow
+from studies.pages import DOCS, RESULTS, ROOT, fill
 from studies.peers import __main__ as study
 from studies.peers.drives import FULL_SIZE, PEER_DRIVES
 from studies.peers.page import estimator_table
@@ -151,6 +153,34 @@ def test_a_calibrated_figure_is_accepted_and_others_are_not():
     ]
     lines = [line.split("|") for line in coverage_table(pl.DataFrame(scores)).splitlines()[2:]]
     assert {line[1].strip(): line[-2].strip() for line in lines} == {"right": "yes", "narrow": "no", "wide": "too wide"}
+
+
+def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
+    names = [case.name for case in reference.cases()]
+    assert len(set(names)) == len(names)
+    stored = json.loads((RESULTS / "reference" / reference.STORED).read_text(encoding="utf-8"))
+    assert set(names) <= set(stored)
+    page = (DOCS / "reference.md").read_text(encoding="utf-8")
+    assert page == fill(page, reference.blocks(stored), "reference.md")
+
+
+def test_added_gnss_is_read_as_a_topic_of_the_log(sample_logs_dir, tmp_path):
+    log = sample_logs_dir / "step.mcap"
+    start = inspect_log(log).to_dict()["start_ns"]
+    stamps = start + np.arange(20, dtype=np.int64) * 100_000_000
+    copy = reference.add_gnss(log, tmp_path / "copy.mcap", stamps, np.full((20, 2), 3.0))
+    before, after = ({t["name"]: t["messages"] for t in inspect_log(p).to_dict()["topics"]} for p in (log, copy))
+    assert after == before | {reference.GNSS_TOPIC: 20}
+
+
+def test_a_row_without_its_files_is_skipped_with_the_reason(tmp_path, monkeypatch, capsys):
+    absent = tmp_path / "drive.mcap"
+    row = GateRow("recorded drives", "drive.mcap", lambda _: pytest.fail("measured"), needs=(absent,))
+    monkeypatch.setattr(gates, "all_rows", lambda: [row])
+    assert gates.main(["--work", str(tmp_path / "work")]) == 0
+    out, err = capsys.readouterr()
+    assert f"recorded drives/drive.mcap: skipped, because {absent} is absent" in err
+    assert out == "no figure moved\n"
 
 
 DOCUMENTS = [*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile", *ROOT.glob("sample_logs/*.toml")]
