@@ -205,7 +205,7 @@ def _rows(
         over = metric.over or (metric.name,)
         if not {*columns.values, *of_family} >= {*over} or (metric.whole and segment != ALL):
             continue
-        values: list[Any] = [of_family[n] if n in of_family else where_known(n, over[0]) for n in over]
+        values: list[Any] = [where_known(n, over[0]) if n in columns.values else of_family[n] for n in over]
         n = len(values[0])
         value = metric.formula(*values) if n else None
         if value is not None:
