@@ -49,7 +49,7 @@ Names = Annotated[
     BeforeValidator(lambda v: tuple(filter(None, map(str.strip, v.split(",")))) if isinstance(v, str) else v),
 ]
 #: A file or folder, as a path or a text.
-File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]
+File = Annotated[Path, Field(strict=False)]
 Keep = Literal["metrics", "estimates", "full"]
 
 
