@@ -259,7 +259,7 @@ _TRAITS = tuple((trait, _rule(text)) for trait, texts in VOCABULARY["traits"].it
 _QUANTITIES: tuple[tuple[_Rule, tuple[str, ...]], ...] = tuple(
     (_rule(text), tuple(quantity)) for text, quantity in VOCABULARY["quantities"].items()
 )
-_PLACE_WORDS = frozenset({"gps", "gnss", "ins", "pos", "position", "abs"})
+_PLACE_WORDS = frozenset(VOCABULARY["topics"]["navigation"].split()) | {"pos", "position", "abs"}
 _PLACE_OR_UNIT = _PLACE_WORDS | _UNIT_WORDS
 
 
