@@ -79,12 +79,15 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         likely = [h for p, h in mistakes if p > NAMED * wrong]
         contradicted = [r for r in relations if not r.accepts()] or relations
         return _wrong(name, likely, contradicted, measured, wrong)
-    shown = [r for r in relations if r.accepts(math.prod(h.acts_on(r) for h in chosen))]
-    if not shown:
-        others = " and ".join(sorted({n for h in chosen for n in h.factors} & relations[0].powers.keys()))
-        remedy = TEXTS["rest"].format(others=others) if others else TEXTS["unexplained"]
+    factors = {r.law.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
+    usable = [r for r in relations if not math.isnan(factors[r.law.text])]
+    if not usable:
+        others = " and ".join(sorted({n for h in chosen for n in h.factors} & set(relations[0].powers)))
+        remedy = TEXTS["rest"].format(others=others)
         return [result(UNIT, "undecided", name, evidence=relations[0].evidence, remedy=remedy)]
-    best = max(shown, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
+    if not any(r.accepts(factors[r.law.text]) for r in usable):
+        return [result(UNIT, "undecided", name, evidence=usable[0].evidence, remedy=TEXTS["unexplained"])]
+    best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
     return [result(n, "passed", name, evidence=best.evidence) for n in (SIGN, UNIT)]
 
 

@@ -337,10 +337,14 @@ def _scaled_to(wheel: FloatArray, pace: _Pace) -> FloatArray:
 def _courses(columns: Mapping[str, FloatArray], pace: _Pace) -> Iterator[Relation]:
     """Relate the yaw rates to the course rates of the ground truth, and of a GNSS receiver's velocity and positions."""
     for path, key in ((COURSE_RATE, "course"), (GNSS_COURSE_RATE, "course"), (GNSS_PATH[0], "gnss_path")):
+        turnings = [columns[path]] if path in columns else []
+        # In a spin, the sideslip changes as well.
+        if turnings and "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:
+            turnings.append(columns[path] - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
         line, mapped = ("course", "") if path == GNSS_COURSE_RATE else ("path", COURSE_RATE)
-        for name in (n for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if {n, path} <= columns.keys()):
+        for name in (n for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns):
             its = law(key, name=name, line=line, mapped=mapped)
-            yield from compare(its, columns[path], columns[name], pace.moving)
+            yield from _best([r for t in turnings for r in compare(its, t, columns[name], pace.moving)])
 
 
 def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
