@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pdhef_logtool.drive.check_table import NEEDS, TEXTS, result
-from pdhef_logtool.drive.hypotheses import MOST_ENERGY, Hypothesis, Posterior, Relation
+from pdhef_logtool.drive.hypotheses import FOREIGN, MOST_ENERGY, Hypothesis, Posterior, Relation, units_of
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
 from pdhef_logtool.drive.relations import COURSE_RATE
 from pdhef_logtool.records.checks import Check, Verdict
@@ -87,8 +87,21 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         return [result(UNIT, "undecided", name, evidence=relations[0].evidence, remedy=remedy)]
     if not any(r.accepts(factors[r.law.text]) for r in usable):
         return [result(UNIT, "undecided", name, evidence=usable[0].evidence, remedy=TEXTS["unexplained"])]
+    return _passed(name, usable, factors)
+
+
+def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    return [result(n, "passed", name, evidence=best.evidence) for n in (SIGN, UNIT)]
+    # Wheel radii and wheelbases vary by more; a speed separates mph from km/h, tyres do not.
+    foreign = () if name.startswith(("steer", "wheel")) else FOREIGN
+    units = {f for f, said in units_of(name.removeprefix("truth.")) if said not in ("is in m/s", "is in rad/s")}
+    units |= {f**p for f in foreign for p in (1.0, -1.0)}
+    units = {f for f in units if name not in NEEDS["units"] or max(f, 1.0 / f) > 3.0}
+    is_open = any(all(r.accepts(factors[r.law.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units)
+    return [
+        result(SIGN, "passed", name, evidence=best.evidence),
+        result(UNIT, "undecided" if is_open else "passed", name, evidence=best.evidence, remedy=_needs(name, "unit")),
+    ]
 
 
 def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -> bool:

@@ -55,8 +55,9 @@ SHOWN_STD = 8.0
 REVERSE_M_S = 10.0
 #: In a bend, wheels differ by less; a wheel that differs by more spins or locks.
 SPIN_SHARE = 0.2
-#: Speeds of full-size vehicles.
-FULL_SIZE_M_S = (12.0, 70.0)
+#: Speeds of full-size vehicles. A wrong speed must not lengthen the wheelbase by the vehicle file: the lowest of speed,
+#: ground truth and a_y / r counts, up to ``FAST_M_S``.
+FULL_SIZE_M_S, FAST_M_S = (12.0, 70.0), 40.0
 #: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature; above, the
 #: front tyres slip.
 STEERING_SHARE = 0.6
@@ -117,9 +118,7 @@ def measured_relations(
     for key, name, other in TWICE:
         if {name, other} <= columns.keys():
             relations += compare(law(key, other=other, name=name), columns[name], columns[other])
-    bends = {"ay_m_s2", "yaw_rate_rad_s"}
-    agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
-    return relations + _axle_sideslips(columns, vehicle, speed_name, agree) + _sideslips(columns)
+    return relations + _sideslips(columns)
 
 
 # ------------------------------------------------------------------------------------------- relations
@@ -211,16 +210,22 @@ def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
 
 def _lengths(pace: _Pace, vehicle: VehicleParameters | None) -> dict[str, tuple[float, float]]:
     """Return the plausible effective wheelbases by road-wheel and by steering-wheel angle, m."""
-    if vehicle is not None:
-        low, high = (factor * vehicle.wheelbase_m for factor in LENGTHS["file"])
-        return {
-            "steer_rad": (low, high),
-            "steering_wheel_rad": (low * vehicle.steering_ratio, high * vehicle.steering_ratio),
-        }
-    finite = np.abs(pace.speed[np.isfinite(pace.speed)])
-    is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, 0.9) < FULL_SIZE_M_S[1]
-    lengths = LENGTHS["full_size"] if is_full_size else LENGTHS
-    return {name: tuple(lengths[name]) for name in _STEERING}
+    columns, speed = pace.columns, pace.speed
+    if vehicle is None:
+        finite = np.abs(speed[np.isfinite(speed)])
+        is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, 0.9) < FULL_SIZE_M_S[1]
+        lengths = LENGTHS["full_size"] if is_full_size else LENGTHS
+        return {name: tuple(lengths[name]) for name in _STEERING}
+    paces = [median_known(np.abs(c)) for c in (speed, columns.get("truth.vx_m_s")) if c is not None]
+    if "ay_m_s2" in columns:
+        ay, rate = (columns[n] for n in ("ay_m_s2", "yaw_rate_rad_s"))
+        finite = np.isfinite(ay) & np.isfinite(rate)
+        paces.append(float(ay[finite].std() / max(rate[finite].std(), 1e-9)) if finite.any() else FAST_M_S)
+    gradient = max(0.0, vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction))
+    low, high = (f * (vehicle.wheelbase_m + gradient * min(*paces, FAST_M_S) ** 2) for f in LENGTHS["file"])
+    return {
+        name: (low * ratio, high * ratio) for name, ratio in zip(_STEERING, (1.0, vehicle.steering_ratio), strict=True)
+    }
 
 
 def effective_wheelbase_m(columns: Mapping[str, FloatArray], speed_name: str | None) -> float:
@@ -250,17 +255,12 @@ def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relati
     is_turning = driven.size > 0 and bool(driven.std() > max(DRIVEN["yaw_rate_rad_s"], abs(driven.mean())))
     curvature = np.where(pace.moving, yaw / speed, np.nan)
     for name, lengths in _lengths(pace, vehicle).items():
-        steer, typical = columns.get(name), math.sqrt(math.prod(lengths))
-        if steer is None:
+        if name not in columns:
             continue
-        by_rate, by_ay = (law(key, steer=name, pace=pace.name) for key in ("steering", "steering_lateral"))
-        by_rate = replace(by_rate, gains=lengths, typical=typical)
-        either = [r for use in (pace.moving, gentle) for r in compare(by_rate, curvature, steer, use)]
+        its = replace(law("steering", steer=name, pace=pace.name), gains=lengths, typical=math.sqrt(math.prod(lengths)))
+        either = [r for use in (pace.moving, gentle) for r in compare(its, curvature, columns[name], use)]
         # Sliding front tyres break the relation at large angles, and noise breaks it at small ones.
         yield from _best([replace(r, moves=r.correlation == 0.0 and is_turning) for r in either])  # dead sensor
-        if "ay_m_s2" in columns:
-            by_ay = replace(by_ay, gains=(1.0 / lengths[1], 1.0 / lengths[0]), typical=1.0 / typical)
-            yield from compare(by_ay, steer * speed**2, columns["ay_m_s2"], gentle)
 
 
 def _speeds(pace: _Pace) -> Iterator[Relation]:
@@ -411,34 +411,6 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     of_vx = subject != "truth.sideslip_rad"  # sideslip from v_y and v_x, otherwise v_y from sideslip and v_x
     by_rate = law("sideslip_rate", subject=subject, scaled="" if of_vx else "truth.vx_m_s")
     return _partial(by_rate, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
-
-
-def _axle_sideslips(
-    columns: Mapping[str, FloatArray], vehicle: VehicleParameters | None, speed_name: str | None, agree: bool
-) -> list[Relation]:
-    """Relate the ground-truth sideslip to the rear axle model of the vehicle file, v_y = l r - C a_y v.
-
-    The relation needs a_y and r that ``agree``; otherwise either term may be wrong.
-    """
-    subject = next((n for n in ("truth.sideslip_rad", "truth.vy_m_s") if n in columns), "")
-    ay, rate, sideslip = (columns.get(n) for n in ("ay_m_s2", "yaw_rate_rad_s", subject))
-    if vehicle is None or speed_name is None or not agree or ay is None or rate is None or sideslip is None:
-        return []
-    is_moved = subject == "truth.vy_m_s" and CG_VY not in columns
-    lever = vehicle.cg_to_rear_axle_m + (0.0 if is_moved else vehicle.truth_position_m[0])
-    stiffness = vehicle.cornering_stiffness_n_per_rad(False, vehicle.assumed_friction)
-    compliance = vehicle.mass_kg * vehicle.cg_to_front_axle_m / (vehicle.wheelbase_m * stiffness)
-    speed, its = columns[speed_name], law("rear_axle", subject=subject)
-    slip, gentle = compliance * ay * speed, gentle_at(speed * rate, _moving(columns, speed))
-    expected, used = lever * rate - slip, gentle & np.isfinite(slip) & np.isfinite(rate)
-    # Where the two terms cancel, the file's compliance, known to a quarter, decides the sign.
-    if not used.any() or expected[used].std() < 0.25 * slip[used].std():
-        return []
-    if subject == "truth.sideslip_rad":
-        expected /= speed
-    # Files without a position of ground truth imply the CG, but it may be at any axle.
-    high = its.gains[1] * max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
-    return compare(replace(its, gains=(its.gains[0], high)), expected, sideslip, gentle)
 
 
 def _partial(

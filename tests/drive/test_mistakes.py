@@ -29,7 +29,6 @@ from studies.pages import write_toml
 from tests.drive.test_checks import checks_of, drive
 
 VEHICLE = default_vehicle().model_copy(update={"mass_kg": default_vehicle().mass_kg + 1.0})
-TEXT = "truth.vy_m_s against the rear axle of the vehicle file"
 
 
 def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, Channel], dict[str, Channel]]:
@@ -50,7 +49,7 @@ def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, 
 
 @pytest.mark.parametrize("place_m", [-1.1, 0.0])
 @pytest.mark.parametrize("factor", [1.0, 57.2958, 1.0 / 57.2958, 9.80665, 1.0 / 9.80665])
-def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
+def test_a_wrong_unit_of_v_y_never_passes(place_m, factor):
     vehicle = VEHICLE.model_copy(update={"truth_position_m": (place_m, 0.0, 0.0)})
     signals, truth = with_truth(vehicle, factor)
     derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
@@ -95,14 +94,6 @@ def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro():
     truth["yaw_rate_rad_s"] = replace(rate, values=2000.0 * rate.values)
     found = checks_of(signals, truth, derive_truth(truth), VEHICLE)
     assert {c.subject for c in found if c.verdict == "failed"} == {"truth.yaw_rate_rad_s"}
-
-
-def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back():
-    """A file without the place of ground truth means the CG; the lever of its front axle is no other unit."""
-    back = VEHICLE.model_copy(update={"cg_to_rear_axle_m": 0.8, "cg_to_front_axle_m": 1.8})
-    signals, truth = with_truth(back, 1.0)
-    (axle,) = (r for r in measure(signals, truth, derive_truth(truth), back).relations if r.law.text == TEXT)
-    assert axle.law.gains[1] > (0.8 + 1.8) / 0.8
 
 
 def test_a_unit_that_the_drive_leaves_open_is_not_checkable():

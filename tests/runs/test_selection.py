@@ -28,7 +28,7 @@ field = "twist.twist.linear.x"
 topic = "/truth/perfect/odometry"
 field = "twist.twist.linear.y"
 """
-SHUFFLED = TRUTH.replace('linear.y"', 'angular.z"\nscale = -7.0').replace('linear.x"', 'linear.x"\nscale = 0.8')
+SHUFFLED = TRUTH.replace('linear.y"', 'angular.z"\nscale = -7.0').replace('linear.x"', 'linear.x"\nscale = 0.5')
 
 
 def d2(unexplained: str = "zero", /, **values: float) -> list[MetricRow]:
