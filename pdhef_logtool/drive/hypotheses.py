@@ -11,7 +11,7 @@ import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -170,6 +170,14 @@ class Hypothesis:
         """Whether the factors are exact units and signs, not a typical steering ratio or wheel radius."""
         return not any(abs(f) in _TYPICAL or math.isnan(f) for f in self.factors.values())
 
+    @cached_property
+    def energy(self) -> float:
+        """Negative logarithm of the prior odds."""
+        if self.kind == "open sign":
+            return PRIORS[self.kind]
+        names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
+        return PRIORS[self.kind] + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
+
     def is_about(self, names: set[str]) -> bool:
         """Return whether all signals of the hypothesis (for an open sign: any) are among these names."""
         shared = len(self.factors.keys() & names)
@@ -178,10 +186,6 @@ class Hypothesis:
     def acts_on(self, relation: Relation) -> float:
         """Return the factor on the relation's gain when the mistake is corrected."""
         return math.prod(f ** relation.powers[n] for n, f in self.factors.items() if n in relation.powers)
-
-
-#: No mistake.
-_NONE = Hypothesis({}, "", "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,34 +216,38 @@ def posterior(
     telling = [r for r in relations if r.tells]
     touched = {n for r in telling for n in r.powers}
     # Mistakes of signals without a relation change no likelihood.
-    useful = [_NONE, *(h for h in hypotheses if h.is_about(touched))]
-    priors = np.array([PRIORS.get(h.kind, 0.0) + _of_scales(h, scales or {}) for h in useful])
+    useful = [h for h in hypotheses if h.is_about(touched)]
+    priors = np.array([*(h.energy + _of_scales(h, scales or {}) for h in useful), 0.0])
+    none = len(useful)
+    # Factors of the mistakes by signal; the last one is of no mistake.
+    factors = {name: np.ones(none + 1) for name in touched}
+    for k, mistake in enumerate(useful):
+        for name in mistake.factors.keys() & touched:
+            factors[name][k] = mistake.factors[name]
     first, second = np.nonzero(np.triu(_compatible(useful)))
-    energy = priors[first] + priors[second]
-    factors = {name: np.array([h.factors.get(name, 1.0) for h in useful]) for name in touched}
+    first, second = np.append(np.arange(none + 1), first), np.append(np.full(none + 1, none), second)
+    energy = np.zeros(len(first))
     for relation in telling:
         on_gain = np.prod([factors[name] ** power for name, power in relation.powers.items()], axis=0)
         single, index = np.unique(on_gain, return_inverse=True)
         table = relation.energies(np.outer(single, single).ravel()).reshape(len(single), len(single))
         energy += table[index[first], index[second]]
-    likely = np.flatnonzero(energy < energy.min() + 25.0)  # all others are less than 1e-10 times as likely
-    likely = likely[np.argsort(energy[likely], kind="stable")]
-    weights = np.exp(energy.min() - energy[likely])
-    pairs = zip((weights / weights.sum()).tolist(), first[likely], second[likely], strict=True)
-    return Posterior(tuple((p, tuple(useful[i] for i in pair if i)) for p, *pair in pairs))
+    energy += priors[first] + priors[second]
+    least = float(energy.min())
+    likely = np.flatnonzero(energy < least + 25.0)  # all others are less than 1e-10 times as likely
+    weights = {tuple(sorted({int(first[i]), int(second[i])} - {none})): math.exp(least - energy[i]) for i in likely}
+    total = sum(weights.values())
+    ordered = sorted(weights.items(), key=lambda x: (-x[1], x[0]))
+    return Posterior(tuple((w / total, tuple(useful[i] for i in k)) for k, w in ordered))
 
 
 def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
-    """Return bool [N, N], the pairs that can be true together: of different signals, neither of kind ``foreign``.
-
-    The first of them, :data:`_NONE`, can be true with each other one, and with itself.
-    """
+    """Return bool [N, N], the pairs that can be true together: of different signals, neither of kind ``foreign``."""
     names = sorted({n for h in mistakes for n in h.factors})
     about = np.array([[n in h.factors for n in names] for h in mistakes], dtype=np.float32)
+    about = about.reshape(len(mistakes), len(names))
     common = np.array([h.kind != "foreign" for h in mistakes], dtype=bool)
-    pairs = np.outer(common, common) & (about @ about.T == 0.0)
-    pairs[0] = True
-    return np.asarray(pairs)
+    return np.asarray(np.outer(common, common) & (about @ about.T == 0.0))
 
 
 @lru_cache
@@ -286,7 +294,7 @@ def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
             both = f"{words} {text} and has the wrong sign"
             yield Hypothesis({part[0]: -factor}, both, "sign and unit")
     # Sensors are mounted upside down or backwards, and ground truth has other conventions; speeds are positive ahead.
-    if _SIZE not in part and (is_one or not _NEVER_TURNED & set(part)):
+    if part != ("truth.position_speed_m_s",) and (is_one or not _NEVER_TURNED & set(part)):  # a size has no sign
         has = "has" if is_one else "have"
         yield Hypothesis(dict.fromkeys(part, -1.0), f"{words} {has} the wrong sign", "sign")
     verb = "are" if words.endswith("speeds") else "is"
@@ -297,8 +305,6 @@ def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
 
 
 _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
-#: A speed without a sign.
-_SIZE = "truth.position_speed_m_s"
 
 
 def _together(names: Sequence[str]) -> str:
