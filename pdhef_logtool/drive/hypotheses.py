@@ -1,8 +1,8 @@
 """Posterior probabilities of wrong units, signs and fields, given the relations between signals.
 
-Each relation has a gain. A hypothesis rescales it. Its energy is the prior plus the distances of the rescaled gains
-from their plausible ranges. The distance is bounded, because sliding, wheel spin or a bank change a gain, too.
-Probabilities are exp(-energy), normalised.
+Each relation stores one gain per block of the drive. A hypothesis rescales these gains. Its energy is the prior plus
+the distance of the rescaled gains from the plausible range. The distance is bounded for each block, because sliding,
+wheel spin or a bank change some blocks only, and a wrong unit changes all. Probabilities are exp(-energy), normalised.
 """
 
 from __future__ import annotations
@@ -44,8 +44,11 @@ SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
 LEAST_WIDTH, EDGE, WIDE_EDGE = 0.05, 0.15, 0.04
 #: Largest energy of one relation (sensors fail and cars slide), and its energy if a wrong field is mapped.
 MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
-#: Energies of hypotheses: negative logarithms of their prior odds.
+#: Energies of hypotheses (negative logarithms of their prior odds), and signals by the frequency of their mistakes.
 PRIORS: dict[str, float] = TABLE["priors"]
+_OFTEN_WRONG: list[str] = TABLE["often_wrong"]["signals"]
+#: Number of blocks of a drive with separate gains.
+BLOCKS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +87,7 @@ class Relation:
     Attributes
     ----------
     samples : number of independent samples. moves : whether the signals vary by more than disturbances cause.
-    sides : predicted and measured [N].
+    blocks : gains of blocks of the drive, each without the block's means. sides : predicted and measured [N].
     """
 
     law: Law
@@ -92,6 +95,7 @@ class Relation:
     gain: float
     samples: float
     moves: bool = False
+    blocks: tuple[float, ...] = ()
     sides: tuple[FloatArray, FloatArray] | None = None
 
     @property
@@ -102,7 +106,7 @@ class Relation:
     @property
     def decides_unit(self) -> bool:
         """Return whether the plausible range is narrow enough to exclude all other units."""
-        return self.law.gains[1] < DECIDES_UNIT * self.law.gains[0]
+        return self.law.gains[1] < DECIDES_UNIT * self.law.gains[0] * self.correlation**2
 
     @property
     def tells(self) -> bool:
@@ -126,26 +130,28 @@ class Relation:
         return size > 0.0 and gain / size >= self.law.gains[0] and gain * size <= self.law.gains[1]
 
     def energies(self, factors: FloatArray) -> FloatArray:
-        """Return the negative log likelihoods [N] of the gain times each factor [N].
+        """Return the negative log likelihoods [N] of the blocks' gains times each factor [N].
 
         A NaN factor means a wrong field, for which any gain is possible.
         """
-        gains = factors * self.gain
+        gains = factors[:, None] * (self.blocks or (self.gain,))
         low, high = (math.log(max(e, 1e-12)) for e in self.law.gains)
         with np.errstate(divide="ignore"):
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
-        # Sliding and fast steering change the gain by half of the share that the relation does not explain.
-        apart = 0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2))
+        # Blocks differ by sliding and by fast steering, which change during the drive; a wrong unit does not change.
+        # A drive without blocks may slide throughout: half of the unexplained share is assumed as their difference.
+        unknown = 0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2))
+        apart = float(np.std(np.log(np.abs(self.blocks)))) if self.blocks and all(self.blocks) else unknown
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
         energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
             middle = math.log(self.law.typical) if low < math.log(self.law.typical) < high else 0.5 * (low + high)
             off = np.maximum(np.abs(size - middle) - room, 0.0)
             energy += 0.5 * (off / math.hypot(max((high - low) / 6.0, LEAST_WIDTH), apart)) ** 2
-        excluded = (gains <= 0.0) & (not self.law.signless)
-        energy = np.where(excluded, self.law.most_energy, np.minimum(energy, self.law.most_energy))
-        return np.where(np.isnan(factors), _ANY_GAIN, energy)
+        energy = np.minimum(energy, self.law.most_energy)
+        mean = (energy if self.law.signless else np.where(gains > 0.0, energy, self.law.most_energy)).mean(axis=1)
+        return np.where(np.isnan(factors), _ANY_GAIN, mean)
 
     @property
     def evidence(self) -> str:
@@ -176,7 +182,10 @@ class Hypothesis:
         if self.kind == "open sign":
             return PRIORS[self.kind]
         names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
-        return PRIORS[self.kind] + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
+        rank = max(_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in names)
+        seldom = 0.0 if rank < 2 else (PRIORS["seldom"] + PRIORS["seldom step"] * rank)
+        seldom *= 2.0 if self.kind == "foreign" else 1.0
+        return PRIORS[self.kind] + seldom + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
 
     def is_about(self, names: set[str]) -> bool:
         """Return whether all signals of the hypothesis (for an open sign: any) are among these names."""
@@ -343,3 +352,21 @@ def is_odd(name: str, scale: float) -> bool:
     of_units = units_of(name.removeprefix("truth."))
     units = (1.0, *(f for f, words in of_units if words.startswith("is in") and f not in _TYPICAL))
     return not any(abs(abs(scale) - unit) < 0.01 * unit for unit in units)
+
+
+def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:
+    """Return the gains [at most ``blocks``] of moving blocks; each block's means are removed (bank, bias).
+
+    Parameters
+    ----------
+    reference, measured : float64 [N], without NaN.
+    """
+    least, gains = 0.3 * float(reference.std()), []
+    for a, b in zip(np.array_split(reference, blocks), np.array_split(measured, blocks), strict=True):
+        spread_a, spread_b = float(a.std()), float(b.std())
+        if a.size < 2 or min(spread_a - least, spread_b) <= 1e-12:
+            continue
+        correlation = float(np.mean((a - a.mean()) * (b - b.mean()))) / (spread_a * spread_b)
+        if abs(correlation) >= MIN_CORRELATION:
+            gains.append(math.copysign(spread_b / spread_a, correlation))
+    return tuple(gains) if len(gains) >= 3 else ()

@@ -119,8 +119,7 @@ class Measured:
             n for n in ("truth.yaw_rate_rad_s", "truth.vy_m_s", "truth.sideslip_rad", "truth.ay_m_s2") if n in columns
         ]
         speeds = [n for n in ("truth.vx_m_s", "truth.vy_m_s", "truth.position_speed_m_s") if n in columns]
-        frame = [n for n in (TURNING, COURSE_RATE) if n in columns]  # of a pose, which may be mirrored
-        groups = [tuple(g) for g in (*topics.values(), truth, speeds, frame) if 2 <= len(g) <= 6]
+        groups = [tuple(g) for g in (*topics.values(), truth, speeds) if 2 <= len(g) <= 6]
         return [*groups, *([tuple(wheels)] if len(wheels) > 1 else [])]
 
 

@@ -12,14 +12,14 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known, moving_at
-from pdhef_logtool.drive.hypotheses import MIN_SAMPLES, TABLE, Law, Relation, kind_of
+from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_SAMPLES, TABLE, Law, Relation, block_gains, kind_of
 from pdhef_logtool.mapping.naming import CACHED_NAMES
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 LENGTHS: dict[str, Any] = TABLE["lengths"]
 MOST: dict[str, float] = TABLE["most"]
 #: Least correlation of two residuals of a regression: they are small, and sliding changes their relation.
-MIN_PARTIAL_CORRELATION = 0.7
+MIN_PARTIAL_CORRELATION = 0.8
 #: Column of the ground-truth v_y at the CG if v_y is mapped. The mapped v_y has its own column, because the lever-arm
 #: term of v_y at the CG would hide a wrong unit.
 CG_VY = "truth.vy_m_s at the CG"
@@ -118,7 +118,9 @@ def measured_relations(
     for key, name, other in TWICE:
         if {name, other} <= columns.keys():
             relations += compare(law(key, other=other, name=name), columns[name], columns[other])
-    return relations + _sideslips(columns)
+    bends = {"ay_m_s2", "yaw_rate_rad_s"}
+    agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
+    return relations + _axle_sideslips(columns, vehicle, speed_name, agree) + _sideslips(columns)
 
 
 # ------------------------------------------------------------------------------------------- relations
@@ -153,7 +155,10 @@ def compare(law: Law, predicted: FloatArray, measured: FloatArray, use: BoolArra
     correlation = (correlation * spread_a * spread_b + of_means[0] * of_means[1]) / (rms_a * rms_b)
     # The ratio of the sizes lies between the two regressions, because either side may be noisy.
     gain = float(np.copysign(rms_b / rms_a, correlation))
-    return [Relation(law, correlation, gain, samples, both, sides)]
+    # The gain of a block with fewer samples is random, and a block on a circle has none.
+    by_means = abs(of_means[0]) > spread_a
+    blocks = () if by_means else block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
+    return [Relation(law, correlation, gain, samples, both, blocks, sides)]
 
 
 def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
@@ -255,12 +260,17 @@ def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relati
     is_turning = driven.size > 0 and bool(driven.std() > max(DRIVEN["yaw_rate_rad_s"], abs(driven.mean())))
     curvature = np.where(pace.moving, yaw / speed, np.nan)
     for name, lengths in _lengths(pace, vehicle).items():
-        if name not in columns:
+        steer, typical = columns.get(name), float(np.sqrt(lengths[0] * lengths[1]))
+        if steer is None:
             continue
-        its = replace(law("steering", steer=name, pace=pace.name), gains=lengths, typical=math.sqrt(math.prod(lengths)))
-        either = [r for use in (pace.moving, gentle) for r in compare(its, curvature, columns[name], use)]
+        by_rate, by_ay = (law(key, steer=name, pace=pace.name) for key in ("steering", "steering_lateral"))
+        by_rate = replace(by_rate, gains=lengths, typical=typical)
+        either = [r for use in (pace.moving, gentle) for r in compare(by_rate, curvature, steer, use)]
         # Sliding front tyres break the relation at large angles, and noise breaks it at small ones.
         yield from _best([replace(r, moves=r.correlation == 0.0 and is_turning) for r in either])  # dead sensor
+        if "ay_m_s2" in columns:
+            by_ay = replace(by_ay, gains=(1.0 / lengths[1], 1.0 / lengths[0]), typical=1.0 / typical)
+            yield from compare(by_ay, steer * speed**2, columns["ay_m_s2"], gentle)
 
 
 def _speeds(pace: _Pace) -> Iterator[Relation]:
@@ -277,9 +287,10 @@ def _speeds(pace: _Pace) -> Iterator[Relation]:
         use = next((u for u in uses if independent_samples(u) >= MIN_SAMPLES), None)
         if use is None:
             continue
-        ratio = float(np.median(column[use] / speed[use]))
+        ratios = column[use] / speed[use]
         over = law(keys[name], name=name, pace=pace.name, mapped="" if name == GNSS_PATH[1] else name)
-        yield Relation(over, 1.0, ratio, independent_samples(use))
+        blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
+        yield Relation(over, 1.0, float(np.median(ratios)), independent_samples(use), blocks=blocks)
     of_wheels = (
         any(n.startswith("wheel") and n.endswith("_rad_s") for n in pace.columns) and pace.name == "wheel_speeds"
     )
@@ -413,6 +424,34 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     return _partial(by_rate, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving)
 
 
+def _axle_sideslips(
+    columns: Mapping[str, FloatArray], vehicle: VehicleParameters | None, speed_name: str | None, agree: bool
+) -> list[Relation]:
+    """Relate the ground-truth sideslip to the rear axle model of the vehicle file, v_y = l r - C a_y v.
+
+    The relation needs a_y and r that ``agree``; otherwise either term may be wrong.
+    """
+    subject = next((n for n in ("truth.sideslip_rad", "truth.vy_m_s") if n in columns), "")
+    ay, rate, sideslip = (columns.get(n) for n in ("ay_m_s2", "yaw_rate_rad_s", subject))
+    if vehicle is None or speed_name is None or not agree or ay is None or rate is None or sideslip is None:
+        return []
+    is_moved = subject == "truth.vy_m_s" and CG_VY not in columns
+    lever = vehicle.cg_to_rear_axle_m + (0.0 if is_moved else vehicle.truth_position_m[0])
+    stiffness = vehicle.cornering_stiffness_n_per_rad(False, vehicle.assumed_friction)
+    compliance = vehicle.mass_kg * vehicle.cg_to_front_axle_m / (vehicle.wheelbase_m * stiffness)
+    speed, its = columns[speed_name], law("rear_axle", subject=subject)
+    slip, gentle = compliance * ay * speed, gentle_at(speed * rate, _moving(columns, speed))
+    expected, used = lever * rate - slip, gentle & np.isfinite(slip) & np.isfinite(rate)
+    # Where the two terms cancel, the file's compliance, known to a quarter, decides the sign.
+    if not used.any() or expected[used].std() < 0.25 * slip[used].std():
+        return []
+    if subject == "truth.sideslip_rad":
+        expected /= speed
+    # Files without a position of ground truth imply the CG, but it may be at any axle.
+    high = its.gains[1] * max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
+    return compare(replace(its, gains=(its.gains[0], high)), expected, sideslip, gentle)
+
+
 def _partial(
     law: Law, predicted: FloatArray, measured: FloatArray, others: list[FloatArray], use: BoolArray
 ) -> list[Relation]:
@@ -423,4 +462,9 @@ def _partial(
     aside, left = np.stack(others, axis=1)[finite], np.full((2, len(finite)), np.nan)
     for rest, column in zip(left, (predicted, measured), strict=True):
         rest[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
-    return compare(replace(law, least_correlation=MIN_PARTIAL_CORRELATION), left[0], left[1], finite)
+    strict = replace(law, least_correlation=MIN_PARTIAL_CORRELATION)
+    # Agreement of most blocks on the sign is not random.
+    return [
+        r if len(r.blocks) > BLOCKS // 2 and len(set(np.sign(r.blocks))) == 1 else replace(r, law=strict)
+        for r in compare(law, left[0], left[1], finite)
+    ]
