@@ -40,7 +40,6 @@ from pdhef_logtool.records.signals import Channel
 LEAST_AY_DELAY_S = 0.015
 #: Largest number of corrections of a recognised mapping, one after the other: mounting, undocumented signs, one unit.
 MOST_CORRECTIONS = 3
-_INVERTED = "its sign is not documented, and the drive shows that it is inverted"
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +173,8 @@ def _certain_proposals(survey: Survey, *, is_mounting_blind: bool) -> tuple[list
     if is_mounting_blind and mounting is not None and not mounting.is_as_named:
         return _of_mounting(mapping, mounting), "mounting"
     if signs := [n for g in measured.open_signs if measured.posterior.turned(g[0]) >= CERTAIN for n in g]:
-        return _rescaled(mapping, dict.fromkeys(signs, (-1.0, _INVERTED))), "sign"
+        why = "its sign is not documented, and the drive shows that it is inverted"
+        return _rescaled(mapping, dict.fromkeys(signs, (-1.0, why))), "sign"
     documented = replace(measured, open_signs=()).without_truth()
     return _rescaled(mapping, explained_factors(documented, most=1)), "unit"
 
