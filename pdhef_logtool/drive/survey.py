@@ -38,8 +38,8 @@ from pdhef_logtool.records.signals import Channel
 
 #: Smaller delays of a_y may be due to body roll.
 LEAST_AY_DELAY_S = 0.015
-#: Largest number of corrections of a recognised mapping, one after the other: mounting, undocumented signs, one unit.
-MOST_CORRECTIONS = 3
+#: Kinds of corrections of a recognised mapping: at most one of each, one after the other.
+CORRECTIONS = ("mounting", "sign", "unit")
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def survey_log(
     span_ns: tuple[int, int],
     vehicle: VehicleParameters | None = None,
     *,
-    corrections: int = MOST_CORRECTIONS,
+    corrections: int = len(CORRECTIONS),
 ) -> Survey:
     """Read a span of a log and find the mounting of its IMU and a wrong unit or sign.
 
