@@ -311,6 +311,9 @@ def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequen
 def _uncommented(row: Sequence[str], width: int) -> Sequence[str]:
     """Return a row of ``width`` cells, without the mark of a comment and an empty cell at its end."""
     if row and (mark := PATTERNS["comment"].match(row[0])):
+        listed = " ".join(row)[mark.end() :].lstrip("# ").split(",")
+        if len(listed) == width:  # as NumPy writes titles above columns with another separator
+            return listed
         title = row[0][mark.end() :].lstrip("# ")
         row = [title, *row[1:]] if title or len(row) <= width else row[1:]
     return row[:-1] if len(row) == width + 1 and not row[-1].strip() else row

@@ -199,6 +199,12 @@ def test_a_cell_without_an_end_costs_only_the_cells_behind_it(tmp_path):
     assert len(read.columns["speed"]) > 20_000
 
 
+def test_titles_in_a_comment_may_have_another_separator_than_the_values(tmp_path):
+    rows = [f"{t} {a} {v}" for t, a, v in zip(SECONDS, AY, SPEED, strict=True)]
+    read = opened(tmp_path / "a.csv", "\n".join(["# time(s),lateral ay(m/s/s),speed(mph)", *rows, ""]))
+    np.testing.assert_array_equal(read.columns["speed"], SPEED)
+
+
 @pytest.mark.parametrize(
     ("row", "kinds"),
     [("#0.1,5,5", {"bad-cell", "bad-stamp"}), ("#a comment", {"comment"}), ("# one, two", {"comment"})],
