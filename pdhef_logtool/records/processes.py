@@ -53,6 +53,12 @@ def release_memory(rows: int) -> None:
             ctypes.CDLL(None).malloc_trim(0)
 
 
+def share_memory() -> None:
+    """Let all threads allocate from one arena: the C library keeps freed memory for each thread otherwise."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(-8, 1)  # M_ARENA_MAX
+
+
 def wait_for_end(pid: int, most_s: float = 5.0) -> None:
     """Wait until a killed process has ended, which need not be a child of this process."""
     until = time.monotonic() + most_s

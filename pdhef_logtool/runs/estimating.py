@@ -178,6 +178,7 @@ def estimate_drive(
     first: dict[tuple[str, int], Estimator] = {}
     for estimator, computation in zip(estimators, computations, strict=True):
         first.setdefault(computation, estimator)
+    processes.share_memory()
     pool = ThreadPoolExecutor(1 if processes.worker_number else numba.config.NUMBA_NUM_THREADS)
     try:
         running = {computation: pool.submit(run, estimator) for computation, estimator in first.items()}
