@@ -67,8 +67,9 @@ class Measured:
         is_place = "truth.lat_deg" in self.scales and "truth.y_m" not in self.scales
         return ("truth.lon_deg", "truth.lat_deg") if is_place else ("truth.x_m", "truth.y_m")
 
-    def without_truth(self) -> Measured:
-        """Return the columns and relations of the signals alone."""
+    @cached_property
+    def sensors(self) -> Measured:
+        """The columns and relations of the signals alone."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
         speed = None if (self.speed_name or "").startswith("truth.") else self.speed_name
         relations = tuple(self._of_sensors)

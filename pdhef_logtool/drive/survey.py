@@ -68,12 +68,12 @@ class Survey:
         """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
         if not self.measured.truth:
             return self.checks
-        return (*self.mounted, *check_drive(self.measured.without_truth()))
+        return (*self.mounted, *check_drive(self.measured.sensors))
 
     @property
     def assumed_car(self) -> VehicleParameters:
         """The car that is assumed without a vehicle file, by the sensors."""
-        sensed = self.measured.without_truth()
+        sensed = self.measured.sensors
         return assumed_car(effective_wheelbase_m(sensed.columns, sensed.speed_name))
 
     def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
@@ -135,7 +135,7 @@ def survey_log(
     truth_plan, derived = _derived(channels.truth, vehicle)
     measured = measure(channels.signals, channels.truth, derived, vehicle, mapping)
     # The inputs of an estimator must not depend on ground truth: a mounting from ground truth is only checked.
-    mounting = find_mounting(measured.without_truth(), triads, mapping)
+    mounting = find_mounting(measured.sensors, triads, mapping)
     blind = mounting is not None and mounting.confident
     if not blind and derived is not None:
         mounting = find_mounting(measured, triads, mapping)
@@ -175,7 +175,7 @@ def _certain_proposals(survey: Survey, *, is_mounting_blind: bool) -> tuple[list
     if signs := [n for g in measured.open_signs if measured.posterior.turned(g[0]) >= CERTAIN for n in g]:
         why = "its sign is not documented, and the drive shows that it is inverted"
         return _rescaled(mapping, dict.fromkeys(signs, (-1.0, why))), "sign"
-    documented = replace(measured, open_signs=()).without_truth()
+    documented = (replace(measured, open_signs=()) if measured.open_signs else measured).sensors
     return _rescaled(mapping, explained_factors(documented, most=1)), "unit"
 
 
