@@ -48,15 +48,19 @@ def _host() -> str:
 
 def release_memory(rows: int) -> None:
     """Give memory of freed arrays of many rows back: the C library keeps holes between arrays that are in use."""
-    with contextlib.suppress(OSError, AttributeError):  # other C libraries than GNU's
-        if rows > 1 << 15:  # the arrays of a short drive are small
-            ctypes.CDLL(None).malloc_trim(0)
+    if rows > 1 << 15:  # the arrays of a short drive are small
+        _call_c_library("malloc_trim", 0)
 
 
 def share_memory() -> None:
     """Let all threads allocate from one arena: the C library keeps freed memory for each thread otherwise."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(-8, 1)  # M_ARENA_MAX
+    _call_c_library("mallopt", -8, 1)  # M_ARENA_MAX
+
+
+def _call_c_library(name: str, *arguments: int) -> None:
+    """Call a function of GNU's C library, which other systems do not have."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        getattr(ctypes.CDLL(None), name)(*arguments)
 
 
 def wait_for_end(pid: int, most_s: float = 5.0) -> None:
