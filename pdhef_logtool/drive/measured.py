@@ -71,8 +71,10 @@ class Measured:
     def sensors(self) -> Measured:
         """The columns and relations of the signals alone."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
+        if len(columns) == len(self.columns) and not self.truth:
+            return self
         speed = None if (self.speed_name or "").startswith("truth.") else self.speed_name
-        relations = tuple(self._of_sensors)
+        relations = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
         return replace(self, truth={}, derived=None, columns=columns, speed_name=speed, relations=relations)
 
     def without(self, names: Iterable[str]) -> Measured:
@@ -80,11 +82,6 @@ class Measured:
         gone = set(names)
         columns = {n: c for n, c in self.columns.items() if n not in gone}
         return replace(self, columns=columns, signals={n: c for n, c in self.signals.items() if n not in gone})
-
-    @property
-    def _of_sensors(self) -> list[Relation]:
-        """Relations without ground truth."""
-        return [r for r in self.relations if not any(n.startswith("truth.") for n in r.powers)]
 
     @property
     def topics(self) -> dict[str, str]:
@@ -99,7 +96,7 @@ class Measured:
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
         """Sensors with late time stamps, from the signals alone."""
-        return late_sensors(self._of_sensors, self.topics)
+        return late_sensors(self.relations, self.topics) if self.sensors is self else self.sensors.late
 
     @cached_property
     def posterior(self) -> Posterior:
