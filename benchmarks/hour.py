@@ -1,6 +1,6 @@
 """Commands on an hour of a simulated road drive.
 
-Each command runs once, in a new process on one core, with code compiled before, start included.
+Each command runs once, in a new process, with code compiled before, start included.
 """
 
 from __future__ import annotations
