@@ -25,6 +25,7 @@ from pdhef_logtool.drive.relations import (
     measured_relations,
 )
 from pdhef_logtool.drive.truth import TruthTrack, channel_of, derive_truth
+from pdhef_logtool.mapping.candidates import UNIT_NOT_GIVEN
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import GNSS, GNSS_POSITION, WHEELS, Channel, FloatArray
@@ -46,7 +47,7 @@ class Measured:
     signals, truth : mapped channels by name. derived : ground truth at the CG, if any.
     columns : [N] by name; names of ground truth begin with ``truth.``. speed_name : the column used as the speed.
     vehicle : from a file; None without a file. scales : scales of the mapping, by name.
-    open_signs : groups of signals with an undocumented common sign.
+    open_signs : groups of signals with an undocumented common sign. open_units : signals whose unit is an assumption.
     is_mounted : whether the drive confirms the IMU's mounting.
     """
 
@@ -59,6 +60,7 @@ class Measured:
     vehicle: VehicleParameters | None
     scales: Mapping[str, float | tuple[float, ...]]
     open_signs: tuple[tuple[str, ...], ...] = ()
+    open_units: frozenset[str] = frozenset()
     is_mounted: bool = False
 
     @property
@@ -101,7 +103,7 @@ class Measured:
     @cached_property
     def posterior(self) -> Posterior:
         """Probabilities of the mistakes that mappings make with these signals."""
-        mistakes = known_hypotheses((*self.columns,), tuple(self.groups), self.open_signs)
+        mistakes = known_hypotheses((*self.columns,), tuple(self.groups), self.open_signs, self.open_units)
         return posterior(self.relations, mistakes, self.scales)
 
     @property
@@ -142,8 +144,10 @@ def measure(
     of_truth = {n: (s.topic, s.paths) for n, s in sources.items() if n.startswith("truth.")}
     read = [[of_truth[n] for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    open_signs, scales = () if mapping is None else mapping.open_signs, {n: s.scale for n, s in sources.items()}
-    return Measured(signals, truth, derived, columns, speed_name, tuple(related), vehicle, scales, open_signs)
+    scales, mapping = {n: s.scale for n, s in sources.items()}, mapping or SignalMapping()
+    open_units = frozenset(c.subject for c in mapping.checks if UNIT_NOT_GIVEN in c.evidence)
+    of_mapping = mapping.open_signs, open_units
+    return Measured(signals, truth, derived, columns, speed_name, tuple(related), vehicle, scales, *of_mapping)
 
 
 def drive_columns(

@@ -307,6 +307,14 @@ def test_two_mistakes_are_found_that_are_worse_than_none_alone():
     assert probability > 0.97 and {n for h in chosen for n in h.factors} == {*imu, "steer_rad"}
 
 
+def test_an_assumed_unit_is_wrong_before_one_that_is_given():
+    names = ("speed_m_s", "steering_wheel_rad")
+    km_h = [relation(3.6, 3.7, 3.5, powers=dict.fromkeys(names, 1), text=text) for text in "ab"]
+    given, assumed = (posterior(km_h, known_hypotheses(names, (), (), frozenset(of))) for of in ((), names[:1]))
+    assert given.sets[0][1][0].factors.keys() == {names[1]}
+    assert assumed.sets[0][1][0].factors == {names[0]: 1.0 / 3.6} and assumed.sets[0][0] > 0.9
+
+
 def test_scales_of_right_mappings_are_those_of_units():
     """A gain between km/h and mph fits both; only one of them corrects the mapping to the scale of a unit."""
     between = relation(2.8, 2.9, 2.85, powers={"speed_m_s": 1}, text="another speed")
