@@ -112,7 +112,7 @@ def measured_relations(
     for of in ("", "truth."):
         pace_name = f"{of}vx_m_s" if f"{of}vx_m_s" in columns else speed_name
         if pace_name is not None:
-            relations += _motion(columns, of, pace_name)
+            relations += motion(columns, of, pace_name)
     if speed_name is not None:
         pace = _Pace.of(columns, speed_name)
         relations += [*_steering(pace, vehicle), *_speeds(pace), *_wheel_differences(pace), *_courses(of_path, pace)]
@@ -173,7 +173,7 @@ def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
             yield Relation(reached, 1.0, large / most, independent_samples(finite))
 
 
-def _motion(columns: Mapping[str, FloatArray], of: str, pace_name: str) -> Iterator[Relation]:
+def motion(columns: Mapping[str, FloatArray], of: str, pace_name: str) -> Iterator[Relation]:
     """Relate the accelerations to speed and yaw rate, of the sensors or of ground truth."""
     pace = columns[pace_name]
     moving = _moving(columns, pace)
@@ -293,10 +293,7 @@ def _speeds(pace: _Pace) -> Iterator[Relation]:
         over = law(keys[name], name=name, pace=pace.name, mapped="" if name == GNSS_PATH[1] else name)
         blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
         yield Relation(over, 1.0, float(np.median(ratios)), independent_samples(use), blocks=blocks)
-    of_wheels = (
-        any(n.startswith("wheel") and n.endswith("_rad_s") for n in pace.columns) and pace.name == "wheel_speeds"
-    )
-    is_fast = np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)
+    is_fast = np.abs(speed) > REVERSE_M_S
     if (samples := independent_samples(is_fast)) >= 2.0 * MIN_SAMPLES:
         yield Relation(law("ahead", pace=pace.name), 1.0, float(np.sign(np.median(speed[is_fast]))), samples)
 
