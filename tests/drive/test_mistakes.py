@@ -94,6 +94,24 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(factor, mirrore
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
 
 
+@pytest.mark.parametrize("share", [0.1, 1.0])
+@pytest.mark.parametrize("is_over_ground", [False, True])
+def test_a_velocity_in_the_axes_of_the_positions_is_named(share, is_over_ground):
+    """Also on a road along x, where v_x is the same in both axes."""
+    signals, truth = with_truth(VEHICLE, 1.0)
+    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    yaw = np.cumsum(rate) * 0.01
+    yaw = share * (yaw - yaw.mean())
+    east, north = vx * np.cos(yaw) - vy * np.sin(yaw), vx * np.sin(yaw) + vy * np.cos(yaw)
+    pose = {"x_m": np.cumsum(east) * 0.01, "y_m": np.cumsum(north) * 0.01, "yaw_rad": yaw}
+    pose |= {"vx_m_s": east, "vy_m_s": north} if is_over_ground else {}
+    truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
+    checks = {c.name: c for c in checks_of(signals, truth, derive_truth(truth), VEHICLE)}
+    named = checks.get("truth.vy_m_s.axis")
+    assert (named is not None) == is_over_ground
+    assert named is None or "enu_velocity_m_s" in named.remedy
+
+
 def test_exchanged_velocities_of_ground_truth_are_named():
     signals, truth = with_truth(VEHICLE, 1.0)
     ahead, across = truth["vx_m_s"], truth["vy_m_s"]
