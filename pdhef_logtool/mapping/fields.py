@@ -219,7 +219,7 @@ def _speeds(fields: Fields) -> None:
     reference = max(settled, key=lambda f: f.log_odds, default=None)
     velocity = path_velocity(fields.pieces, fields.positions)
     along_path = [] if velocity is None else [np.hypot(*velocity)]
-    for item in fields.all("speed"):
+    for item in (f for f in fields.candidates if f.meaning.quantity == "speed"):
         others = along_path + ([] if reference is None or reference is item else [reference.si])
         times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others]
         settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x > 0.0], "other speeds")

@@ -627,6 +627,12 @@ def test_columns_without_names_by_the_drive():
     assert {c.subject for c in auto.mapping.checks} >= {"speed_m_s", "yaw_rate_rad_s"}
 
 
+def test_ground_truth_without_units_beside_a_speed_in_km_h():
+    box = topic(speed_kmh=3.6 * V, yaw_rate=RATE, lat_acc=AY, truth_vx=V, truth_vy=-0.2 * RATE)
+    truth = found(box=box).mapping.truth
+    assert (truth["vx_m_s"].scale, truth["vy_m_s"].scale) == (1.0, 1.0)
+
+
 @pytest.mark.parametrize(("yaw", "is_rate"), [(RATE, True), (RATE / DEG, True), (np.cumsum(RATE) * 0.01, False)])
 def test_a_yaw_that_turns_the_car_is_its_rate(yaw, is_rate):
     rates = taken(found(box=topic(speed_mps=V, lat_acc=AY, yaw=yaw)))
