@@ -11,17 +11,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
+from pdhef_logtool.drive import truth as derivation
 from pdhef_logtool.drive.delays import estimate_truth_latency
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.drive.truth import (
-    channel_of,
-    dependent_signals,
-    derive_truth,
-    differentiate,
-    plan_truth,
-    truth_at,
-    valid_as_a_whole,
-)
+from pdhef_logtool.drive.truth import dependent_signals, derive_truth, truth_at, valid_as_a_whole
 from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.records.geometry import geodetic_from_ecef
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
@@ -196,7 +189,7 @@ def test_specific_force_on_a_bank(bank, gradient, axes):
     turn = body_to_enu(d) * Rotation.from_rotvec((bank * np.sin(d.t) + gradient * force)[:, None] * [1.0, 0.0, 0.0])
     attitude = quat(turn if axes == "quat" else NED * turn * FRD)
     channels = channels_of(stamps, body(d) | {"enu_velocity_m_s": d.velocity, "quat_wxyz": attitude})
-    plan = plan_truth(channels, roll_gradient_rad_per_m_s2=gradient)
+    plan = derivation.plan_truth(channels, roll_gradient_rad_per_m_s2=gradient)
     track = derive_truth(channels, plan=plan).track
     inner = np.isfinite(track.ay_m_s2)
     assert inner.mean() > 0.85
@@ -230,7 +223,7 @@ def test_ground_speed_alone_claims_no_sideslip():
 
 
 def test_no_truth_is_an_empty_track():
-    assert plan_truth({}) is None
+    assert derivation.plan_truth({}) is None
     assert len(derive_truth({"vx_m_s": channel("vx_m_s", [], [])}).track) == 0
     at = truth_at(derive_truth({}), np.arange(5, dtype=np.int64))
     assert not at.valid.any()
@@ -245,7 +238,7 @@ def test_derivative_agrees_with_scipy_on_even_stamps():
     rng = np.random.default_rng(3)
     stamps = T0 + np.arange(400) * 10_000_000
     y = rng.normal(size=400).cumsum()
-    ours = differentiate(stamps, y, 10, 30_000_000)
+    ours = derivation.differentiate(stamps, y, 10, 30_000_000)
     theirs = savgol_filter(y, 21, 3, deriv=1, delta=0.01)
     np.testing.assert_allclose(ours[10:-10], theirs[10:-10], atol=1e-8)
     assert np.isnan(ours[:10]).all()
@@ -257,7 +250,7 @@ def test_no_derivative_across_a_gap_or_a_missing_value():
     stamps[150:] += 1_000_000_000
     y = np.where(np.arange(300) < 150, 0.0, 100.0)
     y[50] = np.nan
-    slope = differentiate(stamps, y, 5, 30_000_000)
+    slope = derivation.differentiate(stamps, y, 5, 30_000_000)
     np.testing.assert_allclose(slope[np.isfinite(slope)], 0.0, atol=1e-9)
     expected = np.isnan(slope)
     assert expected[45:56].all()
@@ -351,7 +344,8 @@ def test_the_gyros_own_channel_as_truth_is_flagged():
 
 def test_latency_of_a_truth_whose_yaw_rate_is_derived():
     stamps, d = drive(60.0, rate=20)
-    derived = channel_of(derive_truth(channels_of(stamps, sources(stamps, d)["position, yaw"])), "yaw_rate_rad_s")
+    track = derive_truth(channels_of(stamps, sources(stamps, d)["position, yaw"]))
+    derived = derivation.channel_of(track, "yaw_rate_rad_s")
     assert np.isfinite(derived.values).all()
     t = np.arange(0, 60, 0.01)
     gyro = channel("yaw_rate_rad_s", T0 + np.round((t - 0.05) * 1e9), Drive(t).r, SIGNAL_UNITS, "/imu")
