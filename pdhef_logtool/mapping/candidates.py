@@ -245,7 +245,7 @@ def _signs_of(paths: Collection[str]) -> dict[str, str]:
 
 
 def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
-    """Return the paths of signs, and of magnitudes with an unreadable sign: a text, or a signal of a bus."""
+    """Return the paths that are no values: signs, and magnitudes with a text or another bus signal as their sign."""
     signs, texts = _signs_of({f.path for f in fields}), {f.path for f in fields if f.kind == "string"}
     return {*signs.values(), *(m for m, sign in signs.items() if topic.encoding == "can" or sign in texts)}
 

@@ -49,6 +49,14 @@ def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, 
     return signals, {n: replace(rate, name=n, values=v) for n, v in values.items()}
 
 
+def pose_of(truth: dict[str, Channel]) -> dict[str, np.ndarray]:
+    """Return the position and the heading of a velocity."""
+    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    yaw = np.cumsum(rate) * 0.01
+    x, y = vx * np.cos(yaw) - vy * np.sin(yaw), vx * np.sin(yaw) + vy * np.cos(yaw)
+    return {"x_m": np.cumsum(x) * 0.01, "y_m": np.cumsum(y) * 0.01, "yaw_rad": yaw}
+
+
 @pytest.mark.parametrize("place_m", [-1.1, 0.0])
 @pytest.mark.parametrize("factor", [1.0, 57.2958, 1.0 / 57.2958, 9.80665, 1.0 / 9.80665])
 def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
@@ -77,11 +85,10 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(factor, mirrore
     """A rigid-body identity: a pose with y to the right, or from an antenna further ahead, fails no check."""
     vehicle = default_vehicle().model_copy(update={"truth_position_m": (1.3, 0.0, 0.0)})
     signals, truth = with_truth(vehicle, 1.0)
-    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
-    yaw, side = np.cumsum(rate) * 0.01, -1.0 if mirrored else 1.0
-    pose = {"x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * 0.01, "yaw_rad": side * yaw}
-    pose["y_m"] = side * (np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)) * 0.01 + antenna_m * np.sin(yaw))
-    pose["x_m"] += antenna_m * np.cos(yaw)
+    pose, side, vy = pose_of(truth), -1.0 if mirrored else 1.0, truth["vy_m_s"].values
+    pose["x_m"] += antenna_m * np.cos(pose["yaw_rad"])
+    pose["y_m"] = side * (pose["y_m"] + antenna_m * np.sin(pose["yaw_rad"]))
+    pose["yaw_rad"] = side * pose["yaw_rad"]
     truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
     truth["vy_m_s"] = replace(truth["vy_m_s"], values=factor * vy)
     truth["y_m"] = truth["y_m"].take(np.arange(vy.size) % 1000 != 500)  # a sample of one axis is missing
@@ -164,14 +171,8 @@ def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed():
 @pytest.mark.parametrize(("name", "factor"), [("x_m", 1e-3), ("y_m", 3.2808), ("x_m", -1.0), ("y_m", -1.0), ("", 1.0)])
 def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(name, factor):
     signals, truth = with_truth(VEHICLE, 1.0)
-    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
-    yaw = np.cumsum(rate) * 0.01
-    pose = {
-        "x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)),
-        "y_m": np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)),
-    }
-    scales = {n: factor if n == name else 1.0 for n in pose}
-    truth |= {n: replace(truth["vx_m_s"], name=n, values=0.01 * scales[n] * v) for n, v in pose.items()}
+    pose, scales = pose_of(truth), {name: factor}
+    truth |= {n: replace(truth["vx_m_s"], name=n, values=scales.get(n, 1.0) * pose[n]) for n in ("x_m", "y_m")}
     checks = checks_of(signals, truth, derive_truth(truth), VEHICLE)
     failed = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject.startswith("truth.")}
     expected = "" if not name else "truth.y_m.sign" if factor < 0.0 else f"truth.{name}.scale"

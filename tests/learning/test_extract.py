@@ -112,19 +112,8 @@ def test_manifest_follows_its_schema(dataset, sample_logs_dir):
 def test_rows_are_whole_and_in_order(dataset):
     (file,) = dataset.output.glob("split=*/car=truthsim-saloon-*/part-dlc.parquet")
     frame = pl.read_parquet(file, hive_partitioning=False)
-    assert frame.columns == [
-        "stamp_ns",
-        *FEATURES,
-        "target_dvy_m_s",
-        "target_dyaw_rate_rad_s",
-        "truth_vx_m_s",
-        "truth_vy_m_s",
-        "truth_std_rad",
-        "truth_source",
-        "weight",
-        "segment",
-        "chosen",
-    ]
+    others = "target_dvy_m_s target_dyaw_rate_rad_s truth_vx_m_s truth_vy_m_s truth_std_rad truth_source weight segment"
+    assert frame.columns == ["stamp_ns", *FEATURES, *others.split(), "chosen"]
     assert frame["stamp_ns"].diff().drop_nulls().min() > 0
     entry = next(d for d in dataset.manifest["drives"] if d["log"] == "dlc")
     assert (len(frame), int((frame["weight"] > 0).sum())) == (entry["rows"], entry["usable_rows"])
@@ -298,14 +287,9 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir, tmp_path):
     extract([log], out, first)
     both = extract([log], out, second).manifest
     follows(both, "dataset.schema.json")
-    assert [(d["name"], d["split"]) for d in both["drives"]] == [
-        ("road.0-8.0", "train"),
-        ("road.10.0-14.0", "validation"),
-    ]
-    assert [d.entry["name"] for d in read_dataset(out).drives if len(d.load().stamps_ns)] == [
-        "road.0-8.0",
-        "road.10.0-14.0",
-    ]
+    parts = {"road.0-8.0": "train", "road.10.0-14.0": "validation"}
+    assert {d["name"]: d["split"] for d in both["drives"]} == parts
+    assert [d.entry["name"] for d in read_dataset(out).drives if len(d.load().stamps_ns)] == list(parts)
     again = extract([log], out, second).manifest
     assert again["sha256"] == both["sha256"], "what is extracted again takes its own place"
     other = extract([str(sample_logs_dir / "dlc.mcap")], out, ExtractSettings(RunConfig(), split="train")).manifest
