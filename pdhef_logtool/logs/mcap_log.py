@@ -25,8 +25,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.byte_source import WHOLE_BYTES, ByteSource
+from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
+from pdhef_logtool.logs.constants import WHOLE_BYTES
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
     MCAP_MAGIC,

@@ -47,8 +47,6 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
 MOST: dict[str, float] = VOCABULARY["largest"]
 #: Largest usual values of quantities, SI: units in which a field has larger ones are less likely.
 USUAL: dict[str, float] = VOCABULARY["usual"]
-#: Least share of valid values: a number that means "not available" may last for seconds.
-VALID_SHARE = 0.95
 #: Words of a doubt about a unit that is an assumption.
 UNIT_NOT_GIVEN = "unit not given"
 CONSTANT = "constant in the parts of the log that were read"
@@ -359,7 +357,7 @@ def anchors_of(
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
     """Return the units that are possible by a field's range; a unit in its name excludes all others."""
     named = () if meaning.scale is None else ((meaning.unit, meaning.scale),)
-    largest = float(np.nanquantile(np.abs(seen.values), VALID_SHARE)) if named and seen.changes else seen.largest
+    largest = float(np.nanquantile(np.abs(seen.values), _NAMES["valid"])) if named and seen.changes else seen.largest
     most = MOST.get(meaning.quantity, math.inf)
     # Beyond a car's range, the unit in the name is wrong.
     units = (u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most)
