@@ -305,7 +305,13 @@ def field_of(
     if meaning.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
         meaning = replace(meaning, quantity="wheel rate")
         factors = _factors(meaning, seen)
+    stated = meaning.unit
+    if not factors and documented is None:
+        meaning = replace(meaning, unit="", scale=None)
+        factors = _factors(meaning, seen)
     item = Field(topic, info.path, meaning, role, stamp_of(fields, info.path), seen, factors)
+    if stated != meaning.unit:
+        item.doubts.append(f"its values are out of a car's range in {stated}, the unit in its name")
     if documented is not None:
         entry = documented.fields[info.path]
         item.section = "truth" if entry in documented.truth else "signals"

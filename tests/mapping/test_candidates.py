@@ -533,6 +533,12 @@ def test_numbers_that_mean_not_available_change_no_unit():
     assert (got["speed_m_s"].valid_max, got["steering_wheel_rad"].valid_min) == (110.0, -32.0)
 
 
+def test_a_unit_that_the_values_exclude_is_replaced_with_a_doubt():
+    auto = found(box=topic(speed_mps=V, lat_acc_mps2=AY, yaw_rate_radps=RATE / DEG))
+    assert taken(auto)["yaw_rate_rad_s"][1] == pytest.approx(DEG, rel=1e-3)
+    assert "yaw_rate_rad_s.candidate" in undecided(auto)
+
+
 def test_ground_truth_without_units_beside_a_speed_in_km_h():
     box = topic(speed_kmh=3.6 * V, yaw_rate=RATE, lat_acc=AY, truth_vx=V, truth_vy=-0.2 * RATE)
     truth = found(box=box).mapping.truth
