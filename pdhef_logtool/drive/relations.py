@@ -42,7 +42,7 @@ POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: A signal that moves by more, 1-sigma, shows that the car is driven.
 DRIVEN = {"yaw_rate_rad_s": 0.06, "ay_m_s2": 1.0, "ax_m_s2": 1.0}
 #: Largest residual of a difference that has a cause.
-EXPLAINED_SHARE = 0.3
+EXPLAINED_SHARE: float = TABLE["explained_share"]
 #: Share of the offset between two sides that changes in a drive.
 DISTURBED = 0.6
 _STEERING = ("steer_rad", "steering_wheel_rad")
