@@ -115,12 +115,8 @@ def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(c
         _, yaw = accelerations(*state[:3], steer, mu, p)
         want_reading[i] = (1.0 + p.ay_roll_gain) * ay + w * yaw * p.imu_x_m - state[2] ** 2 * p.imu_y_m
     np.testing.assert_allclose(reading[: model.LANES], want_reading, rtol=TOLERANCE, atol=TOLERANCE)
-    np.testing.assert_allclose(
-        block[[model.VX, model.VY, model.YAW_RATE, model.AX_BIAS], : model.LANES].T,
-        want,
-        rtol=TOLERANCE,
-        atol=TOLERANCE,
-    )
+    found = block[[model.VX, model.VY, model.YAW_RATE, model.AX_BIAS], : model.LANES].T
+    np.testing.assert_allclose(found, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 
 # --- with axle forces and parts --------------------------------------------------------------------------------------
