@@ -117,6 +117,22 @@ def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles):
     assert found.is_as_named == (angles == (0, 0, 0))
 
 
+@pytest.mark.parametrize("bends", [0.02, 0.2])
+def test_a_hill_in_a_banked_bend_turns_no_imu(components, bends):
+    """Only in quick bends, crossfall and grade cannot resemble an IMU that is turned."""
+    channels, triads, mapping = components
+    like = channels.signals[RATES[2]].take(np.arange(800))
+    seconds = 1e-9 * (like.stamps_ns - like.stamps_ns[0])
+    rate = bends * np.sin(1.2 * seconds)
+    speed = 28.0 + 0.2 * np.sin(0.5 * seconds)
+    values = dict(zip(RATES, (0.0 * rate, 0.0 * rate, rate), strict=True))
+    values |= dict(zip(ACCELERATIONS, (speed * rate, 0.01 * np.cos(9.0 * seconds), 9.81 + 0.0 * rate), strict=True))
+    values |= {"speed_m_s": speed, "steer_rad": 2.8 * rate / speed}
+    found = find_mounting(measure({n: replace(like, name=n, values=v) for n, v in values.items()}), triads, mapping)
+    assert not found.is_as_named
+    assert found.confident == (bends > 0.1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("angles", [(0, 0, 0), (0, 90, 0), (180, 0, 270)])
 def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles):

@@ -227,6 +227,7 @@ def test_extract_chooses_rows_and_leaves_copies_out(sample_logs_dir, tmp_path):
     vx, ay = (rows.features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2"))
     assert rows.chosen is not None and 0.1 < rows.chosen.mean() < 0.9
     np.testing.assert_array_equal(rows.chosen, (np.abs(ay) > 0.5) & ~(vx * 3.6 < 60.0))
+    assert made.entry["usable_rows"] == np.count_nonzero(rows.chosen & (rows.weight > 0.0))
     # The same signals under another name, in another call, replace the existing ones.
     extract(logs[1:], out, replace(asked, split="validation"))
     (other,) = read_dataset(out).drives
@@ -298,6 +299,18 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir, tmp_path):
     with pytest.raises(UsageError, match="for phy-ukf"):
         extract([log], out, replace(first, model="phy-ukf"))
     assert read_dataset(out).sha256 == other["sha256"], "a call that is refused leaves what was there"
+
+
+@pytest.mark.slow
+def test_logs_of_one_name_in_several_calls_are_several_drives(sample_logs_dir, tmp_path):
+    told: list[str] = []
+    for name in ("dlc", "sweep", "sweep"):
+        (tmp_path / name).mkdir(exist_ok=True)
+        log = shutil.copy(sample_logs_dir / f"{name}.mcap", tmp_path / name / "run.mcap")
+        result = extract([log], tmp_path / "out", ExtractSettings(RunConfig()), reporter=Reporter(warn=told.append))
+    names = [d["name"] for d in result.manifest["drives"]]
+    assert len(names) == 2 and names[0] == "run" and names[1].startswith("run-")
+    assert sum("another log of this name" in text for text in told) == 2
 
 
 # ---- command line ----

@@ -92,6 +92,10 @@ def test_a_unit_that_nothing_tells_is_taken_by_convention_and_told():
     auto = found(gyro=topic(**still))
     assert taken(auto) == {"yaw_rate_rad_s": ("/gyro.angular_velocity.z", 1.0)}
     assert undecided(auto) == {"yaw_rate_rad_s.candidate"}
+    for km_h in (100.0, 30.0):  # as m/s, only race cars reach the first
+        auto = found(car=topic(speed=km_h + 5.0 * np.sin(S)))
+        assert taken(auto) == {"speed_m_s": ("/car.speed", round(1.0 / 3.6, 6) if km_h > 70.0 else 1.0)}
+        assert undecided(auto) == {"speed_m_s.candidate"}
 
 
 @pytest.mark.parametrize(
@@ -518,6 +522,12 @@ def test_columns_without_names_by_the_drive():
         "speed_m_s": "/box.ch1", "ax_m_s2": "/box.ch2", "ay_m_s2": "/box.ch3", "yaw_rate_rad_s": "/box.ch4",
     }  # fmt: skip
     assert {c.subject for c in auto.mapping.checks} >= {"speed_m_s", "yaw_rate_rad_s"}
+
+
+@pytest.mark.parametrize(("yaw", "is_rate"), [(RATE, True), (RATE / DEG, True), (np.cumsum(RATE) * 0.01, False)])
+def test_a_yaw_that_turns_the_car_is_its_rate(yaw, is_rate):
+    rates = taken(found(box=topic(speed_mps=V, lat_acc=AY, yaw=yaw)))
+    assert ("yaw_rate_rad_s" in rates) == is_rate
 
 
 def test_axes_by_gravity_and_of_a_level_device_by_the_speed():

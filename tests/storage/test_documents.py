@@ -155,7 +155,8 @@ def test_what_cannot_be_read_is_one_line(loader, tmp_path):
     assert "utf-8" in outcome(loader, path)
     entry = '{"format": %s}' if path.suffix == ".json" else "a = %s\n"
     endless = [entry % number for number in ("1" + "0" * 5000, "0x" + "f" * 5000, "1" + "0" * 30)]
-    for text in ("= ][", "\0" * 100, "#" + "x" * sealing.MAX_BYTES, *endless):
+    dates = ["name = 2026-01-01\n", "name = [{ a = 07:30:00 }]\n"]
+    for text in ("= ][", "\0" * 100, "#" + "x" * sealing.MAX_BYTES, *endless, *dates):
         path.write_text(text)
         assert outcome(loader, path)
     for depth in (sealing.MAX_DEPTH + 1, 100_000):
