@@ -87,13 +87,13 @@ def test_all_problems_come_in_one_line(tmp_path):
         assert part in line, part
 
 
+X, Y, UNIT = '\ntopic="/a"\nfield="x"', '\ntopic="/a"\nfield="y"', '\nstamp="t"\nstamp_unit'
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (
-            '[signals.steer_rad]\ntopic="/a"\nfield="x"\n[signals.steering_wheel_rad]\ntopic="/a"\nfield="y"',
-            "signals.steer_rad and signals.steering_wheel_rad",
-        ),
+        (f"[signals.steer_rad]{X}\n[signals.steering_wheel_rad]{Y}", ".steer_rad and signals.steering_wheel_rad"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\n[signals.ay_m_s2]\ntopic="/a"\nfield="x"', "duplicates"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\n[signals.ax_m_s2]\ntopic="/a"\nfield="y"', "ax_m_s2"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nscale=[1.0,1.0]', "no vector"),
@@ -102,11 +102,7 @@ def test_all_problems_come_in_one_line(tmp_path):
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nvalid_min=2\nvalid_max=1', "valid_min must be below valid_max"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nclock="device"\nstamp="log_time"', "needs a stamp of the device"),
         ('[truth_quality]\ntopic="/a"\nfield="x"', "give min, max or values"),
-        (
-            '[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nstamp="t"\nstamp_unit="s"\n'
-            '[signals.ay_m_s2]\ntopic="/a"\nfield="y"\nstamp="t"\nstamp_unit="ns"',
-            "another stamp_unit",
-        ),
+        (f'[signals.ax_m_s2]{X}{UNIT}="s"\n[signals.ay_m_s2]{Y}{UNIT}="ns"', "another stamp_unit"),
         ('[signals.speed_m_s]\ntopic="/c"\nfield="can:A.b"', "needs [can]"),
         ('[can]\ndbc="a.dbc"\n[signals.speed_m_s]\ntopic="/c"\nfield="can:A"', "can:<message>.<signal>"),
         ("[can]\ndbc = []", "can: dbc should name at least one file"),
@@ -163,14 +159,9 @@ GATES = st.builds(
     max=st.sampled_from([None, 4.0]), values=st.lists(numbers, min_size=1, max_size=3).map(tuple), stamp=texts,
     latency_s=numbers,
 )  # fmt: skip
-MAPPINGS = st.builds(
-    Mapping,
-    signals=sources(sorted(set(SIGNAL_UNITS) - EXCLUSIVE), "s"),
-    truth=sources(sorted(TRUTH_UNITS), "t"),
-    quality=st.none() | GATES,
-    origin=st.just("file"),
-    notes=st.just(()),
-)
+SIGNALS, TRUTHS = sources(sorted(set(SIGNAL_UNITS) - EXCLUSIVE), "s"), sources(sorted(TRUTH_UNITS), "t")
+REST = {"quality": st.none() | GATES, "origin": st.just("file"), "notes": st.just(())}
+MAPPINGS = st.builds(Mapping, signals=SIGNALS, truth=TRUTHS, **REST)
 
 
 @pytest.mark.slow
