@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 CONSTANTS: Mapping[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+#: Smaller logs are read as a whole, where a part of a larger one is enough.
+WHOLE_BYTES: int = CONSTANTS["whole_bytes"]
 #: Patterns of texts in tables.
 PATTERNS: Mapping[str, re.Pattern[str]] = {name: re.compile(text) for name, text in CONSTANTS["patterns"].items()}
 

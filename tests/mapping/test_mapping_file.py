@@ -316,6 +316,17 @@ def test_topics_with_dots_are_found_by_the_longest_that_fits():
     assert {n: (s.topic, s.field) for n, s in sources.items()} == {"vx_m_s": ("a.b", "c"), "vy_m_s": ("a", "c")}
 
 
+@pytest.mark.parametrize(
+    ("flag", "scale"),
+    [("sideslip_rad=/esc.beta_deg", np.pi / 180.0), ("vx_m_s=/esc.v_kmh", 1.0 / 3.6), ("vy_m_s=/esc.vy", 1.0)],
+)
+def test_a_flag_has_the_unit_of_its_field(flag, scale):
+    name, _, label = flag.partition("=")
+    log = _log(**{"/esc": {label.partition(".")[2]: np.zeros(10)}})
+    sources, _ = sources_of(log, [flag], ESTIMATE_UNITS, "--estimate")
+    assert sources[name].scale == pytest.approx(scale)
+
+
 def test_flags_win_over_tables(tmp_path):
     (tmp_path / "m.toml").write_text(TABLES)
     mapping = load_mapping(tmp_path / "m.toml")
