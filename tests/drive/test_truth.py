@@ -18,7 +18,6 @@ from pdhef_logtool.drive.truth import (
     dependent_signals,
     derive_truth,
     differentiate,
-    plan_truth,
     truth_at,
     valid_as_a_whole,
 )
@@ -187,7 +186,7 @@ def test_specific_force_on_a_bank(bank, gradient, axes):
     attitude = quat(turn if axes == "quat" else NED * turn * FRD)
     values = {"enu_velocity_m_s": d.velocity, "vx_m_s": d.vx, "vy_m_s": d.vy, "yaw_rate_rad_s": d.r}
     channels = {n: channel(n, stamps, v) for n, v in {**values, "quat_wxyz": attitude}.items()}
-    plan = plan_truth(channels, roll_gradient_rad_per_m_s2=gradient)
+    plan = derive_truth(channels, roll_gradient_rad_per_m_s2=gradient).plan
     track = derive_truth(channels, plan=plan).track
     inner = np.isfinite(track.ay_m_s2)
     assert inner.mean() > 0.85
@@ -221,7 +220,7 @@ def test_ground_speed_alone_claims_no_sideslip():
 
 
 def test_no_truth_is_an_empty_track():
-    assert plan_truth({}) is None
+    assert derive_truth({}).plan is None
     assert len(derive_truth({"vx_m_s": channel("vx_m_s", [], [])}).track) == 0
     at = truth_at(derive_truth({}), np.arange(5, dtype=np.int64))
     assert not at.valid.any()
