@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.posterior import Posterior
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.car.posterior import Posterior
 
 #: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
