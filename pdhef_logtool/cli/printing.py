@@ -11,8 +11,9 @@ from typing import Any
 
 from jinja2 import Environment
 from rich.console import Console
+from rich.padding import Padding
 
-from pdhef_logtool.cli.console import BREAK, cell, marked_up, named_lines, print_indented, protected, table
+from pdhef_logtool.cli.console import BREAK, cell, marked_up, named_lines, protected, table
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.storage.templates import environment
 
@@ -36,7 +37,7 @@ _HOMES = {
 
 def _later(home: str) -> Callable[..., Any]:
     """Return a function that is ``module:name``, imported when it is called."""
-    return lambda *arguments: resolve_name(home)(*arguments)
+    return lambda *arguments, **named: resolve_name(home)(*arguments, **named)
 
 
 @cache
@@ -72,7 +73,7 @@ def _print_line(line: str, console: Console) -> str:
     if line.startswith("=="):
         return line.removeprefix("==").strip()
     if line.startswith("  "):
-        print_indented(marked_up(line[2:]), console)
+        console.print(Padding(marked_up(line[2:]), (0, 0, 0, 2), expand=False))  # also its continuation lines
     else:
         console.print(marked_up(line.removeprefix("|")), soft_wrap=line.startswith("|"))
     return ""

@@ -343,6 +343,8 @@ class _Source:
         if channel is None or name not in self:
             n, k = self.stamps_ns.shape[0], VECTOR_COLUMNS.get(name, 1)
             return np.full((n, k) if k > 1 else n, np.nan)
+        if np.array_equal(channel.stamps_ns, self.stamps_ns):
+            return wrap_angle(channel.values) if name in _ANGLES else channel.values + 0.0  # a copy, without -0
         bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * NS_PER_S))
         if name in _ANGLES:
             return bracket.angle(channel.values)

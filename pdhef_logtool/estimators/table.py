@@ -52,7 +52,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.presets import AIDED, OPEN_LOOP, SELF_CALIBRATED, calibration_of, preset_of
+from pdhef_logtool.estimators.presets import AIDED, OPEN_LOOP, SELF_CALIBRATED, preset_of, uses_calibration
 from pdhef_logtool.estimators.presets import Options as Options
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.printable import printable
@@ -139,7 +139,7 @@ class Spec:
         if isinstance(build, str):
             module, _, function = build.partition(":")
             build = getattr(import_module(f"{__package__}.{module}"), function)
-        calibration = calibration_of(self.name, car)
+        calibration = car.self_calibrated if uses_calibration(self.name) else None
         car = car if calibration is None else car.calibrated_car
         estimator = build(car.vehicle, self.name) if isinstance(build, type) else build(self.name, car, options)
         if options.gnss and self.name in AIDED:
