@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pdhef_logtool import PdhefError, inspect_log
 from studies.gates.tool import Tool
 from studies.pages import ROOT, read_toml, write_toml
@@ -64,7 +66,7 @@ def mistaken(mapping: dict[str, Any], subject: str, kind: str) -> dict[str, Any]
         if kind != AXIS:
             if kind == "sign" and source.get("combine") == "norm":
                 return None  # the size of a vector
-            source["scale"] = source.get("scale", 1.0) * FACTORS[kind]
+            source["scale"] = np.multiply(source.get("scale", 1.0), FACTORS[kind]).tolist()
             continue
         other_table, other = _place(OTHER[subject])
         if other not in mapping[other_table]:

@@ -22,9 +22,12 @@ from pdhef_logtool.drive.relations import (
     SPIN_SHARE,
     TURNING,
     direction_rate,
+    law,
     measured_relations,
+    motion,
 )
 from pdhef_logtool.drive.truth import TruthTrack, channel_of, derive_truth
+from pdhef_logtool.mapping.candidates import UNIT_NOT_GIVEN
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import GNSS, GNSS_POSITION, WHEELS, Channel, FloatArray
@@ -46,7 +49,7 @@ class Measured:
     signals, truth : mapped channels by name. derived : ground truth at the CG, if any.
     columns : [N] by name; names of ground truth begin with ``truth.``. speed_name : the column used as the speed.
     vehicle : from a file; None without a file. scales : scales of the mapping, by name.
-    open_signs : groups of signals with an undocumented common sign.
+    open_signs : groups of signals with an undocumented common sign. open_units : signals whose unit is an assumption.
     is_mounted : whether the drive confirms the IMU's mounting.
     """
 
@@ -59,6 +62,7 @@ class Measured:
     vehicle: VehicleParameters | None
     scales: Mapping[str, float | tuple[float, ...]]
     open_signs: tuple[tuple[str, ...], ...] = ()
+    open_units: frozenset[str] = frozenset()
     is_mounted: bool = False
 
     @property
@@ -101,7 +105,7 @@ class Measured:
     @cached_property
     def posterior(self) -> Posterior:
         """Probabilities of the mistakes that mappings make with these signals."""
-        mistakes = known_hypotheses((*self.columns,), tuple(self.groups), self.open_signs)
+        mistakes = known_hypotheses((*self.columns,), tuple(self.groups), self.open_signs, self.open_units)
         return posterior(self.relations, mistakes, self.scales)
 
     @property
@@ -135,21 +139,29 @@ def measure(
     derived : ground truth at the CG. vehicle : not used if it is the default car. mapping : of the channels, if known.
     """
     truth, vehicle = truth or {}, None if vehicle == default_vehicle() else vehicle
-    columns, speed_name = drive_columns(signals, truth, derived)
+    columns, speed_name = drive_columns(signals, truth, derived, vehicle)
     sources = {} if mapping is None else mapping.by_subject
     related = measured_relations(columns, speed_name, vehicle)
     # Two quantities of ground truth from the same field agree trivially.
     of_truth = {n: (s.topic, s.paths) for n, s in sources.items() if n.startswith("truth.")}
     read = [[of_truth[n] for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    open_signs, scales = () if mapping is None else mapping.open_signs, {n: s.scale for n, s in sources.items()}
-    return Measured(signals, truth, derived, columns, speed_name, tuple(related), vehicle, scales, open_signs)
+    scales, mapping = {n: s.scale for n, s in sources.items()}, mapping or SignalMapping()
+    open_units = frozenset(c.subject for c in mapping.checks if UNIT_NOT_GIVEN in c.evidence)
+    of_mapping = mapping.open_signs, open_units
+    return Measured(signals, truth, derived, columns, speed_name, tuple(related), vehicle, scales, *of_mapping)
 
 
 def drive_columns(
-    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None
+    signals: Mapping[str, Channel],
+    truth: Mapping[str, Channel],
+    derived: TruthTrack | None,
+    vehicle: VehicleParameters | None = None,
 ) -> tuple[dict[str, FloatArray], str | None]:
-    """Return signals and ground truth on one grid, and the name of the column used as the speed."""
+    """Return signals and ground truth on one grid, and the name of the column used as the speed.
+
+    ``vehicle``: of a file, with the radius of its wheels.
+    """
     channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
     if derived is not None:
         for name in _TRUTH:
@@ -175,7 +187,7 @@ def drive_columns(
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
         columns |= {POSITION[0]: vx, POSITION[1]: vy, "truth.position_speed_m_s": np.hypot(vx, vy)}
         columns[COURSE_RATE] = direction_rate(vx, vy)
-    return columns, _speed_of(columns)
+    return columns, _speed_of(columns, vehicle)
 
 
 def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
@@ -204,7 +216,7 @@ def _pose_velocity(truth: Mapping[str, Channel]) -> dict[str, Channel]:
     return {f"truth.{n}": channel_of(derived, of) for n, of in names.items()}
 
 
-def _speed_of(columns: dict[str, FloatArray]) -> str | None:
+def _speed_of(columns: dict[str, FloatArray], vehicle: VehicleParameters | None) -> str | None:
     """Return the name of the speed column. Without a speed sensor, a robust mean of the wheel speeds is added."""
     if "speed_m_s" in columns:
         return "speed_m_s"
@@ -219,6 +231,18 @@ def _speed_of(columns: dict[str, FloatArray]) -> str | None:
                 typical = [[median_known(share)] for share in shares]  # a wheel in another unit does not spin
                 spin = np.sum(np.abs(shares - typical) > SPIN_SHARE, axis=0) > 1
             mean = np.mean(np.clip(wheels, middle - most, middle + most), axis=0)
-            columns[WHEEL_SPEEDS] = np.asarray(np.where(spin, np.nan, mean))
+            speed = np.asarray(np.where(spin, np.nan, mean))
+            columns[WHEEL_SPEEDS] = speed * (1.0 if unit == "m_s" else _radius_m(speed, columns, vehicle))
             return WHEEL_SPEEDS
     return "truth.vx_m_s" if "truth.vx_m_s" in columns else None
+
+
+def _radius_m(rotation: FloatArray, columns: Mapping[str, FloatArray], vehicle: VehicleParameters | None) -> float:
+    """Return the radius of wheels with this mean rotation [N], rad/s: of the file, else by a_y = v r or a_x = v̇."""
+    if vehicle is not None:
+        return vehicle.wheel_radius_m
+    low, high = (1.0 / gain for gain in reversed(law("wheel_rad_s", name="", pace="").gains))
+    for relation in motion({**columns, WHEEL_SPEEDS: rotation}, "", WHEEL_SPEEDS):
+        if relation.tells:
+            return min(max(abs(relation.gain), low), high)
+    return default_vehicle().wheel_radius_m

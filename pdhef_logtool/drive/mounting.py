@@ -43,6 +43,8 @@ MAX_ERROR_DEG = 7.5
 TURNED_DEG = 4.0
 ASKEW_SAMPLES, SURE_STD = 40.0, 3.0
 ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
+#: Grade and crossfall alone move an accelerometer by less: in gentler driving, blocks of the drive must agree.
+LEAST_DRIVEN_M_S2 = 1.0
 #: Least correlation of the yaw rate with another measurement that decides its sign, and its independent samples (5 s).
 SIGN_CORRELATION, MIN_SAMPLES = 0.5, 10.0
 #: Words for the axes of a rate, x first.
@@ -221,7 +223,8 @@ def find_mounting(measured: Measured, triads: tuple[Triad, Triad] | None, mappin
         return None
     best = max(turns, key=lambda x: x.correlation + np.sign(x.sign))
     mounting = Mounting(triads, _snapped(best), named, best.evidence, _is_shown(best, measured))
-    is_sure = best.correlation >= ASKEW_CORRELATION or best.errors_deg[0] <= MAX_ERROR_DEG or mounting.is_as_named
+    is_driven = best.driven_m_s2 > LEAST_DRIVEN_M_S2 and best.correlation >= ASKEW_CORRELATION
+    is_sure = is_driven or best.errors_deg[0] <= MAX_ERROR_DEG or mounting.is_as_named
     return replace(mounting, confident=mounting.confident and is_sure)
 
 
@@ -251,7 +254,7 @@ class _Turn:
     ``error_deg``: standard error of yaw by the residual. ``errors_deg``: of yaw and of the tilt by blocks of the drive,
     infinite on a short one.
     ``sign``: correlation of the yaw rate with another measurement, 0 without one. ``along``: the speed alone shows
-    which way is forward. ``rate``: yaw rate.
+    which way is forward. ``rate``: yaw rate. ``driven_m_s2``: 1-sigma of the level acceleration by speed and yaw rate.
     """
 
     rotation: FloatArray
@@ -262,6 +265,7 @@ class _Turn:
     along: bool
     evidence: str
     rate: FloatArray
+    driven_m_s2: float
 
 
 def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
@@ -327,7 +331,7 @@ def _turned(
         return None
     ahead = compare(law("longitudinal", of="", pace=""), driven[0].real, f @ rotation[0], used)
     along = any(r.correlation > SIGN_CORRELATION for r in ahead)
-    return _Turn(rotation, correlation, error, by_blocks, sign, along, evidence, rate)
+    return _Turn(rotation, correlation, error, by_blocks, sign, along, evidence, rate, float(np.std(driven[0][used])))
 
 
 def _sides(column: NDArray[Any]) -> FloatArray:

@@ -166,7 +166,7 @@ def plan_drive(
 
 
 def without_refused_truth(mapping: Mapping, refused: Mapped[str, str]) -> Mapping:
-    """Return the mapping without refused ground truth; without all ground truth if a derived quantity is refused."""
+    """Return the mapping without the refused ground truth, or without any if a quantity derived from it is refused."""
     names = {n.removeprefix("truth.") for n in refused if n.startswith("truth.")}
     if not names:
         return mapping

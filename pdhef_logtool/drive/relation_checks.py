@@ -126,7 +126,10 @@ def _wrong(
         remedy = TEXTS["several"].format(signals=" and ".join(relations[0].powers))
     else:
         kinds = {h.kind for h in mistakes}
-        of_kinds = {SIGN: {"sign", "open sign", "sign and unit"}, UNIT: {"unit", "foreign", "sign and unit"}}
+        of_kinds = {
+            SIGN: {"sign", "open sign", "sign and unit"},
+            UNIT: {"unit", "open unit", "foreign", "sign and unit"},
+        }
         names = [n for n, of in of_kinds.items() if kinds & of]
         evidence = "; ".join(r.evidence for r in relations[:2])
         remedy = TEXTS["perhaps"].format(mistakes=_corrections(name, mistakes, measured.scales.get(name)))

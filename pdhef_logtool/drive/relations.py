@@ -41,6 +41,10 @@ TWICE = (
 POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: A signal that moves by more, 1-sigma, shows that the car is driven.
 DRIVEN = {"yaw_rate_rad_s": 0.06, "ay_m_s2": 1.0, "ax_m_s2": 1.0}
+#: Two points of a car are closer, m; yaw explains a difference of their velocities with a residual below this share.
+LEVER_M, LEVER_RESIDUAL = 3.0, 0.3
+#: 1-sigma of a heading against the direction of a velocity.
+HEADING_RAD = math.radians(1.0)
 #: Share of the offset between two sides that changes in a drive.
 DISTURBED = 0.6
 _STEERING = ("steer_rad", "steering_wheel_rad")
@@ -110,7 +114,7 @@ def measured_relations(
     for of in ("", "truth."):
         pace_name = f"{of}vx_m_s" if f"{of}vx_m_s" in columns else speed_name
         if pace_name is not None:
-            relations += _motion(columns, of, pace_name)
+            relations += motion(columns, of, pace_name)
     if speed_name is not None:
         pace = _Pace.of(columns, speed_name)
         relations += [*_steering(pace, vehicle), *_speeds(pace), *_wheel_differences(pace), *_courses(of_path, pace)]
@@ -171,7 +175,7 @@ def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
             yield Relation(reached, 1.0, large / most, independent_samples(finite))
 
 
-def _motion(columns: Mapping[str, FloatArray], of: str, pace_name: str) -> Iterator[Relation]:
+def motion(columns: Mapping[str, FloatArray], of: str, pace_name: str) -> Iterator[Relation]:
     """Relate the accelerations to speed and yaw rate, of the sensors or of ground truth."""
     pace = columns[pace_name]
     moving = _moving(columns, pace)
@@ -291,10 +295,7 @@ def _speeds(pace: _Pace) -> Iterator[Relation]:
         over = law(keys[name], name=name, pace=pace.name, mapped="" if name == GNSS_PATH[1] else name)
         blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
         yield Relation(over, 1.0, float(np.median(ratios)), independent_samples(use), blocks=blocks)
-    of_wheels = (
-        any(n.startswith("wheel") and n.endswith("_rad_s") for n in pace.columns) and pace.name == "wheel_speeds"
-    )
-    is_fast = np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)
+    is_fast = np.abs(speed) > REVERSE_M_S
     if (samples := independent_samples(is_fast)) >= 2.0 * MIN_SAMPLES:
         yield Relation(law("ahead", pace=pace.name), 1.0, float(np.sign(np.median(speed[is_fast]))), samples)
 
@@ -391,11 +392,15 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     signs = [np.sign(r.gain) for yaw in yaws for r in compare(anything, turning, yaw, moving) if r.tells]
     is_vy = subject == "truth.vy_m_s"
     its = law("pose", subject=subject, scaled="truth.position_speed_m_s" if is_vy else "")
-    its = replace(its, signless=len(signs) < 2 or len(set(signs)) > 1)
+    bias = HEADING_RAD * (median_known(speed) if is_vy else 1.0)
+    its = replace(its, signless=len(signs) < 2 or len(set(signs)) > 1, bias=bias)
     sides = (min(signs, default=1.0) * (left if is_vy else left / speed), columns[subject])
     # Velocity and position may refer to different points of the car; yaw adds a velocity between them.
     apart = _partial(its, *sides, [turning, np.ones_like(turning)], moving)
-    return _best([*compare(its, *sides, moving), *apart])
+    difference = (sides[1] - sides[0]) * (1.0 if is_vy else speed)
+    lever = fit(difference, [turning], moving)
+    by_lever = lever is not None and abs(lever[0][0]) < LEVER_M and lever[2] < LEVER_RESIDUAL * np.nanstd(difference)
+    return _best([*(r for r in compare(its, *sides, moving) if r.accepts() or not by_lever), *apart])
 
 
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:

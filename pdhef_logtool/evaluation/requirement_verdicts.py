@@ -329,9 +329,9 @@ def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[Driv
 
 
 def _times(requirement: Requirement, bounded: statistics.Bounded) -> float:
-    """Return the factor on the amount of driving that gives a verdict if value and spread do not change, in tenths.
+    """Return how many times as much driving gives a verdict if value and spread do not change, rounded up to tenths.
 
-    The width of the interval is in proportion to the inverse square root of the amount, for positive values in the
+    The interval narrows with the square root of the amount of driving; that of a positive value is taken in its
     logarithm, as in the bootstrap.
     """
     near, value = requirement.bound, bounded.value

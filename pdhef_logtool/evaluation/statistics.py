@@ -183,7 +183,7 @@ def _correlation(x: FloatArray, parts: Sequence[IntArray]) -> float:
 
 
 def _shared(weights: FloatArray, parts: Sequence[IntArray]) -> float:
-    """Return the share of pairs with a common factor in the variance of a weighted sum, per unit of correlation."""
+    """Return the relative growth of a weighted sum's variance if drives with a common factor correlate fully."""
     return _pairs(weights, parts) / float(weights @ weights)
 
 

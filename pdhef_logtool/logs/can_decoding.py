@@ -342,7 +342,7 @@ def fit_of(database: Database, sent: frozenset[int]) -> float:
 
 
 def signal_groups(message: Message) -> Iterator[tuple[str, list[Signal], Selectors]]:
-    """Yield the signals of a message that are sent together: an ending of their name, they, and their multiplexers."""
+    """Yield groups of signals that are sent together: the suffix of their topic, the signals, their multiplexers."""
     by_name = {s.name: s for s in message.signals}
     groups: dict[Selectors, list[Signal]] = {}
     for signal in message.signals:

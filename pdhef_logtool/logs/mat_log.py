@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
-from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
+from pdhef_logtool.logs.table_columns import (
+    Sheet,
+    clock_notes,
+    field_name,
+    find_clock,
+    is_regular,
+    split_unit,
+    tables_of,
+    unique,
+)
 from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables, left_out
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
@@ -76,7 +85,8 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
     arrays: dict[str, dict[str, NDArray[Any]]] = {}
     units: dict[str, dict[str, str]] = {}
     unusable = []
-    leaves = (leaf for name, value in _with_titles(dict(variables)).items() for leaf in _leaves(name, value, 0))
+    leaves = [leaf for name, value in _with_titles(dict(variables)).items() for leaf in _leaves(name, value, 0)]
+    pairs = _pairs({path: value for path, value, _ in leaves if isinstance(value, np.ndarray)})
     rate_hz = file.settings.rate_hz
     for path, value, unit in leaves:
         struct_, _, title = path.rpartition(_SLASH)
@@ -85,7 +95,7 @@ def tables_of_variables(variables: Iterable[tuple[str, Any]], file: TableFile, l
             continue
         name, given = split_unit(title)
         unit = unit or given
-        if isinstance(value, np.ndarray) and _has_times(value):
+        if path in pairs:
             name = (struct_.rpartition(_SLASH)[2] or name) if name.lower() in _DATA else name
             arrays[path], units[path] = {"time": value[:, 0], field_name(name): value[:, 1]}, {field_name(name): unit}
             continue
@@ -354,11 +364,23 @@ def _with_titles(variables: Mapping[str, Any]) -> dict[str, Any]:
     return results
 
 
-def _has_times(array: NDArray[Any]) -> bool:
-    """Return whether an array is a matrix of rising times and of values."""
-    is_pair = array.ndim == 2 and array.shape[1] == 2 and len(array) >= _MAT["fewest"] and array.dtype.kind in "iuf"
-    # As floats, because differences of unsigned numbers wrap.
-    return is_pair and (np.diff(array.astype(np.float64), axis=0) > 0.0).all(axis=0).tolist() == [True, False]
+def _pairs(arrays: Mapping[str, NDArray[Any]]) -> set[str]:
+    """Return the names of matrices of rising times and of values.
+
+    If the values rise, too, the times are regular or within those of another matrix; otherwise they may be positions.
+    """
+    spans: dict[str, tuple[float, float]] = {}
+    rising: set[str] = set()
+    for name, array in arrays.items():
+        if array.ndim == 2 and array.shape[1] == 2 and len(array) >= _MAT["fewest"] and array.dtype.kind in "iuf":
+            # As floats, because differences of unsigned numbers wrap.
+            steps, changes = np.diff(array.astype(np.float64), axis=0).T
+            if (steps > 0.0).all():
+                spans[name] = float(array[0, 0]), float(array[-1, 0])
+                rising |= {name} if (changes > 0.0).all() and not is_regular(steps) else set()
+    first = min((spans[n][0] for n in spans.keys() - rising), default=math.inf)
+    last = max((spans[n][1] for n in spans.keys() - rising), default=-math.inf)
+    return {n for n, (start, end) in spans.items() if n not in rising or first <= start < end <= last}
 
 
 def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:

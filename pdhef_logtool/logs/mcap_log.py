@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.byte_source import ByteSource
+from pdhef_logtool.logs.byte_source import WHOLE_BYTES, ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
@@ -327,7 +327,9 @@ class McapContainer(FileContainer):
             )
 
     def _check_data(self) -> None:
-        """Check the CRC of the data section if no other checksum or count protects the messages, unless it is remote.
+        """Check the CRC of the data section if no other checksum or count protects the messages.
+
+        Of a large remote file, this would fetch parts that nothing else needs: a note says that it is not verified.
 
         After other damage, the check is skipped: it adds no information.
         """
@@ -337,7 +339,7 @@ class McapContainer(FileContainer):
         chunks = self.chunks[:1] if self._is_partial else self.chunks
         if not crc or (self._statistics is not None and all(map(self._has_crc, chunks))):
             return
-        if self._is_partial:
+        if self._is_partial and self.source.size > WHOLE_BYTES:
             what = "the CRC of the data section was not verified, as the log is read in parts from its server"
             self.lost.append(Loss(UNVERIFIED, what, str(self.path), severity="note"))
         elif self._crc(0, self._data_end) != crc:

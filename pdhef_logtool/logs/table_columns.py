@@ -235,10 +235,15 @@ def _grade_of_numbers(sheet: Sheet, name: str, given: NDArray[Any]) -> int | Non
         return 1 if _TIME_LIKE.search(text) else 2 if is_date else 3
     steps = np.diff(given)
     is_count = bool((steps == steps[0]).all()) and steps[0] == 1
-    is_regular = np.quantile(np.abs(steps - np.median(steps)), _ENOUGH_ROWS) <= _ALIKE * np.median(steps)
     are_few = len(sheet.columns) < CONSTANTS["clocks"]["fewest_columns"]
     is_alone = are_few or name != next(iter(sheet.columns)) or name in sheet.units
-    return 4 if is_regular and not (is_count or is_alone) else None
+    return 4 if is_regular(steps) and not (is_count or is_alone) else None
+
+
+def is_regular(steps: FloatArray) -> bool:
+    """Return whether most steps [N] are alike, as those of times."""
+    usual = float(np.median(steps))
+    return bool(np.quantile(np.abs(steps - usual), _ENOUGH_ROWS) <= _ALIKE * usual)
 
 
 def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float | None) -> Clock:

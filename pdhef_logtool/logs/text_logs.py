@@ -550,7 +550,7 @@ def _named_rows(value: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _array_of(value: Any, depth: int) -> Any:
-    """Return objects with lists of numbers, or of dates, as arrays; keys that count rows are a list."""
+    """Return a JSON value with its lists of numbers or dates as arrays; an object with numbers as keys is a list."""
     if isinstance(value, dict) and depth:
         if len(value) > 1 and all(key.isdigit() for key in value):
             return _array_of([*value.values()], depth)

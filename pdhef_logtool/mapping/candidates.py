@@ -45,6 +45,10 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
 }
 #: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
 MOST: dict[str, float] = VOCABULARY["largest"]
+#: Largest usual values of quantities, SI: units in which a field has larger ones are less likely.
+USUAL: dict[str, float] = VOCABULARY["usual"]
+#: Words of a doubt about a unit that is an assumption.
+UNIT_NOT_GIVEN = "unit not given"
 CONSTANT = "constant in the parts of the log that were read"
 PROPOSED: float = _NAMES["proposed"]
 
@@ -135,10 +139,10 @@ class Field:
         """Doubt about a unit that neither the name nor the drive determines."""
         if self.unit_known or self.fixed:
             return []
-        unit = self.factors[0][0]
-        if unit != HYPOTHESES[self.meaning.quantity][0][0]:
-            return [f"unit not given; taken as {unit}: values in other units are out of a car's range"]
-        return [f"unit not given and not observable in this drive; taken as {unit}"]
+        unit, usual = self.factors[0][0], HYPOTHESES[self.meaning.quantity][0][0]
+        if unit != usual:
+            return [f"{UNIT_NOT_GIVEN}; taken as {unit}, because its values in {usual} are out of a car's range"]
+        return [f"{UNIT_NOT_GIVEN} and not observable in this drive; taken as {unit}"]
 
     @property
     def is_axis(self) -> bool:
@@ -239,7 +243,7 @@ def _signs_of(paths: Collection[str]) -> dict[str, str]:
 
 
 def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
-    """Return the paths of signs, and of magnitudes with an unreadable sign: a text, or a signal of a bus."""
+    """Return the paths that are no values: signs, and magnitudes with a text or another bus signal as their sign."""
     signs, texts = _signs_of({f.path for f in fields}), {f.path for f in fields if f.kind == "string"}
     return {*signs.values(), *(m for m, sign in signs.items() if topic.encoding == "can" or sign in texts)}
 
@@ -356,7 +360,8 @@ def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
     named = () if meaning.scale is None else ((meaning.unit, meaning.scale),)
     most = MOST.get(meaning.quantity, math.inf)
     # Beyond a car's range, the unit in the name is wrong.
-    return tuple(u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most)
+    units = (u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most)
+    return tuple(sorted(units, key=lambda u: largest * u[1] > USUAL.get(meaning.quantity, math.inf)))
 
 
 def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:

@@ -106,7 +106,8 @@ def _open_columns(
     log: DriveLog, fields: Fields, topics: Sequence[tuple[TopicInfo, Role]], named: Sequence[Named]
 ) -> Iterator[_Column]:
     """Yield the columns of the sensors' fields without a unit, and without a word that has a meaning."""
-    by_name = {(topic.name, info.path) for topic, _, info, _, _ in named}
+    # A "yaw" may be the yaw rate.
+    by_name = {(topic.name, info.path) for topic, _, info, meant, _ in named if meant.quantity != "heading"}
     infos: dict[tuple[str, str], tuple[TopicInfo, FieldInfo]] = {}
     for topic in (t for t, role in topics if role == "sensor"):
         its = log.fields(topic.name, quiet=True)

@@ -384,8 +384,15 @@ def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> navigatio
         return ""
     anchors = anchors_of(draft.log, sources, draft.samples)
     rate = anchors.pop("yaw_rate_rad_s", None)
+    if rate is not None and _is_down(draft, rate.topic):
+        rate.sign = -1.0
     steps = path_velocity(pieces, [*anchors.values()])
     return navigation.axes_of(pieces, x.cells, y.cells, steps, None if rate is None else rate.si)
+
+
+def _is_down(draft: _Draft, imu: TopicInfo) -> bool:
+    """Return whether gravity shows that the z axis of an IMU is downward, in m/s² or g."""
+    return _mean(draft.values(imu, "az_m_s2")) < -0.5
 
 
 def _device(topic: str) -> str:
@@ -592,7 +599,7 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         why = "the type's convention is the body frame, although x is mostly not the direction of travel"
         draft.doubt("ground-truth velocity frame", (f"{chosen.name} as body velocity",), chosen.name, why)
     imus = [t for t in draft.log.topics if type_of(t) in IMU_TYPES and _device(t.name) == _device(chosen.name)]
-    down = any(_mean(draft.values(imu, "az_m_s2")) < -0.5 for imu in imus)  # m/s² or g
+    down = any(_is_down(draft, imu) for imu in imus)
     rates = draft.values(chosen, "yaw_rate_rad_s")
     is_filler = rates.shape[0] > 0 and not rates.any()
     draft.take(draft.truth, chosen, "vx_m_s")

@@ -10,6 +10,8 @@ posterior, or of the prior without a fit to the log. s_l is the uncertainty of t
 centre of gravity if no file contains it: the lateral velocity is determined at the rear axle. On a vehicle of the
 drive's posterior, χ ≥ 1 is the RMS error of the fit over the assumed one (Birge 1932), and s_car is χ times the model
 error of a single track, which is nearly constant within a drive; otherwise s_car is the rear slip angle on a crossfall.
+On such a vehicle, m² = (χ² − 1) s_own² of a wrong model is replaced by m² B / (m² + B) with the mean square B of the
+drive's sideslip: the error of the estimate 0, which needs no model.
 c is the lateral kinematic consistency, as far as it correlates with the driving: of the whole drive if the vehicle was
 fitted to it, otherwise as available online (:func:`running_consistency`). The variance of v_y is the same sum as a
 velocity. Estimates are unchanged.
@@ -103,7 +105,16 @@ class Interval:
             added = running_consistency(track, signals, vehicle.roll_gradient_rad_per_m_s2)
         added = np.hypot(np.nan_to_num(added), self.car_std_rad * track.vx_m_s)
         added = np.hypot(added, self.cg_std_m * track.yaw_rate_rad_s)
-        return widened(track, np.hypot(np.nan_to_num(added), self._spread), slow_m_s, self.scale)
+        return widened(track, np.hypot(np.nan_to_num(added), self._spread), slow_m_s, self._own_share(track))
+
+    def _own_share(self, track: StateTrack) -> FloatArray | float:
+        """Return the factor on a track's own 1-sigma, [N] for a whole drive: χ, bounded as described above."""
+        drives = track.valid & (np.abs(track.vx_m_s) > self.filters[0].vehicle.low_speed_blend_m_s)
+        if not self.whole_drive or not drives.any():
+            return self.scale
+        misfit, own = self.scale**2 - 1.0, track.sideslip_std_rad**2
+        square = float(np.mean((track.sideslip_rad**2 + own)[drives]))
+        return np.asarray(np.sqrt(1.0 + misfit * square / (misfit * own + square)))
 
     def _lateral_velocity(self, physics: VehicleUkf, signals: Signals, number: int) -> FloatArray:
         """Return v_y [N] of a filter, on means of ``number`` samples as its vehicle corrects them.
@@ -201,7 +212,7 @@ def spread(vy: FloatArray, varied: Sequence[FloatArray]) -> FloatArray:
     return np.sqrt(sum((np.nan_to_num(other - vy) ** 2 for other in varied), np.zeros(len(vy))))
 
 
-def widened(track: StateTrack, added_m_s: FloatArray, slow_m_s: float, own_share: float) -> StateTrack:
+def widened(track: StateTrack, added_m_s: FloatArray, slow_m_s: float, own_share: FloatArray | float) -> StateTrack:
     """Return a track [N] with wider 1-sigmas of sideslip and v_y; NaN stays NaN.
 
     Parameters

@@ -176,6 +176,10 @@ def concatenate(pieces: Iterable[StateTrack], rows: int, *, single: Collection[s
 
     All pieces have the same columns; a missing one (:func:`make_track`) takes no memory. ``single`` : columns that are
     joined in single precision.
+
+    Raises
+    ------
+    ValueError : the pieces have another number of stamps in all.
     """
     columns: dict[str, Any] = {}
     end = 0
@@ -189,6 +193,8 @@ def concatenate(pieces: Iterable[StateTrack], rows: int, *, single: Collection[s
             if name not in columns:
                 columns[name] = np.empty(shape, np.float32 if name in single else part.dtype)
             columns[name][start:end] = part
+    if end != rows:
+        raise ValueError(f"expected pieces with {rows} stamps in all, got {end}")
     return StateTrack(**columns)
 
 

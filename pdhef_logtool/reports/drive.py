@@ -126,9 +126,9 @@ def by_segment(report: Mapping[str, Any], roles: Roles) -> list[_Table]:
 
 
 def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres: bool) -> _Table | None:
-    """Return metrics that need no ground truth, of manoeuvres or the others, NIS per degree of freedom.
+    """Return the table of the metrics that need no ground truth, either those of ``manoeuvres`` or the others.
 
-    A table has heads, and rows of a name and its values; None without any value.
+    It has heads, and rows of a name and its values; None if all values are unknown. NIS is per degree of freedom.
     """
     figures = figures_of(report)
 

@@ -113,9 +113,10 @@ class _Sample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """Normal equations of each block [B, c + 2, c + 2]: sums of products of (1, features, error), in s; its drive [B].
+    """A least-squares problem by blocks of drives.
 
-    ``whole``: sums over drives, which include the ends of the blocks.
+    ``blocks`` [B, c + 2, c + 2]: integrals over time of the products of (1, features, error), in s; ``drives`` [B]: the
+    drive of each block; ``whole``: the sums of each drive, with the ends that no block contains.
     """
 
     blocks: FloatArray

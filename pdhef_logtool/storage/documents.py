@@ -5,6 +5,7 @@ A document of our own contains the digest of its other entries (:func:`seal`), b
 
 from __future__ import annotations
 
+import datetime as dt
 import hashlib
 import json
 import math
@@ -133,6 +134,8 @@ def _oddity(document: object) -> str:
     for _ in range(MAX_DEPTH):
         if any(isinstance(value, int) and value not in _WHOLE for value in level):
             return "a whole number of more than 64 bits"
+        if dates := [value for value in level if isinstance(value, dt.date | dt.time)]:
+            return f"a date or time without quotes: {dates[0]}"
         parts = (v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list))
         level = [value for part in parts for value in part]
         if not level:

@@ -121,10 +121,8 @@ def test_the_first_command_of_the_readme_answers_with_an_error_and_no_verdict(tm
     page = next((tmp_path / "out").glob("logs/*/report.html")).read_text()
     for text in (done.stdout, page):
         assert not re.search(r"INCONCLUSIVE|FAIL|more driving|s more\b", text)
-    top = json.loads(next((tmp_path / "out").glob("logs/*/report.json")).read_text())["operating_space"][
-        "speed_max_m_s"
-    ]
-    assert f"speed up to {top:.1f} m/s" in page
+    report = json.loads(next((tmp_path / "out").glob("logs/*/report.json")).read_text())
+    assert f"speed up to {report['operating_space']['speed_max_m_s']:.1f} m/s" in page
 
 
 def test_only_the_named_estimator_runs_and_is_judged(sample_logs_dir, tmp_path, capfd):

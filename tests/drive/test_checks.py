@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive, sideslip_offset
 from pdhef_logtool.drive.delays import LatencyEstimate, booked_on_the_late, truth_latency
 from pdhef_logtool.drive.measured import measure
@@ -340,6 +340,18 @@ def test_two_spinning_wheels_show_no_speed():
     assert 0.5 < np.isfinite(measure(spinning).columns["wheel_speeds"]).mean() < 0.8
     km_h = with_front(np.full(len(wheel), 3.6))
     assert np.isfinite(measure(km_h).columns["wheel_speeds"]).mean() > 0.95
+
+
+@pytest.mark.parametrize("with_file", [False, True])
+@pytest.mark.parametrize("radius_m", [0.05, 0.3])
+def test_the_rotation_of_wheels_alone_gives_the_speed(radius_m, with_file):
+    channels = drive(3, wheel_radius_m=radius_m)
+    del channels["speed_m_s"], channels["wheel_speed_rl_m_s"]
+    vehicle = default_vehicle().model_copy(update={"wheel_radius_m": radius_m}) if with_file else None
+    passed = {"ay_m_s2.unit", "ax_m_s2.unit", "yaw_rate_rad_s.unit", "steer_rad.unit", "wheel_speed_fr_rad_s.sign"}
+    checks = checks_of(channels, vehicle=vehicle)
+    assert verdicts(checks, "passed") >= passed
+    assert not verdicts(checks, "failed")
 
 
 def test_a_magnitude_without_its_sign_does_not_pass():

@@ -49,6 +49,14 @@ def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, 
     return signals, {n: replace(rate, name=n, values=v) for n, v in values.items()}
 
 
+def pose_of(truth: dict[str, Channel]) -> dict[str, np.ndarray]:
+    """Return the position and the heading of a velocity."""
+    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    yaw = np.cumsum(rate) * 0.01
+    x, y = vx * np.cos(yaw) - vy * np.sin(yaw), vx * np.sin(yaw) + vy * np.cos(yaw)
+    return {"x_m": np.cumsum(x) * 0.01, "y_m": np.cumsum(y) * 0.01, "yaw_rad": yaw}
+
+
 @pytest.mark.parametrize("place_m", [-1.1, 0.0])
 @pytest.mark.parametrize("factor", [1.0, 57.2958, 1.0 / 57.2958, 9.80665, 1.0 / 9.80665])
 def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
@@ -62,25 +70,53 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
         assert checks["truth.vy_m_s.unit"].verdict != "passed"
 
 
-@pytest.mark.parametrize(("mirrored", "antenna_m"), [(False, 0.0), (True, 0.0), (False, 1.5)])
-@pytest.mark.parametrize("factor", [1.0, 3.6, 1.0 / 3.6, -1.0])
-def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(factor, mirrored, antenna_m):
+@pytest.mark.parametrize(
+    ("factor", "mirrored", "antenna_m", "is_short"),
+    [
+        *(
+            (factor, mirrored, antenna_m, False)
+            for factor in (1.0, 3.6, 1.0 / 3.6, -1.0)
+            for mirrored, antenna_m in [(False, 0.0), (True, 0.0), (False, 1.5)]
+        ),
+        (1.0, False, 1.5, True),  # yaw times the lever is most of v_y
+    ],
+)
+def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(factor, mirrored, antenna_m, is_short):
     """A rigid-body identity: a pose with y to the right, or from an antenna further ahead, fails no check."""
     vehicle = default_vehicle().model_copy(update={"truth_position_m": (1.3, 0.0, 0.0)})
     signals, truth = with_truth(vehicle, 1.0)
-    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
-    yaw, side = np.cumsum(rate) * 0.01, -1.0 if mirrored else 1.0
-    pose = {"x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * 0.01, "yaw_rad": side * yaw}
-    pose["y_m"] = side * (np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)) * 0.01 + antenna_m * np.sin(yaw))
-    pose["x_m"] += antenna_m * np.cos(yaw)
+    pose, side, vy = pose_of(truth), -1.0 if mirrored else 1.0, truth["vy_m_s"].values
+    pose["x_m"] += antenna_m * np.cos(pose["yaw_rad"])
+    pose["y_m"] = side * (pose["y_m"] + antenna_m * np.sin(pose["yaw_rad"]))
+    pose["yaw_rad"] = side * pose["yaw_rad"]
     truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
     truth["vy_m_s"] = replace(truth["vy_m_s"], values=factor * vy)
     truth["y_m"] = truth["y_m"].take(np.arange(vy.size) % 1000 != 500)  # a sample of one axis is missing
+    end_ns = truth["vx_m_s"].stamps_ns[400 if is_short else -1]
+    signals, truth = ({n: c.take(c.stamps_ns <= end_ns) for n, c in some.items()} for some in (signals, truth))
     derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
     checks = {c.name: c for c in checks_of(signals, truth, derived, vehicle) if c.subject == "truth.vy_m_s"}
     failed = [n for n, c in checks.items() if c.verdict == "failed"]
     assert failed == ([] if factor == 1.0 else ["truth.vy_m_s.sign" if factor < 0.0 else "truth.vy_m_s.unit"])
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
+
+
+@pytest.mark.parametrize("share", [0.1, 1.0])
+@pytest.mark.parametrize("is_over_ground", [False, True])
+def test_a_velocity_in_the_axes_of_the_positions_is_named(share, is_over_ground):
+    """Also on a road along x, where v_x is the same in both axes."""
+    signals, truth = with_truth(VEHICLE, 1.0)
+    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    yaw = np.cumsum(rate) * 0.01
+    yaw = share * (yaw - yaw.mean())
+    east, north = vx * np.cos(yaw) - vy * np.sin(yaw), vx * np.sin(yaw) + vy * np.cos(yaw)
+    pose = {"x_m": np.cumsum(east) * 0.01, "y_m": np.cumsum(north) * 0.01, "yaw_rad": yaw}
+    pose |= {"vx_m_s": east, "vy_m_s": north} if is_over_ground else {}
+    truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
+    checks = {c.name: c for c in checks_of(signals, truth, derive_truth(truth), VEHICLE)}
+    named = checks.get("truth.vy_m_s.axis")
+    assert (named is not None) == is_over_ground
+    assert named is None or "enu_velocity_m_s" in named.remedy
 
 
 def test_exchanged_velocities_of_ground_truth_are_named():
@@ -135,14 +171,8 @@ def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed():
 @pytest.mark.parametrize(("name", "factor"), [("x_m", 1e-3), ("y_m", 3.2808), ("x_m", -1.0), ("y_m", -1.0), ("", 1.0)])
 def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(name, factor):
     signals, truth = with_truth(VEHICLE, 1.0)
-    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
-    yaw = np.cumsum(rate) * 0.01
-    pose = {
-        "x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)),
-        "y_m": np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)),
-    }
-    scales = {n: factor if n == name else 1.0 for n in pose}
-    truth |= {n: replace(truth["vx_m_s"], name=n, values=0.01 * scales[n] * v) for n, v in pose.items()}
+    pose, scales = pose_of(truth), {name: factor}
+    truth |= {n: replace(truth["vx_m_s"], name=n, values=scales.get(n, 1.0) * pose[n]) for n in ("x_m", "y_m")}
     checks = checks_of(signals, truth, derive_truth(truth), VEHICLE)
     failed = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject.startswith("truth.")}
     expected = "" if not name else "truth.y_m.sign" if factor < 0.0 else f"truth.{name}.scale"
@@ -294,6 +324,14 @@ def test_two_mistakes_are_found_that_are_worse_than_none_alone():
     found = posterior(relations, known_hypotheses((*NAMES, "steer_rad"), (imu,), (("steer_rad",),)))
     probability, chosen = found.sets[0]
     assert probability > 0.97 and {n for h in chosen for n in h.factors} == {*imu, "steer_rad"}
+
+
+def test_an_assumed_unit_is_wrong_before_one_that_is_given():
+    names = ("speed_m_s", "steering_wheel_rad")
+    km_h = [relation(3.6, 3.7, 3.5, powers=dict.fromkeys(names, 1), text=text) for text in "ab"]
+    given, assumed = (posterior(km_h, known_hypotheses(names, (), (), frozenset(of))) for of in ((), names[:1]))
+    assert given.sets[0][1][0].factors.keys() == {names[1]}
+    assert assumed.sets[0][1][0].factors == {names[0]: 1.0 / 3.6} and assumed.sets[0][0] > 0.9
 
 
 def test_scales_of_right_mappings_are_those_of_units():

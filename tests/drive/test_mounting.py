@@ -1,5 +1,6 @@
 """Signals of an IMU in any mounting are rotated to x forward, z up; a doubtful rotation is reported, not applied."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -7,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.measured import measure
@@ -15,39 +15,49 @@ from pdhef_logtool.drive.mounting import ACCELERATIONS, RATES, angles_deg, find_
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive, with_gyro_delay
 from pdhef_logtool.drive.recorded import read_recorded
 from pdhef_logtool.drive.survey import Survey, mapping_proposals, survey_log
+from pdhef_logtool.logs.drive_log import Columns
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks, load_mapping, read_signals, resolve_mapping
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.runs.inspection.report import inspect_drive_log, write_mapping
 
+TOPIC = "/imu/data"
 TRIADS = tuple(tuple(f"{part}.{axis}" for axis in "xyz") for part in ("linear_acceleration", "angular_velocity"))
 
 
-class TurnedLog:
-    """Wraps ``log``; ``car_from_sensor`` [3, 3] rotates the new readings of its topic into the original ones."""
+class ChangedLog:
+    """Wraps a log; each of ``changes`` returns new columns of a topic that is read, of the IMU from all its columns."""
 
-    def __init__(self, log: Any, car_from_sensor: NDArray[np.float64], topic: str = "/imu/data") -> None:
-        self._log, self._topic, self._turn = log, topic, car_from_sensor
+    def __init__(self, log: Any, *changes: Callable[[str, Columns], dict[str, FloatArray]]) -> None:
+        self._log, self._changes = log, changes
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._log, name)
 
     def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int, **options: bool) -> dict[str, Any]:
-        asked = dict(requests)
-        if self._topic in asked:
-            asked[self._topic] = [*dict.fromkeys([*asked[self._topic], *TRIADS[0], *TRIADS[1]])]
-        found = dict(self._log.read(asked, start_ns, end_ns, **options))
-        if self._topic in found:
-            columns = found[self._topic]
-            fields = dict(columns.fields)
-            for paths in TRIADS:
-                turned = np.stack([fields[p] for p in paths], axis=1) @ self._turn
-                fields.update({p: turned[:, i] for i, p in enumerate(paths)})
-            found[self._topic] = replace(columns, fields=fields)
+        whole = {t: [*dict.fromkeys([*p, *TRIADS[0], *TRIADS[1]])] for t, p in requests.items() if t == TOPIC}
+        found = self._log.read({**requests, **whole}, start_ns, end_ns, **options)
+        for change in self._changes:
+            found = {t: replace(c, fields={**c.fields, **change(t, c)}) for t, c in found.items()}
         return found
 
 
-def rotation(roll: float, pitch: float, yaw: float) -> NDArray[np.float64]:
+def turning(car_from_sensor: FloatArray) -> Callable[[str, Columns], dict[str, FloatArray]]:
+    """Return the change of an IMU; ``car_from_sensor`` [3, 3] rotates its new readings into the original ones."""
+
+    def change(topic: str, columns: Columns) -> dict[str, FloatArray]:
+        triads = TRIADS if topic == TOPIC else ()
+        turned = {paths: np.stack([columns.fields[p] for p in paths], axis=1) @ car_from_sensor for paths in triads}
+        return {p: vectors[:, i] for paths, vectors in turned.items() for i, p in enumerate(paths)}
+
+    return change
+
+
+def turned_log(log: Any, *angles: float) -> ChangedLog:
+    return ChangedLog(log, turning(rotation(*angles)))
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
     """Return the rotation [3, 3] of a sensor that is turned by yaw, then pitch, then roll (deg) into the car's axes."""
     (cr, cp, cy), (sr, sp, sy) = (f(np.radians([roll, pitch, yaw])) for f in (np.cos, np.sin))
     about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
@@ -107,10 +117,26 @@ def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles):
     assert found.is_as_named == (angles == (0, 0, 0))
 
 
+@pytest.mark.parametrize("bends", [0.02, 0.2])
+def test_a_hill_in_a_banked_bend_turns_no_imu(components, bends):
+    """Only in quick bends, crossfall and grade cannot resemble an IMU that is turned."""
+    channels, triads, mapping = components
+    like = channels.signals[RATES[2]].take(np.arange(800))
+    seconds = 1e-9 * (like.stamps_ns - like.stamps_ns[0])
+    rate = bends * np.sin(1.2 * seconds)
+    speed = 28.0 + 0.2 * np.sin(0.5 * seconds)
+    values = dict(zip(RATES, (0.0 * rate, 0.0 * rate, rate), strict=True))
+    values |= dict(zip(ACCELERATIONS, (speed * rate, 0.01 * np.cos(9.0 * seconds), 9.81 + 0.0 * rate), strict=True))
+    values |= {"speed_m_s": speed, "steer_rad": 2.8 * rate / speed}
+    found = find_mounting(measure({n: replace(like, name=n, values=v) for n, v in values.items()}), triads, mapping)
+    assert not found.is_as_named
+    assert found.confident == (bends > 0.1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("angles", [(0, 0, 0), (0, 90, 0), (180, 0, 270)])
 def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles):
-    turned = TurnedLog(log, rotation(*angles))
+    turned = turned_log(log, *angles)
     plan = planned(turned)
     upright = angles == (0, 0, 0)
     assert (plan.mapping == auto_map(turned).mapping) == upright
@@ -126,7 +152,7 @@ def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles):
 @pytest.mark.slow
 @pytest.mark.parametrize("angles", [(7, 0, 0), (180, 0, 30)])
 def test_a_mounting_askew_is_found_to_two_degrees(log, angles):
-    turned = TurnedLog(log, rotation(*angles))
+    turned = turned_log(log, *angles)
     plan = planned(turned)
     rest = difference(signals_of(turned, plan), signals_of(log, planned(log)))
     assert rest < 0.5, "2 deg of gravity are 0.34 m/s^2"
@@ -135,7 +161,7 @@ def test_a_mounting_askew_is_found_to_two_degrees(log, angles):
 
 @pytest.mark.slow
 def test_a_written_mapping_turns_once_and_never_again(log, tmp_path):
-    turned = TurnedLog(log, rotation(0, 90, 25))
+    turned = turned_log(log, 0, 90, 25)
     found = inspect_drive_log(turned)
     write_mapping(found, tmp_path / "mapping.toml")
     mapping = load_mapping(tmp_path / "mapping.toml")
@@ -148,7 +174,7 @@ def test_a_written_mapping_turns_once_and_never_again(log, tmp_path):
 
 
 def test_a_mapping_file_is_checked_and_left_alone(log):
-    turned = TurnedLog(log, rotation(0, 0, 90))
+    turned = turned_log(log, 0, 0, 90)
     mapping = replace(auto_map(turned).mapping, origin="file")
     plan = planned(turned, mapping)
     assert plan.mapping is mapping
@@ -160,18 +186,13 @@ def test_a_mapping_file_is_checked_and_left_alone(log):
 
 @pytest.mark.slow
 def test_a_sensor_that_takes_gravity_off_is_turned_by_its_rates(log):
-    class Compensated(TurnedLog):
-        def read(self, requests, start_ns, end_ns, **options):
-            found = super().read(requests, start_ns, end_ns, **options)
-            for name, columns in found.items():
-                if name == "/imu/data":
-                    gravity = 9.81 * self._turn[2]
-                    for i, axis in enumerate("xyz"):
-                        columns.fields[f"linear_acceleration.{axis}"] -= gravity[i]
-            return found
-
     for angles in ((90, 0, 0), (180, 0, 90)):
-        turned = Compensated(log, rotation(*angles))
+        gravity = dict(zip(TRIADS[0], 9.81 * rotation(*angles)[2], strict=True))
+
+        def compensated(topic: str, columns: Columns, of: dict[str, float] = gravity) -> dict[str, FloatArray]:
+            return {p: columns.fields[p] - g for p, g in of.items()} if topic == TOPIC else {}
+
+        turned = ChangedLog(log, turning(rotation(*angles)), compensated)
         assert difference(signals_of(turned, planned(turned)), signals_of(log, planned(log))) < 1e-9
 
 
@@ -185,35 +206,28 @@ AY_DELAY_S = 0.024
 CAR = default_vehicle().model_copy(update={"name": "other"})
 
 
-class WrongLog(TurnedLog):
-    """An IMU on its side and off the CG, late, its gyro with a gain, and a steering of the wrong sign."""
+ON_ITS_SIDE = rotation(90, 0, 0)
 
-    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int, **options: bool) -> dict[str, Any]:
-        found = super().read(requests, start_ns, end_ns, **options)
-        if "/imu/data" in found:
-            columns = found["/imu/data"]
-            fields = dict(columns.fields)
-            time_s = (columns.log_time_ns - columns.log_time_ns[0]) * 1e-9
-            rates = np.stack([fields[f"angular_velocity.{a}"] for a in "xyz"], axis=1)
-            smooth = np.convolve(rates @ self._turn[2], np.ones(11) / 11.0, mode="same")
-            turning = np.gradient(smooth, time_s)
-            for i, axis in enumerate("xyz"):
-                name = f"angular_velocity.{axis}"
-                fields[name] = GAIN * np.interp(time_s - DELAY_S, time_s, fields[name])
-                # The lever acts along the car's left.
-                felt = fields[f"linear_acceleration.{axis}"] + LEVER_M * turning * self._turn[1, i]
-                fields[f"linear_acceleration.{axis}"] = np.interp(time_s - AY_DELAY_S, time_s, felt)
-            found["/imu/data"] = replace(columns, fields=fields)
-        for columns in found.values():
-            if "steering_tire_angle" in columns.fields:
-                columns.fields["steering_tire_angle"] = -columns.fields["steering_tire_angle"]
-        return found
+
+def wrong(topic: str, columns: Columns) -> dict[str, FloatArray]:
+    """Change an IMU on its side: off the CG, late, its gyro with a gain; and the sign of the steering."""
+    fields = dict(columns.fields)
+    if topic != TOPIC:
+        return {p: -v for p, v in fields.items() if p == "steering_tire_angle"}
+    time_s = (columns.log_time_ns - columns.log_time_ns[0]) * 1e-9
+    forces, rates = TRIADS
+    smooth = np.convolve(np.stack([fields[p] for p in rates], axis=1) @ ON_ITS_SIDE[2], np.ones(11) / 11.0, mode="same")
+    late = {p: GAIN * np.interp(time_s - DELAY_S, time_s, fields[p]) for p in rates}
+    for i, path in enumerate(forces):  # the lever acts along the car's left
+        felt = fields[path] + LEVER_M * np.gradient(smooth, time_s) * ON_ITS_SIDE[1, i]
+        late[path] = np.interp(time_s - AY_DELAY_S, time_s, felt)
+    return late
 
 
 @pytest.fixture(scope="module")
 def wrong_log(sample_logs_dir):
     opened = open_log(sample_logs_dir / "sweep.mcap")
-    yield WrongLog(opened, rotation(90, 0, 0))
+    yield ChangedLog(opened, turning(ON_ITS_SIDE), wrong)
     opened.close()
 
 
@@ -256,24 +270,18 @@ def test_proposals_say_where_they_belong_and_why(wrong_log):
     assert [p["subject"] for p in found.to_dict()["proposals"]] == [p.subject for p in found.proposals]
 
 
-class TurnedTruth(TurnedLog):
-    """A log with the body velocity of its ground truth rotated by 0.4 degrees."""
-
-    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int, **options: bool) -> dict[str, Any]:
-        found = dict(self._log.read(requests, start_ns, end_ns, **options))
-        c, s = np.cos(np.radians(0.4)), np.sin(np.radians(0.4))
-        for topic, columns in found.items():
-            vx, vy = (columns.fields.get(f"twist.twist.linear.{a}") for a in "xy")
-            if vx is not None and vy is not None:
-                turned = {"twist.twist.linear.x": c * vx - s * vy, "twist.twist.linear.y": s * vx + c * vy}
-                found[topic] = replace(columns, fields={**columns.fields, **turned})
-        return found
+def turned_truth(_topic: str, columns: Columns) -> dict[str, FloatArray]:
+    """Rotate the body velocity of the ground truth by 0.4 degrees."""
+    paths = [f"twist.twist.linear.{axis}" for axis in "xy"]
+    vx, vy = (columns.fields.get(p) for p in paths)
+    c, s = np.cos(np.radians(0.4)), np.sin(np.radians(0.4))
+    return {} if vx is None or vy is None else dict(zip(paths, (c * vx - s * vy, s * vx + c * vy), strict=True))
 
 
 @pytest.mark.slow
 def test_a_turned_truth_is_turned_back_once(sample_logs_dir, tmp_path):
     opened = open_log(sample_logs_dir / "road.mcap")
-    wrong_log = TurnedTruth(opened, np.eye(3))
+    wrong_log = ChangedLog(opened, turned_truth)
     found = inspect_drive_log(wrong_log)
     assert {p.subject for p in found.proposals} == {"truth.vx_m_s", "truth.vy_m_s"}
     write_mapping(found, tmp_path / "mapping.toml")

@@ -11,16 +11,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
+from pdhef_logtool.drive import truth as derivation
 from pdhef_logtool.drive.delays import estimate_truth_latency
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.drive.truth import (
-    channel_of,
-    dependent_signals,
-    derive_truth,
-    differentiate,
-    truth_at,
-    valid_as_a_whole,
-)
+from pdhef_logtool.drive.truth import dependent_signals, derive_truth, truth_at, valid_as_a_whole
 from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.records.geometry import geodetic_from_ecef
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
@@ -42,6 +36,16 @@ def channel(name, stamps_ns, values, units=TRUTH_UNITS, source="/ins", delay_ns=
     return Channel(
         name, units[name], f"{source}.{name}", stamps_ns, stamps_ns + delay_ns, np.asarray(values, dtype=float)
     )
+
+
+def channels_of(stamps_ns, values) -> dict[str, Channel]:
+    """Return channels of ground truth at the same stamps."""
+    return {name: channel(name, stamps_ns, v) for name, v in values.items()}
+
+
+def body(d) -> dict[str, np.ndarray]:
+    """Return the velocity and the yaw rate of a drive."""
+    return {"vx_m_s": d.vx, "vy_m_s": d.vy, "yaw_rate_rad_s": d.r}
 
 
 class Drive:
@@ -95,7 +99,7 @@ def sources(stamps, d: Drive) -> dict[str, dict]:
     turn = body_to_enu(d)
     wrapped = np.angle(np.exp(1j * d.yaw))
     return {
-        "body": {"vx_m_s": d.vx, "vy_m_s": d.vy, "yaw_rate_rad_s": d.r},
+        "body": body(d),
         "vx, sideslip": {"vx_m_s": d.vx, "sideslip_rad": d.beta, "yaw_rate_rad_s": d.r},
         "vx, course, yaw": {"vx_m_s": d.vx, "course_rad": d.course, "yaw_rad": wrapped},
         "enu velocity, yaw": {"enu_velocity_m_s": d.velocity, "yaw_rad": wrapped},
@@ -121,7 +125,7 @@ KINDS = tuple(sources(*drive(1.0)))
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_source_gives_the_same_body_velocity(kind):
     stamps, d = drive(jitter=0.2)
-    channels = {n: channel(n, stamps, v) for n, v in sources(stamps, d)[kind].items()}
+    channels = channels_of(stamps, sources(stamps, d)[kind])
     truth = derive_truth(channels)
     track = truth.track
     good = np.isfinite(track.vx_m_s) & np.isfinite(track.vy_m_s)
@@ -165,7 +169,7 @@ def test_lever_arm_is_taken_back_to_the_cg(kind):
     at_sensor.velocity = np.stack(
         [d.velocity[:, 0] + d.r * (-s * p[0] - c * p[1]), d.velocity[:, 1] + d.r * (c * p[0] - s * p[1]), 0 * s], axis=1
     )
-    channels = {n: channel(n, stamps, v) for n, v in sources(stamps, at_sensor)[kind].items()}
+    channels = channels_of(stamps, sources(stamps, at_sensor)[kind])
     truth = derive_truth(channels, truth_position_m=(-0.7, 0.4, 0.3))
     good = np.isfinite(truth.track.vy_m_s)
     np.testing.assert_allclose(truth.track.vx_m_s[good], d.vx[good], atol=3e-4)
@@ -184,8 +188,7 @@ def test_specific_force_on_a_bank(bank, gradient, axes):
     force = d.ay + 9.80665 * np.sin(bank * np.sin(d.t))
     turn = body_to_enu(d) * Rotation.from_rotvec((bank * np.sin(d.t) + gradient * force)[:, None] * [1.0, 0.0, 0.0])
     attitude = quat(turn if axes == "quat" else NED * turn * FRD)
-    values = {"enu_velocity_m_s": d.velocity, "vx_m_s": d.vx, "vy_m_s": d.vy, "yaw_rate_rad_s": d.r}
-    channels = {n: channel(n, stamps, v) for n, v in {**values, "quat_wxyz": attitude}.items()}
+    channels = channels_of(stamps, body(d) | {"enu_velocity_m_s": d.velocity, "quat_wxyz": attitude})
     plan = derive_truth(channels, roll_gradient_rad_per_m_s2=gradient).plan
     track = derive_truth(channels, plan=plan).track
     inner = np.isfinite(track.ay_m_s2)
@@ -212,7 +215,7 @@ def test_specific_force_of_the_simulated_road(sample_logs_dir):
 
 def test_ground_speed_alone_claims_no_sideslip():
     stamps, d = drive(3.0)
-    truth = derive_truth({"enu_velocity_m_s": channel("enu_velocity_m_s", stamps, d.velocity)})
+    truth = derive_truth(channels_of(stamps, {"enu_velocity_m_s": d.velocity}))
     np.testing.assert_allclose(truth.track.vx_m_s, np.hypot(d.vx, d.vy))
     assert np.isnan(truth.track.sideslip_rad).all()
     assert "sideslip_rad" not in truth.derivation
@@ -235,7 +238,7 @@ def test_derivative_agrees_with_scipy_on_even_stamps():
     rng = np.random.default_rng(3)
     stamps = T0 + np.arange(400) * 10_000_000
     y = rng.normal(size=400).cumsum()
-    ours = differentiate(stamps, y, 10, 30_000_000)
+    ours = derivation.differentiate(stamps, y, 10, 30_000_000)
     theirs = savgol_filter(y, 21, 3, deriv=1, delta=0.01)
     np.testing.assert_allclose(ours[10:-10], theirs[10:-10], atol=1e-8)
     assert np.isnan(ours[:10]).all()
@@ -247,7 +250,7 @@ def test_no_derivative_across_a_gap_or_a_missing_value():
     stamps[150:] += 1_000_000_000
     y = np.where(np.arange(300) < 150, 0.0, 100.0)
     y[50] = np.nan
-    slope = differentiate(stamps, y, 5, 30_000_000)
+    slope = derivation.differentiate(stamps, y, 5, 30_000_000)
     np.testing.assert_allclose(slope[np.isfinite(slope)], 0.0, atol=1e-9)
     expected = np.isnan(slope)
     assert expected[45:56].all()
@@ -261,10 +264,7 @@ def test_no_derivative_across_a_gap_or_a_missing_value():
 def test_truth_at_other_stamps_with_latency_and_gaps():
     stamps, d = drive(10.0, rate=50)
     keep = (d.t < 4.0) | (d.t > 5.0)
-    channels = {
-        n: channel(n, stamps[keep], v[keep]) for n, v in {"vx_m_s": d.vx, "vy_m_s": d.vy, "yaw_rate_rad_s": d.r}.items()
-    }
-    truth = derive_truth(channels)
+    truth = derive_truth(channels_of(stamps[keep], {name: values[keep] for name, values in body(d).items()}))
     latency = 0.03
     at = T0 + np.arange(-50, 1050, dtype=np.int64) * 10_000_000
     out = truth_at(truth, at, latency)
@@ -282,12 +282,8 @@ def test_truth_at_other_stamps_with_latency_and_gaps():
 def test_headings_are_interpolated_the_shorter_way():
     stamps = T0 + np.arange(10) * 10_000_000
     yaw = np.angle(np.exp(1j * (3.0 + 0.1 * np.arange(10))))
-    channels = {
-        "x_m": channel("x_m", stamps, np.arange(10.0)),
-        "y_m": channel("y_m", stamps, np.zeros(10)),
-        "yaw_rad": channel("yaw_rad", stamps, yaw),
-    }
-    out = truth_at(derive_truth(channels), stamps[:-1] + 5_000_000)
+    pose = {"x_m": np.arange(10.0), "y_m": np.zeros(10), "yaw_rad": yaw}
+    out = truth_at(derive_truth(channels_of(stamps, pose)), stamps[:-1] + 5_000_000)
     np.testing.assert_allclose(np.exp(1j * out.yaw_rad), np.exp(1j * (3.05 + 0.1 * np.arange(9))), atol=1e-12)
 
 
@@ -348,8 +344,8 @@ def test_the_gyros_own_channel_as_truth_is_flagged():
 
 def test_latency_of_a_truth_whose_yaw_rate_is_derived():
     stamps, d = drive(60.0, rate=20)
-    channels = {n: channel(n, stamps, v) for n, v in sources(stamps, d)["position, yaw"].items()}
-    derived = channel_of(derive_truth(channels), "yaw_rate_rad_s")
+    track = derive_truth(channels_of(stamps, sources(stamps, d)["position, yaw"]))
+    derived = derivation.channel_of(track, "yaw_rate_rad_s")
     assert np.isfinite(derived.values).all()
     t = np.arange(0, 60, 0.01)
     gyro = channel("yaw_rate_rad_s", T0 + np.round((t - 0.05) * 1e9), Drive(t).r, SIGNAL_UNITS, "/imu")
@@ -363,8 +359,7 @@ def test_latency_of_a_truth_whose_yaw_rate_is_derived():
 
 def test_a_truth_channel_that_is_an_input_is_found():
     stamps, d = drive(10.0)
-    rng = np.random.default_rng(0)
-    truth = {n: channel(n, stamps, v) for n, v in {"vx_m_s": d.vx, "vy_m_s": d.vy, "yaw_rate_rad_s": d.r}.items()}
+    rng, truth = np.random.default_rng(0), channels_of(stamps, body(d))
     signals = {
         "speed_m_s": channel("speed_m_s", stamps[5:], d.vx[5:].astype(np.float32), SIGNAL_UNITS, "/can"),
         "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, d.r + rng.normal(0, 1e-3, d.r.size), SIGNAL_UNITS, "/imu"),
@@ -378,23 +373,15 @@ def test_a_truth_channel_that_is_an_input_is_found():
 def test_a_few_equal_samples_or_a_constant_do_not_make_a_copy():
     stamps, d = drive(10.0)
     mixed = np.where(np.arange(stamps.size) % 20 == 0, d.vx + 0.1, d.vx)  # 95 % equal
-    truth = {"vx_m_s": channel("vx_m_s", stamps, d.vx)}
-    assert dependent_signals({"speed_m_s": channel("speed_m_s", stamps, mixed, SIGNAL_UNITS)}, truth) == {}
-    standing = channel("speed_m_s", stamps, np.zeros(stamps.size), SIGNAL_UNITS)
-    assert (
-        dependent_signals({"speed_m_s": standing}, {"vx_m_s": channel("vx_m_s", stamps, np.zeros(stamps.size))}) == {}
-    )
+    for speed, vx in ((mixed, d.vx), (0.0 * d.vx, 0.0 * d.vx)):
+        signals = {"speed_m_s": channel("speed_m_s", stamps, speed, SIGNAL_UNITS)}
+        assert dependent_signals(signals, channels_of(stamps, {"vx_m_s": vx})) == {}
 
 
 def test_valid_means_that_everything_claimed_is_known():
     stamps, d = drive(10.0, rate=50)
-    vy = d.vy.copy()
     keep = (d.t < 4.0) | (d.t > 5.0)
-    channels = {
-        "vx_m_s": channel("vx_m_s", stamps, d.vx),
-        "vy_m_s": channel("vy_m_s", stamps[keep], vy[keep]),
-        "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, d.r),
-    }
+    channels = channels_of(stamps, body(d)) | channels_of(stamps[keep], {"vy_m_s": d.vy[keep]})
     truth = derive_truth(channels)
     at_stamps = truth_at(truth, stamps[5:-5])
     out = valid_as_a_whole(at_stamps, truth.derivation, 0.3)
@@ -413,12 +400,8 @@ def test_there_is_no_sideslip_at_standstill():
     stamps, d = drive(10.0, rate=50)
     noise = np.random.default_rng(0).normal(0.0, 0.01, (2, len(stamps)))
     standing = d.t > 5.0
-    channels = {
-        "vx_m_s": channel("vx_m_s", stamps, np.where(standing, noise[0], d.vx)),
-        "vy_m_s": channel("vy_m_s", stamps, np.where(standing, noise[1], d.vy)),
-        "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, d.r),
-    }
-    truth, at = derive_truth(channels), stamps[20:-20]
+    d.vx, d.vy = np.where(standing, noise[0], d.vx), np.where(standing, noise[1], d.vy)
+    truth, at = derive_truth(channels_of(stamps, body(d))), stamps[20:-20]
     out, before = truth_at(truth, at, standstill_m_s=0.3), truth_at(truth, at)
     still = standing[20:-20]
     assert np.ptp(before.sideslip_rad[still]) > 6.0
@@ -463,12 +446,8 @@ def test_measured_lateral_acceleration_is_moved_too():
     t = (stamps - T0) * 1e-9
     r = 0.4 * np.sin(t)
     x, y = 1.5, -0.5
-    channels = {
-        "vx_m_s": channel("vx_m_s", stamps, 10 + 0 * t),
-        "vy_m_s": channel("vy_m_s", stamps, 0 * t),
-        "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, r),
-        "ay_m_s2": channel("ay_m_s2", stamps, 10 * r + 0.4 * np.cos(t) * x - r**2 * y),
-    }
+    motion = {"vx_m_s": 10 + 0 * t, "vy_m_s": 0 * t, "yaw_rate_rad_s": r}
+    channels = channels_of(stamps, motion | {"ay_m_s2": 10 * r + 0.4 * np.cos(t) * x - r**2 * y})
     track = derive_truth(channels, truth_position_m=(x, y, 0.0)).track
     good = np.isfinite(track.ay_m_s2)
     np.testing.assert_allclose(track.ay_m_s2[good], 10 * r[good], atol=1e-5)
@@ -476,8 +455,7 @@ def test_measured_lateral_acceleration_is_moved_too():
 
 def test_without_a_yaw_rate_velocities_stay_and_the_report_says_so():
     stamps, d = drive(2.0)
-    channels = {n: channel(n, stamps, v) for n, v in {"vx_m_s": d.vx, "vy_m_s": d.vy}.items()}
-    truth = derive_truth(channels, truth_position_m=(1.0, 0.0, 0.0))
+    truth = derive_truth(channels_of(stamps, {"vx_m_s": d.vx, "vy_m_s": d.vy}), truth_position_m=(1.0, 0.0, 0.0))
     np.testing.assert_array_equal(truth.track.vy_m_s, d.vy)
     assert "no yaw rate" in truth.derivation["cg"]
     assert np.isnan(truth.track.ay_m_s2).all()

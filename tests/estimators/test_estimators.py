@@ -24,7 +24,7 @@ from pdhef_logtool.estimators.table import Options, all_specs, make_estimator
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, GNSS_COMPONENTS, TRUTH_UNITS, Signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
 
 pytestmark = pytest.mark.slow
 
@@ -375,3 +375,10 @@ def test_covariance_is_definite_on_any_clock(seed, log_low, speed):
     made = drive(slalom(min(0.3, 8.0 / speed**2), 0.5), speed=speed, step_s=dt)
     signals = with_noise(made.signals, seed % 1000)
     check_sane(run("phy-ukf", signals), "phy-ukf", signals)
+
+
+def test_pieces_of_a_track_have_its_stamps_in_all():
+    piece = make_track("a", np.arange(3), vx_m_s=np.ones(3))
+    assert len(concatenate([piece, piece], 6)) == 6
+    with pytest.raises(ValueError, match="7 stamps in all, got 6"):
+        concatenate([piece, piece], 7)

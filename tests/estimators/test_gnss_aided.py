@@ -124,27 +124,25 @@ def test_without_a_sample_the_estimate_is_that_of_the_filter_bit_for_bit(bare):
     np.testing.assert_array_equal(aided.covariance, plain.covariance)
 
 
-@pytest.mark.parametrize("fault", ["multipath", "swapped", "outage", "wild", "slow clock", "lag", "noise"])
+#: Wrong velocities [N, 2] of a receiver, from the time and the right ones.
+FAULTS = {
+    "multipath": lambda t, v: v + 0.35 * ((t > 20.0) & (t < 25.0))[:, None],
+    "swapped": lambda _, v: v[:, ::-1].copy(),
+    "outage": lambda t, v: np.where(t[:, None] > 15.0, np.nan, v),
+    "wild": lambda t, v: v + 5.0 * (np.random.default_rng(1).random(len(t)) < 0.2)[:, None],
+    "slow clock": lambda _, v: v,
+    "lag": lambda _, v: np.roll(v, 20, axis=0),
+    "noise": lambda _, v: v + 0.4 * np.random.default_rng(2).standard_normal(v.shape),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("driven", ["road", "fishhook"])
 def test_wrong_gnss_costs_nothing(bare, driven, fault):
     drive = gnss_drive(driven)
-    signals = drive.aided
-    velocity = signals.gnss_velocity_m_s.copy()
-    t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
-    if fault == "multipath":
-        velocity[(t > 20.0) & (t < 25.0)] += 0.35
-    elif fault == "swapped":
-        velocity = velocity[:, ::-1].copy()
-    elif fault == "outage":
-        velocity[t > 15.0] = np.nan
-    elif fault == "wild":
-        wild = np.random.default_rng(1).random(len(t)) < 0.2
-        velocity[wild] += 5.0
-    elif fault == "lag":
-        velocity = np.roll(velocity, 20, axis=0)
-    elif fault == "noise":
-        velocity += 0.4 * np.random.default_rng(2).standard_normal(velocity.shape)
-    else:
+    signals, t = drive.aided, (drive.aided.stamps_ns - drive.aided.stamps_ns[0]) * 1e-9
+    velocity = FAULTS[fault](t, signals.gnss_velocity_m_s)
+    if fault == "slow clock":
         signals = replace(signals, gnss_late_s=np.full(len(t), 3.0))
     plain, _ = _error_deg(drive, run_estimator(make_estimator("physics", bare), signals))
     aided, _ = _error_deg(drive, run_estimator(_aided(bare), replace(signals, gnss_velocity_m_s=velocity)))

@@ -28,23 +28,12 @@ from pdhef_logtool.residual_model.interface import ENTRY_POINTS, plug_in_names
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.command_line import called
+from tests.plug_in import install
 
 
 def example_code() -> str:
     """Return the estimator as the docstring shows it."""
     return dedent((table.__doc__ or "").partition("Example::\n")[2])
-
-
-def install(
-    folder: Path, code: str, name: str = "half_slip", group: str = "pdhef.estimators", of: str = "SPEC"
-) -> Path:
-    """Write a distribution with one module and an entry point to its ``of``; return the folder for ``sys.path``."""
-    (folder / f"{name}.py").write_text(code, encoding="utf-8")
-    info = folder / f"{name}-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", encoding="utf-8")
-    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {name}:{of}\n", encoding="utf-8")
-    return folder
 
 
 @dataclass(frozen=True)

@@ -209,16 +209,7 @@ def _drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 
 
 #: Errors of the IMU over the hundredths of a second between a knot and a GNSS sample, and on the yaw rate.
-_OVER_THE_OFFSET = {
-    kinematics.AX_BIAS,
-    kinematics.AY_BIAS,
-    kinematics.ROLL_GAIN,
-    kinematics.AX_GAIN,
-    kinematics.IMU_X,
-    kinematics.IMU_Y,
-    kinematics.IMU_YAW,
-    kinematics.YAW_RATE_BIAS,
-    kinematics.YAW_RATE_GAIN,
-}
+_NAMES = "AX_BIAS AY_BIAS ROLL_GAIN AX_GAIN IMU_X IMU_Y IMU_YAW YAW_RATE_BIAS YAW_RATE_GAIN"
+_OVER_THE_OFFSET = {getattr(kinematics, name) for name in _NAMES.split()}
 #: The transition neglects errors of the gyro in the centripetal term and in the tilt.
 _SECOND_ORDER = {kinematics.YAW_RATE_BIAS, kinematics.YAW_RATE_GAIN}

@@ -77,7 +77,6 @@ def test_the_true_sideslip_explains_the_yaw_rate_and_zero_does_not(sample_logs_d
     with read_drive(sample_logs_dir / "road.mcap", SALOON) as drive:
         whole = drive.whole()
     road = replace(whole, signals=whole.signals.rows(0, 6000), truth=whole.truth.rows(0, 6000))
-    assert road.truth is not None
     zero = run_estimator(make_estimator("zero", SALOON), road.signals)
     true, none = figure([road.truth, zero], road)
     assert true < 0.1 * float(np.sqrt(np.nanmean(road.signals.yaw_rate_rad_s**2)))
@@ -85,7 +84,6 @@ def test_the_true_sideslip_explains_the_yaw_rate_and_zero_does_not(sample_logs_d
 
 
 def test_a_gyro_bias_and_a_steering_delay_that_the_log_calibrated_are_taken_off(lane_change):
-    assert lane_change.truth is not None
     signals, delay = lane_change.signals, 5
     late = np.concatenate([np.full(delay, signals.steer_rad[0]), signals.steer_rad[:-delay]])
     spoilt = replace(signals, steer_rad=late, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.02)
@@ -94,16 +92,12 @@ def test_a_gyro_bias_and_a_steering_delay_that_the_log_calibrated_are_taken_off(
     vehicle = VEHICLE.model_copy(update={"sensors": sensors})
     step_s = float(np.median(np.diff(signals.stamps_ns))) * 1e-9
     drive = replace(lane_change, signals=spoilt)
-    (clean,), (corrected,) = (
-        figure([lane_change.truth], lane_change),
-        figure([lane_change.truth], drive, vehicle, -delay * step_s),
-    )
-    (ignored,) = figure([lane_change.truth], drive)
+    (clean,), (ignored,) = (figure([lane_change.truth], of) for of in (lane_change, drive))
+    (corrected,) = figure([lane_change.truth], drive, vehicle, -delay * step_s)
     assert corrected < 1.3 * clean < ignored
 
 
 def test_there_is_no_figure_without_steering_or_speed(lane_change):
-    assert lane_change.truth is not None
     nothing = np.full(len(lane_change.signals), np.nan)
     for name in ("steer_rad", "speed_m_s"):
         blind = replace(lane_change.signals, **{name: nothing})

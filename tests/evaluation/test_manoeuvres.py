@@ -46,15 +46,9 @@ def as_signals(drive):
     """Sensor values of a simulated drive, on the stamps of its IMU."""
     imu, steering, wheels = (drive.channels[c] for c in ("imu", "steering", "wheels"))
     t = imu.times_s
-    speed = 0.5 * (wheels.fields["rl_m_s"] + wheels.fields["rr_m_s"])
-    return signals(
-        t,
-        np.interp(t, steering.times_s, steering.fields["steer_rad"]),
-        np.interp(t, wheels.times_s, speed),
-        imu.fields["yaw_rate_rad_s"],
-        imu.fields["ax_m_s2"],
-        imu.fields["ay_m_s2"],
-    )
+    speed = np.interp(t, wheels.times_s, 0.5 * (wheels.fields["rl_m_s"] + wheels.fields["rr_m_s"]))
+    steer = np.interp(t, steering.times_s, steering.fields["steer_rad"])
+    return signals(t, steer, speed, *(imu.fields[name] for name in ("yaw_rate_rad_s", "ax_m_s2", "ay_m_s2")))
 
 
 @cache

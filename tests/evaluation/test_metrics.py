@@ -197,9 +197,8 @@ def test_a_sideways_velocity_error_becomes_its_distance():
     stamps = stamps_of(n)
     t = (stamps - T0) * 1e-9
     z = np.zeros(n)
-    truth = make_track(
-        "truth", stamps, vx_m_s=z + 10, vy_m_s=z, yaw_rate_rad_s=z, x_m=z, y_m=10 * t, yaw_rad=z + np.pi / 2
-    )
+    north = {"x_m": z, "y_m": 10 * t, "yaw_rad": z + np.pi / 2}
+    truth = make_track("truth", stamps, vx_m_s=z + 10, vy_m_s=z, yaw_rate_rad_s=z, **north)
     estimate = make_track("e", stamps, vx_m_s=z + 10, vy_m_s=z + 0.1, yaw_rate_rad_s=z)
     np.testing.assert_allclose(position_error(estimate, truth), 0.1 * t, atol=1e-9)
     np.testing.assert_allclose(lateral_errors(estimate, truth), 0.1, atol=1e-9)
@@ -210,13 +209,8 @@ def test_a_sideways_velocity_error_becomes_its_distance():
 def test_lateral_seconds_agree_with_a_plain_restart_every_second():
     truth = circle(1001, -2.0)
     rng = np.random.default_rng(0)
-    estimate = make_track(
-        "e",
-        truth.stamps_ns,
-        vx_m_s=truth.vx_m_s + rng.normal(0, 0.3, 1001),
-        vy_m_s=rng.normal(0, 0.3, 1001).cumsum() * 0.05,
-        yaw_rate_rad_s=truth.yaw_rate_rad_s + 0.02,
-    )
+    vx, vy = truth.vx_m_s + rng.normal(0, 0.3, 1001), rng.normal(0, 0.3, 1001).cumsum() * 0.05
+    estimate = make_track("e", truth.stamps_ns, vx_m_s=vx, vy_m_s=vy, yaw_rate_rad_s=truth.yaw_rate_rad_s + 0.02)
     expected = []
     for k in range(10):
         x, y, yaw = truth.x_m[100 * k], truth.y_m[100 * k], truth.yaw_rad[100 * k]

@@ -112,19 +112,8 @@ def test_manifest_follows_its_schema(dataset, sample_logs_dir):
 def test_rows_are_whole_and_in_order(dataset):
     (file,) = dataset.output.glob("split=*/car=truthsim-saloon-*/part-dlc.parquet")
     frame = pl.read_parquet(file, hive_partitioning=False)
-    assert frame.columns == [
-        "stamp_ns",
-        *FEATURES,
-        "target_dvy_m_s",
-        "target_dyaw_rate_rad_s",
-        "truth_vx_m_s",
-        "truth_vy_m_s",
-        "truth_std_rad",
-        "truth_source",
-        "weight",
-        "segment",
-        "chosen",
-    ]
+    others = "target_dvy_m_s target_dyaw_rate_rad_s truth_vx_m_s truth_vy_m_s truth_std_rad truth_source weight segment"
+    assert frame.columns == ["stamp_ns", *FEATURES, *others.split(), "chosen"]
     assert frame["stamp_ns"].diff().drop_nulls().min() > 0
     entry = next(d for d in dataset.manifest["drives"] if d["log"] == "dlc")
     assert (len(frame), int((frame["weight"] > 0).sum())) == (entry["rows"], entry["usable_rows"])
@@ -238,6 +227,7 @@ def test_extract_chooses_rows_and_leaves_copies_out(sample_logs_dir, tmp_path):
     vx, ay = (rows.features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2"))
     assert rows.chosen is not None and 0.1 < rows.chosen.mean() < 0.9
     np.testing.assert_array_equal(rows.chosen, (np.abs(ay) > 0.5) & ~(vx * 3.6 < 60.0))
+    assert made.entry["usable_rows"] == np.count_nonzero(rows.chosen & (rows.weight > 0.0))
     # The same signals under another name, in another call, replace the existing ones.
     extract(logs[1:], out, replace(asked, split="validation"))
     (other,) = read_dataset(out).drives
@@ -297,14 +287,9 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir, tmp_path):
     extract([log], out, first)
     both = extract([log], out, second).manifest
     follows(both, "dataset.schema.json")
-    assert [(d["name"], d["split"]) for d in both["drives"]] == [
-        ("road.0-8.0", "train"),
-        ("road.10.0-14.0", "validation"),
-    ]
-    assert [d.entry["name"] for d in read_dataset(out).drives if len(d.load().stamps_ns)] == [
-        "road.0-8.0",
-        "road.10.0-14.0",
-    ]
+    parts = {"road.0-8.0": "train", "road.10.0-14.0": "validation"}
+    assert {d["name"]: d["split"] for d in both["drives"]} == parts
+    assert [d.entry["name"] for d in read_dataset(out).drives if len(d.load().stamps_ns)] == list(parts)
     again = extract([log], out, second).manifest
     assert again["sha256"] == both["sha256"], "what is extracted again takes its own place"
     other = extract([str(sample_logs_dir / "dlc.mcap")], out, ExtractSettings(RunConfig(), split="train")).manifest
@@ -314,6 +299,18 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir, tmp_path):
     with pytest.raises(UsageError, match="for phy-ukf"):
         extract([log], out, replace(first, model="phy-ukf"))
     assert read_dataset(out).sha256 == other["sha256"], "a call that is refused leaves what was there"
+
+
+@pytest.mark.slow
+def test_logs_of_one_name_in_several_calls_are_several_drives(sample_logs_dir, tmp_path):
+    told: list[str] = []
+    for name in ("dlc", "sweep", "sweep"):
+        (tmp_path / name).mkdir(exist_ok=True)
+        log = shutil.copy(sample_logs_dir / f"{name}.mcap", tmp_path / name / "run.mcap")
+        result = extract([log], tmp_path / "out", ExtractSettings(RunConfig()), reporter=Reporter(warn=told.append))
+    names = [d["name"] for d in result.manifest["drives"]]
+    assert len(names) == 2 and names[0] == "run" and names[1].startswith("run-")
+    assert sum("another log of this name" in text for text in told) == 2
 
 
 # ---- command line ----

@@ -211,20 +211,26 @@ def test_a_sound_log_whose_data_has_a_crc_is_covered_by_it(tmp_path, chunked):
     assert called("inspect", path).returncode == EXIT_OK
 
 
-def test_a_log_on_a_server_says_what_was_not_verified(tmp_path):
+def test_a_log_on_a_server_says_what_was_not_verified(tmp_path, monkeypatch):
     pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
     from tests.counting_server import serving
 
     path = tmp_path / "log.mcap"
-    with mcap_writer(path, chunk_size=4000, enable_crcs=False, enable_data_crcs=True) as writer:
+    kind = CompressionType.NONE
+    with mcap_writer(path, chunk_size=4000, compression=kind, enable_crcs=False, enable_data_crcs=True) as writer:
         schema = writer.register_schema(
             "T", "jsonschema", b'{"type": "object", "properties": {"a": {"type": "number"}}}'
         )
         channels = [writer.register_channel(topic, "json", schema) for topic in ("/a", "/b")]
         for i in range(2 * N):  # each chunk has one topic
             writer.add_message(channels[i // N], T0 + i * 10_000_000, b'{"a": %d}' % i, T0 + i * 10_000_000)
-    with serving(**{"log.mcap": path.read_bytes()}) as server:
+    damaged = path.read_bytes().replace(b'{"a": 7}', b'{"a": 8}')
+    with serving(**{"log.mcap": path.read_bytes(), "damaged.mcap": damaged}) as server:
         place = RemotePlace(server.place("log.mcap"))
+        with closing(open_log(place)) as log, closing(open_log(RemotePlace(server.place("damaged.mcap")))) as other:
+            assert log.lost == ()
+            assert [loss.kind for loss in other.lost] == ["bad-data-crc"]
+        monkeypatch.setattr("pdhef_logtool.logs.mcap_log.WHOLE_BYTES", 1000)
         with closing(open_log(place)) as log:
             assert [(loss.kind, loss.severity) for loss in log.lost] == [("unverified", "note")]
             assert log.messages is not None

@@ -31,6 +31,7 @@ from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
 from studies import mcap_logs
+from tests.plug_in import install
 
 VALUES = np.arange(40) * 0.25
 
@@ -225,12 +226,8 @@ yaw_rate_rad_s = {topic = "imu", field = "yaw_rate", scale = 0.01745329251994329
 def _installed(tmp_path_factory, monkeypatch):
     """Install a package that adds the format: a module and an entry point."""
     folder = tmp_path_factory.mktemp("package")
-    shutil.copy(Path(__file__).with_name("npz_log.py"), folder)
-    about = folder / "npz_log-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: npz-log\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[pdhef.log_formats]\nnpz = npz_log:FORMAT\n")
-    monkeypatch.syspath_prepend(str(folder))
+    code = Path(__file__).with_name("npz_log.py").read_text()
+    monkeypatch.syspath_prepend(str(install(folder, code, "npz_log", "pdhef.log_formats", "FORMAT")))
     importlib.invalidate_caches()
     formats.formats_of_other_packages.cache_clear()
     yield

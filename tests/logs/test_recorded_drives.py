@@ -66,14 +66,6 @@ def test_values_equal_those_of_an_independent_reader(shared_dir, name):
             assert read[topic].fields[field].dtype == (np.int64 if field.endswith("stamp") else np.float64)
 
 
-def test_elements_of_an_array_are_those_of_the_whole_one(shared_dir):
-    paths = ["data", "data[0]", "data[1]", "data[7]"]
-    with closing(open_log(shared_dir / "data/drives/f1tenth_hoons_run2.bag")) as log:
-        whole, *elements, missing = log.read({"/sensors/wheel_speed": paths})["/sensors/wheel_speed"].fields.values()
-    np.testing.assert_array_equal(np.stack(elements, axis=1), whole[:, :2])
-    assert np.all(np.isnan(missing))
-
-
 def test_a_split_folder_is_one_log(shared_dir):
     split, whole = open_log(shared_dir / FAULTY / "revs_250lm_a_split"), open_log(shared_dir / REVS)
     assert split.kind == "rosbag2-mcap"

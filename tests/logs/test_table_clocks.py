@@ -9,15 +9,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.logs.table_clocks import (
-    NO_TIME,
-    RELATIVE_NS,
-    TIME_UNITS_NS,
-    ascending_rows,
-    number_clock,
-    text_clock,
-    week_clock,
-)
+from pdhef_logtool.logs import table_clocks
+from pdhef_logtool.logs.table_clocks import NO_TIME, RELATIVE_NS, ascending_rows, week_clock
 from pdhef_logtool.logs.table_columns import Sheet, find_clock, split_unit, tables_of
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -37,7 +30,7 @@ def _times(rate_hz: float, n: int) -> IntArray:
 
 @settings(max_examples=150, deadline=None)
 @given(
-    unit=st.sampled_from(sorted(TIME_UNITS_NS)),
+    unit=st.sampled_from(sorted(table_clocks.TIME_UNITS_NS)),
     rate_hz=st.sampled_from([0.2, 1.0, 5.0, 10.0, 50.0, 100.0, 1000.0, 5000.0]),
     n=st.integers(5, 3000),
     start_s=st.sampled_from([0.0, 3.7, 52_000.0]),
@@ -45,7 +38,7 @@ def _times(rate_hz: float, n: int) -> IntArray:
 )
 def test_times_since_a_start_come_back_in_each_stated_unit(unit, rate_hz, n, start_s, in_name):
     expected = _times(rate_hz, n)
-    values = (expected + round(start_s * 1e9)) / TIME_UNITS_NS[unit]
+    values = (expected + round(start_s * 1e9)) / table_clocks.TIME_UNITS_NS[unit]
     name = f"time_{unit.replace('μ', 'u').replace('µ', 'u')}" if in_name else "time"
     clock = _clock("" if in_name else f"[{unit}]", name, **{name: values})
     assert clock.notes == ()
@@ -152,16 +145,15 @@ def test_weeks_of_ten_bits_and_values_that_are_no_weeks():
     ],
 )
 def test_texts_have_one_order_of_day_and_month(texts, seconds, note):
-    clock = text_clock(pl.Series(texts))
+    clock = table_clocks.text_clock(pl.Series(texts))
     np.testing.assert_allclose(clock.stamps_ns * 1e-9, seconds, atol=1e-6)
     assert bool(clock.notes) == note
 
 
 def test_times_that_do_not_fit_are_none_and_never_wrap():
-    assert text_clock(pl.Series(["9999-01-01 00:00:00", "2024-02-30", "x", None, "2024-05-01"])).stamps_ns.tolist() == [
-        NO_TIME, NO_TIME, NO_TIME, NO_TIME, MAY_1_NS,
-    ]  # fmt: skip
-    assert number_clock(np.array([0.0, 1e12, -1e300, np.inf, np.nan, 0.02]), "s").stamps_ns.tolist() == [
+    texts = pl.Series(["9999-01-01 00:00:00", "2024-02-30", "x", None, "2024-05-01"])
+    assert table_clocks.text_clock(texts).stamps_ns.tolist() == [NO_TIME] * 4 + [MAY_1_NS]
+    assert table_clocks.number_clock(np.array([0.0, 1e12, -1e300, np.inf, np.nan, 0.02]), "s").stamps_ns.tolist() == [
         RELATIVE_NS, NO_TIME, NO_TIME, NO_TIME, NO_TIME, RELATIVE_NS + 20_000_000,
     ]  # fmt: skip
     years = np.array(["2024-05-01", "3000-01-01", "NaT"], "M8[us]")

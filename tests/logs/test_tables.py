@@ -588,6 +588,17 @@ def test_titles_of_a_vbo_file_may_contain_units(tmp_path):
     assert read.lost == ()
 
 
+@pytest.mark.parametrize("with_others", [False, True])
+def test_a_pair_of_times_and_rising_values_is_a_signal(with_others, tmp_path):
+    times = TIME_S + 0.002 * np.sin(9.0 * np.arange(N)) * with_others  # not regular, but those of another pair
+    path = np.stack([100.0 + 5.0 * times**2, 10.0 + times], 1)  # positions
+    pairs = {"speed": np.stack([times, SPEED], 1)} | ({"ay": np.stack([times, AY], 1)} if with_others else {})
+    savemat(tmp_path / "a.mat", pairs | {"xy": path})
+    read = opened(tmp_path / "b.mat", (tmp_path / "a.mat").read_bytes())
+    assert {*read.columns} == ({"speed", "ay"} if with_others else {"speed"})
+    np.testing.assert_array_equal(read.columns["speed"], SPEED)
+
+
 def test_a_damaged_variable_costs_only_itself(tmp_path):
     savemat(tmp_path / "a.mat", {"t": TIME_S, "ay": AY, "speed": SPEED}, do_compression=True)
     data = bytearray((tmp_path / "a.mat").read_bytes())

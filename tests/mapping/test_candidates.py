@@ -1,7 +1,9 @@
 """Candidates: signals selected from a drive with third-party names, units, nesting and signs."""
 
+import csv
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,20 +17,8 @@ from pdhef_logtool.mapping.mapping_file import mapping_from_dict
 from pdhef_logtool.mapping.naming import meaning_among, meaning_of
 from pdhef_logtool.mapping.vendors import load_vendors, meaning_of_source
 from pdhef_logtool.records.errors import MappingFileError
+from tests.mapping.winding_road import AX, AY, DEG, EAST, FIX, NORTH, RATE, STEER, YAW, G, N, S, T, V
 
-N = 3000
-START = 1_700_000_000_000_000_000
-T = START + np.arange(N, dtype=np.int64) * 10_000_000
-S = np.arange(N) * 0.01
-DEG = math.pi / 180.0
-G = 9.80665
-
-#: A car of 2.7 m wheelbase on a winding road: metres, seconds, radians.
-V = 15.0 + 3.0 * np.sin(0.3 * S)
-RATE = 0.25 * np.sin(0.9 * S)
-AY = V * RATE
-AX = np.gradient(V, 0.01)
-STEER = 2.7 * RATE / V
 HALF_TRACK = 0.75
 
 
@@ -102,6 +92,10 @@ def test_a_unit_that_nothing_tells_is_taken_by_convention_and_told():
     auto = found(gyro=topic(**still))
     assert taken(auto) == {"yaw_rate_rad_s": ("/gyro.angular_velocity.z", 1.0)}
     assert undecided(auto) == {"yaw_rate_rad_s.candidate"}
+    for km_h in (100.0, 30.0):  # as m/s, only race cars reach the first
+        auto = found(car=topic(speed=km_h + 5.0 * np.sin(S)))
+        assert taken(auto) == {"speed_m_s": ("/car.speed", round(1.0 / 3.6, 6) if km_h > 70.0 else 1.0)}
+        assert undecided(auto) == {"speed_m_s.candidate"}
 
 
 @pytest.mark.parametrize(
@@ -193,16 +187,11 @@ def test_the_odd_sign_is_turned_by_the_wheels_and_of_two_alone_is_told():
     assert unsettled(two) >= {"yaw_rate_rad_s", "ay_m_s2"}
 
 
-PATH_YAW = np.cumsum(RATE) * 0.01
-WHERE = {
-    "latitude": 48.0 + np.cumsum(V * np.sin(PATH_YAW)) * 0.01 / 111_000.0,
-    "longitude": 11.0 + np.cumsum(V * np.cos(PATH_YAW)) * 0.01 / 111_000.0 / math.cos(math.radians(48.0)),
-}
 WHEELS = {"fl_kph": 3.6 * (V - HALF_TRACK * RATE), "fr_kph": 3.6 * (V + HALF_TRACK * RATE)}
 
 
 WITNESSES = {
-    "path": {"gps__fix": topic("sensor_msgs/msg/NavSatFix", **WHERE)},
+    "path": {"gps__fix": topic("sensor_msgs/msg/NavSatFix", **FIX)},
     "wheels": {"can__wheels": topic("x/WheelSpeeds", **WHEELS)},
 }
 
@@ -219,19 +208,18 @@ def test_what_is_all_positive_to_the_right_is_turned_by_the_way_the_car_turned(w
 @pytest.mark.parametrize(
     ("raw", "scale", "offset"),
     [
-        (np.mod(90.0 - PATH_YAW / DEG, 360.0), -DEG, math.pi / 2.0),
-        (np.mod(math.pi / 2.0 - PATH_YAW, 2.0 * math.pi), -1.0, math.pi / 2.0),
-        (np.angle(np.exp(1j * PATH_YAW)), 1.0, 0.0),
-        (np.angle(np.exp(1j * PATH_YAW)) / DEG, DEG, 0.0),
-        (np.mod(200.0 - PATH_YAW / DEG, 360.0), None, None),
+        (np.mod(90.0 - YAW / DEG, 360.0), -DEG, math.pi / 2.0),
+        (np.mod(math.pi / 2.0 - YAW, 2.0 * math.pi), -1.0, math.pi / 2.0),
+        (np.angle(np.exp(1j * YAW)), 1.0, 0.0),
+        (np.angle(np.exp(1j * YAW)) / DEG, DEG, 0.0),
+        (np.mod(200.0 - YAW / DEG, 360.0), None, None),
     ],
     ids=["compass deg", "compass rad", "east rad", "east deg", "turned away"],
 )
 @pytest.mark.parametrize("names", [("vel_n", "vel_e", "vel_d"), ("north_velocity", "east_velocity", "up_velocity"), ()])
 def test_the_path_shows_how_a_heading_counts(raw, scale, offset, names):
-    north, east = V * np.sin(PATH_YAW), V * np.cos(PATH_YAW)
-    velocity = dict(zip(names, (north, east, 0.01 * np.sin(S)), strict=False))
-    auto = found(ins__solution=topic(heading=raw, **WHERE, **velocity), imu__data=topic(**imu_fields()), **SPEED)
+    velocity = dict(zip(names, (NORTH, EAST, 0.01 * np.sin(S)), strict=False))
+    auto = found(ins__solution=topic(heading=raw, **FIX, **velocity), imu__data=topic(**imu_fields()), **SPEED)
     yaw = auto.mapping.truth.get("yaw_rad")
     assert (scale, offset) == (None, None) if yaw is None else (yaw.scale, yaw.offset) == (scale, offset)
     expected = {"lat_deg", "lon_deg"} | ({"enu_velocity_m_s"} if names else set()) | ({"yaw_rad"} if scale else set())
@@ -244,11 +232,10 @@ def test_the_path_shows_how_a_heading_counts(raw, scale, offset, names):
 
 @pytest.mark.parametrize("attitude", [True, False])
 def test_a_receiver_has_a_course_and_an_ins_a_heading_also_without_a_vertical_velocity(attitude):
-    north, east = V * np.sin(PATH_YAW), V * np.cos(PATH_YAW)
-    fields = {"north_vel_cmps": 100.0 * north, "east_vel_cmps": 100.0 * east} if attitude else {}
+    fields = {"north_vel_cmps": 100.0 * NORTH, "east_vel_cmps": 100.0 * EAST} if attitude else {}
     fields |= {"roll": 0.01 * np.sin(S)} if attitude else {}
-    compass = np.mod(90.0 - PATH_YAW / DEG, 360.0)
-    gnss = topic(heading=compass, speed_kmh=3.6 * V, **WHERE, **fields)
+    compass = np.mod(90.0 - YAW / DEG, 360.0)
+    gnss = topic(heading=compass, speed_kmh=3.6 * V, **FIX, **fields)
     mapping = found(gps=gnss, imu__data=topic(**imu_fields())).mapping
     assert mapping.signals["speed_m_s"].field == "speed_kmh"
     assert ("gnss_course_rad" in mapping.signals, "yaw_rad" in mapping.truth) == (not attitude, attitude)
@@ -361,8 +348,8 @@ def test_documented_types_say_unit_sign_and_page():
 
 def test_an_ins_whose_type_is_documented_is_truth_before_a_bare_fix():
     velocity = {"north_velocity": V, "east_velocity": 0 * V, "up_velocity": 0 * V}
-    ins = topic("novatel_oem7_msgs/msg/INSPVA", **WHERE, **velocity, azimuth=S)
-    fix = topic("sensor_msgs/msg/NavSatFix", **WHERE, status__status=0 * S)
+    ins = topic("novatel_oem7_msgs/msg/INSPVA", **FIX, **velocity, azimuth=S)
+    fix = topic("sensor_msgs/msg/NavSatFix", **FIX, status__status=0 * S)
     auto = found(novatel__inspva=ins, gps__fix=fix)
     assert {s.topic for s in auto.mapping.truth.values()} == {"/novatel/inspva"}
     assert set(auto.mapping.truth) == {"lat_deg", "lon_deg", "yaw_rad", "enu_velocity_m_s"}
@@ -371,17 +358,12 @@ def test_an_ins_whose_type_is_documented_is_truth_before_a_bare_fix():
     assert any("/gps/fix is not used" in n for n in auto.mapping.notes)
 
 
-def test_latitude_and_longitude_of_two_topics_show_the_path():
-    apart = {f"bus__{n}": topic(value=v) for n, v in WHERE.items()}
-    auto = found(**apart, bus__vehicle_speed=topic(value=3.6 * V))
-    assert taken(auto) == {"speed_m_s": ("/bus/vehicle_speed.value", round(1 / 3.6, 6))}
-    assert undecided(auto) == set()
-
-
-def test_the_unit_of_a_speed_by_positions():
-    auto = found(gps__fix=topic("sensor_msgs/msg/NavSatFix", **WHERE), bus=topic(vehicle_speed=3.6 * V))
-    assert taken(auto) == {"speed_m_s": ("/bus.vehicle_speed", round(1 / 3.6, 6))}
-    assert undecided(auto) == set()
+def test_positions_in_one_or_two_topics_show_the_unit_of_a_speed():
+    apart = {f"bus__{n}": topic(value=v) for n, v in FIX.items()}
+    for places in ({"gps__fix": topic("sensor_msgs/msg/NavSatFix", **FIX)}, apart):
+        auto = found(**places, bus__vehicle_speed=topic(value=3.6 * V))
+        assert taken(auto) == {"speed_m_s": ("/bus/vehicle_speed.value", round(1 / 3.6, 6))}
+        assert undecided(auto) == set()
 
 
 def test_a_documented_trap_is_left_out_with_its_reason():
@@ -421,7 +403,7 @@ def test_wheels_without_any_speed_are_told_by_turning_and_a_tie_with_a_doubt(fac
 
 
 def test_an_export_is_told_by_its_fields():
-    vbo = {"satellites": 9.0 + 0.0 * S, "latitude": 60.0 * WHERE["latitude"], "longitude": -60.0 * WHERE["longitude"],
+    vbo = {"satellites": 9.0 + 0.0 * S, "latitude": 60.0 * FIX["latitude"], "longitude": -60.0 * FIX["longitude"],
            "velocity kmh": 3.6 * V, "heading": (90.0 - np.degrees(np.cumsum(RATE) * 0.01)) % 360.0,
            "Long accel g": AX / G, "Lat accel g": AY / G, "Yaw_rate deg/s": RATE / DEG}  # fmt: skip
     fields = {k: np.asarray(v, dtype=np.float64) for k, v in vbo.items()}
@@ -455,34 +437,6 @@ def test_a_users_file_comes_first(tmp_path, monkeypatch):
         load_vendors()
 
 
-@pytest.mark.parametrize(
-    ("path", "quantity"),
-    [
-        ("steering_wheel_torque", ""), ("engine_speed_rpm", ""), ("yaw_rate_std", ""),
-        ("angular_velocity_covariance[0]", ""), ("steering_angle_velocity", ""), ("steering_ratio", ""),
-        ("wheel_speed_rpm", ""), ("frame_rate", ""), ("accelerator_pedal", ""), ("gyro_bias.z", ""),
-        ("wind_speed", ""), ("yaw_rate", "rate"), ("vehicle_speed", "speed"), ("angular_velocity.z", "rate"),
-        ("ay", "acceleration"), ("imu.accel.y", "acceleration"), ("a_lat", "acceleration"), ("psi_dot", "rate"),
-        ("angVelZ", "rate"), ("v_lat", "velocity"), ("StrgWhlAng", "steering"), ("wheel_fl.speed", "wheel speed"),
-        ("rear_right.speed", "wheel speed"), ("omega_fl", "wheel rate"), ("LWI_Lenkradwinkel", "steering"),
-        ("ESP_Gierrate", "rate"), ("Querbeschleunigung", "acceleration"), ("Längsbeschleunigung", "acceleration"),
-        ("ESP_HL_Radgeschw", "wheel speed"), ("Fahrzeuggeschwindigkeit", "speed"), ("lat", "latitude"),
-        ("state.twist.twist.linear.x", "speed"), ("state.twist.twist.linear.y", "velocity"),
-        ("state.twist.twist.angular.z", "rate"), ("wheel_angle", "steering"), ("wheel_angle_speed", ""),
-        ("trans_accel", "acceleration"),
-        ("steering_angle_sign", ""), ("cross_acceleration", "acceleration"), ("speed_vessel_frame.y", "velocity"),
-        ("accelerometer.acceleration.v[1]", "acceleration"), ("gyroscope.gyroUncalibrated.v[2]", "rate"),
-        ("vEgo", "speed"), ("LFspeed", "wheel speed"), ("AFRspeed", ""), ("gx", ""), ("V [V]", ""), ("YR", ""),
-        ("LWS_Speed [°/s]", ""), ("FL_Susp_Vel [mm/s]", ""), ("VW_FL [bar]", ""), ("str", ""),
-        ("StePinRelInit_An_Sns [Degrees]", ""), ("Lateral [deg]", ""),
-    ],
-)  # fmt: skip
-def test_what_is_beside_a_quantity_is_not_it(path, quantity):
-    name, _, unit = path.partition(" [")
-    meaning = meaning_of("/topic", "a/B", name, unit.rstrip("]"))
-    assert (meaning.quantity if meaning else "") == quantity
-
-
 @pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 @pytest.mark.parametrize("values", ["nan", "inf", "huge", "zero", "noise", "few"])
 def test_values_that_are_no_drive_break_nothing(values):
@@ -510,39 +464,17 @@ def test_a_rate_of_the_steering_is_no_steering_angle():
         assert meaning is not None and meaning.quantity == "steering"
 
 
-@pytest.mark.parametrize(
-    ("name", "unit", "quantity", "part", "scale"),
-    [
-        ("LWS_Angle", "°", "steering", "wheel", DEG), ("SAS_deg", "", "steering", "wheel", DEG),
-        ("delta_SW", "deg", "steering", "wheel", DEG),
-        ("LWI_Lenkradwinkel", "Unit_DegreOfArc", "steering", "wheel", DEG),
-        ("LW_WINKEL", "Grad", "steering", "wheel", DEG), ("STR_ANG", "deg", "steering", "", DEG),
-        ("GY", "G", "acceleration", "y", G), ("a_x", "Unit_MeterPerSeconSquar", "acceleration", "x", 1.0),
-        ("YR", "deg/s", "rate", "z", DEG), ("psiP_Veh", "rad/s", "rate", "z", 1.0),
-        ("AngularVelocity.Yaw", "", "rate", "z", None),
-        ("ESP_v_Signal", "Unit_KiloMeterPerHour", "speed", "", 1 / 3.6), ("v", "m/s", "speed", "", 1.0),
-        ("WSFL", "km/h", "wheel speed", "fl", 1 / 3.6), ("ESP_wheelSpeedReL", "kph", "wheel speed", "rl", 1 / 3.6),
-        ("Raddrehzahl_VR", "1/min", "wheel rate", "fr", 2.0 * math.pi / 60.0),
-        ("wheel_rl", "U/min", "wheel rate", "rl", 2.0 * math.pi / 60.0), ("pose.yaw", "", "heading", "", None),
-        ("Yaw", "Deg/Sec", "rate", "z", DEG), ("IMU_YawRtVal", "deg/s", "rate", "z", DEG),
-        ("VehYaw_W_Actl", "rad/s", "rate", "z", 1.0), ("Lateral", "m/s^2", "acceleration", "y", 1.0),
-        ("StePinComp_An_Est", "Degrees", "steering", "wheel", DEG),
-        ("WHEELSPEEDRL", "km/h", "wheel speed", "rl", 1 / 3.6), ("Angle volant", "deg", "steering", "wheel", DEG),
-        ("Vitesse de lacet", "deg/s", "rate", "z", DEG), ("Accelerazione laterale", "g", "acceleration", "y", G),
-        ("Velocidad", "km/h", "speed", "", 1 / 3.6),
-        ("Girhastighet", "°/s", "rate", "z", DEG),
-        ("Rad_VL_Geschw", "km/h", "wheel speed", "fl", 1 / 3.6),
-        ("Rattvinkel", "°", "steering", "wheel", DEG),
-        ("Hjulhastighet VB", "km/h", "wheel speed", "rl", 1 / 3.6),
-        ("Predkosc katowa odchylenia", "°/s", "rate", "z", DEG),
-        ("Kat obrotu kierownicy", "°", "steering", "wheel", DEG),
-        ("StW_Angl", "deg", "steering", "wheel", DEG),
-    ],
-)  # fmt: skip
-def test_abbreviations_and_spelled_out_units(name, unit, quantity, part, scale):
-    meaning = meaning_of("log", "", name, unit)
-    assert (meaning.quantity, meaning.part) == (quantity, part)
-    assert meaning.scale == (None if scale is None else pytest.approx(scale))
+with Path(__file__).with_name("names.csv").open(encoding="utf-8") as _names:
+    #: Titles of columns with their unit and the names beside them, and the quantity that they mean, if any.
+    NAMES = list(csv.DictReader(_names))
+
+
+@pytest.mark.parametrize("row", NAMES, ids=lambda row: "-".join([row["name"], row["unit"], row["beside"]]).strip("-"))
+def test_a_name_is_the_quantity_that_it_and_the_names_beside_it_show(row):
+    meaning = meaning_among("log", "", row["name"], row["unit"], {row["name"], *row["beside"].split()})
+    assert (meaning.quantity if meaning else "", meaning.part if meaning else "") == (row["quantity"], row["part"])
+    scale = meaning.scale if meaning else None
+    assert scale == (pytest.approx(float(row["scale"])) if row["scale"] else None)
 
 
 @pytest.mark.parametrize(
@@ -569,22 +501,6 @@ def test_a_comment_above_describes_the_fields_up_to_a_blank_line_and_no_field_wi
     assert {name: unit for name, (_, unit) in units.items()} == {"a": "km/h", "b": "", "c": "km/h", "d": "", "e": ""}
 
 
-@pytest.mark.parametrize(
-    ("path", "beside", "meant"),
-    [
-        ("ins.vl", ("ins.vf", "ins.vu"), ("velocity", "y")),
-        ("Vl", ("Vq", "Schwimmwinkel"), ("speed", "x")),
-        ("Vq", ("Vl", "Schwimmwinkel"), ("velocity", "y")),
-        ("vl", ("vr", "hl"), None),
-        ("Vl", (), None),
-        ("s.r", ("s.u", "s.v"), ("rate", "z")),
-    ],
-)
-def test_a_short_name_is_what_the_names_beside_it_show(path, beside, meant):
-    meaning = meaning_among("log", "", path, "", {path, *beside})
-    assert (meaning and (meaning.quantity, meaning.part)) == meant
-
-
 def test_a_v_without_a_unit_is_a_speed_if_the_acceleration_follows_it():
     fields = {"v": V, "ax": AX, "ay": AY, "yaw_rate": RATE}
     assert taken(found(state=topic(**fields)))["speed_m_s"] == ("/state.v", 1.0)
@@ -600,21 +516,6 @@ def test_the_axis_of_a_lateral_velocity_is_that_of_the_acceleration_beside_it():
     assert auto.mapping.truth["vy_m_s"].scale == -1.0
 
 
-@pytest.mark.parametrize(
-    ("name", "meant"),
-    [
-        ("Speed_2D", ("speed", "")),
-        ("VelN", ("over ground", "n")),
-        ("Gierwinkelgeschwindigkeit", ("rate", "z")),
-        ("Sideakselerasjon", ("acceleration", "y")),
-        ("kmph", ("speed", "")),
-    ],
-)
-def test_words_of_languages_and_directions(name, meant):
-    meaning = meaning_among("log", "", name, "")
-    assert (meaning.quantity, meaning.part) == meant
-
-
 def test_columns_without_names_by_the_drive():
     auto = found(box=topic(ch1=3.6 * V, ch2=AX, ch3=AY, ch4=RATE, ch5=12.0 + 0.0 * S))
     assert {n: s[0] for n, s in taken(auto).items()} == {
@@ -623,18 +524,21 @@ def test_columns_without_names_by_the_drive():
     assert {c.subject for c in auto.mapping.checks} >= {"speed_m_s", "yaw_rate_rad_s"}
 
 
-def test_axes_by_gravity():
+@pytest.mark.parametrize(("yaw", "is_rate"), [(RATE, True), (RATE / DEG, True), (np.cumsum(RATE) * 0.01, False)])
+def test_a_yaw_that_turns_the_car_is_its_rate(yaw, is_rate):
+    rates = taken(found(box=topic(speed_mps=V, lat_acc=AY, yaw=yaw)))
+    assert ("yaw_rate_rad_s" in rates) == is_rate
+
+
+def test_axes_by_gravity_and_of_a_level_device_by_the_speed():
     down = {"acc_x": AX, "acc_y": -AY, "acc_z": -G + 0.0 * S, "gyro_z": -RATE}
-    assert taken(found(box=topic(**down)))["ay_m_s2"] == ("/box.acc_y", -1.0)
-    assert taken(found(box=topic(**down)))["yaw_rate_rad_s"] == ("/box.gyro_z", -1.0)
+    turned = taken(found(box=topic(**down)))
+    assert (turned["ay_m_s2"], turned["yaw_rate_rad_s"]) == (("/box.acc_y", -1.0), ("/box.gyro_z", -1.0))
+    level = topic(acc_x=-AY, acc_y=AX, acc_z=G + 0.0 * S, speed_kmh=3.6 * V)
+    turned = taken(found(box=level))
+    assert (turned["ax_m_s2"], turned["ay_m_s2"]) == (("/box.acc_y", 1.0), ("/box.acc_x", -1.0))
 
 
 def test_an_acceleration_alone_is_not_proposed():
     """It may be the derivative of the speed."""
     assert set(taken(found(state=topic(vEgo=V, aEgo=AX, yawRate=RATE)))) == {"speed_m_s", "yaw_rate_rad_s"}
-
-
-def test_axes_of_a_level_device_by_the_speed():
-    box = topic(acc_x=-AY, acc_y=AX, acc_z=G + 0.0 * S, speed_kmh=3.6 * V)
-    turned = taken(found(box=box))
-    assert (turned["ax_m_s2"], turned["ay_m_s2"]) == (("/box.acc_y", 1.0), ("/box.acc_x", -1.0))

@@ -1,5 +1,7 @@
 """Device clocks against log time, and unusable header stamps: log time replaces them and a note reports it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
@@ -57,6 +59,14 @@ def test_a_few_messages_are_enough(n):
     np.testing.assert_allclose(got - T0 - device, 0, atol=2)
 
 
+def fitted(log: FakeLog, *sources: SignalSource) -> dict[str, ClockModel]:
+    return fit_clocks(log, Mapping(signals={s.name: s for s in sources}), log.start_ns, log.end_ns)
+
+
+DEVICE = SignalSource("ay_m_s2", "/imu", "a", stamp="t", stamp_unit="s", clock="device")
+STAMPED = SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")
+
+
 def device_log(n: int, duration_s: float) -> FakeLog:
     stamps = np.rint(np.linspace(1.0, 1.0 + duration_s, n) * 1e9).astype(np.int64)
     log_time = T0 + np.rint(stamps * (1 + 1e-4)).astype(np.int64)
@@ -65,8 +75,7 @@ def device_log(n: int, duration_s: float) -> FakeLog:
 
 def test_a_long_log_is_surveyed_in_parts():
     log = device_log(40_000, 4000.0)
-    source = SignalSource("ay_m_s2", "/imu", "a", stamp="t", stamp_unit="s", clock="device")
-    clock = fit_clocks(log, Mapping(signals={"ay_m_s2": source}), log.start_ns, log.end_ns)[clock_key(source)]
+    clock = fitted(log, DEVICE)[clock_key(DEVICE)]
     assert clock.samples < 10_000
     topic = log.contents["/imu"]
     stamps = np.rint(topic.fields["t"] * 1e9).astype(np.int64)
@@ -78,9 +87,8 @@ def test_a_long_log_is_surveyed_in_parts():
 def test_a_device_clock_without_stamps_is_one_line():
     log = device_log(100, 1.0)
     log.contents["/imu"].fields["t"][:] = np.nan
-    source = SignalSource("ay_m_s2", "/imu", "a", stamp="t", stamp_unit="s", clock="device")
     with pytest.raises(MappingError, match="no usable stamp"):
-        fit_clocks(log, Mapping(signals={"ay_m_s2": source}), log.start_ns, log.end_ns)
+        fitted(log, DEVICE)
 
 
 MS, S = 1_000_000, 1_000_000_000
@@ -107,10 +115,8 @@ def test_log_time_serves(name):
     stamps, why = UNUSABLE[name]
     assert why in why_unusable(stamps, LOG)
     log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": stamps, "v": np.arange(float(N))})})
-    source = SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp", latency_s=0.001)
-    mapping = Mapping(signals={"ay_m_s2": source})
-    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    found = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    late = replace(STAMPED, latency_s=0.001)
+    found = read_signals(log, Mapping(signals={"ay_m_s2": late}), fitted(log, late), log.start_ns, log.end_ns)
     np.testing.assert_array_equal(found.signals["ay_m_s2"].stamps_ns, LOG - MS)
     np.testing.assert_array_equal(found.signals["ay_m_s2"].arrival_ns, LOG)
     assert [(x.kind, x.severity) for x in found.losses] == [("log-time-serves", "note")]
@@ -147,16 +153,11 @@ def test_one_topic_of_another_clock(behind_ns, serves):
         "/imu": FakeTopic("a/b", LOG, {"header.stamp": TRUE - behind_ns, "v": np.arange(float(N))}),
         "/steer": FakeTopic("a/b", LOG, {"header.stamp": TRUE, "v": np.arange(float(N))}),
     }
-    both = {
-        "ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp"),
-        "steer_rad": SignalSource("steer_rad", "/steer", "v", stamp="header.stamp"),
-    }
     log = FakeLog(topics)
-    clocks = fit_clocks(log, Mapping(signals=both), log.start_ns, log.end_ns)
+    clocks = fitted(log, STAMPED, replace(STAMPED, name="steer_rad", topic="/steer"))
     assert bool(clocks["/imu.header.stamp"].unusable) == serves
     assert not clocks["/steer.header.stamp"].unusable
-    alone = fit_clocks(log, Mapping(signals={"ay_m_s2": both["ay_m_s2"]}), log.start_ns, log.end_ns)
-    assert not alone["/imu.header.stamp"].unusable
+    assert not fitted(log, STAMPED)["/imu.header.stamp"].unusable
 
 
 def test_a_step_between_the_parts_of_a_survey_is_found():
@@ -164,18 +165,15 @@ def test_a_step_between_the_parts_of_a_survey_is_found():
     true = START + np.arange(n, dtype=np.int64) * 100 * MS
     stamps = true - np.where(np.arange(n) < 17_437, 0, 3 * S)
     log = FakeLog({"/imu": FakeTopic("a/b", true + 5 * MS, {"header.stamp": stamps, "v": np.zeros(n)})})
-    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
-    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    assert "step back by 2.9 s" in clocks["/imu.header.stamp"].unusable
+    assert "step back by 2.9 s" in fitted(log, STAMPED)["/imu.header.stamp"].unusable
 
 
 def test_zero_stamps_lose_no_topic():
     zeros = np.zeros(N, np.int64)
     log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": zeros, "v": np.arange(float(N))})})
-    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
-    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    assert clocks["/imu.header.stamp"].unusable == "100% of its stamps are zero or no time"
-    assert clocks["/imu.header.stamp"].median_period_s == pytest.approx(0.01, abs=0.001)
+    clock = fitted(log, STAMPED)["/imu.header.stamp"]
+    assert clock.unusable == "100% of its stamps are zero or no time"
+    assert clock.median_period_s == pytest.approx(0.01, abs=0.001)
 
 
 @given(

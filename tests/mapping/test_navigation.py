@@ -16,18 +16,9 @@ from pdhef_logtool.records.errors import MappingFileError
 from studies.strangers import containers
 from studies.strangers.containers import Topic
 from tests.fake_drive_log import FakeLog, FakeTopic
+from tests.mapping.winding_road import AX, AY, EAST, FIX, NORTH, RATE, YAW, S, T, V
 
-N = 3000
-START = 1_700_000_000_000_000_000
-T = START + np.arange(N, dtype=np.int64) * 10_000_000
-S = np.arange(N) * 0.01
-V = 15.0 + 3.0 * np.sin(0.3 * S)
-RATE = 0.25 * np.sin(0.9 * S)
-YAW = np.cumsum(RATE) * 0.01
-EAST, NORTH = V * np.cos(YAW), V * np.sin(YAW)
-FIX = {"latitude": 48.0 + np.cumsum(NORTH) * 0.01 / 111_200.0,
-       "longitude": 11.0 + np.cumsum(EAST) * 0.01 / (111_200.0 * np.cos(np.radians(48.0)))}  # fmt: skip
-IMU = {"linear_acceleration.x": np.gradient(V, 0.01), "linear_acceleration.y": V * RATE,
+IMU = {"linear_acceleration.x": AX, "linear_acceleration.y": AY,
        "linear_acceleration.z": 9.81 + 0.0 * S, "angular_velocity.z": RATE}  # fmt: skip
 
 
@@ -78,16 +69,14 @@ def test_a_velocity_east_and_north_gives_the_speed(witness):
 
 @pytest.mark.parametrize("names", [("VelN", "VelE"), ("v_n", "v_e"), ("north_speed", "east_speed")])
 def test_north_and_east_in_a_table_of_everything_are_speed_and_receiver(names):
-    table = {"AccX": IMU["linear_acceleration.x"], "AccY": IMU["linear_acceleration.y"], "GyroZ": RATE}
-    signals = of_table(**table, **dict(zip(names, (NORTH, EAST), strict=True))).mapping.signals
+    signals = of_table(AccX=AX, AccY=AY, GyroZ=RATE, **dict(zip(names, (NORTH, EAST), strict=True))).mapping.signals
     assert signals["speed_m_s"].paths == names[::-1]
     assert signals["gnss_velocity_north_m_s"].paths + signals["gnss_velocity_east_m_s"].paths == names
 
 
 def test_the_truths_velocity_stands_in_with_a_mark():
     pva = {"north_velocity": NORTH, "east_velocity": EAST, "up_velocity": 0.0 * S}
-    place = {"latitude": FIX["latitude"], "longitude": FIX["longitude"], "height": 0.0 * S}
-    auto = found(ins=topic("novatel_oem7_msgs/msg/INSPVA", pva | place))
+    auto = found(ins=topic("novatel_oem7_msgs/msg/INSPVA", pva | FIX | {"height": 0.0 * S}))
     np.testing.assert_allclose(speed_of(auto), V)
     assert any("is also the ground truth" in n for n in auto.mapping.notes)
 
@@ -139,15 +128,14 @@ def test_a_twist_that_turns_with_the_car_is_a_receivers_velocity(name, swap):
 
 
 def test_position_speed_and_heading_of_one_table_are_a_receivers():
-    place = {"LATITUDE": FIX["latitude"], "LONGITUDE": FIX["longitude"]}
+    place = {name.upper(): values for name, values in FIX.items()}
     signals = of_table(**place, SPEED_KPH=3.6 * V, HEADING_DEG=90.0 - np.degrees(YAW)).mapping.signals
     assert {"gnss_latitude_deg", "gnss_longitude_deg", "gnss_speed_m_s", "gnss_course_rad"} <= set(signals)
     assert signals["gnss_speed_m_s"].scale == pytest.approx(1.0 / 3.6)
 
 
 def test_letters_are_signals_where_physics_shows_them():
-    forces = {"a_x": IMU["linear_acceleration.x"], "a_y": np.roll(V * RATE, -8)}
-    mapping = of_table(u=V, v=0.3 * RATE, r=RATE, delta=2.9 * RATE / V, **forces).mapping
+    mapping = of_table(u=V, v=0.3 * RATE, r=RATE, delta=2.9 * RATE / V, a_x=AX, a_y=np.roll(AY, -8)).mapping
     paths = {n: s.paths[0] for n, s in mapping.signals.items()}
     assert (paths["speed_m_s"], paths["yaw_rate_rad_s"]) == ("u", "r")
     assert {c.name for c in mapping.checks} >= {"truth.source"}

@@ -291,13 +291,17 @@ def test_a_sideslip_that_follows_the_heading_is_in_the_axes_of_the_body():
     heading = 0.05 * np.sin(2.0 * S)  # about east, so that the axes of body and earth are nearly parallel
     sensor = imu(**{"angular_velocity.z": np.gradient(heading, S)})
 
-    def truth(direction: np.ndarray) -> set[str]:
+    down = {n: -sensor.fields[n] for n in ("angular_velocity.z", "linear_acceleration.y")}
+    hanging = imu(**down, **{"linear_acceleration.z": np.full(N, -9.81)})
+
+    def truth(direction: np.ndarray, sensor: FakeTopic = sensor) -> set[str]:
         log = odometry(10.0 * np.cos(direction), 10.0 * np.sin(direction))
         log.fields |= {"pose.pose.position.x": 10.0 * S, "pose.pose.position.y": -0.25 * np.cos(2.0 * S)}
         return set(found({"/ground_truth/odom": log, "/imu": sensor}).mapping.truth)
 
     assert "vx_m_s" in truth(0.3 * heading)
     assert "enu_velocity_m_s" in truth(heading)
+    assert "enu_velocity_m_s" in truth(heading, hanging)
 
 
 def test_a_simulators_odometry_with_a_lateral_velocity_is_ground_truth():

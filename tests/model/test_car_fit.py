@@ -15,17 +15,10 @@ from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.model import fit as rules
+from pdhef_logtool.model import priors
 from pdhef_logtool.model.driving import STEP_S, Driving, driving_of
 from pdhef_logtool.model.fit import fit_car
-from pdhef_logtool.model.priors import (
-    CORRELATION,
-    RATIO,
-    REAR_STIFFNESS,
-    front_stiffness,
-    parameters_of,
-    prior_of,
-    with_earlier,
-)
+from pdhef_logtool.model.priors import REAR_STIFFNESS, prior_of
 from pdhef_logtool.records.signals import Signals
 
 RIGHT = default_vehicle()
@@ -65,7 +58,7 @@ def found(signals: Signals, vehicle: VehicleParameters) -> Posterior:
 def stiffness_errors(posterior: Posterior) -> list[tuple[float, float]]:
     """Return the errors of the logarithm of the rear axle's stiffness and of the ratio of the axles, and their sd."""
     rear, front = (RIGHT.cornering_stiffness_n_per_rad(axle, FRICTION) for axle in (False, True))
-    true = {REAR_STIFFNESS: rear, RATIO: front / front_stiffness(RIGHT, 1.0, rear)}
+    true = {REAR_STIFFNESS: rear, priors.RATIO: front / priors.front_stiffness(RIGHT, 1.0, rear)}
     by = {p.name: p for p in posterior.parameters}
     return [(math.log(by[name].value / value), by[name].sd) for name, value in true.items()]
 
@@ -184,14 +177,14 @@ def test_a_drive_overrules_earlier_drives_that_it_contradicts():
 
 def test_earlier_drives_determine_a_parameter_as_random_effects_do():
     """A drive is its car plus a deviation: one has the share ρ of its change in the next drive, many have all of it."""
-    before = next(p for p in parameters_of(RIGHT) if p.name == REAR_STIFFNESS)
+    before = next(p for p in priors.parameters_of(RIGHT) if p.name == REAR_STIFFNESS)
 
     def theta(count: int, level: float) -> tuple[float, float]:
         drive = TaughtParameter(name=REAR_STIFFNESS, value=before.value(0.5), std=1e-6, ay_m_s2=4.0)
-        (after,) = with_earlier([before], [drive] * count, level)
+        (after,) = priors.with_earlier([before], [drive] * count, level)
         return before.theta(after.mean), after.std / before.std
 
-    rho = CORRELATION
+    rho = priors.CORRELATION
     assert theta(1, 4.0) == pytest.approx((0.5 * rho, math.sqrt(1.0 - rho**2)))
     assert theta(1, 8.0) == theta(1, 2.0) == pytest.approx((0.25 * rho, math.sqrt(1.0 - 0.25 * rho**2)))
     assert theta(1, 0.0) == pytest.approx(theta(1, 4.0))  # an unknown level

@@ -101,13 +101,25 @@ def test_on_a_car_that_was_fitted_to_the_drive_it_is_the_sum_of_its_parts(signal
     read = CalibratedSignals(corrected_anew(signals, OWN, FOUND), FOUND)
     consistency = DRIVE_SHARE * driven_consistency(plain, read, FOUND.low_speed_blend_m_s)
     assert consistency > 0.0
-    expected = 4.0 * (plain.vy_std_m_s**2 + (CAR_STD_RAD * plain.vx_m_s) ** 2) + consistency**2
-    fast = plain.vx_m_s > OWN.low_speed_blend_m_s
+    fast, own = plain.vx_m_s > OWN.low_speed_blend_m_s, plain.sideslip_std_rad**2
+    square = np.mean((plain.sideslip_rad**2 + own)[fast & plain.valid])
+    share = 1.0 + 3.0 * square / (3.0 * own + square)
+    expected = share * plain.vy_std_m_s**2 + 4.0 * (CAR_STD_RAD * plain.vx_m_s) ** 2 + consistency**2
     if varied:
         expected = expected + spread((FOUND, *varied), Posterior(FOUND).noise, signals)
         assert_alike(wide.vy_std_m_s[fast], np.sqrt(expected[fast]))
     else:
         np.testing.assert_allclose(wide.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
+
+
+def test_a_model_that_explains_nothing_widens_it_by_no_more_than_the_sideslip_itself(signals):
+    plain, wide = tracks_of("physics", calibrated(scale=300.0), signals)
+    fast, own = plain.vx_m_s > OWN.low_speed_blend_m_s, plain.sideslip_std_rad**2
+    read = CalibratedSignals(corrected_anew(signals, OWN, FOUND), FOUND)
+    consistency = DRIVE_SHARE * driven_consistency(plain, read, FOUND.low_speed_blend_m_s)
+    others = (300.0 * CAR_STD_RAD) ** 2 + (consistency / plain.vx_m_s) ** 2
+    most = own + np.mean((plain.sideslip_rad**2 + own)[fast & plain.valid]) + others
+    assert (wide.sideslip_std_rad**2 < most)[fast].all()
 
 
 def test_on_an_identified_car_it_is_the_sum_of_its_parts(signals):

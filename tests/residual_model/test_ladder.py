@@ -108,16 +108,10 @@ def test_the_mirrored_drive_has_the_mirrored_residual(seed, size):
 def random_model() -> LadderModel:
     """Return the linear model with random features of small weight."""
     model, rng, count = linear_model(), np.random.default_rng(5), 12
-    return LadderModel(
-        **{
-            **model.model_dump(),
-            "rung": "random",
-            "odd_directions": rng.normal(size=(count, ODD_COUNT)).tolist(),
-            "even_directions": rng.normal(size=(count, len(model.even_mean))).tolist(),
-            "phases": rng.uniform(size=count).tolist(),
-            "weights": [*model.weights, *(rng.normal(size=count) * 1e-3).tolist()],
-        }
-    )
+    odd, even = (rng.normal(size=(count, width)).tolist() for width in (ODD_COUNT, len(model.even_mean)))
+    drawn = {"odd_directions": odd, "even_directions": even, "phases": rng.uniform(size=count).tolist()}
+    weights = [*model.weights, *(rng.normal(size=count) * 1e-3).tolist()]
+    return LadderModel(**model.model_dump() | drawn | {"rung": "random", "weights": weights})
 
 
 def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds():

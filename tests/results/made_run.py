@@ -26,30 +26,14 @@ def digest(text: str) -> str:
 
 def entry(label: str, **changed: Any) -> dict[str, Any]:
     car = {"file": "golf", "name": "golf", "sha256": digest("golf"), "network_sha256": None}
-    return {
-        "log": label,
-        "file": f"{label}.mcap",
-        "outcome": "ok",
-        "main": "pd-hef",
-        "sha256": digest(f"file {label}"),
-        "signals_sha256": digest(f"signals {label}"),
-        "truth_sha256": digest(f"truth {label}"),
-        "mapping_sha256": digest("mapping"),
-        "car": car,
-        **changed,
-    }
+    content = {f"{of}_sha256": digest(f"{of} {label}") for of in ("signals", "truth")}
+    content |= {"sha256": digest(f"file {label}"), "mapping_sha256": digest("mapping"), "car": car}
+    return {"log": label, "file": f"{label}.mcap", "outcome": "ok", "main": "pd-hef", **content, **changed}
 
 
 def row(label: str, value: float, **changed: Any) -> MetricRow:
-    known = {
-        "estimator": "pd-hef",
-        "signal": "sideslip_rad",
-        "segment": "all",
-        "metric": "rmse",
-        "unit": "rad",
-        "n": 99,
-    }
-    return MetricRow(log=label, value=value, **{**known, **changed})
+    base = {"estimator": "pd-hef", "signal": "sideslip_rad", "segment": "all", "metric": "rmse", "unit": "rad", "n": 99}
+    return MetricRow(log=label, value=value, **{**base, **changed})
 
 
 def write_tables(

@@ -14,14 +14,8 @@ from pdhef_logtool.results.opened_run import open_run
 from tests.results.made_run import entry, row, write_run
 from tests.run_report import TRUTH, report, truth
 
-LOST = {
-    "kind": "truncated",
-    "what": "ends at byte 3; what follows is gone (a.mcap)",
-    "where": "a.mcap",
-    "severity": "lost",
-    "start_ns": None,
-    "end_ns": None,
-}
+LOST = {"kind": "truncated", "where": "a.mcap", "severity": "lost", "start_ns": None, "end_ns": None}
+LOST |= {"what": "ends at byte 3; what follows is gone (a.mcap)"}
 CELL = {"speed": 4, "ay": 1, "seconds": 5.0, "scored": 100, "sideslip_mse_rad2": 1e-4}
 SPACE = {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": [CELL]}
 
@@ -98,14 +92,8 @@ def test_effects_have_intervals_and_keys_without_one_are_not_significant(run):
     rng = np.random.default_rng(2)
     for i in range(40):
         wet = i % 2
-        metadata = {
-            "road": "wet" if wet else "dry",
-            "water": str(wet),
-            "odometer": str(1000 + i),
-            "driver": f"x{i}",
-            "tyre": "ab"[i % 3 == 0],
-            "same": "1",
-        }
+        metadata = {"road": "wet" if wet else "dry", "water": str(wet), "odometer": str(1000 + i)}
+        metadata |= {"driver": f"x{i}", "tyre": "ab"[i % 3 == 0], "same": "1"}
         run.add(f"d{i}", {"pd-hef": float((3.0 if wet else 1.0) * rng.lognormal(0.0, 0.2))}, metadata=metadata)
     found = run.read()
     by_key = {b.key: b for b in found.breakdowns}

@@ -26,21 +26,16 @@ SOURCE_TOPICS = {
     "/can/speed": ("can.Speed", "json", 120),
     "/blob": (None, "octets", 6),
 }
-OUR_TOPICS = {
-    "/pdhef/phy_ukf/state": (STATE, "cdr", 600),
-    "/pdhef/phy_ukf/odometry": (ODOMETRY, "cdr", 588),
-    "/pdhef/zero/state": (STATE, "cdr", 600),
-    "/pdhef/zero/odometry": (ODOMETRY, "cdr", 588),
-    "/pdhef/truth/state": (STATE, "cdr", 600),
-    "/pdhef/truth/odometry": (ODOMETRY, "cdr", 588),
-    **{
-        f"/pdhef/{token}/{what}": (type_name, "cdr", n)
-        for token in ("phy_ukf", "zero", "truth")
-        for what, type_name, n in (("plot", "pdhef_msgs/msg/PlottedEstimate", 120), ("path", "nav_msgs/msg/Path", 1))
-    },
+#: Topics of each track.
+TRACK_TOPICS = {
+    "state": (STATE, "cdr", 600),
+    "odometry": (ODOMETRY, "cdr", 588),
+    "plot": ("pdhef_msgs/msg/PlottedEstimate", "cdr", 120),
+    "path": ("nav_msgs/msg/Path", "cdr", 1),
 }
-TOPICS = SOURCE_TOPICS | OUR_TOPICS
 NAMES = {"phy_ukf": "phy-ukf", "zero": "zero", "truth": "truth"}
+OUR_TOPICS = {f"/pdhef/{token}/{what}": topic for token in NAMES for what, topic in TRACK_TOPICS.items()}
+TOPICS = SOURCE_TOPICS | OUR_TOPICS
 
 ALGORITHM = {"algorithm": "vehicle-ukf", "sha256": "ab" * 32, "options": {"limit_gain": 1.0}}
 RMSE = {"signal": "sideslip_rad", "metric": "rmse", "unit": "rad"}

@@ -240,24 +240,15 @@ except OutputError as error:
 """
 
 
-def run_script(tmp_path: Path, **env: str) -> str:
-    home = tmp_path / "home"
-    home.mkdir()
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(tmp_path / "recording.rrd")],
-        env={**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": "", "XDG_DATA_HOME": "", **env},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=300,
-    )
-    assert not [p for p in home.rglob("*") if "rerun" in p.name or "analytics" in p.name]
-    return done.stdout
-
-
 @pytest.mark.slow
 def test_writing_starts_no_analytics_and_a_switched_off_rerun_is_said(tmp_path):
-    assert "unset RERUN" in run_script(tmp_path, RERUN="off")
+    home = tmp_path / "home"
+    home.mkdir()
+    env = {**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": "", "XDG_DATA_HOME": "", "RERUN": "off"}
+    call = [sys.executable, "-c", SCRIPT, str(tmp_path / "recording.rrd")]
+    done = subprocess.run(call, env=env, capture_output=True, text=True, check=True, timeout=300)
+    assert not [p for p in home.rglob("*") if "rerun" in p.name or "analytics" in p.name]
+    assert "unset RERUN" in done.stdout
 
 
 @settings(max_examples=6, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

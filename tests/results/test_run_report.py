@@ -72,15 +72,9 @@ def test_faults_are_in_words():
 
 
 def test_run_says_how_each_log_ended(tmp_path):
-    run = build_run(
-        {"estimators": ["phy-ukf"], "start": None},
-        None,
-        [
-            LogOutcome("a", "logs/a.mcap", SHA),
-            LogOutcome("b", "logs/b.mcap", None, failed="no log"),
-            LogOutcome("c", "logs/c.mcap", SHA, lost=["the last 3 s", "a chunk"]),
-        ],
-    )
+    outcomes = [LogOutcome("a", "logs/a.mcap", SHA), LogOutcome("b", "logs/b.mcap", None, failed="no log")]
+    outcomes.append(LogOutcome("c", "logs/c.mcap", SHA, lost=["the last 3 s", "a chunk"]))
+    run = build_run({"estimators": ["phy-ukf"], "start": None}, None, outcomes)
     path = tmp_path / "run.json"
     write_json(path, run)
     run = read(path)
@@ -173,10 +167,8 @@ def test_an_estimate_that_is_worse_than_none_is_said_to_be_of_no_use(own, said):
 
 def test_a_truth_that_is_an_input_is_no_independent_check():
     metrics = errors_deg(pd_hef=0.1)
-    assert (
-        "not an independent check"
-        in texts(metrics=metrics, truth=TRUTH | {"not_independent": ["sideslip_rad"]})["result"]
-    )
+    dependent = TRUTH | {"not_independent": ["sideslip_rad"]}
+    assert "not an independent check" in texts(metrics=metrics, truth=dependent)["result"]
     assert "not an independent check" not in texts(metrics=metrics)["result"]
 
 

@@ -355,10 +355,4 @@ def test_an_output_that_a_node_does_not_see_is_told(tmp_path, monkeypatch):
 def test_without_ray_or_a_cluster_there_is_one_line(tmp_path):
     logs = named_logs(tmp_path / "logs", "a", "b")
     with pytest.raises(UsageError, match="--ray: expected"):
-        run_logs(
-            [str(logs)],
-            tmp_path / "out",
-            RunConfig(),
-            schedule=Schedule(ray="127.0.0.1:1", limits=Limits()),
-            work=stub_drive,
-        )
+        run(logs, tmp_path / "out", ray="127.0.0.1:1")

@@ -78,13 +78,8 @@ def test_signals_are_measured():
     ay = found.signals["ay_m_s2"]
     values = log.contents["/imu"].fields["linear_acceleration.y"]
     good = values[np.isfinite(values)]
-    assert (ay.topic, ay.field, ay.samples, ay.gaps, ay.dropped) == (
-        "/imu",
-        "linear_acceleration.y",
-        2999,
-        1,
-        {"nan": 1},
-    )
+    assert (ay.topic, ay.field) == ("/imu", "linear_acceleration.y")
+    assert (ay.samples, ay.gaps, ay.dropped) == (2999, 1, {"nan": 1})
     assert [ay.mean, ay.std, ay.minimum, ay.maximum] == pytest.approx([good.mean(), good.std(), good.min(), good.max()])
     assert ay.latency_s == pytest.approx(0.003)
     assert found.signals["ax_m_s2"].dropped == {}
@@ -104,18 +99,9 @@ def test_an_empty_log_is_reported():
 def test_tables_fit_and_say_what_matters(width):
     text = rendered(render_inspection, inspect_drive_log(small_log()), width)
     assert max(len(line) for line in text.splitlines()) <= width
-    for part in (
-        "/imu",
-        "sensor_msgs/Imu",
-        "/vendor",
-        "1.51 @ 10.0",
-        "yaw_rate_rad_s",
-        "linear_acceleration.y",
-        "steer_rad",
-    ):
+    for part in ["/imu", "sensor_msgs/Imu", "/vendor", "yaw_rate_rad_s", "linear_acceleration.y", "steer_rad"]:
         assert part in text, part
-    assert "lost" in text
-    assert "the file ends early" in text
+    assert "1.51 @ 10.0" in text and "lost" in text and "the file ends early" in text
 
 
 def test_the_written_mapping_loads_and_names_the_candidates(tmp_path):

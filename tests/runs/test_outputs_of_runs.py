@@ -36,10 +36,8 @@ SLICE = ("--start", "2", "--end", "4")
 
 def config(sample_logs_dir: Path, **changes: Any) -> RunConfig:
     """Return settings of a short run: one second of driving, without the compiler."""
-    car = sample_logs_dir / "vehicle.toml"
-    return RunConfig(
-        **{"car": car, "estimators": ("zero",), "annotate": "sidecar", "start": "2", "end": "3", **changes}
-    )
+    usual = {"car": sample_logs_dir / "vehicle.toml", "estimators": ("zero",), "annotate": "sidecar"}
+    return RunConfig(**{**usual, "start": "2", "end": "3", **changes})
 
 
 @pytest.fixture
@@ -382,13 +380,8 @@ def test_where_nothing_is_usable_the_exit_code_is_1(out):
     report, events = command("report", str(out)), command("events", str(out), "--where", "speed_m_s > 1")
     assert (report.code, events.code) == (1, 1)
     assert (len(warnings(report)), len(warnings(events))) == (2, 2)
-    flip(out / "tables/metrics.parquet")
-    for name, call in {
-        "tables/metrics.parquet": ("compare", str(out), str(out)),
-        "run.json": ("report", str(out)),
-    }.items():
-        if name == "run.json":
-            flip(out / name)
+    for name, call in (("tables/metrics.parquet", ("compare", str(out), str(out))), ("run.json", ("report", str(out)))):
+        flip(out / name)
         ended = command(*call)
         assert ended.code == 1
         assert ended.err.startswith(f"pdhef: {out / name}: expected ")

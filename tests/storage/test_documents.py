@@ -24,15 +24,8 @@ from pdhef_logtool.storage import documents as sealing
 from pdhef_logtool.storage.toml_text import toml_text
 
 SHIPPED, CAR = SHIPPED_FOLDERS["default"], SHIPPED_CARS["saloon"]
-VALID_CONFIG = {
-    "estimators": ["zero"],
-    "car": "car.toml",
-    "start": 3,
-    "end": "end-2s",
-    "friction": 0.5,
-    "network": "none",
-    "annotate": "full",
-}
+VALID_CONFIG = {"estimators": ["zero"], "car": "car.toml", "start": 3, "end": "end-2s", "friction": 0.5}
+VALID_CONFIG |= {"network": "none", "annotate": "full"}
 VALID_MAPPING = {
     "signals": {"ax_m_s2": {"topic": "/imu", "field": "x", "scale": 9.81, "stamp": "t", "latency_s": 0.1}},
     "truth": {"ecef_position_m": {"topic": "/gnss", "field": ["x", "y", "z"], "scale": [1.0, 1.0, 1.0]}},
@@ -41,21 +34,12 @@ VALID_MAPPING = {
     "can": {"dbc": ["car.dbc"], "bus": 1, "bus_field": "bus"},
     "fill_recognised": True,
 }
-VALID_FIT = {
-    "format": "pdhef-fit",
-    "version": 1,
-    "physics_sha256": "ab" * 32,
-    "filter": {"phy-ukf:tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}},
-    "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
-}
-VALID_MODEL = {
-    "format": "pdhef-model",
-    "version": 1,
-    "physics_sha256": "ab" * 32,
-    "truth": "ground truth",
-    "parameters": [{"name": "yaw inertia", "value": 1500.0, "std": 0.1}],
-    "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
-}
+OF_A_CAR = {"version": 1, "physics_sha256": "ab" * 32}
+OF_A_CAR |= {"drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}]}
+NOISE = {"phy-ukf:tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}}
+VALID_FIT = {"format": "pdhef-fit", **OF_A_CAR, "filter": NOISE}
+PARAMETERS = [{"name": "yaw inertia", "value": 1500.0, "std": 0.1}]
+VALID_MODEL = {"format": "pdhef-model", **OF_A_CAR, "truth": "ground truth", "parameters": PARAMETERS}
 VALID_PLAN = {"requirement": [{"id": "SR-1", "signal": "sideslip_rad", "metric": "rmse", "limit_deg": 0.5}]}
 
 
@@ -171,7 +155,8 @@ def test_what_cannot_be_read_is_one_line(loader, tmp_path):
     assert "utf-8" in outcome(loader, path)
     entry = '{"format": %s}' if path.suffix == ".json" else "a = %s\n"
     endless = [entry % number for number in ("1" + "0" * 5000, "0x" + "f" * 5000, "1" + "0" * 30)]
-    for text in ("= ][", "\0" * 100, "#" + "x" * sealing.MAX_BYTES, *endless):
+    dates = ["name = 2026-01-01\n", "name = [{ a = 07:30:00 }]\n"]
+    for text in ("= ][", "\0" * 100, "#" + "x" * sealing.MAX_BYTES, *endless, *dates):
         path.write_text(text)
         assert outcome(loader, path)
     for depth in (sealing.MAX_DEPTH + 1, 100_000):

@@ -19,25 +19,17 @@ from studies.paper.page import write_page
 pytestmark = pytest.mark.slow
 
 #: Largest sideslip RMSE in degrees by scenario and scheme.
-SIDESLIP_BOUNDS_DEG: dict[tuple[str, str], float] = {
-    ("A", "pd-hef:fixed-r"): 0.05,
-    ("A", "pd-hef"): 0.05,
-    ("B", "pd-hef:fixed-r"): 0.06,
-    ("B", "pd-hef"): 0.06,
-    ("A", "phy-ukf"): 0.40,
-    ("B", "phy-ukf"): 0.60,
+SIDESLIP_BOUNDS_DEG = {
+    (scenario, scheme): bound
+    for scheme, bounds in {"pd-hef:fixed-r": (0.05, 0.06), "pd-hef": (0.05, 0.06), "phy-ukf": (0.4, 0.6)}.items()
+    for scenario, bound in zip("AB", bounds, strict=True)
 }
 #: Least relative reduction of the sideslip RMSE of the first scheme against the second, by scenario.
-LEAST_GAIN: dict[tuple[str, str, str], float] = {
-    ("A", "pd-hef", "phy-ukf"): 0.6,
-    ("B", "pd-hef", "phy-ukf"): 0.6,
-    ("A", "pd-hef", "phy-ukf:tuned"): 0.4,
-    ("B", "pd-hef", "phy-ukf:tuned"): 0.4,
-    ("A", "pd-hef-paper", "phy-ukf"): 0.2,
-    ("B", "pd-hef-paper", "phy-ukf"): 0.2,
-    ("A", "pd-hef-paper, esp", "phy-ukf, esp"): 0.1,
-    ("B", "pd-hef-paper, esp", "phy-ukf, esp"): 0.1,
-}
+GAINS = {
+    ("pd-hef", "phy-ukf"): 0.6, ("pd-hef", "phy-ukf:tuned"): 0.4,
+    ("pd-hef-paper", "phy-ukf"): 0.2, ("pd-hef-paper, esp", "phy-ukf, esp"): 0.1,
+}  # fmt: skip
+LEAST_GAIN = {(scenario, *pair): gain for pair, gain in GAINS.items() for scenario in "AB"}
 SCHEMES = (
     "phy-ukf", "phy-ukf:tuned", "pd-hef:fixed-r", "pd-hef-paper", "pd-hef", "phy-ukf, esp", "pd-hef-paper, esp",
 )  # fmt: skip

@@ -161,19 +161,13 @@ def test_rows_are_the_same_drives_with_one_thing_wrong():
     assert 0.15 <= drives["low-friction"].friction <= 0.25
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        lambda p: write_suite(p, count=0, seed=1),
-        lambda p: write_suite(p, count=1, seed=-1),
-        lambda p: write_suite(p, count=1, seed=1, processes=0),
-        lambda p: write_suite(p, count=1, seed=1, vehicles="all"),
-        lambda p: write_suite(p, count=1, seed=1, duration_s=1.0),
-        lambda p: write_conditions(p, rows=["hail"]),
-        lambda p: write_conditions(p, rows=[]),
-        lambda p: write_conditions(p, drives=0),
-    ],
-)
+WRONG = ({"count": 0}, {"seed": -1}, {"processes": 0}, {"vehicles": "all"}, {"duration_s": 1.0})
+
+
+@pytest.mark.parametrize("wrong", [*WRONG, {"rows": ["hail"]}, {"rows": []}, {"drives": 0}], ids=str)
 def test_bad_requests_are_refused(wrong, tmp_path):
     with pytest.raises(UsageError):
-        wrong(tmp_path / "x")
+        if wrong in WRONG:
+            write_suite(tmp_path / "x", **{"count": 1, "seed": 1, **wrong})
+        else:
+            write_conditions(tmp_path / "x", **wrong)

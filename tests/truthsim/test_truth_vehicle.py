@@ -9,23 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.records.errors import VehicleError
+from tests.truthsim.test_truth_gates import loads, open_loop
 from truthsim.linear_theory import steady_roll, understeer_gradient_rad_per_m_s2
 from truthsim.manoeuvres import Plan
-from truthsim.motion import Motion, simulate_motion
+from truthsim.motion import simulate_motion
 from truthsim.randomisation import randomise
 from truthsim.tyres import Tyre, cornering_stiffness_n_per_rad, forces_n
 from truthsim.vehicle import Vehicle
 from truthsim.vehicle_files import VEHICLES, load_vehicle
 
 CAR = Vehicle()
-
-
-def open_loop(speed: float, steer: np.ndarray) -> Plan:
-    return Plan(speed, (steer.shape[0] - 1) * 1e-3, steer_rad=steer)
-
-
-def loads(motion: Motion) -> np.ndarray:
-    return np.stack([motion.column(f"fz_{w}_n") for w in ("fl", "fr", "rl", "rr")], axis=1)
 
 
 def test_a_wheel_leaves_the_road_and_comes_back():
@@ -74,22 +67,15 @@ def check_bands(found: dict, bands: dict[str, tuple[float, float, float]]) -> No
 
 OTHER_TYRE = {"stiffness_friction_power": 0.0, "lateral_relaxation_m": 0.2, "lateral_relaxation_min_m": 0.2}
 #: The sedan with the known values of the other car: no bars, short relaxation, no compliance, its axle stiffness.
+BARS = ("front_anti_roll_n_m_per_rad", "rear_anti_roll_n_m_per_rad")
 LIKE_THE_OTHER = CAR._replace(
-    front_anti_roll_n_m_per_rad=0.0,
-    rear_anti_roll_n_m_per_rad=0.0,
+    **dict.fromkeys([*BARS, "front_compliance_rad_per_n", "rear_compliance_rad_per_n", "ackermann"], 0.0),
     pitch_centre_height_m=0.05,
-    front_compliance_rad_per_n=0.0,
-    rear_compliance_rad_per_n=0.0,
-    ackermann=0.0,
     front_tyre=CAR.front_tyre._replace(stiffness_peak=15.80, **OTHER_TYRE),
     rear_tyre=CAR.rear_tyre._replace(stiffness_peak=20.81, **OTHER_TYRE),
 )
-CLOSE = {
-    "ay": (0.94, 1.03, 0.999),
-    "yaw_rate": (0.96, 1.06, 0.999),
-    "beta": (1.05, 1.20, 0.99),
-    "roll": (1.02, 1.14, 0.998),
-}
+CLOSE = {"ay": (0.94, 1.03, 0.999), "yaw_rate": (0.96, 1.06, 0.999), "beta": (1.05, 1.20, 0.99)}
+CLOSE |= {"roll": (1.02, 1.14, 0.998)}
 
 
 def test_with_the_other_s_values_the_difference_goes(shared_dir):
@@ -99,11 +85,8 @@ def test_with_the_other_s_values_the_difference_goes(shared_dir):
         found = against_another_simulator(shared_dir, run, friction, LIKE_THE_OTHER)
         check_bands(found, {"ay": (0.95, 1.05, 0.97), "yaw_rate": (1.0, 1.12, 0.995), "roll": (1.0, 1.15, 0.95)})
     # The bands see a steering 10 % too strong, one the wrong way round, and a car that yaws against its moments.
-    for gain, car in (
-        (1.1, LIKE_THE_OTHER),
-        (-1.0, LIKE_THE_OTHER),
-        (1.0, CAR._replace(yaw_inertia_kg_m2=-CAR.yaw_inertia_kg_m2)),
-    ):
+    backwards = CAR._replace(yaw_inertia_kg_m2=-CAR.yaw_inertia_kg_m2)
+    for gain, car in ((1.1, LIKE_THE_OTHER), (-1.0, LIKE_THE_OTHER), (1.0, backwards)):
         with pytest.raises(AssertionError), np.errstate(all="ignore"):
             check_bands(against_another_simulator(shared_dir, *step, car, gain=gain), CLOSE)
 

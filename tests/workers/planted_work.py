@@ -131,21 +131,10 @@ def _alone(value: str, tell: Tell) -> int:
     return len(Path(f"/proc/{parent}/task/{parent}/children").read_text().split())
 
 
-_FAULTS = {
-    "kill": _kill,
-    "kill once": _kill_once,
-    "kill server once": _kill_server_once,
-    "exit": lambda _value, _tell: os._exit(5),
-    "hang": _hang,
-    "stop": _stop,
-    "cut": _cut,
-    "slowly": _slowly,
-    "grow": _grow,
+_NAMED = (_kill, _kill_once, _kill_server_once, _hang, _stop, _cut, _slowly, _grow, _raise, _alone, _burn, _wait)
+_FAULTS = {of.__name__[1:].replace("_", " "): of for of in _NAMED} | {
     "8 GB": _8_gb,
-    "raise": _raise,
+    "exit": lambda _value, _tell: os._exit(5),
     "quit": lambda _value, _tell: sys.exit(3),
     "odd": lambda _value, _tell: Odd(),
-    "alone": _alone,
-    "burn": _burn,
-    "wait": _wait,
 }

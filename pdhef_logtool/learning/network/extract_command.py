@@ -31,13 +31,13 @@ from pdhef_logtool.evaluation.statistics import gathered
 from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, record_of, set_manifest, tell_drive
 from pdhef_logtool.learning.network import dataset, residuals
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
-from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log, identity_of
+from pdhef_logtool.logs.discovery import LogInput, Logs, as_taken, hash_log, identity_of, with_free_stem
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car
-from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, LogError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import S_PER_NS, Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
@@ -179,9 +179,9 @@ def extract(
     """
     output = local_path(output)
     _check(settings)
-    inputs = logs_of(arguments, settings.config.read_options)
-    work = _plan_jobs(inputs, output, settings, resume, reporter.warn)
     before = _earlier(output, settings)
+    inputs = [_with_own_name(i, before, reporter.warn) for i in logs_of(arguments, settings.config.read_options)]
+    work = _plan_jobs(inputs, output, settings, resume, reporter.warn)
     names = {settings.name_of(i.stem) for i in inputs}
     read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
     check_no_input(read, [output / dataset.MANIFEST])
@@ -272,6 +272,24 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
         expected = f"a new folder, or a residual dataset for {settings.model}"
         remedy = "choose another folder with -o"
         raise UsageError(expected=expected, got=error.got, where=output, remedy=remedy) from None
+
+
+def _with_own_name(log: LogInput, before: Mapping[str, Any], warn: Tell) -> LogInput:
+    """Return a log with another name if the dataset contains another log of its name."""
+    contents = {as_taken(d["log"]): d["source"]["sha256"] for d in before.get("drives", ())}
+    if as_taken(log.stem) not in contents:
+        return log
+    try:
+        content = identity_of(log)
+    except LogError:
+        return log  # reported when it is read
+    if contents[as_taken(log.stem)] == content:
+        return log
+    names = (d["log"] for d in before["drives"] if d["source"] == {"file": log.path.name, "sha256": content})
+    known = next(names, None)
+    log = with_free_stem(log, contents) if known is None else replace(log, stem=known)
+    warn(f"{log.path.name}: the dataset contains another log of this name; this one is {log.stem}")
+    return log
 
 
 def _check(settings: ExtractSettings) -> None:
@@ -374,7 +392,9 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
             "end_s": end_s,
             "duration_s": float(rows.stamps_ns[-1] - rows.stamps_ns[0]) * S_PER_NS,
             "rows": len(rows),
-            "usable_rows": int(np.count_nonzero(rows.weight > 0.0)),
+            "usable_rows": int(
+                np.count_nonzero(rows.weight > 0.0 if rows.chosen is None else rows.weight * rows.chosen > 0.0)
+            ),
             "truth": truth,
             "friction_from": drive.friction.label,
             "losses": [asdict(x) for x in drive.losses],

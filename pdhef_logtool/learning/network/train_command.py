@@ -323,7 +323,7 @@ class _Training:
         return float(np.mean(losses)) if losses else 0.0
 
     def validate(self, pieces: Iterable[_Piece]) -> float:
-        """Return the loss as in operation, over whole sequences; a network that is mirrored is made odd."""
+        """Return the mean loss over whole sequences, with the network as it is used: a mirrored one is made odd."""
         self.network.eval()
         total, weight = 0.0, 0.0
         with torch.inference_mode():

@@ -18,6 +18,7 @@ from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.drive.survey import Proposal, apply_proposals, mapping_proposals, survey_log
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import all_specs
+from pdhef_logtool.logs.byte_source import WHOLE_BYTES
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
@@ -113,9 +114,8 @@ def number_text(value: float) -> str:
 
 
 WINDOW_NS = 600_000_000_000
-#: Of a larger log with a sound index values are looked at in a part: its first ten minutes, and windows over the rest.
-WHOLE_BYTES = 32 << 20
-#: Where that is a larger share of the chunks, the rest is read too.
+#: Of a log with a sound index and more than ``WHOLE_BYTES``, values are looked at in a part: its first ten minutes, and
+#: windows over the rest. Where that is a larger share of the chunks, the rest is read too.
 MOST_SAMPLED = 0.75
 #: Kinds of loss that are counted by topic and concern all its signals.
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
