@@ -104,7 +104,8 @@ def loaded(*heavy):
     print("ended:", *(name for name in heavy if name in sys.modules))
 import pdhef_logtool
 loaded("numpy", "pydantic")
-import pdhef_logtool.cli.inspecting, pdhef_logtool.runs.config, pdhef_logtool.runs.inspection, truthsim.manoeuvres
+import pdhef_logtool.cli.inspecting, pdhef_logtool.runs.config, pdhef_logtool.runs.inspection.report
+import truthsim.manoeuvres
 loaded("numba", "torch", "scipy", "rerun", "polars", "pyarrow")
 from pdhef_logtool.cli.app import main
 sys.argv = ["pdhef", *sys.argv[1:]]

@@ -24,7 +24,7 @@ from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, SignalSource, auto_map
 from pdhef_logtool.records.signals import Channel
-from pdhef_logtool.runs.inspection import inspect_drive_log
+from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
 from studies.pages import write_toml
 from tests.drive.test_checks import checks_of, drive

@@ -22,9 +22,10 @@ from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.mapping import SignalSource, load_mapping
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.runs.inspection import ask_mapping, fields_of_log, inspect_drive_log, inspect_log, write_mapping
+from pdhef_logtool.runs.inspection.asking import ask_mapping
+from pdhef_logtool.runs.inspection.fields import fields_of_log
 from pdhef_logtool.runs.inspection.page import inspection_page, sparkline
-from pdhef_logtool.runs.inspection.report import Inspection
+from pdhef_logtool.runs.inspection.report import Inspection, inspect_drive_log, inspect_log, write_mapping
 from pdhef_logtool.storage.documents import jsonable
 from tests.command_line import called, printed, rendered
 from tests.counting_server import serving
