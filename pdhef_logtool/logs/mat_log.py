@@ -7,6 +7,7 @@ is their clock. Sparse matrices, objects and, in HDF5, values in other files are
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from collections import Counter
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs import table_columns
-from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
+from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
 from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
@@ -382,7 +383,7 @@ def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 
 def _leaves(path: str, value: Any, depth: int, unit: str = "") -> Iterator[tuple[str, Any, str]]:
-    is_rate = PATTERNS["rate"].fullmatch(path.rpartition(_SLASH)[2].lower())
+    is_rate = re.fullmatch(CONSTANTS["patterns"]["rate"], path.rpartition(_SLASH)[2].lower())
     if (is_rate and isinstance(value, float | int) and value > 0) or isinstance(value, np.ndarray | _Unusable):
         yield path, value, unit
     elif isinstance(value, dict | list) and depth >= _DEEPEST:

@@ -24,7 +24,7 @@ from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, SignalSource, auto_map
 from pdhef_logtool.records.signals import Channel
-from pdhef_logtool.runs.inspection import inspect_drive_log
+from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
 from studies.pages import write_toml
 from tests.drive.test_checks import checks_of, drive
@@ -73,11 +73,7 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
 @pytest.mark.parametrize(
     ("factor", "mirrored", "antenna_m", "is_short"),
     [
-        *(
-            (factor, mirrored, antenna_m, False)
-            for factor in (1.0, 3.6, 1.0 / 3.6, -1.0)
-            for mirrored, antenna_m in [(False, 0.0), (True, 0.0), (False, 1.5)]
-        ),
+        *((factor, *at, False) for factor in (1.0, 3.6, 1 / 3.6, -1.0) for at in [(False, 0), (True, 0), (False, 1.5)]),
         (1.0, False, 1.5, True),  # yaw times the lever is most of v_y
     ],
 )
