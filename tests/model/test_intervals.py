@@ -28,7 +28,13 @@ from pdhef_logtool.model.intervals import (
     drive_intervals,
     running_consistency,
 )
-from pdhef_logtool.model.priors import coefficients, prior_variations
+from pdhef_logtool.model.priors import (
+    FILE_TYRE_STD,
+    STATED_PEAK_STD,
+    coefficients,
+    prior_posterior,
+    prior_variations,
+)
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.records.signals import Signals
@@ -225,3 +231,10 @@ def test_the_centre_of_gravity_is_assumed_without_a_file_or_weight_split():
     given = vehicle_of_entries({"name": "mine", "mass_kg": 1500.0, "wheelbase_m": 2.7}, where="test")
     car = Car(given.vehicle, assumed=given.assumed)
     assert car.cg_std_m == pytest.approx(FRONT_WEIGHT_SHARE_SPREAD * 2.7 * FRONT_WEIGHT_SHARE)
+
+
+@pytest.mark.parametrize(("friction", "std"), [(0.85, STATED_PEAK_STD), (None, FILE_TYRE_STD)])
+def test_before_a_fit_the_peak_force_is_known_as_well_as_the_friction_of_the_file(friction, std):
+    prior = prior_posterior(OWN.model_copy(update={"friction": friction}))
+    least = min(v.assumed_friction for v in prior.varied)
+    assert least == pytest.approx(np.exp(-std) * prior.vehicle.assumed_friction)
