@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.fleet import run_logs as run  # noqa: F401
     from pdhef_logtool.runs.frames import estimate as estimate
     from pdhef_logtool.runs.frames import score as score
-    from pdhef_logtool.runs.inspection import inspect_log as inspect_log
+    from pdhef_logtool.runs.inspection.report import inspect_log as inspect_log
 
 #: Module of each public name, ``module`` or ``module:name in it``.
 _HOMES = {
@@ -37,7 +37,7 @@ _HOMES = {
     "ReadOptions": "drive.options",
     "Drive": "drive.reading",
     "read_drive": "drive.reading",
-    "inspect_log": "runs.inspection",
+    "inspect_log": "runs.inspection.report",
     "LearnSettings": "learning.drives",
     "learn": "learning.learn",
     "ExtractSettings": "learning.network.extract_command",

@@ -16,7 +16,7 @@ def main() -> NoReturn:
     """Run the command line; Ctrl-C is in order from here on, also while its modules are imported."""
     stopping.watch()
     # The objects of modules stay; to search them for cycles after every 700 new ones takes longer than to load some.
-    gc.set_threshold(50_000, 20)
+    gc.set_threshold(250_000, 20)
     # Otherwise pydantic searches all installed packages for its plug-ins.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
     try:

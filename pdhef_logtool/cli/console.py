@@ -114,13 +114,6 @@ def named_lines(texts: Iterable[tuple[str | Text, str | Text]]) -> Table:
     return lines
 
 
-def print_indented(line: str | Text, console: Console) -> None:
-    """Print a line, and its continuation lines, indented by two columns."""
-    from rich.padding import Padding
-
-    console.print(Padding(line, (0, 0, 0, 2), expand=False))
-
-
 def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
     """Return a number for a table, or a dash for None."""
     return "-" if value is None else f"{round(value * factor, digits) + 0.0:.{digits}f}"  # no -0

@@ -38,14 +38,15 @@ def inspect(
 
     Of an MCAP file above 32 MB with an intact index, only a part of the chunks is read; the output states how many.
     """
-    from pdhef_logtool.runs.inspection import fields_of_log
-    from pdhef_logtool.runs.inspection import write_mapping as write_mapping_file
+    from pdhef_logtool.runs.inspection.report import write_mapping as write_mapping_file
 
     if topic is not None and not fields:
         raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic needs --fields")
     if fields and (report or write_mapping) is not None:
         raise UsageError(expected="--fields alone", got="--report or --write-mapping as well", where="--fields")
     if fields:
+        from pdhef_logtool.runs.inspection.fields import fields_of_log
+
         topic_fields = fields_of_log(_place(log, config), topic, config.read_options)
         console.finish(topic_fields, "fields")
 
@@ -96,13 +97,13 @@ def map_(log: str, *, config: RunConfig, output: Path = Path("mapping.toml")) ->
     """
     import sys
 
-    from pdhef_logtool.runs.inspection import ask_mapping, write_mapping
+    from pdhef_logtool.runs.inspection import asking, report
 
     inspection = _inspect(log, config)
     if sys.stdin.isatty() and sys.stderr.isatty():
-        answers = ask_mapping(inspection, _ask, console.say)
+        answers = asking.ask_mapping(inspection, _ask, console.say)
         inspection = replace(inspection, mapping=answers)
-    write_mapping(inspection, output)
+    report.write_mapping(inspection, output)
     console.say(f"mapping written to {output}")
 
 
@@ -115,7 +116,7 @@ def _place(log: str, config: RunConfig) -> LogPlace:
 
 def _inspect(log: str, config: RunConfig, **given: Any) -> Inspection:
     """Inspect the log of an argument as configured."""
-    from pdhef_logtool.runs.inspection import inspect_log
+    from pdhef_logtool.runs.inspection.report import inspect_log
 
     return inspect_log(_place(log, config), config.mapping, config.read_options, **given)
 

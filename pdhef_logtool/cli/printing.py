@@ -2,42 +2,50 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from functools import cache
 from itertools import groupby
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from jinja2 import Environment
 from rich.console import Console
+from rich.padding import Padding
 
-from pdhef_logtool.cli.console import BREAK, cell, marked_up, named_lines, print_indented, protected, table
-from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_steps
-from pdhef_logtool.evaluation.statistics import gathered
-from pdhef_logtool.evaluation.units import read_unit
-from pdhef_logtool.evaluation.validation_plan import shown
-from pdhef_logtool.logs.recording_span import shown_time
+from pdhef_logtool.cli.console import BREAK, cell, marked_up, named_lines, protected, table
 from pdhef_logtool.records.geometry import DEGREES
-from pdhef_logtool.records.printable import listed
-from pdhef_logtool.records.signals import is_dated
-from pdhef_logtool.results.run_report import lines_of
-from pdhef_logtool.results.selected_estimate import assumptions_of, degrees, figures_of, is_worse, result_of
-from pdhef_logtool.runs.inspection.report import number_text
 from pdhef_logtool.storage.templates import environment
 
 #: Styles of the outcomes of requirements.
 _STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
-#: Functions and constants of all templates.
-_OF_RESULTS = assumptions_of, degrees, figures_of, is_worse, lines_of, joint_notes, next_steps, result_of
-_FUNCTIONS = *_OF_RESULTS, cell, gathered, is_dated, listed, math.expm1, math.isfinite, read_unit, shown, shown_time
-_NAMED = {"BREAK": BREAK, "DEGREES": DEGREES, "STYLES": _STYLES, "number": number_text}
+#: Functions of templates in other modules, which are imported at the first call: most commands need few of them.
+_HOMES = {
+    "math": "expm1 isfinite",
+    "pdhef_logtool.evaluation.requirement_verdicts": "joint_notes next_steps",
+    "pdhef_logtool.evaluation.statistics": "gathered",
+    "pdhef_logtool.evaluation.units": "read_unit",
+    "pdhef_logtool.evaluation.validation_plan": "shown",
+    "pdhef_logtool.logs.recording_span": "shown_time",
+    "pdhef_logtool.records.printable": "listed",
+    "pdhef_logtool.records.signals": "is_dated",
+    "pdhef_logtool.results.run_report": "lines_of",
+    "pdhef_logtool.results.selected_estimate": "assumptions_of degrees figures_of is_worse result_of",
+    "pdhef_logtool.runs.inspection.report": "number_text",
+}
+
+
+def _later(home: str) -> Callable[..., Any]:
+    """Return a function that is ``module:name``, imported when it is called."""
+    return lambda *arguments, **named: resolve_name(home)(*arguments, **named)
 
 
 @cache
 def _environment() -> Environment:
     made = environment(Path(__file__).parent / "templates")
     made.finalize = protected
-    made.globals |= {function.__name__: function for function in _FUNCTIONS} | _NAMED
+    made.globals |= {name: _later(f"{module}:{name}") for module, names in _HOMES.items() for name in names.split()}
+    made.globals |= {"BREAK": BREAK, "DEGREES": DEGREES, "STYLES": _STYLES, "cell": cell}
     return made
 
 
@@ -65,7 +73,7 @@ def _print_line(line: str, console: Console) -> str:
     if line.startswith("=="):
         return line.removeprefix("==").strip()
     if line.startswith("  "):
-        print_indented(marked_up(line[2:]), console)
+        console.print(Padding(marked_up(line[2:]), (0, 0, 0, 2), expand=False))  # also its continuation lines
     else:
         console.print(marked_up(line.removeprefix("|")), soft_wrap=line.startswith("|"))
     return ""

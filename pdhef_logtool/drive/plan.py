@@ -146,16 +146,16 @@ def plan_drive(
     mapping, sound = without_refused_truth(survey.mapping, refused), survey
     if mapping is not survey.mapping:
         sound = survey.with_truth(mapping.truth)
-    measured, truth = sound.measured, sound.truth_plan
+    measured, derived = sound.measured, sound.measured.derived
     return DrivePlan(
         mapping=mapping,
         vehicle=vehicle or survey.assumed_car,
         clocks=clocks,
         alignment=alignment.without(refused),
-        truth=truth,
+        truth=None if derived is None else derived.plan,
         latency=measured.latency,
-        dependent=dependent_signals(measured.signals, measured.truth) if truth else {},
-        derivation={} if measured.derived is None else dict(measured.derived.derivation),
+        dependent=dependent_signals(measured.signals, measured.truth) if derived else {},
+        derivation={} if derived is None else dict(derived.derivation),
         survey_truth=dict(measured.truth),
         start_ns=start_ns,
         end_ns=end_ns,

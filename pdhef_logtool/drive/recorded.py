@@ -177,8 +177,6 @@ def _gaps(channel: Channel) -> list[Loss]:
         return []
     steps = np.diff(stamps)
     least = max(TOLD_GAP_S * NS_PER_S, TOLD_GAP_PERIODS * float(np.median(steps)))
-    text, times = "no samples for {:.2f} s", stamps.tolist()
-    return [
-        Loss("gap", text.format(steps[i] * S_PER_NS), channel.source, times[i], times[i + 1], 1, "note")
-        for i in np.flatnonzero(steps > least)
-    ]
+    longer, text = np.flatnonzero(steps > least), "no samples for {:.2f} s"
+    spans = zip(stamps[longer].tolist(), stamps[longer + 1].tolist(), strict=True)
+    return [Loss("gap", text.format((b - a) * S_PER_NS), channel.source, a, b, 1, "note") for a, b in spans]

@@ -29,7 +29,7 @@ from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.mounting import ACCELERATIONS, RATES, Mounting, find_mounting, find_triads
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.relations import effective_wheelbase_m
-from pdhef_logtool.drive.truth import TruthPlan, TruthTrack, derive_truth, plan_truth
+from pdhef_logtool.drive.truth import TruthTrack, derive_truth
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, read_signals
 from pdhef_logtool.mapping.mapping_file import entries_of
@@ -48,7 +48,6 @@ class Survey:
 
     mapping: Mapping
     measured: Measured
-    truth_plan: TruthPlan | None
     mounting: Mounting | None = None
     corrected: tuple[Check, ...] = ()
 
@@ -90,8 +89,8 @@ class Survey:
     def with_truth(self, names: Collection[str]) -> Survey:
         """Return the survey with the ground truth of some channels only, for its plan, track and latency."""
         truth = {n: c for n, c in self.measured.truth.items() if n in names}
-        plan, derived = _derived(truth, self.measured.vehicle or default_vehicle())
-        return replace(self, truth_plan=plan, measured=replace(self.measured, truth=truth, derived=derived))
+        derived = _derived(truth, self.measured.vehicle or default_vehicle())
+        return replace(self, measured=replace(self.measured, truth=truth, derived=derived))
 
     def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
         """Yield the mapping's undecided checks that the drive does not decide either."""
@@ -132,7 +131,7 @@ def survey_log(
     triads = find_triads(log, mapping)
     extra = {} if triads is None else triads[0].components(ACCELERATIONS) | triads[1].components(RATES)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    truth_plan, derived = _derived(channels.truth, vehicle)
+    derived = _derived(channels.truth, vehicle)
     measured = measure(channels.signals, channels.truth, derived, vehicle, mapping)
     # The inputs of an estimator must not depend on ground truth: a mounting from ground truth is only checked.
     mounting = find_mounting(measured.sensors, triads, mapping)
@@ -140,7 +139,7 @@ def survey_log(
     if not blind and derived is not None:
         mounting = find_mounting(measured, triads, mapping)
     is_mounted = mounting is not None and mounting.confident and mounting.is_as_named
-    survey = Survey(mapping, replace(measured.without(extra), is_mounted=is_mounted), truth_plan, mounting)
+    survey = Survey(mapping, replace(measured.without(extra), is_mounted=is_mounted), mounting)
     if corrections == 0 or mapping.origin != "auto":
         return survey
     proposals, kind = _certain_proposals(survey, is_mounting_blind=blind)
@@ -157,11 +156,11 @@ def survey_log(
     return replace(again, corrected=(*documented, *again.corrected))
 
 
-def _derived(truth: Mapped[str, Channel], vehicle: VehicleParameters) -> tuple[TruthPlan | None, TruthTrack | None]:
-    """Return plan and track of the ground truth; None without any."""
+def _derived(truth: Mapped[str, Channel], vehicle: VehicleParameters) -> TruthTrack | None:
+    """Return the ground truth of a car; None without any."""
     place, gradient = vehicle.truth_position_m, vehicle.roll_gradient_rad_per_m_s2
-    plan = plan_truth(truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
-    return plan, None if plan is None else derive_truth(truth, plan=plan)
+    track = derive_truth(truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
+    return None if track.plan is None else track
 
 
 def _certain_proposals(survey: Survey, *, is_mounting_blind: bool) -> tuple[list[Proposal], str]:

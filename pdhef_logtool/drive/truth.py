@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -98,69 +99,44 @@ class TruthPlan:
 class TruthTrack:
     """Ground truth at the CG on its own clock. ``derivation`` describes the source of each quantity.
 
-    ``max_gap_s``: values are not interpolated across longer steps.
+    ``max_gap_s``: values are not interpolated across longer steps. ``plan``: how it was derived.
     """
 
     track: StateTrack
     max_gap_s: float
     derivation: Mapping[str, str] = field(default_factory=dict)
+    plan: TruthPlan | None = None
 
 
-def plan_truth(
+def derive_truth(
     channels: Mapping[str, Channel],
     *,
     truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     roll_gradient_rad_per_m_s2: float = 0.0,
-) -> TruthPlan | None:
-    """Decide clock, derivation, local frame and the convention of the quaternion.
-
-    Parameters
-    ----------
-    channels : truth channels by name, quality gate applied (samples that failed are absent).
-    truth_position_m : measurement point from the CG.
-    roll_gradient_rad_per_m_s2 : of the car; separates body roll from the bank of the road.
-
-    Returns
-    -------
-    TruthPlan, or None when no channel has two samples.
-    """
-    survey = {name: c for name, c in channels.items() if len(c) > 1}
-    if not survey.keys() - {_FRICTION}:
-        return None
-    origin = _find_origin(survey)
-    source, base = _velocity_source(survey, origin)
-    periods = {name: float(np.median(np.diff(c.stamps_ns))) * S_PER_NS for name, c in survey.items()}
-    gaps = {name: GAP_PERIODS * p for name, p in periods.items()}
-    half_window = max(2, round(DIFFERENTIATION_HALF_S / periods[base]))
-    place, gradient = truth_position_m, roll_gradient_rad_per_m_s2
-    plan = TruthPlan(base, source, gaps, half_window, origin, None, place, gradient)
-    return replace(plan, attitude=_find_attitude(_Source(survey, plan))) if "quat_wxyz" in survey else plan
-
-
-def derive_truth(
-    truth_channels: Mapping[str, Channel],
-    *,
-    truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     plan: TruthPlan | None = None,
 ) -> TruthTrack:
     """Derive body velocity, yaw rate, sideslip, a_y and pose at the CG from the mapped truth channels.
 
     Parameters
     ----------
-    truth_channels : quality gate applied.
-    truth_position_m : as for :func:`plan_truth`; not used with a ``plan``.
-    plan : from :func:`plan_truth` over the log's beginning; computed from these channels by default.
+    channels : truth channels by name, quality gate applied (samples that failed are absent).
+    truth_position_m : measurement point from the CG.
+    roll_gradient_rad_per_m_s2 : of the car; separates body roll from the bank of the road.
+    plan : from the log's beginning; None decides clock, derivation, local frame and the convention of the quaternion
+        from these channels, with the two values above.
 
     Returns
     -------
     TruthTrack
-        Empty without ground truth, with the stamps of the plan's base channel. Sideslip is the atan2 of the velocities
-        at the CG, or the mapped sideslip without velocities. ``yaw_rad`` is wrapped.
+        With the stamps of the plan's base channel; empty and without a plan when no channel has two samples. Sideslip
+        is the atan2 of the velocities at the CG, or the mapped sideslip without velocities. ``yaw_rad`` is wrapped.
     """
-    plan = plan or plan_truth(truth_channels, truth_position_m=truth_position_m)
+    plan = plan or _plan(channels, truth_position_m, roll_gradient_rad_per_m_s2)
     if plan is None:
         return TruthTrack(track=make_track("truth", np.empty(0, dtype=np.int64)), max_gap_s=0.0)
-    source = _Source(truth_channels, plan)
+    source = _Source(channels, plan)
+    if "quat_wxyz" in source and plan.attitude is None:
+        source.plan = replace(plan, attitude=_find_attitude(source))
     columns = dict(zip(("x_m", "y_m", "yaw_rad"), _pose(source), strict=True))
     rate = columns["yaw_rate_rad_s"] = _yaw_rate(source, columns["yaw_rad"])
     vx, vy = _velocity_at_cg(source, *_body_velocity(source), rate)
@@ -169,7 +145,22 @@ def derive_truth(
     if _FRICTION in source:
         source.says[_FRICTION] = source.name(_FRICTION)
     track = make_track("truth", source.stamps_ns, **columns)
-    return TruthTrack(track, plan.max_gap_s[plan.base], source.says)
+    return TruthTrack(track, plan.max_gap_s[plan.base], source.says, source.plan)
+
+
+def _plan(
+    channels: Mapping[str, Channel], truth_position_m: tuple[float, float, float], roll_gradient_rad_per_m_s2: float
+) -> TruthPlan | None:
+    """Decide clock, derivation and local frame; None when no channel has two samples."""
+    survey = {name: c for name, c in channels.items() if len(c) > 1}
+    if not survey.keys() - {_FRICTION}:
+        return None
+    origin = _find_origin(survey)
+    kind, base = _velocity_source(survey, origin)
+    periods = {name: float(np.median(np.diff(c.stamps_ns))) * S_PER_NS for name, c in survey.items()}
+    gaps = {name: GAP_PERIODS * p for name, p in periods.items()}
+    half_window = max(2, round(DIFFERENTIATION_HALF_S / periods[base]))
+    return TruthPlan(base, kind, gaps, half_window, origin, None, truth_position_m, roll_gradient_rad_per_m_s2)
 
 
 def truth_at(
@@ -299,7 +290,7 @@ def _find_origin(survey: Mapping[str, Channel]) -> tuple[float, float, float] | 
 
 def _find_attitude(source: _Source) -> Attitude:
     """Choose frame and body axes such that z points up and the car moves along x; ENU and FLU when in doubt."""
-    velocity = source.velocity()
+    velocity = source.velocity
     frames: tuple[Literal["ENU", "ECEF", "NED"], ...]
     frames = ("ENU", "NED") if source.plan.origin is None else ("ENU", "ECEF", "NED")
     bodies: tuple[Literal["FLU", "FRD"], ...] = ("FLU", "FRD")
@@ -352,6 +343,8 @@ class _Source:
         if channel is None or name not in self:
             n, k = self.stamps_ns.shape[0], VECTOR_COLUMNS.get(name, 1)
             return np.full((n, k) if k > 1 else n, np.nan)
+        if np.array_equal(channel.stamps_ns, self.stamps_ns):
+            return wrap_angle(channel.values) if name in _ANGLES else channel.values + 0.0  # a copy, without -0
         bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * NS_PER_S))
         if name in _ANGLES:
             return bracket.angle(channel.values)
@@ -364,8 +357,9 @@ class _Source:
         lat_rad, lon_rad, _ = map(float, geodetic_from_ecef(np.array([self.plan.origin]))[0])
         return enu_from_ecef_rotation(lat_rad, lon_rad)
 
+    @cached_property
     def position(self) -> FloatArray:
-        """Return [N, 3] in the local ENU frame; an unknown height is 0."""
+        """Position [N, 3] in the local ENU frame; an unknown height is 0."""
         if "x_m" in self and "y_m" in self:
             x, y = self.column("x_m"), self.column("y_m")
             return np.stack([x, y, np.zeros_like(x)], axis=1)
@@ -378,20 +372,25 @@ class _Source:
             ecef = ecef_from_geodetic(lat, lon, self.column("alt_m") if "alt_m" in self else np.zeros_like(lat))
         return _turn(self._from_ecef(), ecef - np.array(self.plan.origin))
 
+    @cached_property
     def velocity(self) -> FloatArray:
-        """Return [N, 3] in the local ENU frame, differentiated from the position if there is no velocity."""
+        """Velocity [N, 3] in the local ENU frame, differentiated from the position if there is no velocity."""
         if "enu_velocity_m_s" in self:
             return self.column("enu_velocity_m_s")
         if "ecef_velocity_m_s" in self and self.plan.origin is not None:
             return _turn(self._from_ecef(), self.column("ecef_velocity_m_s"))
-        position = self.position()
-        return np.stack([self.derivative(position[:, i]) for i in range(3)], axis=1)
+        east, north, up = self.position.T
+        return np.stack([*map(self.derivative, (east, north)), self.derivative(up) if up.any() else up], axis=1)
+
+    @cached_property
+    def _rotation(self) -> FloatArray:
+        """Matrices [N, 3, 3] of the quaternion as mapped."""
+        quat = self.column("quat_wxyz")
+        return rotation_from_quat(np.where(np.linalg.norm(quat, axis=1, keepdims=True) > 1e-6, quat, np.nan))
 
     def rotation(self, attitude: Attitude) -> FloatArray:
         """Return matrices [N, 3, 3] that turn forward-left-up body vectors into the local ENU frame."""
-        quat = self.column("quat_wxyz")
-        quat = np.where(np.linalg.norm(quat, axis=1, keepdims=True) > 1e-6, quat, np.nan)
-        matrix = rotation_from_quat(quat)
+        matrix = self._rotation
         if attitude.body == "FRD":
             matrix = matrix @ _FRD_TO_FLU
         if attitude.frame == "NED":
@@ -460,7 +459,7 @@ def differentiate(
 
 def _pose(source: _Source) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return x, y and yaw at the CG; without yaw, at the measurement point."""
-    position, plan, says = source.position(), source.plan, source.says
+    position, plan, says = source.position, source.plan, source.says
     if "x_m" in source and "y_m" in source:
         says["position_m"] = f"{source.name('x_m')} and {source.name('y_m')}"
     elif plan.origin is not None:
@@ -497,7 +496,7 @@ def _body_velocity(source: _Source) -> tuple[FloatArray, FloatArray]:
     if kind in ("velocity and heading", "position and heading"):
         return _velocity_by_heading(source)
     if kind in ("ground speed and sideslip", "ground speed alone"):
-        velocity, ground = source.velocity(), f"ground speed of {name(source.plan.base)}"
+        velocity, ground = source.velocity, f"ground speed of {name(source.plan.base)}"
         speed = np.hypot(velocity[:, 0], velocity[:, 1])
         if kind == "ground speed alone":
             says["vx_m_s"] = f"{ground} taken as v_x, no heading known"
@@ -520,7 +519,7 @@ def _body_velocity(source: _Source) -> tuple[FloatArray, FloatArray]:
 
 
 def _velocity_by_heading(source: _Source) -> tuple[FloatArray, FloatArray]:
-    velocity, attitude = source.velocity(), source.plan.attitude
+    velocity, attitude = source.velocity, source.plan.attitude
     if "yaw_rad" in source or attitude is None:
         yaw, by = source.column("yaw_rad"), source.name("yaw_rad")
         vx = np.cos(yaw) * velocity[:, 0] + np.sin(yaw) * velocity[:, 1]

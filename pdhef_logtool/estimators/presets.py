@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.posterior import Posterior
-
 #: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
 #: The filter on the vehicle file.
@@ -18,11 +15,6 @@ OPEN_LOOP = "open-loop:calibrated"
 def uses_calibration(name: str) -> bool:
     """Return whether an estimator uses the calibrated or identified vehicle; all others use the vehicle file."""
     return name == OPEN_LOOP or preset_of(name) in SELF_CALIBRATED
-
-
-def calibration_of(name: str, car: Car) -> Posterior | None:
-    """Return the calibration of the log that an estimator of a car uses; None without one."""
-    return car.self_calibrated if uses_calibration(name) else None
 
 
 #: Presets that GNSS velocity corrects.

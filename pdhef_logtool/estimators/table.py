@@ -49,17 +49,19 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from itertools import chain
-from typing import Any, Final, Literal, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.presets import AIDED, OPEN_LOOP, SELF_CALIBRATED, calibration_of, preset_of
+from pdhef_logtool.estimators.presets import AIDED, OPEN_LOOP, SELF_CALIBRATED, preset_of, uses_calibration
 from pdhef_logtool.estimators.presets import Options as Options
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import has_gnss
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.base import Estimator
 
 #: Inputs of the vehicle model; a filter uses a_y and yaw rate if the log has them, ``physics`` steering too.
 _SPEED = frozenset({"speed_m_s"})
@@ -137,7 +139,7 @@ class Spec:
         if isinstance(build, str):
             module, _, function = build.partition(":")
             build = getattr(import_module(f"{__package__}.{module}"), function)
-        calibration = calibration_of(self.name, car)
+        calibration = car.self_calibrated if uses_calibration(self.name) else None
         car = car if calibration is None else car.calibrated_car
         estimator = build(car.vehicle, self.name) if isinstance(build, type) else build(self.name, car, options)
         if options.gnss and self.name in AIDED:

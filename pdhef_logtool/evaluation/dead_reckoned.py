@@ -65,7 +65,7 @@ def path_drift(estimate: StateTrack, truth: StateTrack) -> dict[str, float] | No
     aligned by position and heading first (:func:`aligned_path`).
     """
     count = min(len(truth), _MOST_POINTS)
-    rows = np.unique(np.linspace(0, max(len(truth) - 1, 0), count).astype(np.int64))
+    rows = np.linspace(0, max(len(truth) - 1, 0), count).astype(np.int64)
     source, target = (np.stack([track.x_m[rows], track.y_m[rows]]) for track in (estimate, truth))
     finite = np.isfinite(source + target).all(axis=0)
     source, target = source[:, finite], target[:, finite]

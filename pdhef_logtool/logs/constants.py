@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 CONSTANTS: Mapping[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-#: Patterns of texts in tables.
-PATTERNS: Mapping[str, re.Pattern[str]] = {name: re.compile(text) for name, text in CONSTANTS["patterns"].items()}
+#: Smaller logs are read as a whole, where a part of a larger one is enough.
+WHOLE_BYTES: int = CONSTANTS["whole_bytes"]
+#: Letters in ASCII.
+LATIN = str.maketrans(CONSTANTS["latin"])
+_ALPHABETS = {name: dict(pair.split("=") for pair in pairs.split()) for name, pairs in CONSTANTS["alphabets"].items()}
+LETTERS = str.maketrans(
+    {u: latin for a in _ALPHABETS.values() for letter, latin in a.items() for u in (letter, letter.upper())}
+)
 
 
 def numbered(table: Mapping[str, Any]) -> dict[int, Any]:

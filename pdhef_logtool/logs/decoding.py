@@ -200,7 +200,7 @@ class ChannelDecoder:
         decode: Callable[[bytes], object] = json.loads
         if schema.wire == "protobuf":
             decode = schema.message_class.FromString
-        elif schema.store is not None:
+        elif schema.wire != "json":
             function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
             decode = bind(function, typename=schema.type_name)
 

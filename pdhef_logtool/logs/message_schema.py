@@ -9,7 +9,7 @@ import inspect
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -103,7 +103,7 @@ Node: TypeAlias = Scalar | Struct | Array | Unknown
 class MessageSchema:
     """A message type: its tree and its decoder.
 
-    ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
+    ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``types`` are the ROS types as rosbags has them,
     ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
     of an installed ROS that it was read from, if the log contains no definition. ``units`` of fields by type are those
     that comments of its text state.
@@ -112,7 +112,7 @@ class MessageSchema:
     type_name: str
     wire: str
     root: Node
-    store: Typestore | None = None
+    types: Any = None
     message_class: Any = None
     limits: ResourceLimits = DEFAULT_LIMITS
     borrowed: tuple[Path, ...] = ()
@@ -122,6 +122,16 @@ class MessageSchema:
     def fields(self) -> tuple[FieldInfo, ...]:
         """The scalar leaves of the tree, times as one leaf."""
         return tuple(replace(f, unit=_stated_unit(self.units, f.path)) for f in leaves(self.root))
+
+    @functools.cached_property
+    def store(self) -> Typestore:
+        """The decoder of single ROS messages, which takes long to generate; it decodes none if its code is invalid."""
+        from rosbags.typesys import Stores, get_typestore
+
+        store = get_typestore(Stores.EMPTY)
+        with suppress(Exception):
+            store.register(self.types)
+        return store
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,10 +270,8 @@ def ros_schema(
                 files = (definitions.installed(name) for name in sorted(set(types) - set(distributed)))
                 borrowed = tuple(file for file in files if file is not None)
         root = _ros_root(types, type_name, limits)
-        store = get_typestore(Stores.EMPTY)
-        store.register(types)
     units = stated_units(text) if encoding in ("ros2msg", "ros1msg") else {}
-    return MessageSchema(type_name, wire, root, store, limits=limits, borrowed=borrowed, units=units)
+    return MessageSchema(type_name, wire, root, types, limits=limits, borrowed=borrowed, units=units)
 
 
 def _idl_types(text: str) -> Any:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS, numbered
+from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.recording_span import NOTED_SHARE, survey_rows
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss, is_dated
 
@@ -337,7 +337,7 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
     the month is first, with a note.
     """
     texts = _numbered_months(texts.str.strip_chars())
-    parts = texts.str.extract_groups(PATTERNS["time_text"].pattern).struct.unnest()
+    parts = texts.str.extract_groups(CONSTANTS["patterns"]["time_text"]).struct.unnest()
     if dates is not None and parts["a"].null_count() == len(parts):
         return text_clock(dates.str.strip_chars() + " " + texts)
     number = {n: parts[n].cast(int, strict=False).fill_null(-1).to_numpy() for n in parts.columns if n not in _WORDS}
@@ -371,7 +371,7 @@ _MONTHS = [names.replace(" ", "|") for names in _CLOCKS["months"]]
 
 def _numbered_months(texts: Series) -> Series:
     """Return texts [N] in which a named month is a number between day and year, and dates of digits have marks."""
-    compact, *named = (PATTERNS[name].pattern for name in ("compact_date", "named_month", "month_first"))
+    compact, *named = (CONSTANTS["patterns"][name] for name in ("compact_date", "named_month", "month_first"))
     if texts.drop_nulls().head(1).str.contains(compact).any():
         return texts.str.replace(compact, "${1}-${2}-${3} ${4}:${5}:${6}")
     every = "|".join(_MONTHS)

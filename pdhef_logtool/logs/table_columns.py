@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs import table_clocks
-from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
+from pdhef_logtool.logs.constants import CONSTANTS, LATIN, LETTERS
 from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, Clock
 from pdhef_logtool.logs.table_file import left_out
 from pdhef_logtool.logs.table_log import Table
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 #: steps that are not negative, of a column that may contain times. Rows of a device in a table of several, and devices.
 _REGULAR, _ENOUGH_ROWS, _ALIKE, _ASCENDING_SHARE, _FEW_ROWS, _MOST_KINDS = 1.5, 0.9, 0.01, 0.99, 10, 50
 
+#: Patterns of texts in tables.
+PATTERNS: Mapping[str, re.Pattern[str]] = {name: re.compile(text) for name, text in CONSTANTS["patterns"].items()}
 #: Evidence of motion on the unit of a clock.
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
@@ -38,12 +40,6 @@ _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS
 #: Products and quotients of units, with exponents.
 _SYMBOL = rf"(?:{'|'.join(map(re.escape, CONSTANTS['table_units']['symbols'].split()))})(?:\^?\**[-+]?\d|[⁻¹²³]+)?"
 _COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/·.]|\bper\b|\s)\s*{_SYMBOL})+")
-#: Letters in ASCII.
-LATIN = str.maketrans(CONSTANTS["latin"])
-_ALPHABETS = {name: dict(pair.split("=") for pair in pairs.split()) for name, pairs in CONSTANTS["alphabets"].items()}
-LETTERS = str.maketrans(
-    {u: latin for a in _ALPHABETS.values() for letter, latin in a.items() for u in (letter, letter.upper())}
-)
 #: Words, and single letters as symbols, of the Greek alphabet; a dot above the symbol of a quantity.
 _GREEK_WORD, _GREEK, _DOT = re.compile("[Ͱ-Ͽ]{3,}"), re.compile("[Ͱ-Ͽ]"), re.compile("(?<=[xyvψβ])\u0307")
 

@@ -26,11 +26,11 @@ import numpy as np
 import polars as pl
 from polars import Series
 
-from pdhef_logtool.logs.constants import CONSTANTS, PATTERNS
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.mat_log import tables_of_variables
 from pdhef_logtool.logs.table_cells import EMPTY, read_cells
 from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, of_digits, placed, to_ns, whole_days
-from pdhef_logtool.logs.table_columns import Sheet, by_times, field_name, is_unit, read_head, tables_of
+from pdhef_logtool.logs.table_columns import PATTERNS, Sheet, by_times, field_name, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError

@@ -265,7 +265,6 @@ class CdrEncoder:
                 lengths[selection.components[0]] = width
         key = tuple(sorted(lengths.items(), key=repr))
         if key not in self._layouts:
-            assert self.schema.store is not None
             constant = self._constant(self.schema.root, (), lengths)
             message = bytes(self.schema.store.serialize_cdr(constant, self.schema.type_name))
             layout = WireLayout(self.schema.root, "cdr", message)

@@ -312,8 +312,9 @@ def _clock_of(source: SignalSource, stamps: _Stamps, unusable: str) -> ClockMode
     if unusable:  # log time replaces the stamps; they do not show the period either
         source, stamps_ns, log_time_ns = replace(source, clock="utc"), recorded_ns, recorded_ns
     n = int(stamps_ns.shape[0])
-    steps_ns = np.diff(np.unique(stamps_ns))
-    steps_ns = steps_ns[steps_ns <= SURVEY_WINDOW_NS]  # larger ones are between the windows of a survey
+    steps_ns = np.diff(np.sort(stamps_ns))
+    # Larger steps are between the windows of a survey.
+    steps_ns = steps_ns[(steps_ns > 0) & (steps_ns <= SURVEY_WINDOW_NS)]
     period_s = float(np.median(steps_ns)) * S_PER_NS if steps_ns.shape[0] else float("nan")
     if n == 0:
         if source.clock == "device":

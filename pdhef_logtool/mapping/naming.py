@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
 
-from pdhef_logtool.logs.table_columns import LATIN, LETTERS
+from pdhef_logtool.logs.constants import LATIN, LETTERS
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
 
 #: Size of the cache of meanings: the drives of a fleet have the same names.

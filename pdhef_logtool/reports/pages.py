@@ -7,13 +7,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError
-from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.results.opened_run import PAGE_FILE, REPORT_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.storage.files import write_bytes
+
+if TYPE_CHECKING:
+    from pdhef_logtool.reports.charts import Charts
 
 
 @dataclass(frozen=True, slots=True, eq=False)

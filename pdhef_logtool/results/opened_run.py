@@ -126,6 +126,10 @@ class OpenedRun:
         """Return one of :data:`TABLES`, read when collected; raises OutputError for a file that is not as written."""
         import polars as pl
 
+        return pl.scan_parquet(self.table_path(name))
+
+    def table_path(self, name: str) -> Path:
+        """Return the file of one of :data:`TABLES`; raises OutputError for one that is not as written."""
         file = table_file(name)
         path = self.folder / file
         if name not in self._sound:
@@ -133,7 +137,7 @@ class OpenedRun:
                 self.mirror.fetch(file)
             checked_sha256(path, self.document.get("files", {}).get(file), RUN_FILE, "run the logs again")
             self._sound.add(name)
-        return pl.scan_parquet(path)
+        return path
 
 
 def table_file(name: str) -> str:

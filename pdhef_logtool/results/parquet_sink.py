@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -205,6 +205,25 @@ def _names(file: pq.ParquetFile) -> list[str]:
     """Return the estimator of each row group, which the statistics of its column state."""
     column, metadata = file.schema_arrow.get_field_index("estimator"), file.metadata
     return [str(metadata.row_group(i).column(column).statistics.min) for i in range(metadata.num_row_groups)]
+
+
+def read_rows(path: Path, columns: list[str], wanted: Mapping[str, Collection[str]]) -> Iterator[tuple[Any, ...]]:
+    """Yield columns of the rows of a table, of those with a wanted text in each of some columns; null numbers are NaN.
+
+    Neither Polars nor the functions of Arrow are imported, which takes longer than to read the table of a few drives.
+
+    Raises
+    ------
+    OutputError : When the file cannot be read.
+    """
+    with reading(path), pq.ParquetFile(path, read_dictionary=columns) as file:
+        for batch in file.iter_batches(columns=columns):
+            use = np.ones(len(batch), np.bool_)
+            for name, texts in wanted.items():
+                is_wanted = np.array([text in texts for text in batch[name].dictionary.to_pylist()], np.bool_)
+                use &= is_wanted[batch[name].indices.to_numpy()]
+            picked = (column.to_numpy(zero_copy_only=False)[use].tolist() for column in batch.select(columns))
+            yield from zip(*picked, strict=True)
 
 
 @contextmanager

@@ -6,10 +6,11 @@ The baseline of a requirement can be another run: run A of a comparison, or an e
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.sensors import NOT_INDEPENDENT, SENSORS
@@ -21,10 +22,8 @@ from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, V
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun, open_run
 from pdhef_logtool.results.pairing import pair_logs
+from pdhef_logtool.results.parquet_sink import read_rows
 from pdhef_logtool.results.sink import TRUTH
-
-if TYPE_CHECKING:
-    import polars as pl
 
 #: Figures beside the requirement's own: exposure, independence, and the estimated reference.
 _BESIDE = ("exposure_s", "exposure_m", NOT_INDEPENDENT, "reference_rms", "reference_std")
@@ -79,32 +78,26 @@ def figures_of_rows(rows: Iterable[MetricRow]) -> Figures:
     return _figures((r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.n) for r in rows)
 
 
-def _figures(rows: Iterable[tuple[str, str, str, str, str, float | None, int]]) -> Figures:
+def _figures(rows: Iterable[tuple[str, str, str, str, str, float, int]]) -> Figures:
     values: dict[_Key, tuple[float, int]] = {}
     names: dict[str, dict[str, None]] = {}
     for log, name, signal, segment, metric, value, n in rows:
-        values[log, name, signal, segment, metric] = (math.nan if value is None else value), n
+        values[log, name, signal, segment, metric] = value, n
         if "~" not in name and name not in (SENSORS, TRUTH, REFERENCE):
             names.setdefault(log, {})[name] = None
     return Figures(values, {log: list(of_log) for log, of_log in names.items()})
 
 
-def figures_of_file(metrics: pl.LazyFrame, plan: ValidationPlan, mains: Iterable[str | None]) -> Figures:
-    """Return the rows of metrics.parquet that a plan needs; only these are read."""
-    import polars as pl
-
-    named = {SENSORS, *names_of(plan.requirements), *(m for m in mains if m is not None)}
+def figures_of_file(path: Path, plan: ValidationPlan, mains: Sequence[str | None]) -> Figures:
+    """Return the rows of a metrics.parquet that a plan needs; raises OutputError."""
     wanted = {
         "signal": {"state", *(r.signal for r in plan.requirements)},
         "segment": {"all", *(r.segment for r in plan.requirements)},
         "metric": {*_BESIDE, *(r.metric for r in plan.requirements)},
     }
-    rows = metrics.filter(*(pl.col(key).cast(pl.String).is_in(sorted(values)) for key, values in wanted.items()))
-    if all(m is not None for m in mains):
-        rows = rows.filter(pl.col("estimator").cast(pl.String).is_in(sorted(named)))
-    columns = ("log", "estimator", "signal", "segment", "metric")
-    table = rows.select(*(pl.col(c).cast(pl.String) for c in columns), "value", "n").collect()
-    return _figures(table.iter_rows())
+    if len(named := [m for m in mains if m is not None]) == len(mains):
+        wanted["estimator"] = {SENSORS, *names_of(plan.requirements), *named}
+    return _figures(read_rows(path, ["log", "estimator", "signal", "segment", "metric", "value", "n"], wanted))
 
 
 #: Figures of another run, and its drive by the label of this run's.
@@ -245,8 +238,8 @@ def _paired(blocks: RequirementBlocks | None, theirs: RequirementBlocks | None) 
 def plan_verdicts_against(plan: ValidationPlan, a: OpenedRun, b: OpenedRun, *, strict: bool) -> PlanVerdicts:
     """Return the verdicts on the drives of B with A as :data:`~.validation_plan.RUN`; raises OutputError."""
     drives: Sequence[JudgedDrive] = [judged_drive(log) for log in b.logs]
-    drives = in_spaces(drives, plan, b.table("drives"), b.table("exposure"))
-    figures = figures_of_file(b.table("metrics"), plan, [d.main for d in drives])
+    drives = in_spaces(drives, plan, b.table_path)
+    figures = figures_of_file(b.table_path("metrics"), plan, [d.main for d in drives])
     against = {**other_runs(plan, b.logs), RUN: _against(plan, a, b.logs)}
     return plan_verdicts(plan, figures, drives, strict=strict, against=against)
 
@@ -264,7 +257,7 @@ def other_runs(plan: ValidationPlan, logs: Sequence[OpenedLog]) -> dict[str, Aga
 
 def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) -> Against:
     partners = {pair.b.label: judged_drive(pair.a) for pair in pair_logs(run.logs, logs)[0]}
-    return figures_of_file(run.table("metrics"), plan, [d.main for d in partners.values()]), partners
+    return figures_of_file(run.table_path("metrics"), plan, [d.main for d in partners.values()]), partners
 
 
 def judged_drive(log: OpenedLog) -> JudgedDrive:
@@ -283,13 +276,13 @@ def in_space(drive: JudgedDrive, report: Mapping[str, Any]) -> JudgedDrive:
 
 
 def in_spaces(
-    drives: Sequence[JudgedDrive], plan: ValidationPlan, table: pl.LazyFrame, exposure: pl.LazyFrame
+    drives: Sequence[JudgedDrive], plan: ValidationPlan, table_path: Callable[[str], Path]
 ) -> Sequence[JudgedDrive]:
-    """Return drives with operating space and friction by two tables of a run, which are read if the plan needs them."""
+    """Return drives with operating space and friction by tables of a run, which are read if the plan needs them."""
     if not any(r.exposure for r in plan.requirements):
         return drives
     spaces: dict[str, dict[tuple[float, float], float]] = {}
-    for log, speed, ay, seconds in exposure.select("log", "speed_m_s", "ay_m_s2", "seconds").collect().iter_rows():
+    for log, speed, ay, seconds in read_rows(table_path("exposure"), ["log", "speed_m_s", "ay_m_s2", "seconds"], {}):
         spaces.setdefault(log, {})[speed, ay] = seconds
-    friction = dict(table.select("log", "friction_median").drop_nulls().collect().iter_rows())
+    friction = dict(read_rows(table_path("drives"), ["log", "friction_median"], {}))
     return [replace(d, space=spaces.get(d.log, {}), friction=friction.get(d.log, math.nan)) for d in drives]

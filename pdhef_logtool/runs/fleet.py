@@ -14,7 +14,7 @@ from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.drive.reading import logs_of
 from pdhef_logtool.estimators.table import FILTERS
@@ -26,6 +26,7 @@ from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.results.no_position import neutral_stem
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, PAGE_FILE, TABLES_FOLDER, open_run
+from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.drive_outputs import check_places, log_place, write_run, write_run_tables
@@ -38,9 +39,6 @@ from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome
 from pdhef_logtool.storage.object_store import is_url
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Ended, Limits, Tell, supervise
-
-if TYPE_CHECKING:
-    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 #: Drives with the largest errors that keep all files if the run keeps metrics only because of their number.
 FULL_WORST = 5

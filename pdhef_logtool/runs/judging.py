@@ -68,11 +68,8 @@ def judge(
         figures = plan_verdicts.figures_of_rows(row for r in done for row in r.rows)
         drives = [plan_verdicts.in_space(d, d.read_report() or {}) for d in drives]
     else:
-        import polars as pl
-
-        metrics, *spaces = (pl.scan_parquet(tables / f"{x}.parquet") for x in ("metrics", "drives", "exposure"))
-        figures = plan_verdicts.figures_of_file(metrics, plan, [d.main for d in drives])
-        drives = plan_verdicts.in_spaces(drives, plan, *spaces)
+        figures = plan_verdicts.figures_of_file(tables / "metrics.parquet", plan, [d.main for d in drives])
+        drives = plan_verdicts.in_spaces(drives, plan, lambda name: tables / f"{name}.parquet")
     against = plan_verdicts.other_runs(plan, [r.opened for r in done])
     return plan_verdicts.plan_verdicts(plan, figures, drives, strict=strict, against=against)
 

@@ -13,7 +13,7 @@ from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.plug_ins import package_of
-from pdhef_logtool.estimators.presets import calibration_of
+from pdhef_logtool.estimators.presets import uses_calibration
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.metrics import MetricRow
@@ -205,7 +205,7 @@ def _estimator_entries(run: PreparedDrive, algorithms: Mapping[str, Algorithm]) 
     """Yield the entries of the estimators that ran, failed or were skipped."""
     not_causal = run.drive.not_causal
     for e in run.estimators:
-        algorithm, calibration = algorithms[e.name], calibration_of(e.name, run.car)
+        algorithm, calibration = algorithms[e.name], run.car.self_calibrated if uses_calibration(e.name) else None
         yield estimator_entry(
             e.name,
             causal=e.causal and not not_causal,

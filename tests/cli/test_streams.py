@@ -104,7 +104,8 @@ def loaded(*heavy):
     print("ended:", *(name for name in heavy if name in sys.modules))
 import pdhef_logtool
 loaded("numpy", "pydantic")
-import pdhef_logtool.cli.inspecting, pdhef_logtool.runs.config, pdhef_logtool.runs.inspection, truthsim.manoeuvres
+import pdhef_logtool.cli.inspecting, pdhef_logtool.runs.config, pdhef_logtool.runs.inspection.report
+import truthsim.manoeuvres
 loaded("numba", "torch", "scipy", "rerun", "polars", "pyarrow")
 from pdhef_logtool.cli.app import main
 sys.argv = ["pdhef", *sys.argv[1:]]
@@ -118,14 +119,8 @@ loaded("torch", "rerun", "scipy.linalg", "scipy.special", "scipy.ndimage", "matp
 
 def ended_of(script: str, *arguments: str) -> list[str]:
     """Run a script in a separate process; return its lines that begin with ``ended:``, without that."""
-    done = subprocess.run(
-        [sys.executable, "-c", script, *arguments],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command, env = [sys.executable, "-c", script, *arguments], {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=True)
     return [line.removeprefix("ended:").strip() for line in done.stdout.splitlines() if line.startswith("ended:")]
 
 

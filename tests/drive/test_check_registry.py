@@ -14,7 +14,7 @@ from pdhef_logtool.drive.check_table import TABLE, judge
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.inspection import inspect_log
+from pdhef_logtool.runs.inspection.report import inspect_log
 from tests.command_line import rendered
 
 NAME = "speed_m_s.range"

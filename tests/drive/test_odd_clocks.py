@@ -17,7 +17,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
 from pdhef_logtool.records.ledger import DAMAGE, DAMAGED_SHARE, SampleCount, damage
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.runs.inspection import inspect_log
+from pdhef_logtool.runs.inspection.report import inspect_log
 from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
 
 S = 1_000_000_000

@@ -189,7 +189,7 @@ def test_specific_force_on_a_bank(bank, gradient, axes):
     turn = body_to_enu(d) * Rotation.from_rotvec((bank * np.sin(d.t) + gradient * force)[:, None] * [1.0, 0.0, 0.0])
     attitude = quat(turn if axes == "quat" else NED * turn * FRD)
     channels = channels_of(stamps, body(d) | {"enu_velocity_m_s": d.velocity, "quat_wxyz": attitude})
-    plan = derivation.plan_truth(channels, roll_gradient_rad_per_m_s2=gradient)
+    plan = derive_truth(channels, roll_gradient_rad_per_m_s2=gradient).plan
     track = derive_truth(channels, plan=plan).track
     inner = np.isfinite(track.ay_m_s2)
     assert inner.mean() > 0.85
@@ -223,7 +223,7 @@ def test_ground_speed_alone_claims_no_sideslip():
 
 
 def test_no_truth_is_an_empty_track():
-    assert derivation.plan_truth({}) is None
+    assert derive_truth({}).plan is None
     assert len(derive_truth({"vx_m_s": channel("vx_m_s", [], [])}).track) == 0
     at = truth_at(derive_truth({}), np.arange(5, dtype=np.int64))
     assert not at.valid.any()

@@ -22,7 +22,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
 from pdhef_logtool.records.errors import EXIT_PARTIAL, LogError
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.runs.inspection import inspect_log
+from pdhef_logtool.runs.inspection.report import inspect_log
 from tests.mcap_files import mcap_writer
 
 N = 300

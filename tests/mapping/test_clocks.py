@@ -13,8 +13,7 @@ from pdhef_logtool.mapping import ClockModel, Mapping, SignalSource, clock_key, 
 from pdhef_logtool.mapping.clocks import apply_clock, fit_clock_line, why_unusable
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import IntArray
-from pdhef_logtool.runs.inspection import inspect_drive_log
-from pdhef_logtool.runs.inspection.report import Steps
+from pdhef_logtool.runs.inspection.report import Steps, inspect_drive_log
 from tests.command_line import rendered
 
 T0 = 1_700_000_000_000_000_000

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,6 +21,7 @@ from pdhef_logtool.results.comparing import compare
 from pdhef_logtool.results.junit import junit_bytes
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts, figures_of_file, figures_of_rows, plan_verdicts
 from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.results.tables import write_metrics
 from pdhef_logtool.runs.judging import judge, read_validation_plan
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import jsonable
@@ -58,12 +58,12 @@ def test_drives_are_pooled_with_the_exposure_of_their_scored_stamps():
     assert verdict.estimators == ("pd-hef",)
 
 
-def test_a_file_gives_the_same_verdict_as_the_rows():
+def test_a_file_gives_the_same_verdict_as_the_rows(tmp_path):
     rows = scored() + scored(value=0.5, estimator="zero")
     plan = ValidationPlan((BETA,))
-    frame = pl.DataFrame([{k: getattr(r, k) for k in MetricRow.__dataclass_fields__} for r in rows]).lazy()
+    write_metrics(tmp_path / "metrics.parquet", rows)
     drives = [JudgedDrive(log, "pd-hef") for log in SIX]
-    of_file = plan_verdicts(plan, figures_of_file(frame, plan, ["pd-hef"] * 6), drives)
+    of_file = plan_verdicts(plan, figures_of_file(tmp_path / "metrics.parquet", plan, ["pd-hef"] * 6), drives)
     assert of_file == plan_verdicts(plan, figures_of_rows(rows), drives)
 
 
@@ -194,13 +194,9 @@ WORST = Requirement("R1", "No bad drive", "sideslip_rad", limit=0.02, statistic=
 def judged_alone(*errors: float | None, strict: bool = False, title: str = "") -> PlanVerdicts:
     """Return one verdict per error of the only drive, in rad; None: the drive has no figure."""
     requirements = tuple(replace(WORST, id=f"R{i}") for i in range(len(errors)))
-    judged = [
-        judge_values(
-            r,
-            [] if e is None else [DriveValue(JudgedDrive("a.mcap", None), "pd-hef", e, 100, seconds=60.0, metres=1e3)],
-        )
-        for r, e in zip(requirements, errors, strict=True)
-    ]
+    drive = JudgedDrive("a.mcap", None)
+    known = [e if e is None else DriveValue(drive, "pd-hef", e, 100, seconds=60.0, metres=1e3) for e in errors]
+    judged = [judge_values(r, [v] if v else []) for r, v in zip(requirements, known, strict=True)]
     return PlanVerdicts(ValidationPlan(requirements, title, "plan.toml"), tuple(judged), strict)
 
 

@@ -18,8 +18,8 @@ from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.drive.survey import Proposal, apply_proposals, mapping_proposals, survey_log
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import all_specs
-from pdhef_logtool.logs.byte_source import WHOLE_BYTES
 from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.constants import WHOLE_BYTES
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
@@ -285,11 +285,10 @@ def inspect_log(
     mapping = mapping_of(mapping)
     with closing(open_log(path, options.limits, options.msgs, tables_for(mapping, options.tables))) as log:
         source = log.messages
-        index = source if source is not None and source.is_indexed and not whole else None
-        # Most of a shorter one is read anyway.
-        long = index is not None and (index.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS)
-        if index is not None and not (long and index.size > WHOLE_BYTES):
-            index = None
+        index = None
+        if source is not None and source.size > WHOLE_BYTES and source.is_indexed and not whole:
+            # Most of a shorter one is read anyway.
+            index = source if source.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS else None
         if index is None and source is not None:
             source.prefetch({topic.name for topic in log.topics}, [(log.start_ns, log.end_ns)])
         inspection = inspect_drive_log(log, mapping, prefer_truth=options.prefer_truth, index=index)
