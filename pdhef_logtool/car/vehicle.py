@@ -297,6 +297,10 @@ class VehicleParameters(Record):
         shape = STIFFNESS_TYRE_SHAPE
         return tyre.cornering_stiffness_n_per_rad / (shape * peak), shape, peak, 0.0
 
+    def most_ay_m_s2(self, friction: float) -> float:
+        """Return the lateral acceleration at which both axles have their peak force."""
+        return sum(self.magic_formula(front, friction)[2] for front in (True, False)) / self.mass_kg
+
     def cornering_stiffness_n_per_rad(self, front: bool, friction: float) -> float:
         """Slope of the axle's lateral force at zero slip."""
         b, c, d, _ = self.magic_formula(front, friction)

@@ -118,8 +118,7 @@ def level_of(driving: Driving) -> float:
 def peak_reached(driving: Driving, vehicle_file: VehicleParameters) -> float:
     """Return the share of the file's peak force that the a_y of the driving needs."""
     ay = driving.columns[equations.AY, driving.settled]
-    most = sum(vehicle_file.magic_formula(front, vehicle_file.assumed_friction)[2] for front in (True, False))
-    return float(np.quantile(np.abs(ay), REACHED_QUANTILE)) * vehicle_file.mass_kg / most
+    return float(np.quantile(np.abs(ay), REACHED_QUANTILE)) / vehicle_file.most_ay_m_s2(vehicle_file.assumed_friction)
 
 
 class CarFit:

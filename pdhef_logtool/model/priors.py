@@ -35,8 +35,9 @@ USUAL_LEVEL, USUAL_RATIO = 1.5, 0.68
 USUAL_STDS, FILE_STDS, FILE_SHARE = (0.5, 0.2), (0.1, 0.1), 1.0 / 3.0
 #: The ratio of models below this mass varies more; vehicles below the mass of cars have the level of cars.
 MODEL_KG, MODEL_STDS, CAR_KG = 50.0, (0.5, 0.5), 400.0
-#: Log standard deviation of a file's peak force (wet or icy roads), and of its stiffness without a calibration.
-FILE_TYRE_STD = 0.5
+#: Log standard deviation of a file's peak force (wet or icy roads), and of its stiffness without a calibration; of the
+#: former before a fit if the file has the friction of the road, which is then accurate to 0.1 (docs/learn.md#friction).
+FILE_TYRE_STD, STATED_PEAK_STD = 0.5, 0.15
 #: Correlation of a parameter between two drives of a car at the same level of a_y: chosen by the sideslip error of
 #: taught cars (docs/method.md#earlier-drives).
 CORRELATION = 0.75
@@ -260,6 +261,8 @@ def prior_posterior(vehicle_file: VehicleParameters, earlier: Sequence[TaughtPar
     """Return the car of a drive before any driving: prior means, with the variations that affect sideslip most."""
     parameters = prior_of(vehicle_file, earlier).parameters
     vehicle = vehicle_with(vehicle_file, {p.name: p.mean for p in parameters})
+    if vehicle_file.friction is not None:
+        parameters = tuple(replace(p, std=STATED_PEAK_STD) if p.name == PEAK else p for p in parameters)
     return Posterior(vehicle, varied=prior_variations(vehicle, parameters), from_earlier=bool(earlier))
 
 

@@ -19,7 +19,7 @@ from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import physics_filter
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
-from pdhef_logtool.model import intervals
+from pdhef_logtool.model import intervals, priors
 from pdhef_logtool.model.priors import coefficients, prior_variations
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
@@ -213,3 +213,10 @@ def test_the_centre_of_gravity_is_assumed_without_a_file_or_weight_split():
     given = vehicle_of_entries({"name": "mine", "mass_kg": 1500.0, "wheelbase_m": 2.7}, where="test")
     car = Car(given.vehicle, assumed=given.assumed)
     assert car.cg_std_m == pytest.approx(FRONT_WEIGHT_SHARE_SPREAD * 2.7 * FRONT_WEIGHT_SHARE)
+
+
+@pytest.mark.parametrize(("friction", "std"), [(0.85, priors.STATED_PEAK_STD), (None, priors.FILE_TYRE_STD)])
+def test_before_a_fit_the_peak_force_is_known_as_well_as_the_friction_of_the_file(friction, std):
+    prior = priors.prior_posterior(OWN.model_copy(update={"friction": friction}))
+    least = min(v.assumed_friction for v in prior.varied)
+    assert least == pytest.approx(np.exp(-std) * prior.vehicle.assumed_friction)
