@@ -122,11 +122,8 @@ def outcomes(tool: Tool, index: int) -> tuple[list[dict[str, Any]], list[dict[st
     runs, scores = list[dict[str, Any]](), list[dict[str, Any]]()
     for (file, document), is_calibrated in product(files.items(), (False, True)):
         name, folder = f"{index}-{file}", tool.work / "cars"
-        given = (
-            write_toml(folder / f"{name}.toml", document)
-            if is_calibrated
-            else write_validated_car(folder / name, document)
-        )
+        writer, path = (write_toml, f"{name}.toml") if is_calibrated else (write_validated_car, name)
+        given = writer(folder / path, document)
         keep = ("--car", given, "--keep", "estimates", "--estimators", ",".join(ESTIMATORS))
         run = tool.run(f"{name}-{is_calibrated}", *logs.values(), *keep)
         found = reports(run)

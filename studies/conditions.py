@@ -86,10 +86,8 @@ def run(given: argparse.Namespace) -> None:
     tool, frames = Tool(ROOT, given.work.resolve()), []
     for row in given.rows:
         print(row, file=sys.stderr)
-        frames += [
-            pl.read_parquet(folder / "metrics.parquet").rename({"log": "drive"}).with_columns(row=pl.lit(row))
-            for folder in runs_of(tool, row, given)
-        ]
+        tables = (pl.read_parquet(folder / "metrics.parquet") for folder in runs_of(tool, row, given))
+        frames += [found.rename({"log": "drive"}).with_columns(row=pl.lit(row)) for found in tables]
     kept = pl.col("metric").is_in(KEPT_METRICS) & pl.col("segment").is_in(("all", "linear", "nonlinear"))
     network = "" if given.network is None else f" --network {given.network.name}"
     facts = {

@@ -102,10 +102,6 @@ def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> Ve
         whole = slice(0, int(np.argmax(force)) + 1)
         tyres[axle] = nominal.fit_axle(alpha[whole] / friction, force[whole] / friction, loads_n[axle])
     linear_m_s2 = min(nominal.LINEAR_A_Y_M_S2, 0.5 * friction * GRAVITY_M_S2)
-    return vehicle.model_copy(
-        update={
-            **{entry: getattr(car, entry) for entry in _MEASURED},
-            "roll_gradient_rad_per_m_s2": nominal.roll_gradient_rad_per_m_s2(motion, linear_m_s2),
-            "tyres": Tyres(front=tyres["front"], rear=tyres["rear"]),
-        }
-    )
+    roll = nominal.roll_gradient_rad_per_m_s2(motion, linear_m_s2)
+    fitted = {"roll_gradient_rad_per_m_s2": roll, "tyres": Tyres(front=tyres["front"], rear=tyres["rear"])}
+    return vehicle.model_copy(update={entry: getattr(car, entry) for entry in _MEASURED} | fitted)

@@ -21,13 +21,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
 #: Environment variables that pytest sets for each test, and Polars and Ray when they are imported.
-OF_LIBRARIES = {
-    "PYTEST_CURRENT_TEST",
-    "PYTHONBREAKPOINT",
-    "RAY_CLIENT_MODE",
-    "_RJEM_MALLOC_CONF",
-    "TORCHINDUCTOR_CACHE_DIR",
-}
+OF_LIBRARIES = {"PYTEST_CURRENT_TEST", "PYTHONBREAKPOINT"}
+OF_LIBRARIES |= {"RAY_CLIENT_MODE", "_RJEM_MALLOC_CONF", "TORCHINDUCTOR_CACHE_DIR"}
 
 hypothesis.settings.register_profile("any load", deadline=None)
 hypothesis.settings.load_profile("any load")

@@ -52,13 +52,7 @@ def linear_residual(weight: float = 0.3, fastest_m_s: float = 40.0) -> LadderMod
     """Return a residual rate, m/s², of the low-passed yaw rate over 0.3, valid up to a speed."""
     weights = [0.0] * ODD_COUNT
     weights[5] = weight
-    return LadderModel(
-        rung="linear",
-        scale=(0.3,) * ODD_COUNT,
-        even_mean=(20.0,) * EVEN_COUNT,
-        even_scale=(5.0,) * EVEN_COUNT,
-        weights=tuple(weights),
-        whitening=tuple(tuple(map(float, 1e-4 * row)) for row in np.eye(ODD_COUNT)),
-        speed_m_s=(5.0, fastest_m_s),
-        largest_m_s2=3.0,
-    )
+    scales = {"scale": (0.3,) * ODD_COUNT, "even_mean": (20.0,) * EVEN_COUNT, "even_scale": (5.0,) * EVEN_COUNT}
+    whitening = tuple(tuple(map(float, 1e-4 * row)) for row in np.eye(ODD_COUNT))
+    limits = {"speed_m_s": (5.0, fastest_m_s), "largest_m_s2": 3.0}
+    return LadderModel(rung="linear", weights=tuple(weights), whitening=whitening, **scales, **limits)

@@ -8,18 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from reference_car import (
-    FRICTION,
-    FRONT_M,
-    MASS_KG,
-    REAR_M,
-    WHEELBASE_M,
-    YAW_INERTIA,
-    Drive,
-    magic_tyre,
-    make_signals,
-    runge_kutta_step,
-)  # fmt: skip
+import reference_car
+from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M, YAW_INERTIA, Drive, make_signals
 from scipy.integrate import solve_ivp
 
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, default_vehicle
@@ -79,7 +69,7 @@ class Oracle:
         ay = s["phi"] / ROLL_GRADIENT if self.has.roll else self.lateral(x, steer)
         found = []
         for slip, front in zip(alpha, (True, False), strict=True):
-            force = magic_tyre(slip, mu, front) / MASS_KG
+            force = reference_car.magic_tyre(slip, mu, front) / MASS_KG
             if self.has.braking and ax < 0.0:
                 arm = -REAR_M if front else FRONT_M
                 force *= (1.0 + ax * CG_HEIGHT_M / (G * arm)) * math.sqrt(1.0 - (ax / (mu * G)) ** 2)
@@ -166,13 +156,9 @@ class Oracle:
                 return self.derivative(y, steer(at), a, FRICTION)
 
             for i in range(n):
-                x = runge_kutta_step(f, x, t0 + i * h, h)
-        signals = make_signals(
-            np.full(count - 1, 0.01),
-            steer_rad=np.array([steer(0.01 * k) for k in range(count)]),
-            ax_m_s2=ax,
-            ay_m_s2=sensed,
-            yaw_rate_rad_s=states[:, 2],
-            speed_m_s=np.where(np.arange(count) % 2 == 0, states[:, 0], np.nan),
-        )
+                x = reference_car.runge_kutta_step(f, x, t0 + i * h, h)
+        speed = np.where(np.arange(count) % 2 == 0, states[:, 0], np.nan)
+        columns = {"ax_m_s2": ax, "ay_m_s2": sensed, "yaw_rate_rad_s": states[:, 2], "speed_m_s": speed}
+        steers = np.array([steer(0.01 * k) for k in range(count)])
+        signals = make_signals(np.full(count - 1, 0.01), steer_rad=steers, **columns)
         return Drive(signals, states[:, 0], states[:, 1], states[:, 2], ay)

@@ -154,15 +154,9 @@ def rolling_drive(
     v, delta = speed(t), steer(t)
     r = v * np.tan(delta) / WHEELBASE_M
     vy = REAR_M * r
-    ay = np.gradient(vy, t) + v * r
-    signals = make_signals(
-        np.full(n - 1, 0.01),
-        steer_rad=delta,
-        ax_m_s2=np.gradient(v, t) - vy * r,
-        ay_m_s2=ay,
-        yaw_rate_rad_s=r,
-        speed_m_s=np.where(np.arange(n) % 2 == 0, v, np.nan),
-    )
+    ax, ay = np.gradient(v, t) - vy * r, np.gradient(vy, t) + v * r
+    columns = {"steer_rad": delta, "ax_m_s2": ax, "ay_m_s2": ay, "yaw_rate_rad_s": r}
+    signals = make_signals(np.full(n - 1, 0.01), speed_m_s=np.where(np.arange(n) % 2 == 0, v, np.nan), **columns)
     return Drive(signals, v, vy, r, ay)
 
 
@@ -184,14 +178,8 @@ def with_noise(signals: Signals, seed: int, scale: float = 1.0) -> Signals:
     def noisy(column: np.ndarray, std: float) -> np.ndarray:
         return column + scale * std * rng.standard_normal(n)
 
-    return replace(
-        signals,
-        steer_rad=noisy(signals.steer_rad, 0.0008),
-        ax_m_s2=noisy(signals.ax_m_s2, 0.12),
-        ay_m_s2=noisy(signals.ay_m_s2, 0.12),
-        yaw_rate_rad_s=noisy(signals.yaw_rate_rad_s, 0.004),
-        speed_m_s=noisy(signals.speed_m_s, 0.08),
-    )
+    stds = {"steer_rad": 0.0008, "ax_m_s2": 0.12, "ay_m_s2": 0.12, "yaw_rate_rad_s": 0.004, "speed_m_s": 0.08}
+    return replace(signals, **{name: noisy(getattr(signals, name), std) for name, std in stds.items()})
 
 
 def rough_drive(seed: int, count: int, noise_seed: int) -> Signals:

@@ -79,8 +79,7 @@ def report(
         "vehicle": car | (vehicle or {}),
         "estimators": [
             ran("zero", algorithm={"physics_sha256": None, "options": {}}),
-            ran("physics", intervals=["intervals: own, parameters and sensors"]),
-            ran("pd-hef", intervals=["intervals: own, parameters and sensors"]),
+            *(ran(name, intervals=["intervals: own, parameters and sensors"]) for name in ("physics", "pd-hef")),
         ],
         "truth": TRUTH,
         "model": None,

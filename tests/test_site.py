@@ -1,20 +1,20 @@
 """The documentation site: a strict build, and a search that works from disk."""
 
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.reports.browser import CHROMIUM, WHY_NOT
+
 pytest.importorskip("material", reason="builds the site: pip install '.[docs]'")
 ROOT = Path(__file__).resolve().parents[1]
-CHROMIUM = next((p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None)
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine (apt-get install chromium)")
+@pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
 def test_the_site_search_works_from_disk(tmp_path):
     assert CHROMIUM is not None
     build = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]

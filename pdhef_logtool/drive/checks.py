@@ -33,7 +33,7 @@ from pdhef_logtool.drive.delays import LatencyEstimate, LateSensor
 from pdhef_logtool.drive.measured import Measured
 from pdhef_logtool.drive.mounting import IS_GRAVITY_M_S2
 from pdhef_logtool.drive.relation_checks import relation_checks
-from pdhef_logtool.drive.relations import CG_VY, POSITION, gentle_at, law, position_factors
+from pdhef_logtool.drive.relations import CG_VY, EXPLAINED_SHARE, POSITION, gentle_at, law, position_factors
 from pdhef_logtool.drive.sensor_changes import SensorChange
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.running_mean import running_mean
@@ -68,8 +68,6 @@ UNEXPLAINED_STEERING = 0.5
 SPEED_SPREAD = 1.4
 #: Understeer gradients of this size and less are neutral. Cars have 2 to 6 mrad per m/s².
 NEUTRAL_MRAD_PER_M_S2 = 0.6
-#: A velocity over ground differs by more from one in the car's axes, and by less than this share from the path's.
-LEAST_OF_BODY_M_S, SAME_AXES = 0.1, 0.3
 _TRUTH = {"truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s"}
 #: A value and its standard error.
 Figure: TypeAlias = tuple[float, float]
@@ -288,7 +286,7 @@ def _sideslip_of_truth(drive: CheckedDrive) -> Iterator[Check]:
     if drive.measured.derived is None or not {"truth.vx_m_s", "truth.vy_m_s"} <= columns.keys():
         return
     over_ground, of_body = _velocity_differences(columns)
-    if of_body > LEAST_OF_BODY_M_S and over_ground < SAME_AXES * of_body:
+    if over_ground < EXPLAINED_SHARE * of_body:
         evidence = TEXTS["over_ground"].format(over_ground=over_ground, of_body=of_body)
         yield result("SIGNAL.axis", "failed", "truth.vy_m_s", cause="over_ground", evidence=evidence)
         return

@@ -261,10 +261,7 @@ def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
 
 @lru_cache
 def known_hypotheses(
-    names: tuple[str, ...],
-    together: tuple[tuple[str, ...], ...] = (),
-    open_signs: tuple[tuple[str, ...], ...] = (),
-    open_units: frozenset[str] = frozenset(),
+    names: tuple[str, ...], together: tuple[tuple[str, ...], ...] = (), open_signs: tuple[tuple[str, ...], ...] = ()
 ) -> tuple[Hypothesis, ...]:
     """List the possible mapping errors of these signals.
 
@@ -272,13 +269,12 @@ def known_hypotheses(
     ----------
     together : signals of one sensor, which have wrong units or signs together.
     open_signs : groups of signals with an undocumented sign; each group has one sign, and a recorder may invert all.
-    open_units : signals whose unit is an assumption.
     """
     groups = [[n for n in group if n in names] for group in together]
     parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
     # The mean of the wheels is not a signal.
     alone = [(n,) for n in names if n != "wheel_speeds"]
-    out = [_opened(h, open_units) for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
+    out = [h for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
     every = tuple(n for group in open_signs for n in group)
     out = [h for h in out if h.kind != "sign" or not h.factors.keys() <= set(every)]
     for part in dict.fromkeys([*open_signs, *_sides(open_signs), *([every] if every else [])]):
@@ -287,8 +283,8 @@ def known_hypotheses(
     return (*out, *(Hypothesis(dict.fromkeys(part, math.nan), _together(part), "field") for part in (*alone, *wheels)))
 
 
-def _opened(mistake: Hypothesis, open_units: frozenset[str]) -> Hypothesis:
-    """Return a mistake of usual prior odds if it is another unit of signals whose unit is an assumption."""
+def opened(mistake: Hypothesis, open_units: frozenset[str]) -> Hypothesis:
+    """Return a mistake, as a likely one if it is another unit of signals whose unit is an assumption."""
     is_open = mistake.kind == "unit" and " is in " in mistake.words and mistake.factors.keys() <= open_units
     return replace(mistake, kind="open unit") if is_open else mistake
 

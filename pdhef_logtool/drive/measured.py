@@ -12,7 +12,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.columns import columns_on_grid, derivative, median_known, moving_at
 from pdhef_logtool.drive.delays import LatencyEstimate, LateSensor, late_sensors, truth_latency
-from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
+from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, opened, posterior
 from pdhef_logtool.drive.relations import (
     CG_VY,
     COURSE_RATE,
@@ -105,8 +105,8 @@ class Measured:
     @cached_property
     def posterior(self) -> Posterior:
         """Probabilities of the mistakes that mappings make with these signals."""
-        mistakes = known_hypotheses((*self.columns,), tuple(self.groups), self.open_signs, self.open_units)
-        return posterior(self.relations, mistakes, self.scales)
+        mistakes = known_hypotheses((*self.columns,), tuple(self.groups), self.open_signs)
+        return posterior(self.relations, [opened(m, self.open_units) for m in mistakes], self.scales)
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
@@ -139,7 +139,8 @@ def measure(
     derived : ground truth at the CG. vehicle : not used if it is the default car. mapping : of the channels, if known.
     """
     truth, vehicle = truth or {}, None if vehicle == default_vehicle() else vehicle
-    columns, speed_name = drive_columns(signals, truth, derived, vehicle)
+    columns = drive_columns(signals, truth, derived)
+    speed_name = _speed_of(columns, vehicle)
     sources = {} if mapping is None else mapping.by_subject
     related = measured_relations(columns, speed_name, vehicle)
     # Two quantities of ground truth from the same field agree trivially.
@@ -153,15 +154,9 @@ def measure(
 
 
 def drive_columns(
-    signals: Mapping[str, Channel],
-    truth: Mapping[str, Channel],
-    derived: TruthTrack | None,
-    vehicle: VehicleParameters | None = None,
-) -> tuple[dict[str, FloatArray], str | None]:
-    """Return signals and ground truth on one grid, and the name of the column used as the speed.
-
-    ``vehicle``: of a file, with the radius of its wheels.
-    """
+    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None
+) -> dict[str, FloatArray]:
+    """Return signals and ground truth on one grid."""
     channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
     if derived is not None:
         for name in _TRUTH:
@@ -187,7 +182,7 @@ def drive_columns(
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
         columns |= {POSITION[0]: vx, POSITION[1]: vy, "truth.position_speed_m_s": np.hypot(vx, vy)}
         columns[COURSE_RATE] = direction_rate(vx, vy)
-    return columns, _speed_of(columns, vehicle)
+    return columns
 
 
 def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:

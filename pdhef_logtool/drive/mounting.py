@@ -21,7 +21,7 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.check_table import result
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, moving_at
 from pdhef_logtool.drive.measured import Measured
-from pdhef_logtool.drive.relations import compare, gentle_at, law, steering_references, yaw_references
+from pdhef_logtool.drive.relations import DRIVEN, compare, gentle_at, law, steering_references, yaw_references
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.checking import has_path
@@ -43,8 +43,6 @@ MAX_ERROR_DEG = 7.5
 TURNED_DEG = 4.0
 ASKEW_SAMPLES, SURE_STD = 40.0, 3.0
 ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
-#: Grade and crossfall alone move an accelerometer by less: in gentler driving, blocks of the drive must agree.
-LEAST_DRIVEN_M_S2 = 1.0
 #: Least correlation of the yaw rate with another measurement that decides its sign, and its independent samples (5 s).
 SIGN_CORRELATION, MIN_SAMPLES = 0.5, 10.0
 #: Words for the axes of a rate, x first.
@@ -223,7 +221,8 @@ def find_mounting(measured: Measured, triads: tuple[Triad, Triad] | None, mappin
         return None
     best = max(turns, key=lambda x: x.correlation + np.sign(x.sign))
     mounting = Mounting(triads, _snapped(best), named, best.evidence, _is_shown(best, measured))
-    is_driven = best.driven_m_s2 > LEAST_DRIVEN_M_S2 and best.correlation >= ASKEW_CORRELATION
+    # Grade and crossfall alone move an accelerometer by less: in gentler driving, blocks of the drive must agree.
+    is_driven = best.driven_m_s2 > DRIVEN["ay_m_s2"] and best.correlation >= ASKEW_CORRELATION
     is_sure = is_driven or best.errors_deg[0] <= MAX_ERROR_DEG or mounting.is_as_named
     return replace(mounting, confident=mounting.confident and is_sure)
 

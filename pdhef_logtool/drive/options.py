@@ -106,7 +106,7 @@ def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:
     if when.tzinfo is None:
         when = when.replace(tzinfo=dt.UTC)
     delta = when - dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
-    return (delta.days * 86_400 + delta.seconds) * 10**9 + delta.microseconds * 1000
+    return (delta.days * 86_400 + delta.seconds) * NS_PER_S + delta.microseconds * 1000
 
 
 def time_slice(options: ReadOptions, start_ns: int, end_ns: int) -> tuple[int, int]:

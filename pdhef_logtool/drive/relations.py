@@ -41,10 +41,8 @@ TWICE = (
 POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: A signal that moves by more, 1-sigma, shows that the car is driven.
 DRIVEN = {"yaw_rate_rad_s": 0.06, "ay_m_s2": 1.0, "ax_m_s2": 1.0}
-#: Two points of a car are closer, m; yaw explains a difference of their velocities with a residual below this share.
-LEVER_M, LEVER_RESIDUAL = 3.0, 0.3
-#: 1-sigma of a heading against the direction of a velocity.
-HEADING_RAD = math.radians(1.0)
+#: Largest residual of a difference that has a cause.
+EXPLAINED_SHARE: float = TABLE["explained_share"]
 #: Share of the offset between two sides that changes in a drive.
 DISTURBED = 0.6
 _STEERING = ("steer_rad", "steering_wheel_rad")
@@ -392,14 +390,16 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     signs = [np.sign(r.gain) for yaw in yaws for r in compare(anything, turning, yaw, moving) if r.tells]
     is_vy = subject == "truth.vy_m_s"
     its = law("pose", subject=subject, scaled="truth.position_speed_m_s" if is_vy else "")
-    bias = HEADING_RAD * (median_known(speed) if is_vy else 1.0)
-    its = replace(its, signless=len(signs) < 2 or len(set(signs)) > 1, bias=bias)
+    its = replace(its, signless=len(signs) < 2 or len(set(signs)) > 1)
+    its = replace(its, bias=its.bias * median_known(speed)) if is_vy else its
     sides = (min(signs, default=1.0) * (left if is_vy else left / speed), columns[subject])
     # Velocity and position may refer to different points of the car; yaw adds a velocity between them.
     apart = _partial(its, *sides, [turning, np.ones_like(turning)], moving)
     difference = (sides[1] - sides[0]) * (1.0 if is_vy else speed)
     lever = fit(difference, [turning], moving)
-    by_lever = lever is not None and abs(lever[0][0]) < LEVER_M and lever[2] < LEVER_RESIDUAL * np.nanstd(difference)
+    by_lever = (
+        lever is not None and abs(lever[0][0]) < LENGTHS["lever"] and lever[2] < EXPLAINED_SHARE * np.nanstd(difference)
+    )
     return _best([*(r for r in compare(its, *sides, moving) if r.accepts() or not by_lever), *apart])
 
 

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import LEAST_DIVISOR, NS_PER_S, BoolArray, FloatArray, IntArray, Signals
 
 #: Cells of the grid; means of the relations; a window after a change, of three, behind the low pass, and the window
 #: before it.
@@ -330,8 +330,8 @@ def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, Flo
         match[part] += (weighted @ step[..., None])[..., 0]
         power[part] += (weighted * effects).sum(axis=2)
         total[part] += np.einsum("np,npq,nq->n", step, information, step)
-    parts = match / np.sqrt(np.maximum(power, 1e-12))
-    match, power = match.sum(axis=0), np.maximum(power.sum(axis=0), 1e-12)
+    parts = match / np.sqrt(np.maximum(power, LEAST_DIVISOR))
+    match, power = match.sum(axis=0), np.maximum(power.sum(axis=0), LEAST_DIVISOR)
     explained, sensor = match**2 / power, np.array([name for name, _ in HYPOTHESES])
     best = np.argmax(explained, axis=1)
     second = np.where(sensor == sensor[best][:, None], 0.0, explained).max(axis=1)

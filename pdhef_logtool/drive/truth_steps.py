@@ -13,7 +13,7 @@ import numpy as np
 
 from pdhef_logtool.drive.check_table import TABLE
 from pdhef_logtool.drive.sensor_changes import SensorChange, cells_of, part_means, sample_steps
-from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, Signals
+from pdhef_logtool.records.signals import LEAST_DIVISOR, NS_PER_S, S_PER_NS, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Duration of a mean, least means on each side of a step, and share of a block that must have samples.
@@ -107,6 +107,6 @@ def _likeliest(y: FloatArray, basis: FloatArray, u: FloatArray, least_std: float
     size = float(behind[k, 0] / power[k])
     left = rest - size * (u * (np.arange(len(y)) >= k) - basis @ behind[k, 2:])
     square = float(left @ left)
-    correlation = float(np.clip(left[1:] @ left[:-1] / max(square, 1e-12), 0.0, 0.95))
+    correlation = float(np.clip(left[1:] @ left[:-1] / max(square, LEAST_DIVISOR), 0.0, 0.95))
     variance = (square / len(y) + least_std**2) * (1.0 + correlation) / (1.0 - correlation)
     return float(explained[k] / variance), k, size, float(np.sqrt(variance / power[k]))

@@ -22,8 +22,6 @@ from pdhef_logtool.records.errors import LogError
 #: Small reads come from a block read ahead, which grows while reads follow each other and shrinks where they jump.
 _LEAST_AHEAD_BYTES = _LARGE_READ_BYTES = 64 * KIB
 _MOST_AHEAD_BYTES = 2 * MIB
-#: Smaller logs are read as a whole, where a part of a larger one is enough.
-WHOLE_BYTES = 32 * MIB
 _KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket"}
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 CONSTANTS: Mapping[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+#: Smaller logs are read as a whole, where a part of a larger one is enough.
+WHOLE_BYTES: int = CONSTANTS["whole_bytes"]
 #: Letters in ASCII.
 LATIN = str.maketrans(CONSTANTS["latin"])
 _PAIRS = (pair.split("=") for pairs in CONSTANTS["alphabets"].values() for pair in pairs.split())

@@ -19,19 +19,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs import table_columns
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import Clock, rate_clock
-from pdhef_logtool.logs.table_columns import (
-    Sheet,
-    clock_notes,
-    field_name,
-    find_clock,
-    is_regular,
-    split_unit,
-    tables_of,
-    unique,
-)
+from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, split_unit, tables_of, unique
 from pdhef_logtool.logs.table_file import NUMBER_BYTES, TableFile, Tables, left_out
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
@@ -369,18 +361,12 @@ def _pairs(arrays: Mapping[str, NDArray[Any]]) -> set[str]:
 
     If the values rise, too, the times are regular or within those of another matrix; otherwise they may be positions.
     """
-    spans: dict[str, tuple[float, float]] = {}
-    rising: set[str] = set()
-    for name, array in arrays.items():
-        if array.ndim == 2 and array.shape[1] == 2 and len(array) >= _MAT["fewest"] and array.dtype.kind in "iuf":
-            # As floats, because differences of unsigned numbers wrap.
-            steps, changes = np.diff(array.astype(np.float64), axis=0).T
-            if (steps > 0.0).all():
-                spans[name] = float(array[0, 0]), float(array[-1, 0])
-                rising |= {name} if (changes > 0.0).all() and not is_regular(steps) else set()
-    first = min((spans[n][0] for n in spans.keys() - rising), default=math.inf)
-    last = max((spans[n][1] for n in spans.keys() - rising), default=-math.inf)
-    return {n for n, (start, end) in spans.items() if n not in rising or first <= start < end <= last}
+    two = (n for n, a in arrays.items() if a.ndim == 2 and a.shape[1] == 2 and a.dtype.kind in "iuf")
+    # As floats, because differences of unsigned numbers wrap.
+    steps = {n: np.diff(arrays[n].astype(np.float64), axis=0).T for n in two if len(arrays[n]) >= _MAT["fewest"]}
+    pairs = {name: arrays[name][:, 0] for name, (of_times, _) in steps.items() if (of_times > 0.0).all()}
+    certain = [t for n, t in pairs.items() if (steps[n][1] <= 0.0).any() or table_columns.is_regular(steps[n][0])]
+    return {n for n, t in pairs.items() if any(c[0] <= t[0] and t[-1] <= c[-1] for c in certain)}
 
 
 def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:

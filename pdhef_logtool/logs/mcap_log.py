@@ -25,8 +25,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.byte_source import WHOLE_BYTES, ByteSource
+from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
+from pdhef_logtool.logs.constants import WHOLE_BYTES
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
     MCAP_MAGIC,
@@ -329,7 +330,7 @@ class McapContainer(FileContainer):
     def _check_data(self) -> None:
         """Check the CRC of the data section if no other checksum or count protects the messages.
 
-        Of a large remote file, this would fetch parts that nothing else needs: a note says that it is not verified.
+        Of a large remote file, this would fetch parts that nothing else needs: it is not verified, with a note.
 
         After other damage, the check is skipped: it adds no information.
         """

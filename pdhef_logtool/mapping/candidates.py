@@ -305,7 +305,13 @@ def field_of(
     if meaning.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
         meaning = replace(meaning, quantity="wheel rate")
         factors = _factors(meaning, seen)
+    stated = meaning.unit
+    if not factors and documented is None:
+        meaning = replace(meaning, unit="", scale=None)
+        factors = _factors(meaning, seen)
     item = Field(topic, info.path, meaning, role, stamp_of(fields, info.path), seen, factors)
+    if stated != meaning.unit:
+        item.doubts.append(f"its values are out of a car's range in {stated}, the unit in its name")
     if documented is not None:
         entry = documented.fields[info.path]
         item.section = "truth" if entry in documented.truth else "signals"
@@ -356,8 +362,8 @@ def anchors_of(
 
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
     """Return the units that are possible by a field's range; a unit in its name excludes all others."""
-    largest = seen.largest
     named = () if meaning.scale is None else ((meaning.unit, meaning.scale),)
+    largest = float(np.nanquantile(np.abs(seen.values), _NAMES["valid"])) if named and seen.changes else seen.largest
     most = MOST.get(meaning.quantity, math.inf)
     # Beyond a car's range, the unit in the name is wrong.
     units = (u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES
+from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES, factor_of
 from pdhef_logtool.mapping.recognition import COVARIANCES, SOURCES
 from pdhef_logtool.mapping.records import CanSettings, SignalSource, near
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
@@ -102,6 +102,8 @@ def sources_of(
 ) -> tuple[dict[str, SignalSource], CovarianceSource | None]:
     """Convert ``[SIGNAL=]TOPIC[.FIELD]`` texts to sources by name, and find the covariance of a topic without a field.
 
+    The unit is that of the file or of the field's name, otherwise SI.
+
     Raises
     ------
     UsageError : The signal is unknown or cannot be determined from the topic's type, or a signal is named twice.
@@ -124,7 +126,9 @@ def sources_of(
                 got = f"{name} from {sources[name].label} and from {topic.name}.{field_path}"
                 remedy = "for several estimators use a mapping file with [estimates.NAME.SIGNAL] tables"
                 raise UsageError(expected="each signal once", got=got, where=option, remedy=remedy)
-            sources[name] = SignalSource(name=name, topic=topic.name, field=field_path)
+            unit = next((f.unit for f in log.fields(topic.name) if f.path == field_path), "")
+            factor = factor_of(name, field_path.rpartition(".")[2], unit) or 1.0
+            sources[name] = SignalSource(name, topic.name, field_path, scale=factor)
     return sources, covariances[0] if len(covariances) == 1 else None
 
 

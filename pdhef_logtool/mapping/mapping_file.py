@@ -161,17 +161,26 @@ def _complete(name: str, table: object, where: str, problems: list[str]) -> obje
     if (unit := named.pop("unit", None)) is None:
         return named
     scale = table.get("scale", 1.0)
-    si = _UNITS.get(name, "")
-    kind = "wheel rate" if si == "rad/s" and name.startswith("wheel") else _KINDS.get(si, "")
-    units = UNITS.get(kind, {})
-    factor = unit_of(f"x_{plain_unit(unit)}", kind)[1] if units and isinstance(unit, str) else None
+    factor = factor_of(name, "x", unit) if isinstance(unit, str) else None
     if factor is None:
+        si, units = _UNITS.get(name, ""), UNITS.get(_kind_of(name), {})
         problems.append(f'{where}: unit = "{unit}" is unknown for {si}, known are {", ".join(units) or si}')
         return named
     if scale not in (1.0, -1.0):
         problems.append(f"{where}: give unit or scale, not both; scale = -1 reverses the sign")
         return named
     return named | {"scale": factor * scale}
+
+
+def factor_of(name: str, leaf: str, unit: str) -> float | None:
+    """Return the factor to the SI unit of a quantity that a field's stated unit, or its name, gives; None without."""
+    kind = _kind_of(name)
+    return unit_of(f"{leaf}_{plain_unit(unit)}" if unit else leaf, kind)[1] if kind in UNITS else None
+
+
+def _kind_of(name: str) -> str:
+    si = _UNITS.get(name, "")
+    return "wheel rate" if si == "rad/s" and name.startswith("wheel") else _KINDS.get(si, "")
 
 
 def _shape_problem(source: SignalSource) -> str:

@@ -64,16 +64,9 @@ def tune(logs: Iterable[LogInput], config: RunConfig, trials: int) -> dict[str, 
             [error_rad(run_estimator(estimator, s), truth, slow) for s, truth in given if truth is not None]
         )
 
-    best = differential_evolution(
-        objective,
-        [(0.0, 1.0)] * len(LOW),
-        popsize=GENERATION // len(LOW),
-        maxiter=max(1, trials // GENERATION) - 1,
-        init="sobol",
-        tol=0.0,
-        polish=False,
-        seed=SEED,
-    )
+    effort = {"popsize": GENERATION // len(LOW), "maxiter": max(1, trials // GENERATION) - 1}
+    way = {"init": "sobol", "tol": 0.0, "polish": False, "seed": SEED}
+    best = differential_evolution(objective, [(0.0, 1.0)] * len(LOW), **effort, **way)
     print(f"{TUNED}: {best.nfev} trials, {best.fun:.4f}°", flush=True)
     return {TUNED: filter_noise(point(best.x))}
 

@@ -73,12 +73,8 @@ def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) ->
     weights = np.linalg.lstsq(np.column_stack([scaled, np.ones(len(scaled))]), target, rcond=None)[0]
     coefficients = np.zeros(len(names))
     coefficients[varies] = weights[:-1] / std[varies]
-    return LinearModel(
-        feature_names=names,
-        coefficients=tuple(float(c) for c in coefficients),
-        intercept_rad=float(weights[-1] - coefficients @ mean),
-        low_pass_hz=LOW_PASS_HZ,
-    )
+    intercept_rad = float(weights[-1] - coefficients @ mean)
+    return LinearModel(names, tuple(float(c) for c in coefficients), intercept_rad, LOW_PASS_HZ)
 
 
 def _training_sequences(data: Dataset) -> Iterable[SideslipSequence]:

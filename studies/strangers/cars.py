@@ -120,15 +120,11 @@ def drive(name: str, imu_x_m: float = 0.0) -> Car:
     of_body = {
         "velocity": np.stack([east, north], axis=1),
         "velocity_enu": np.stack([east, north, np.zeros_like(east)], axis=1),
-        "course_enu": np.arctan2(north, east),
-        "east": east,
-        "north": north,
-        "ground_speed": np.hypot(east, north),
-        "signed_course": course,
-        "course": course % 360.0,
+        "course_enu": np.arctan2(north, east), "signed_course": course, "course": course % 360.0,
+        "east": east, "north": north, "ground_speed": np.hypot(east, north),
         "sideslip": np.where(v_x > 1.0, np.arctan2(v_y, v_x), 0.0),
         "heading": (90.0 - yaw / np.radians(1.0)) % 360.0,
-    }
+    }  # fmt: skip
     read |= {name: Series(body.stamps_ns, body.arrival_ns, values) for name, values in of_body.items()}
     read |= {name: attitude[i] for i, name in enumerate(("roll", "pitch", "yaw"))}
     read |= {name: read["fix"][i] for i, name in enumerate(("lat", "lon", "alt"))}

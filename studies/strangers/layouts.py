@@ -35,10 +35,8 @@ _NAMES = {
     "quaternion": quaternion, "rng": np.random.default_rng, "shift": np.roll,
     **{name: getattr(np, name) for name in _NUMPY},
 }  # fmt: skip
-_TOPICS = {
-    name: getattr(recordings, name)
-    for name in ("Topic", "fix", "imu", "odometry", "road_car", "scalar", "steering", "velocity")
-}
+_MAKERS = ("Topic", "fix", "imu", "odometry", "road_car", "scalar", "steering", "velocity")
+_TOPICS = {name: getattr(recordings, name) for name in _MAKERS}
 
 
 class Columns(dict[str, Any]):
@@ -47,9 +45,8 @@ class Columns(dict[str, Any]):
     def __init__(self, car: Car, clock: Series) -> None:
         stamps_ns = clock.stamps_ns
         # Microseconds since the device was switched on, 100 s before the drive.
-        super().__init__(
-            stamps_ns=stamps_ns, count=np.arange(len(stamps_ns)), micros=(stamps_ns - stamps_ns[0]) / 1000.0 + 1e8
-        )
+        micros = (stamps_ns - stamps_ns[0]) / 1000.0 + 1e8
+        super().__init__(stamps_ns=stamps_ns, count=np.arange(len(stamps_ns)), micros=micros)
         self.car, self.clock = car, clock
 
     def __missing__(self, name: str) -> FloatArray:
@@ -70,35 +67,22 @@ def layouts(*groups: str) -> Iterator[Recording]:
         about = dict(entries)
         also = (value.partition(" = ")[::2] for key, value in entries if key == "also")
         cause = re.sub("|".join(CAUSES), lambda match: CAUSES[match[0]], about.get("cause", ""))
-        yield Recording(
-            name=name,
-            group=group,
-            what=what,
-            container=container,
-            topics=tuple(_topics(car, lines, names)),
-            right=_answers(car, about["right"]) | {n: eval(value, dict(names)) for n, value in also},
-            allowed=_answers(car, about.get("allowed", "")),
-            page=page.strip("-"),
-            cause=cause,
-            at_fault=frozenset(about.get("fault", "").split()),
-        )
+        right = _answers(car, about["right"]) | {n: eval(value, dict(names)) for n, value in also}
+        allowed, at_fault = _answers(car, about.get("allowed", "")), frozenset(about.get("fault", "").split())
+        topics = tuple(_topics(car, lines, names))
+        yield Recording(name, group, what, right, allowed, cause, at_fault, page.strip("-"), container, topics)
 
 
 def mountings() -> Iterator[Recording]:
     """Yield 24 logs with an IMU rotated in steps of 90 degrees; the first has the axes of the car."""
     car, turns = drive("short"), np.rint(Rotation.create_group("O").as_matrix())
     for i, turn in enumerate(sorted(turns, key=np.trace, reverse=True)):
-        yield Recording(
-            name=f"mounting-{i:02}",
-            kind="mounting-90",
-            group="fault",
-            what="IMU turned in steps of 90 degrees, all 24 ways",
-            container="mcap",
-            topics=recordings.road_car(car, imu=recordings.imu(car.force.times(turn), car.rate.times(turn))),
-            right=answers(car, "imu", "steer", "speed", "truth", "truth rate"),
-            cause=CAUSES["MOUNTING"] if i else "",
-            at_fault=frozenset({"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"} if i else ()),
-        )
+        topics = recordings.road_car(car, imu=recordings.imu(car.force.times(turn), car.rate.times(turn)))
+        right = answers(car, "imu", "steer", "speed", "truth", "truth rate")
+        at_fault = frozenset({"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"} if i else ())
+        told = (f"mounting-{i:02}", "fault", "IMU turned in steps of 90 degrees, all 24 ways")
+        cause = CAUSES["MOUNTING"] if i else ""
+        yield Recording(*told, right, {}, cause, at_fault, topics=topics, kind="mounting-90")
 
 
 def layout(name: str) -> Recording:

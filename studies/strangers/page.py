@@ -70,14 +70,10 @@ def merged(results: Sequence[Result]) -> Result:
     names = list(dict.fromkeys(i for r in results for i in r.items))
     items = {n: min((r.items[n] for r in results if n in r.items), key=OUTCOMES.index) for n in names}
     named = [r.named for r in results if r.named is not None]
-    return Result(
-        log=replace(first.log, name=f"{len(results)} logs: {first.log.name.rpartition('-')[0]}"),
-        items=items,
-        silent=tuple(f"{r.log.name}: {what}" for r in results for what in r.silent),
-        verdicts=first.verdicts,
-        alarms=tuple(a for r in results for a in r.alarms),
-        named=all(named) if named else None,
-    )
+    log = replace(first.log, name=f"{len(results)} logs: {first.log.name.rpartition('-')[0]}")
+    silent = tuple(f"{r.log.name}: {what}" for r in results for what in r.silent)
+    alarms, is_named = tuple(a for r in results for a in r.alarms), all(named) if named else None
+    return Result(log, items=items, silent=silent, verdicts=first.verdicts, alarms=alarms, named=is_named)
 
 
 def page(results: Sequence[Result], remark: str) -> str:

@@ -16,6 +16,8 @@ from studies.strangers.cars import Car, Series
 from studies.strangers.containers import Topic
 from truthsim.recording import quaternion
 
+#: Values of fields that are the same in each message.
+Constants = Mapping[str, str | float | Sequence[float]]
 DEG = np.pi / 180.0
 KMH = 1.0 / 3.6
 #: Turns forward, left, up into forward, right, down and back.
@@ -69,7 +71,7 @@ def message(
     fields: Mapping[str, NDArray[Any]],
     *,
     stamp: str | None = "header.stamp",
-    constants: Mapping[str, str | float | Sequence[float]] | None = None,
+    constants: Constants | None = None,
 ) -> Topic:
     """Return a topic at a series' times, with the time in the field ``stamp``."""
     columns: dict[str, NDArray[Any]] = {} if stamp is None else {stamp: clock.stamps_ns}
@@ -86,13 +88,9 @@ def xyz(series: Series, prefix: str, names: str = "xyz") -> dict[str, FloatArray
 
 def imu(force: Series, rate: Series, name: str = "/imu/data", frame: str = "imu_link") -> Topic:
     """Return ``sensor_msgs/Imu`` without an orientation."""
-    return message(
-        name,
-        "sensor_msgs/msg/Imu",
-        force,
-        {**xyz(force, "linear_acceleration"), **xyz(rate.along(force), "angular_velocity")},
-        constants={"header.frame_id": frame, "orientation_covariance": [-1.0] + [0.0] * 8, "orientation.w": 1.0},
-    )
+    columns = xyz(force, "linear_acceleration") | xyz(rate.along(force), "angular_velocity")
+    constants: Constants = {"header.frame_id": frame, "orientation_covariance": [-1.0] + [0.0] * 8}
+    return message(name, "sensor_msgs/msg/Imu", force, columns, constants={**constants, "orientation.w": 1.0})
 
 
 def steering(steer: Series, name: str = "/vehicle/status/steering_status") -> Topic:
@@ -111,35 +109,20 @@ def odometry(
 ) -> Topic:
     """Return GNSS/INS as ``nav_msgs/Odometry``; ``body`` and ``rate`` take the place of its velocity and yaw rate."""
     clock = (body or car.body_velocity).every(up_to)
-    position = car.position.every(up_to).values
     roll, pitch, yaw = car.attitude.every(up_to).values.T
-    return message(
-        name,
-        "nav_msgs/msg/Odometry",
-        clock,
-        {
-            "pose.pose.position.x": position[:, 0],
-            "pose.pose.position.y": position[:, 1],
-            "pose.pose.position.z": position[:, 2],
-            "pose.pose.orientation": quaternion(roll, pitch, yaw),
-            "twist.twist.linear.x": clock.values[:, 0],
-            "twist.twist.linear.y": clock.values[:, 1],
-            "twist.twist.angular.z": (rate or car.yaw_rate).every(up_to).values,
-        },
-        constants={"header.frame_id": "map", "child_frame_id": "base_link"},
-    )
+    pose = xyz(car.position.every(up_to), "pose.pose.position")
+    pose["pose.pose.orientation"] = quaternion(roll, pitch, yaw)
+    twist = xyz(clock, "twist.twist.linear", "xy")
+    twist["twist.twist.angular.z"] = (rate or car.yaw_rate).every(up_to).values
+    frames = {"header.frame_id": "map", "child_frame_id": "base_link"}
+    return message(name, "nav_msgs/msg/Odometry", clock, pose | twist, constants=frames)
 
 
 def fix(car: Car, name: str = "/gps/fix") -> Topic:
     """Return the receiver's ``sensor_msgs/NavSatFix``."""
-    lat, lon, alt = car.fix.values.T
-    return message(
-        name,
-        "sensor_msgs/msg/NavSatFix",
-        car.fix,
-        {"latitude": lat, "longitude": lon, "altitude": alt},
-        constants={"header.frame_id": "gps", "status.service": 1.0, "position_covariance_type": 2.0},
-    )
+    columns = dict(zip(("latitude", "longitude", "altitude"), car.fix.values.T, strict=True))
+    constants: Constants = {"header.frame_id": "gps", "status.service": 1.0, "position_covariance_type": 2.0}
+    return message(name, "sensor_msgs/msg/NavSatFix", car.fix, columns, constants=constants)
 
 
 def scalar(name: str, series: Series, type_name: str = "std_msgs/msg/Float32") -> Topic:
@@ -149,10 +132,6 @@ def scalar(name: str, series: Series, type_name: str = "std_msgs/msg/Float32") -
 
 def road_car(car: Car, **replaced: Topic | None) -> tuple[Topic, ...]:
     """Return IMU, steering, speed and GNSS/INS ground truth; keywords replace a topic, None drops it."""
-    usual: dict[str, Topic | None] = {
-        "imu": imu(car.force, car.rate),
-        "steering": steering(car.steer),
-        "speed": velocity(car.speed),
-        "truth": odometry(car),
-    }
+    usual: dict[str, Topic | None] = {"imu": imu(car.force, car.rate), "steering": steering(car.steer)}
+    usual |= {"speed": velocity(car.speed), "truth": odometry(car)}
     return tuple(topic for topic in (usual | replaced).values() if topic is not None)

@@ -17,6 +17,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from scipy.io import savemat
 
 from pdhef_logtool.records.signals import IntArray
 from studies.pages import read_toml
@@ -93,10 +94,8 @@ def _table_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> It
         at = _times(stamp, start, i)
         cells = zip(row, parts, strict=True)
         values = (form["empty"] if np.isnan(v) else form["number"].format(value=v, **p) for v, p in cells)
-        quoted = (
-            f"{form['quote']}{cell}{form['quote']}" for cell in (*(c.format(**at) for c in form["clock"]), *values)
-        )
-        yield form["separator"].join(quoted)
+        whole = (*(cell.format(**at) for cell in form["clock"]), *values)
+        yield form["separator"].join(f"{form['quote']}{cell}{form['quote']}" for cell in whole)
 
 
 def _value_rows(form: dict[str, Any], topics: Sequence[Topic], start: int) -> Iterator[str]:
@@ -197,12 +196,6 @@ def _filled(template: Any, signals: Sequence[Mapping[str, Any]]) -> Any:
     if first.startswith("()"):
         return np.array([tuple(entry.values()) for entry in entries], [(name, object) for name in entries[0]])
     return np.array(entries, object) if first.startswith("[]") else made
-
-
-def _write_mat(path: Path, document: dict[str, Any]) -> None:
-    from scipy.io import savemat
-
-    savemat(path, document)
 
 
 def _write_json(path: Path, document: dict[str, Any]) -> None:
@@ -308,7 +301,7 @@ def _mdf(path: Path, topics: Sequence[Topic]) -> None:
 
 
 #: Suffix and writer of a document by the begin of a template's name.
-_KINDS = {"mat": (".mat", _write_mat), "json": (".json", _write_json), "hdf5": (".h5", _write_hdf5)}
+_KINDS = {"mat": (".mat", savemat), "json": (".json", _write_json), "hdf5": (".h5", _write_hdf5)}
 
 
 def _document(name: str, path: Path, topics: Sequence[Topic]) -> None:

@@ -18,6 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -157,17 +158,15 @@ def main() -> int:
     parts: list[str] = given.parts
     work: Path = given.work
     work.mkdir(parents=True, exist_ok=True)
+    lengths = product((1.0, given.hours), (("inspect",), _THREE))
+    hours = {f"`{words[0]}`, {h:g} h": partial(long_log, h, words) for h, words in lengths}
     todo: dict[str, Callable[[], Any]] = {
         "bombs": lambda: one_by_one("bombs", work, {b.name: partial(judge_bomb, b) for b in BOMBS}),
         "shared": lambda: one_by_one("shared", work, {bomb.name: partial(judge_bomb, bomb) for bomb in former_cases()}),
         "mutations": lambda: {"logs": judged(given, "logs")},
         "formats": lambda: {name: judged(given, name) for name in given.format or FORMATS},
         "crashes": lambda: one_by_one("crashes", work, crash_cases(work, given.drives, given.kills, given.seed)),
-        "hours": lambda: one_by_one(
-            "hours",
-            work,
-            {f"`{w[0]}`, {h:g} h": partial(long_log, h, w) for h in (1.0, given.hours) for w in (("inspect",), _THREE)},
-        ),
+        "hours": lambda: one_by_one("hours", work, hours),
     }
     if unknown := set(parts) - set(todo):
         parser.error(f"expected parts out of {', '.join(todo)}, got {', '.join(sorted(unknown))}")

@@ -240,13 +240,17 @@ def _chunks() -> tuple[Bomb, ...]:
 def _declarations() -> tuple[Bomb, ...]:
     """Return channels, types and messages with large, endless or unusual declarations."""
 
-    def ros(name: str, codes: tuple[int, ...], type_name: bytes, text: bytes, data: bytes = bytes(64)) -> Bomb:
-        return _made(name, codes, lambda: _typed(type_name, b"ros2msg", text, b"cdr", data))
+    def ros(
+        name: str, codes: tuple[int, ...], type_name: bytes, text: bytes, data: bytes = bytes(64),
+        kinds: tuple[bytes, bytes] = (b"ros2msg", b"cdr"), topic: bytes = b"/t",
+    ) -> Bomb:  # fmt: skip
+        return _made(name, codes, lambda: _typed(type_name, kinds[0], text, kinds[1], data, topic))
 
     def json_(name: str, codes: tuple[int, ...], schema: bytes, data: bytes = b"{}") -> Bomb:
-        return _made(name, codes, lambda: _typed(b"S", b"jsonschema" if schema else b"", schema, b"json", data))
+        return ros(name, codes, b"S", schema, data, (b"jsonschema" if schema else b"", b"json"))
 
     idl = b"module m {" * 500 + b"struct A { double x; };" + b"};" * 500
+    structs = b"B[] a\n" + _MEMBERS + b"p/B\nstring s\n"
     endless = b"\5" + struct.pack("<QHIQQ", 2**63 - 8, 1, 0, START_NS, START_NS)
     markup = "a topic that is markup, terminal codes and a forged line"
     return (
@@ -256,30 +260,16 @@ def _declarations() -> tuple[Bomb, ...]:
         ros("ROS type of 10^12 leaves", _EITHER, b"p/msg/Root", _nested(12)),
         ros("ROS type that contains itself", _EITHER, b"p/msg/A", b"A a\n" + _MEMBERS + b"p/A\nA a\n"),
         ros("ROS array of 2^32", _ANY, b"p/msg/A", b"float64[4294967296] a\nfloat64 b\n"),
-        _made(
-            "ROS 1 sequence that claims 2^32 - 1",
-            _ANY,
-            lambda: _typed(b"p/A", b"ros1msg", b"float64[] a\n", b"ros1", b"\xff" * 8),
-        ),
-        ros(
-            "CDR sequence of structs that claims 2^32 - 1",
-            _ANY,
-            b"p/msg/A",
-            b"B[] a\n" + _MEMBERS + b"p/B\nstring s\n",
-            b"\0\1\0\0" + b"\xff" * 8,
-        ),
-        _made("IDL of 500 modules", _ANY, lambda: _typed(b"p/msg/A", b"ros2idl", idl, b"cdr", bytes(64))),
+        ros("ROS 1 sequence that claims 2^32 - 1", _ANY, b"p/A", b"float64[] a\n", b"\xff" * 8, (b"ros1msg", b"ros1")),
+        ros("CDR sequence of structs that claims 2^32 - 1", _ANY, b"p/msg/A", structs, b"\0\1\0\0" + b"\xff" * 8),
+        ros("IDL of 500 modules", _ANY, b"p/msg/A", idl, bytes(64), (b"ros2idl", b"cdr")),
         json_("JSON schema of 10^12 leaves", _EITHER, _json_references(12)),
         json_("JSON schema 5000 deep", _EITHER, b'{"properties":{"a":' * 5000 + b"{}" + b"}}" * 5000),
         json_("JSON messages 900 deep, without a schema", _ANY, b"", b'{"a":' * 900 + b"1" + b"}" * 900),
         json_("JSON number of a million digits", _ANY, b"", b'{"a": ' + b"9" * 1_000_000 + b"}"),
-        _made(
-            "protobuf type of 10^12 leaves",
-            _EITHER,
-            lambda: _typed(b"p.L0", b"protobuf", _descriptors(12, 10), b"protobuf", b""),
-        ),
+        ros("protobuf type of 10^12 leaves", _EITHER, b"p.L0", _descriptors(12, 10), b"", (b"protobuf",) * 2),
         ros("a type name that is a path", _ANY, b"../../../pdhef_msgs/msg/VehicleStateEstimate", b""),
-        _made(markup, _ANY, lambda: _typed(b"std_msgs/msg/Float64", b"ros2msg", _FLOAT, b"cdr", _CDR, _ODD_NAME)),
+        ros(markup, _ANY, b"std_msgs/msg/Float64", _FLOAT, _CDR, topic=_ODD_NAME),
         _made("one message at time 0", _SOUND, lambda: _times(0)),
         _made("one message at 2^64 - 1", _SOUND, lambda: _times(2**64 - 1)),
         _made("a clock that jumps ten years", _SOUND, lambda: _times(*(_PAST_NS + i * 10**7 for i in range(100)))),

@@ -63,11 +63,8 @@ def write_part(path: Path, part: Record) -> None:
 
 
 def add_fit(folder: Path) -> Fit:
-    fit = Fit(
-        physics_sha256=physics_sha256(load(folder).vehicle),
-        filter={TUNED: FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5})},
-        drives=DRIVES,
-    )
+    noise = {TUNED: FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5})}
+    fit = Fit(physics_sha256=physics_sha256(load(folder).vehicle), filter=noise, drives=DRIVES)
     write_part(folder / FIT_FILE, fit)
     return fit
 
@@ -119,12 +116,9 @@ def test_a_cars_network_may_be_its_own_or_named_by_the_cars_folder(folder, tmp_p
 
 # --- parameters identified with physics -----------------------------------------------------------------------------
 
-FOUND = FittedPhysics(
-    values=default_vehicle().model_copy(
-        update={"yaw_inertia_kg_m2": 1700.0, "steering_ratio": 15.0, "physics": PhysicsParts(lag=True, roll=True)}
-    ),
-    noise=FilterNoise(q_std=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6), r_std={"ay_m_s2": 0.5}),
-)
+VALUES = {"yaw_inertia_kg_m2": 1700.0, "steering_ratio": 15.0, "physics": PhysicsParts(lag=True, roll=True)}
+FOUND_NOISE = FilterNoise(q_std=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6), r_std={"ay_m_s2": 0.5})
+FOUND = FittedPhysics(values=default_vehicle().model_copy(update=VALUES), noise=FOUND_NOISE)
 
 
 def add_physics(folder: Path) -> Fit:

@@ -148,16 +148,17 @@ def test_a_run_records_the_profile(tmp_path):
 
 #: Sensor bias per signal; all values differ, so that a swapped bias is detected.
 TOO_MUCH = {"steer_rad": 0.011, "ax_m_s2": 0.21, "ay_m_s2": -0.37, "yaw_rate_rad_s": 0.0053}
-CAR = vehicle.default_vehicle().model_copy(
-    update={
-        "steer_offset_rad": TOO_MUCH["steer_rad"],
-        "sensors": vehicle.Sensors(
-            ax_bias_m_s2=TOO_MUCH["ax_m_s2"],
-            ay_bias_m_s2=TOO_MUCH["ay_m_s2"],
-            yaw_rate_bias_rad_s=TOO_MUCH["yaw_rate_rad_s"],
-        ),
-    }
-)
+
+
+def biased(offset: float, ratio: float, *biases: float) -> vehicle.VehicleParameters:
+    names = ("ax_bias_m_s2", "ay_bias_m_s2", "yaw_rate_bias_rad_s")
+    sensors = vehicle.Sensors(**dict(zip(names, biases, strict=True)))
+    changes = {"steer_offset_rad": offset, "steering_ratio": ratio, "sensors": sensors}
+    return vehicle.default_vehicle().model_copy(update=changes)
+
+
+OFFSET, *BIASES = TOO_MUCH.values()
+CAR = biased(OFFSET, vehicle.default_vehicle().steering_ratio, *BIASES)
 
 
 def test_what_the_sensors_read_too_much_is_taken_off_and_nothing_else():
@@ -170,14 +171,6 @@ def test_what_the_sensors_read_too_much_is_taken_off_and_nothing_else():
         elif f.name in SIGNAL_COLUMNS:
             np.testing.assert_array_equal(getattr(corrected, f.name), getattr(true, f.name), err_msg=f.name)
     assert corrected.available == true.available
-
-
-def biased(offset: float, ratio: float, *biases: float) -> vehicle.VehicleParameters:
-    names = ("ax_bias_m_s2", "ay_bias_m_s2", "yaw_rate_bias_rad_s")
-    sensors = vehicle.Sensors(**dict(zip(names, biases, strict=True)))
-    return vehicle.default_vehicle().model_copy(
-        update={"steer_offset_rad": offset, "steering_ratio": ratio, "sensors": sensors}
-    )
 
 
 vehicles = st.builds(

@@ -119,14 +119,8 @@ loaded("torch", "rerun", "scipy.linalg", "scipy.special", "scipy.ndimage", "matp
 
 def ended_of(script: str, *arguments: str) -> list[str]:
     """Run a script in a separate process; return its lines that begin with ``ended:``, without that."""
-    done = subprocess.run(
-        [sys.executable, "-c", script, *arguments],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command, env = [sys.executable, "-c", script, *arguments], {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, check=True)
     return [line.removeprefix("ended:").strip() for line in done.stdout.splitlines() if line.startswith("ended:")]
 
 

@@ -16,7 +16,7 @@ from pdhef_logtool import PdhefError, ReadOptions, RunConfig, read_drive, run
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.drive.checks import check_drive, misread_channels
-from pdhef_logtool.drive.hypotheses import Law, Relation, known_hypotheses, posterior
+from pdhef_logtool.drive.hypotheses import Law, Relation, known_hypotheses, opened, posterior
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.plan import plan_drive
 from pdhef_logtool.drive.survey import scaled_source
@@ -73,11 +73,7 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m, factor):
 @pytest.mark.parametrize(
     ("factor", "mirrored", "antenna_m", "is_short"),
     [
-        *(
-            (factor, mirrored, antenna_m, False)
-            for factor in (1.0, 3.6, 1.0 / 3.6, -1.0)
-            for mirrored, antenna_m in [(False, 0.0), (True, 0.0), (False, 1.5)]
-        ),
+        *((factor, *at, False) for factor in (1.0, 3.6, 1 / 3.6, -1.0) for at in [(False, 0), (True, 0), (False, 1.5)]),
         (1.0, False, 1.5, True),  # yaw times the lever is most of v_y
     ],
 )
@@ -329,7 +325,8 @@ def test_two_mistakes_are_found_that_are_worse_than_none_alone():
 def test_an_assumed_unit_is_wrong_before_one_that_is_given():
     names = ("speed_m_s", "steering_wheel_rad")
     km_h = [relation(3.6, 3.7, 3.5, powers=dict.fromkeys(names, 1), text=text) for text in "ab"]
-    given, assumed = (posterior(km_h, known_hypotheses(names, (), (), frozenset(of))) for of in ((), names[:1]))
+    mistakes = known_hypotheses(names)
+    given, assumed = (posterior(km_h, [opened(m, frozenset(of)) for m in mistakes]) for of in ((), names[:1]))
     assert given.sets[0][1][0].factors.keys() == {names[1]}
     assert assumed.sets[0][1][0].factors == {names[0]: 1.0 / 3.6} and assumed.sets[0][0] > 0.9
 

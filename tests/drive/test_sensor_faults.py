@@ -194,13 +194,8 @@ def test_a_quantised_gyro_is_not_stuck(quantum):
 
 
 def test_a_gyro_at_rest_may_repeat(clean):
-    still = replace(
-        clean,
-        speed_m_s=np.zeros(len(clean)),
-        yaw_rate_rad_s=np.zeros(len(clean)),
-        ay_m_s2=np.full(len(clean), 0.03),
-        steer_rad=np.zeros(len(clean)),
-    )
+    values = {"speed_m_s": 0.0, "yaw_rate_rad_s": 0.0, "ay_m_s2": 0.03, "steer_rad": 0.0}
+    still = replace(clean, **{name: np.full(len(clean), value) for name, value in values.items()})
     assert not reason(found(still)).any()
 
 

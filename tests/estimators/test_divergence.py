@@ -44,18 +44,12 @@ def motion(
     r, r_dot, r_dot2 = peak * np.sin(w * t), peak * w * np.cos(w * t), -peak * w * w * np.sin(w * t)
     vy, vy_dot = -0.8 * r_dot, -0.8 * r_dot2
     ay = vy_dot + SPEED_M_S * r
-    signals = make_signals(
-        dt,
-        delay_ns,
-        ay_m_s2=TILT * ay + IMU_X_M * r_dot - IMU_Y_M * r * r,
-        yaw_rate_rad_s=r,
-        speed_m_s=np.full(len(t), SPEED_M_S),
-        friction=np.full(len(t), FRICTION),
-    )
+    speed, friction = np.full(len(t), SPEED_M_S), np.full(len(t), FRICTION)
+    felt = TILT * ay + IMU_X_M * r_dot - IMU_Y_M * r * r
+    signals = make_signals(dt, delay_ns, ay_m_s2=felt, yaw_rate_rad_s=r, speed_m_s=speed, friction=friction)
     covariance = np.tile(np.diag([0.01, 0.01, 1e-5]), (len(t), 1, 1))
-    track = make_track(
-        "f", signals.stamps_ns, vx_m_s=np.full(len(t), SPEED_M_S), vy_m_s=vy, yaw_rate_rad_s=r, covariance=covariance
-    )
+    state = {"vx_m_s": speed, "vy_m_s": vy, "yaw_rate_rad_s": r, "covariance": covariance}
+    track = make_track("f", signals.stamps_ns, **state)
     return signals, track
 
 
@@ -78,12 +72,9 @@ def flags(track: StateTrack, signals: Signals) -> np.ndarray:
 @given(share=st.floats(0.0, 1.0), hz=st.floats(0.1, 1.5), seed=st.integers(0, 99))
 def test_the_true_motion_is_never_flagged(share, hz, seed):
     signals, truth = motion(share, hz=hz, seed=seed)
-    noise = np.random.default_rng(seed)
-    noisy = replace(
-        signals,
-        ay_m_s2=signals.ay_m_s2 + noise.normal(0.0, VEHICLE.sensors.ay_std_m_s2, len(signals)),
-        yaw_rate_rad_s=signals.yaw_rate_rad_s + noise.normal(0.0, VEHICLE.sensors.yaw_rate_std_rad_s, len(signals)),
-    )
+    rng, stds = np.random.default_rng(seed), (VEHICLE.sensors.ay_std_m_s2, VEHICLE.sensors.yaw_rate_std_rad_s)
+    ay, rate = (rng.normal(0.0, std, len(signals)) for std in stds)
+    noisy = replace(signals, ay_m_s2=signals.ay_m_s2 + ay, yaw_rate_rad_s=signals.yaw_rate_rad_s + rate)
     assert not flags(truth, noisy).any()
 
 

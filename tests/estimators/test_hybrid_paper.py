@@ -199,11 +199,8 @@ def test_pure_lstm_says_what_its_network_says_and_predicts_it_over_the_delay():
 def test_linear_regression_is_its_equation():
     """At constant features the low-pass has no say."""
     n = 1500
-    signals = make_signals(
-        np.full(n - 1, 0.01),
-        steer_rad=np.full(n, 0.02), ax_m_s2=np.zeros(n), ay_m_s2=np.full(n, 3.0), yaw_rate_rad_s=np.full(n, 0.15),
-        speed_m_s=np.full(n, 20.0),
-    )  # fmt: skip
+    values = {"steer_rad": 0.02, "ax_m_s2": 0.0, "ay_m_s2": 3.0, "yaw_rate_rad_s": 0.15, "speed_m_s": 20.0}
+    signals = make_signals(np.full(n - 1, 0.01), **{name: np.full(n, value) for name, value in values.items()})
     model = replace(MODEL, linear_regression=LinearModel(("ay_m_s2", "yaw_rate_rad_s"), (-0.01, 0.2), 0.004, 2.0))
     track = run_estimator(make_estimator("linear-regression", Car(VEHICLE, network=model)), signals)
     assert track.sideslip_rad[-1] == pytest.approx(0.004 - 0.03 + 0.03, abs=1e-9)

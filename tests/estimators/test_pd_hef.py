@@ -130,18 +130,11 @@ def test_a_bias_is_found_and_its_removal_helps(bias):
 
 def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_others():
     own, noisy = vehicle(), with_noise(drive(slalom(0.035, 0.5), 4.0, speed=22.0).signals, 3)
-    fitted = own.model_copy(
-        update={
-            "steer_offset_rad": 0.003,
-            "steering_ratio": 15.0,
-            "sensors": own.sensors.model_copy(update={"ay_bias_m_s2": 0.2, "yaw_rate_bias_rad_s": 0.004}),
-            "relaxation_length_m": 0.7,
-            "physics": PhysicsParts(lag=True, roll=True),
-        }
-    )
-    car = replace(
-        Car(own, noise={"physics": FilterNoise()}), fitted_physics=FittedPhysics(values=fitted, noise=FilterNoise())
-    )
+    sensors = own.sensors.model_copy(update={"ay_bias_m_s2": 0.2, "yaw_rate_bias_rad_s": 0.004})
+    changes = {"steer_offset_rad": 0.003, "steering_ratio": 15.0, "relaxation_length_m": 0.7, "sensors": sensors}
+    fitted = own.model_copy(update=changes | {"physics": PhysicsParts(lag=True, roll=True)})
+    physics = FittedPhysics(values=fitted, noise=FilterNoise())
+    car = replace(Car(own, noise={"physics": FilterNoise()}), fitted_physics=physics)
     adaptive = make_estimator("physics", car)
     estimator = adaptive.physics
     assert estimator.vehicle == fitted
@@ -224,11 +217,8 @@ def test_a_burst_raises_r_for_its_time_and_costs_less(made):
     t = made.time_s
     clean, burst = noisy(made, 1), (t > 4) & (t < 6)
     rng = np.random.default_rng(2)
-    bad = replace(
-        clean,
-        ay_m_s2=clean.ay_m_s2 + burst * 2.4 * rng.standard_normal(len(t)),
-        yaw_rate_rad_s=clean.yaw_rate_rad_s + burst * 0.08 * rng.standard_normal(len(t)),
-    )
+    ay, rate = (burst * std * rng.standard_normal(len(t)) for std in (2.4, 0.08))
+    bad = replace(clean, ay_m_s2=clean.ay_m_s2 + ay, yaw_rate_rad_s=clean.yaw_rate_rad_s + rate)
     checked = without_faults(bad, FLAT)
     track = run_estimator(adaptive(), checked)
     assert np.median(track.r_scale[(t > 4.1) & burst]) > 50
@@ -278,13 +268,9 @@ def test_the_mixture_has_the_moments_of_its_samples():
     means = np.array([[20.0, 0.5, 0.1], [20.4, 0.2, 0.16]])
     roots = 0.1 * rng.standard_normal((2, 3, 3))
     P = roots @ roots.transpose(0, 2, 1)
-    tracks = [
-        replace(
-            make_track("x", np.array([0]), vx_m_s=m[:1], vy_m_s=m[1:2], yaw_rate_rad_s=m[2:], ay_m_s2=np.array([1.0])),
-            covariance=p[None],
-        )
-        for m, p in zip(means, P, strict=True)
-    ]
+    names = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
+    motion = [dict(zip(names, np.append(m, 1.0)[:, None], strict=True)) for m in means]
+    tracks = [make_track("x", np.array([0]), **m, covariance=p[None]) for m, p in zip(motion, P, strict=True)]
     mixed = mix(np.array([[0.7, 0.3]]), tracks)
     weights = np.array([0.7, 0.3])
     mean = weights @ means
@@ -357,9 +343,8 @@ def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(driven):
         assert acts(of_log) is calibrated
         without = of_log if not calibrated else plain
         assert any("residual gain 0" in note for note in without.notes)
-    track = track_of(
-        "pd-hef", replace(taught_car(linear_residual(), calibrated=True), self_calibrated=calibration), driven
-    )
+    car = replace(taught_car(linear_residual(), calibrated=True), self_calibrated=calibration)
+    track = track_of("pd-hef", car, driven)
     assert np.nanmax(track.network_trust) == 1.0
 
 

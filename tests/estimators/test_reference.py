@@ -33,16 +33,9 @@ def driven_by(steer: Callable[[float], float]) -> Drive:
     """Drive for 30 s with tyres that saturate, and sensors with noise, biases and a gain of the speed."""
     made = drive(steer, 30.0, 25.0, tyre=tanh_tyre, speed_every=1)
     noisy = with_noise(made.signals, 1, 0.5)
-    return replace(
-        made,
-        signals=replace(
-            noisy,
-            steer_rad=made.signals.steer_rad,
-            ay_m_s2=noisy.ay_m_s2 + 0.1,
-            yaw_rate_rad_s=noisy.yaw_rate_rad_s + 0.002,
-            speed_m_s=noisy.speed_m_s * 1.005,
-        ),
-    )
+    spoilt = {"ay_m_s2": noisy.ay_m_s2 + 0.1, "yaw_rate_rad_s": noisy.yaw_rate_rad_s + 0.002}
+    spoilt |= {"speed_m_s": noisy.speed_m_s * 1.005, "steer_rad": made.signals.steer_rad}
+    return replace(made, signals=replace(noisy, **spoilt))
 
 
 def heading_rad(driven: Drive) -> FloatArray:

@@ -130,9 +130,8 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimato
     """The accelerometer says braking, the speed sensor falls silent: v_x runs below zero."""
     silent = good.time_s > 9.0
     signals = without_impossible(good.signals)
-    signals = replace(
-        signals, speed_m_s=np.where(silent, np.nan, signals.speed_m_s), ax_m_s2=np.where(silent, -4.0, signals.ax_m_s2)
-    )
+    speed, ax = np.where(silent, np.nan, signals.speed_m_s), np.where(silent, -4.0, signals.ax_m_s2)
+    signals = replace(signals, speed_m_s=speed, ax_m_s2=ax)
     steps, _ = estimator.run(signals, None)
     back = steps.x[:, 0] < 0.0
     assert back[-500:].all()

@@ -53,12 +53,8 @@ def same(a: StateTrack, b: StateTrack, upto: int | None = None) -> bool:
 
 
 def test_no_two_lines_share_a_name_or_a_colour():
-    assert (
-        len({s.name for s in table.SPECS})
-        == len({s.colour for s in table.SPECS})
-        == len({s.text for s in table.SPECS})
-        == len(table.SPECS)
-    )
+    for attribute in ("name", "colour", "text"):
+        assert len({getattr(s, attribute) for s in table.SPECS}) == len(table.SPECS)
     assert all(0 < s.colour <= 0xFFFFFF for s in table.SPECS)
 
 
@@ -97,9 +93,8 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec):
     everything = frozenset(ALIGNED_SIGNALS)
     estimators, skipped = table.runnable((spec.name,), Car(VEHICLE), everything)
     lacks = spec.network not in ("", "optional") or spec.needs_noise
-    assert ([e.name for e in estimators], [s.name for s in skipped]) == (
-        ([], [spec.name]) if lacks else ([spec.name], [])
-    )
+    wanted = ([], [spec.name]) if lacks else ([spec.name], [])
+    assert ([e.name for e in estimators], [s.name for s in skipped]) == wanted
     if lacks:
         assert "--network" in skipped[0].reason or "fit.toml" in skipped[0].reason
         with pytest.raises(UsageError, match=spec.name):
@@ -111,12 +106,8 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec):
     ("name", "message"),
     [
         ("physics-plus", r"expected estimators out of all, peers, zero, .* \(0 to 1\), got physics-plus$"),
-        ("pd-hef:trust=1", "got pd-hef:trust=1$"),
-        ("pd-hef:gain", "got pd-hef:gain$"),
-        ("pd-hef:gain=2", "got pd-hef:gain=2$"),
-        ("pd-hef:gain=nan", "got pd-hef:gain=nan$"),
+        *((f"pd-hef:{option}", f"got pd-hef:{option}$") for option in ("trust=1", "gain", "gain=2", "gain=nan", "")),
         ("pd-hef:fixed-r=1", "got pd-hef:fixed-r=1$"),
-        ("pd-hef:", "got pd-hef:$"),
         ("physics:tuned", "got physics:tuned$"),
         ("zero", "zero"),
     ],

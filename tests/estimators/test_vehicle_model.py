@@ -79,18 +79,13 @@ ONE_FRICTION = (
     AxleTyre(B=10.6, C=1.65, D_n=5708.0, E=0.34, reference_friction=1.0),
 )
 OTHER = SEDAN.model_copy(update={"tyres": Tyres(front=ONE_FRICTION[0], rear=ONE_FRICTION[1])})
+STEER_RAD = st.floats(-0.6, 0.6) | st.sampled_from([-0.5 * math.pi, 0.5 * math.pi])
 CARS = [SEDAN, on_axles(SEDAN, 105_000.0, 96_000.0), OTHER]
 
 
 @pytest.mark.parametrize("car", CARS, ids=["magic formula", "cornering stiffness", "formula of one friction"])
 @settings(derandomize=True, deadline=None, max_examples=60)
-@given(
-    st.integers(0, 2**32 - 1),
-    st.floats(0.05, 1.5),
-    st.floats(1e-4, 0.2),
-    st.floats(-0.6, 0.6) | st.sampled_from([-0.5 * math.pi, 0.5 * math.pi]),
-    st.booleans(),
-)
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 1.5), st.floats(1e-4, 0.2), STEER_RAD, st.booleans())
 def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(car, seed, mu, dt, steer, fast):
     """Also with a residual, at any speed and with wheels across the car."""
     p, f, rng = model_parameters(car, roll_correction=True), model.physics_parameters(car), np.random.default_rng(seed)
@@ -115,12 +110,8 @@ def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(c
         _, yaw = accelerations(*state[:3], steer, mu, p)
         want_reading[i] = (1.0 + p.ay_roll_gain) * ay + w * yaw * p.imu_x_m - state[2] ** 2 * p.imu_y_m
     np.testing.assert_allclose(reading[: model.LANES], want_reading, rtol=TOLERANCE, atol=TOLERANCE)
-    np.testing.assert_allclose(
-        block[[model.VX, model.VY, model.YAW_RATE, model.AX_BIAS], : model.LANES].T,
-        want,
-        rtol=TOLERANCE,
-        atol=TOLERANCE,
-    )
+    found = block[[model.VX, model.VY, model.YAW_RATE, model.AX_BIAS], : model.LANES].T
+    np.testing.assert_allclose(found, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 
 # --- with axle forces and parts --------------------------------------------------------------------------------------

@@ -169,9 +169,8 @@ def test_it_is_the_unscented_kalman_filter_of_filterpy(made, irregular):
     extra_r = np.where(t[:, None] < 4.0, 0.0, [0.1, 1e-4])
     links, _ = estimator.linked_steps(irregular, None, rate, extra_r)
     steps = links.posterior
-    assert steps.x[0, :3] == pytest.approx(
-        [irregular.speed_m_s[0], *(irregular.yaw_rate_rad_s[0] * np.array([car.REAR_M, 1]))]
-    )
+    turning = irregular.yaw_rate_rad_s[0] * np.array([car.REAR_M, 1])
+    assert steps.x[0, :3] == pytest.approx([irregular.speed_m_s[0], *turning])
     want, free = filterpy_run(irregular, estimator, motion, sensor, rate, extra_r)
     assert np.nanmax(want["nis"]) < 36.0, "the drive must stay inside the gate, which filterpy does not have"
     assert np.ptp(want["x"][:, 1]) > 0.5, "the drive must excite the lateral motion"

@@ -31,6 +31,7 @@ EXPECTED = {
     "sine-sweep-wide": "sine-sweep",
     "mu-jump": "slalom",
 }
+RATES_HZ = st.sampled_from([40.0, 62.5, 100.0, 200.0])
 NOISY = SensorNoise(
     acceleration_m_s2=0.25, yaw_rate_rad_s=0.008, steer_rad=0.0016, steer_bias_rad=0.004, yaw_rate_bias_rad_s=0.004
 )
@@ -104,12 +105,7 @@ def test_other_speeds_cars_friction_and_noise():
 
 
 @settings(max_examples=10, deadline=None)
-@given(
-    st.sampled_from(sorted(EXPECTED)),
-    st.integers(0, 10**12),
-    st.sampled_from([40.0, 62.5, 100.0, 200.0]),
-    st.booleans(),
-)
+@given(st.sampled_from(sorted(EXPECTED)), st.integers(0, 10**12), RATES_HZ, st.booleans())
 def test_neither_time_nor_rate_nor_side_changes_what_is_found(name, shift_ns, rate_hz, mirror):
     s = simulated(name)
     t = (s.stamps_ns - T0) * 1e-9

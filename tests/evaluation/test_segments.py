@@ -36,15 +36,10 @@ def signals(t, speed, ax, ay, noise=0.0, friction=np.nan):
     n = t.size
     measured = np.where(np.arange(n) % 5 == 0, speed, np.nan)  # a measurement every 50 ms
     rate = np.where(speed > 1, ay / np.maximum(speed, 1), 0.0)
-    return signals_at(
-        T0 + np.round(t * 1e9).astype(np.int64),
-        steer_rad=ay * (2.87 / np.maximum(speed, 1.0) ** 2 + 0.003),
-        ax_m_s2=ax + rng.normal(0, noise, n),
-        ay_m_s2=ay + rng.normal(0, noise, n),
-        yaw_rate_rad_s=rate,
-        speed_m_s=measured,
-        friction=friction,
-    )
+    steer = ay * (2.87 / np.maximum(speed, 1.0) ** 2 + 0.003)
+    columns = {"steer_rad": steer, "yaw_rate_rad_s": rate, "speed_m_s": measured, "friction": friction}
+    columns |= {"ax_m_s2": ax + rng.normal(0, noise, n), "ay_m_s2": ay + rng.normal(0, noise, n)}
+    return signals_at(T0 + np.round(t * 1e9).astype(np.int64), **columns)
 
 
 def spans(masks, stamped, name):

@@ -13,13 +13,11 @@ PULL_M_S2 = 0.5
 
 def weaving(seconds: float = 20.0, speed: float = 22.0) -> Drive:
     """Drive a weaving course at 100 Hz."""
-    return drive(
-        lambda t: 0.03 * math.sin(2 * math.pi * 0.4 * t) + 0.02 * math.sin(2 * math.pi * 0.13 * t + 1.0),
-        seconds,
-        speed,
-        lambda t: 0.3 * math.sin(0.5 * t),
-        side_pull_m_s2=PULL_M_S2,
-    )
+
+    def steer(t: float) -> float:
+        return 0.03 * math.sin(2 * math.pi * 0.4 * t) + 0.02 * math.sin(2 * math.pi * 0.13 * t + 1.0)
+
+    return drive(steer, seconds, speed, lambda t: 0.3 * math.sin(0.5 * t), side_pull_m_s2=PULL_M_S2)
 
 
 def truth_of(stamps: np.ndarray, state: np.ndarray) -> StateTrack:

@@ -185,9 +185,8 @@ def recorded(sample_logs_dir, tmp_path_factory):
     columns |= dict(zip(GNSS, (received.real, received.imag), strict=True))
     known = {f"/{name}": np.isfinite(values) for name, values in columns.items()}
     topics = {f"/{name}": {"value": values[np.isfinite(values)]} for name, values in columns.items()}
-    log = write_log(
-        tmp_path_factory.mktemp("log") / "drive.mcap", topics, {name: stamps[at] for name, at in known.items()}
-    )
+    times = {name: stamps[at] for name, at in known.items()}
+    log = write_log(tmp_path_factory.mktemp("log") / "drive.mcap", topics, times)
     return str(log), stamps, truth.sideslip_rad
 
 

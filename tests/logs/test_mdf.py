@@ -108,9 +108,8 @@ def assembled(blocks: Mapping[str, tuple[list[str], bytes]], version: int = 410)
     """Return a file of blocks: their links, by name, and data; a name begins with the identifier of its block."""
     at: dict[str, int] = {}
     for _ in range(2):  # the first pass finds the addresses
-        out = bytearray(
-            f"MDF     {version / 100:.2f}    test".encode().ljust(28, b"\0") + struct.pack("<H", version)
-        ).ljust(64, b"\0")
+        first = f"MDF     {version / 100:.2f}    test".encode().ljust(28, b"\0") + struct.pack("<H", version)
+        out = bytearray(first.ljust(64, b"\0"))
         for name, (links, data) in blocks.items():
             at[name] = len(out)
             head = struct.pack("<4s4xQQ", f"##{name[:2]}".encode(), 24 + 8 * len(links) + len(data), len(links))
@@ -232,9 +231,8 @@ def test_numbers_with_texts_stay_numbers_and_texts_among_scaled_numbers_are_miss
     scaled = conversion_rule(block_of(4, 7, **texts, default_addr=linear), 4)(raw)
     np.testing.assert_allclose(scaled, [np.nan, np.nan, 1.0])
     ranges = {"ref_param_nr": 2, "lower_0": 254, "upper_0": 255, "text_0": b"not available", "default_addr": linear}
-    np.testing.assert_allclose(
-        conversion_rule(block_of(4, 8, **ranges), 4)(np.asarray([100, 254, 255])), [0, np.nan, np.nan]
-    )
+    of_ranges = conversion_rule(block_of(4, 8, **ranges), 4)
+    np.testing.assert_allclose(of_ranges(np.asarray([100, 254, 255])), [0, np.nan, np.nan])
     old = {"ref_param_nr": 2, "lower_0": 254, "upper_0": 255, "text_0": b"x", "default_addr": b'"0.01*{X}+-1"'}
     np.testing.assert_allclose(conversion_rule(block_of(3, 12, **old), 3)(np.asarray([100, 255])), [0, np.nan])
 
@@ -357,14 +355,7 @@ def can_file(
         TIME,
         Ch("CAN_DataFrame", 8, 8 * (size - 8), data_type=10),
         Ch("CAN_DataFrame.ID", 8, 32, data_type=0),
-        Ch(
-            "CAN_DataFrame.DataBytes",
-            12,
-            64,
-            kind=int(is_variable),
-            data_type=10,
-            stored=stored if is_variable else b"",
-        ),
+        Ch("CAN_DataFrame.DataBytes", 12, 64, int(is_variable), data_type=10, stored=stored if is_variable else b""),
         Ch("CAN_DataFrame.BusChannel", kind=6, bits=0, data_type=0, linear=(2.0, 0.0)),
         Ch("CAN_DataFrame.Dir", kind=6, bits=0, data_type=0),
         *length,
@@ -423,6 +414,7 @@ def many_channels() -> bytes:
     return mdf4([TIME, *(Ch(f"c{i}", 8) for i in range(DEFAULT_LIMITS.schema_leaves))], bytes(16), 1, 16)
 
 
+FAR_BIT, OUTSIDE = [TIME, Ch("AccY", 8, flags=2, invalid_bit=2**20)], "AccY is outside of its record"
 HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
     **{
         f"circle {of}": (partial(circle, *of), "circle")
@@ -433,14 +425,8 @@ HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
     "packed": (lambda: imu(packed=(2**40,)), "table bytes"),
     "rows": (many_rows, "table bytes"),
     "channels": (many_channels, "schema leaves"),
-    "bit of invalid samples": (
-        lambda: mdf4([TIME, Ch("AccY", 8, flags=2, invalid_bit=2**20)], bytes(17 * N), N, 16, invalid_bytes=1),
-        "AccY is outside of its record",
-    ),
-    **{
-        f"offset {of}": (partial(imu, offset=of), "with times.*AccY is outside of its record")
-        for of in (1000, 2**31, 12)
-    },
+    "bit of invalid samples": (partial(mdf4, FAR_BIT, bytes(17 * N), N, 16, invalid_bytes=1), OUTSIDE),
+    **{f"offset {of}": (partial(imu, offset=of), f"with times.*{OUTSIDE}") for of in (1000, 2**31, 12)},
 }
 
 

@@ -56,38 +56,25 @@ def _nested(levels: int, fields: int) -> str:
 
 
 _LISTED = "".join(f"{_NEXT}MSG: p/B{i}\nB{i + 1}[16] x\n" for i in range(6))
-_LAST = f"{_NEXT}MSG: p/B99\nint8 x\n"
-_TWELVE = [f"M{i}" for i in range(12)]
+_CHAIN = "".join(f"{_NEXT}MSG: p/B{i}\nB{i + 1} x\n" for i in range(99))
+_SQUARES = "".join(f"const long X{i + 1} = X{i} * X{i};" for i in range(60))
+_TWELVE = tuple(f"M{i}" for i in range(12))
+_MUTUAL = _descriptors({"name": "a", "messages": dict.fromkeys(_TWELVE, _TWELVE)})
+_IMPORTS = _descriptors(*({"name": f"f{i}", "dependency": [f"f{i + 1}"]} for i in range(3000)))
 _BOMBS = {
     "arrays in arrays": ("ros2msg", f"B0 x\n{_LISTED}{_NEXT}MSG: p/B6\nint8 x\n", "schema leaves"),
     "an endless array of texts": ("ros2msg", "string[4294967295] x\n", "schema leaves"),
     "an array of less than nothing": ("ros2msg", "float64[-3] x\n", "-3 elements"),
     "itself": ("ros2msg", "p/A[] x\n", "contains itself"),
-    "deep": (
-        "ros2msg",
-        "B0 x\n" + "".join(f"{_NEXT}MSG: p/B{i}\nB{i + 1} x\n" for i in range(99)) + _LAST,
-        "schema depth",
-    ),
+    "deep": ("ros2msg", f"B0 x\n{_CHAIN}{_NEXT}MSG: p/B99\nint8 x\n", "schema depth"),
     "a long text": ("ros1msg", "".join(f"int8 a{i}\n" for i in range(40_000)), "schema bytes"),
     "brackets": ("ros2idl", f"{_HEAD}const long X = {'(' * 60}1{')' * 60};{_TAIL}", "nested too deeply"),
     "a number of gigabytes": ("ros2idl", f"{_HEAD}const long X = 1 << 99999999999;{_TAIL}", "cannot be parsed"),
-    "squares": (
-        "ros2idl",
-        f"{_HEAD}const long X0 = 99;{''.join(f'const long X{i + 1} = X{i} * X{i};' for i in range(60))}{_TAIL}",
-        "cannot be parsed",
-    ),
+    "squares": ("ros2idl", f"{_HEAD}const long X0 = 99;{_SQUARES}{_TAIL}", "cannot be parsed"),
     "references": ("jsonschema", _nested(13, 10), "schema leaves"),
     "brackets in JSON": ("jsonschema", "[" * 90_000, "nested too deeply"),
-    "messages in messages": (
-        "protobuf",
-        _descriptors({"name": "a", "messages": dict.fromkeys(_TWELVE, _TWELVE)}),
-        "leaves",
-    ),
-    "imports": (
-        "protobuf",
-        _descriptors(*({"name": f"f{i}", "dependency": [f"f{i + 1}"]} for i in range(3000))),
-        "which the descriptors lack",
-    ),
+    "messages in messages": ("protobuf", _MUTUAL, "leaves"),
+    "imports": ("protobuf", _IMPORTS, "which the descriptors lack"),
     "files": ("protobuf", _descriptors(*({"name": f"f{i}"} for i in range(30_000))), "schema leaves"),
 }
 
@@ -109,9 +96,8 @@ def test_higher_limits_read_what_is_sound_and_large():
 
 
 def test_a_schema_that_refers_to_itself_is_open_there():
-    schema = _schema(
-        "jsonschema", '{"$ref": "#/d", "d": {"properties": {"a": {"$ref": "#/d"}, "b": {"type": "number"}}}}'
-    )
+    text = '{"$ref": "#/d", "d": {"properties": {"a": {"$ref": "#/d"}, "b": {"type": "number"}}}}'
+    schema = _schema("jsonschema", text)
     assert [leaf.path for leaf in leaves(schema.root)] == ["b"]
     values, _ = _columns(schema, "a.a.b", b'{"a": {"a": {"b": 2}}}')
     np.testing.assert_array_equal(values, [2.0])
@@ -204,23 +190,12 @@ _TEXTS = {
     "ros2idl": f"{_HEAD}const long C = -(1) + 2;{_TAIL}",
     "jsonschema": _nested(2, 2),
 }
+_INSERTED = ["", "[", "]", "(", "<", '"', "\n", "\0", "9" * 30, "string", "[99999999]", "$ref", "{", "}"]
+_CUT = st.tuples(st.integers(0, 5000), st.integers(0, 20), st.sampled_from(_INSERTED))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(
-    st.sampled_from(list(_TEXTS)),
-    st.lists(
-        st.tuples(
-            st.integers(0, 5000),
-            st.integers(0, 20),
-            st.sampled_from(
-                ["", "[", "]", "(", "<", '"', "\n", "\0", "9" * 30, "string", "[99999999]", "$ref", "{", "}"]
-            ),
-        ),
-        max_size=5,
-    ),
-    st.binary(max_size=60),
-)
+@given(st.sampled_from(list(_TEXTS)), st.lists(_CUT, max_size=5), st.binary(max_size=60))
 def test_a_mutated_schema_is_read_or_refused(encoding, cuts, message):
     text = _TEXTS[encoding]
     for at, n, new in cuts:

@@ -524,6 +524,27 @@ def test_columns_without_names_by_the_drive():
     assert {c.subject for c in auto.mapping.checks} >= {"speed_m_s", "yaw_rate_rad_s"}
 
 
+def test_numbers_that_mean_not_available_change_no_unit():
+    speed, steering = 3.6 * V, STEER * 16.0 / DEG
+    speed[100:180], steering[900:980] = 655.35, -9999.0
+    box = topic(speed_kmh=speed, steering_wheel_angle_deg=steering, yaw_rate=RATE, lat_acc=AY)
+    got = found(box=box).mapping.signals
+    assert (got["speed_m_s"].scale, got["steering_wheel_rad"].scale) == pytest.approx((1.0 / 3.6, DEG))
+    assert (got["speed_m_s"].valid_max, got["steering_wheel_rad"].valid_min) == (110.0, -32.0)
+
+
+def test_a_unit_that_the_values_exclude_is_replaced_with_a_doubt():
+    auto = found(box=topic(speed_mps=V, lat_acc_mps2=AY, yaw_rate_radps=RATE / DEG))
+    assert taken(auto)["yaw_rate_rad_s"][1] == pytest.approx(DEG, rel=1e-3)
+    assert "yaw_rate_rad_s.candidate" in undecided(auto)
+
+
+def test_ground_truth_without_units_beside_a_speed_in_km_h():
+    box = topic(speed_kmh=3.6 * V, yaw_rate=RATE, lat_acc=AY, truth_vx=V, truth_vy=-0.2 * RATE)
+    truth = found(box=box).mapping.truth
+    assert (truth["vx_m_s"].scale, truth["vy_m_s"].scale) == (1.0, 1.0)
+
+
 @pytest.mark.parametrize(("yaw", "is_rate"), [(RATE, True), (RATE / DEG, True), (np.cumsum(RATE) * 0.01, False)])
 def test_a_yaw_that_turns_the_car_is_its_rate(yaw, is_rate):
     rates = taken(found(box=topic(speed_mps=V, lat_acc=AY, yaw=yaw)))

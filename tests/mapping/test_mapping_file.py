@@ -11,42 +11,15 @@ from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdhef_logtool import mapping as mappings
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import (
-    Mapping,
-    QualityGate,
-    SignalSource,
-    check_mapping,
-    load_mapping,
-    mapping_to_toml,
-    merge_losses,
-    resolve_mapping,
-)
+from pdhef_logtool.mapping import Mapping, QualityGate, SignalSource, check_mapping, load_mapping, mapping_to_toml
 from pdhef_logtool.mapping.estimates import choose_estimates, sources_of
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, Loss
 
-DESIGN_EXAMPLE = """
-[signals.steer_rad]
-topic = "/vehicle/status/steering_status"
-field = "steering_tire_angle"
-stamp = "stamp"
-scale = 1.0
-offset = 0.0
-latency_s = 0.0
-valid_min = -1.0
-valid_max = 1.0
-stamp_unit = "ros"
-clock = "utc"
-[truth.vy_m_s]
-topic = "/ins/odometry"
-field = "twist.twist.linear.y"
-[truth_quality]
-topic = "/ins/status"
-field = "mode"
-values = [4]
-"""
+FORMATS = Path(__file__).parents[2] / "docs/formats.md"
 
 
 def load_text(tmp_path: Path, text: str) -> Mapping:
@@ -56,13 +29,13 @@ def load_text(tmp_path: Path, text: str) -> Mapping:
 
 
 def test_the_documented_example_loads(tmp_path):
-    mapping = load_text(tmp_path, DESIGN_EXAMPLE)
+    mapping = load_text(tmp_path, FORMATS.read_text("utf-8").partition("```toml\n")[2].partition("```")[0])
     assert mapping.signals["steer_rad"] == SignalSource(
         "steer_rad", "/vehicle/status/steering_status", "steering_tire_angle", "stamp", valid_min=-1.0, valid_max=1.0
     )
     assert mapping.truth["vy_m_s"].field == "twist.twist.linear.y"
-    assert mapping.quality == QualityGate(topic="/ins/status", field="mode", values=(4.0,))
-    assert mapping.origin == "file"
+    assert mapping.quality == QualityGate(topic="/ins/status", field="fix", values=(4.0,))
+    assert (mapping.origin, mapping.rate_hz, [*mapping.estimates]) == ("file", 100.0, ["esc"])
     with pytest.raises(MappingError, match="no such file"):
         load_mapping(tmp_path / "none.toml")
 
@@ -114,13 +87,13 @@ def test_all_problems_come_in_one_line(tmp_path):
         assert part in line, part
 
 
+X, Y, UNIT = '\ntopic="/a"\nfield="x"', '\ntopic="/a"\nfield="y"', '\nstamp="t"\nstamp_unit'
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (
-            '[signals.steer_rad]\ntopic="/a"\nfield="x"\n[signals.steering_wheel_rad]\ntopic="/a"\nfield="y"',
-            "signals.steer_rad and signals.steering_wheel_rad",
-        ),
+        (f"[signals.steer_rad]{X}\n[signals.steering_wheel_rad]{Y}", ".steer_rad and signals.steering_wheel_rad"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\n[signals.ay_m_s2]\ntopic="/a"\nfield="x"', "duplicates"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\n[signals.ax_m_s2]\ntopic="/a"\nfield="y"', "ax_m_s2"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nscale=[1.0,1.0]', "no vector"),
@@ -129,11 +102,7 @@ def test_all_problems_come_in_one_line(tmp_path):
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nvalid_min=2\nvalid_max=1', "valid_min must be below valid_max"),
         ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nclock="device"\nstamp="log_time"', "needs a stamp of the device"),
         ('[truth_quality]\ntopic="/a"\nfield="x"', "give min, max or values"),
-        (
-            '[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nstamp="t"\nstamp_unit="s"\n'
-            '[signals.ay_m_s2]\ntopic="/a"\nfield="y"\nstamp="t"\nstamp_unit="ns"',
-            "another stamp_unit",
-        ),
+        (f'[signals.ax_m_s2]{X}{UNIT}="s"\n[signals.ay_m_s2]{Y}{UNIT}="ns"', "another stamp_unit"),
         ('[signals.speed_m_s]\ntopic="/c"\nfield="can:A.b"', "needs [can]"),
         ('[can]\ndbc="a.dbc"\n[signals.speed_m_s]\ntopic="/c"\nfield="can:A"', "can:<message>.<signal>"),
         ("[can]\ndbc = []", "can: dbc should name at least one file"),
@@ -190,14 +159,9 @@ GATES = st.builds(
     max=st.sampled_from([None, 4.0]), values=st.lists(numbers, min_size=1, max_size=3).map(tuple), stamp=texts,
     latency_s=numbers,
 )  # fmt: skip
-MAPPINGS = st.builds(
-    Mapping,
-    signals=sources(sorted(set(SIGNAL_UNITS) - EXCLUSIVE), "s"),
-    truth=sources(sorted(TRUTH_UNITS), "t"),
-    quality=st.none() | GATES,
-    origin=st.just("file"),
-    notes=st.just(()),
-)
+SIGNALS, TRUTHS = sources(sorted(set(SIGNAL_UNITS) - EXCLUSIVE), "s"), sources(sorted(TRUTH_UNITS), "t")
+REST = {"quality": st.none() | GATES, "origin": st.just("file"), "notes": st.just(())}
+MAPPINGS = st.builds(Mapping, signals=SIGNALS, truth=TRUTHS, **REST)
 
 
 @pytest.mark.slow
@@ -228,24 +192,11 @@ T = np.arange(5, dtype=np.int64) + 1_000_000_000
 
 def log() -> FakeLog:
     zeros = np.zeros(5)
-    return FakeLog(
-        {
-            "/imu/data": FakeTopic(
-                "sensor_msgs/msg/Imu",
-                T,
-                {
-                    "header.stamp": T,
-                    "header.frame_id": np.array(["a"] * 5, dtype=object),
-                    "linear_acceleration.x": zeros,
-                    "linear_acceleration.y": zeros,
-                    "angular_velocity.z": zeros,
-                    "seconds": zeros,
-                },
-            ),
-            "/steer": FakeTopic("x/Steer", T, {"stamp": T, "angle": zeros, "gyro": np.zeros((5, 3)), "data[]": zeros}),
-            "/bare": FakeTopic("std_msgs/msg/Float32", T, {"data": zeros}),
-        }
-    )
+    numbers = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z", "seconds")
+    header = {"header.stamp": T, "header.frame_id": np.array(["a"] * 5, dtype=object)}
+    imu = FakeTopic("sensor_msgs/msg/Imu", T, header | dict.fromkeys(numbers, zeros))
+    steer = FakeTopic("x/Steer", T, {"stamp": T, "angle": zeros, "gyro": np.zeros((5, 3)), "data[]": zeros})
+    return FakeLog({"/imu/data": imu, "/steer": steer, "/bare": FakeTopic("std_msgs/msg/Float32", T, {"data": zeros})})
 
 
 def mapping(**sources: SignalSource) -> Mapping:
@@ -312,7 +263,7 @@ def test_stamps_that_the_file_leaves_open_come_from_the_schema():
     sources = {n: SignalSource(n, *where) for n, *where in (*open_, ("speed_m_s", "/bare", "data"))}
     stated = SignalSource("ay_m_s2", "/imu/data", "linear_acceleration.y", stamp="publish_time")
     gate = QualityGate("/steer", "angle", min=0.0)
-    got = resolve_mapping(log(), Mapping({**sources, "ay_m_s2": stated}, quality=gate))
+    got = mappings.resolve_mapping(log(), Mapping({**sources, "ay_m_s2": stated}, quality=gate))
     assert {n: s.stamp for n, s in got.signals.items()} == {
         "ax_m_s2": "header.stamp",
         "steer_rad": "stamp",
@@ -365,6 +316,17 @@ def test_topics_with_dots_are_found_by_the_longest_that_fits():
     assert {n: (s.topic, s.field) for n, s in sources.items()} == {"vx_m_s": ("a.b", "c"), "vy_m_s": ("a", "c")}
 
 
+@pytest.mark.parametrize(
+    ("flag", "scale"),
+    [("sideslip_rad=/esc.beta_deg", np.pi / 180.0), ("vx_m_s=/esc.v_kmh", 1.0 / 3.6), ("vy_m_s=/esc.vy", 1.0)],
+)
+def test_a_flag_has_the_unit_of_its_field(flag, scale):
+    name, _, label = flag.partition("=")
+    log = _log(**{"/esc": {label.partition(".")[2]: np.zeros(10)}})
+    sources, _ = sources_of(log, [flag], ESTIMATE_UNITS, "--estimate")
+    assert sources[name].scale == pytest.approx(scale)
+
+
 def test_flags_win_over_tables(tmp_path):
     (tmp_path / "m.toml").write_text(TABLES)
     mapping = load_mapping(tmp_path / "m.toml")
@@ -390,7 +352,7 @@ def test_losses_of_one_kind_at_one_place_become_one_that_spans_and_counts_all():
     first, second = Loss("nan", "w", "/a.x", 40, 50, 3), Loss("nan", "w", "/a.x", 10, 20, 4)
     whole = Loss("nan", "w", "/a.x")  # uncounted: adds no bound and no count
     for order in permutations((first, second, whole)):
-        assert merge_losses([order[:1], order[1:]]) == (Loss("nan", "w", "/a.x", 10, 50, 7),)
+        assert mappings.merge_losses([order[:1], order[1:]]) == (Loss("nan", "w", "/a.x", 10, 50, 7),)
 
 
 @pytest.mark.parametrize(
@@ -404,4 +366,4 @@ def test_losses_of_one_kind_at_one_place_become_one_that_spans_and_counts_all():
 )
 def test_losses_that_differ_in_kind_words_place_or_weight_stay_apart(other):
     loss = Loss("nan", "w", "/a", 1, 2, 1)
-    assert merge_losses([[loss, other], [loss]]) == (Loss("nan", "w", "/a", 1, 2, 2), other)
+    assert mappings.merge_losses([[loss, other], [loss]]) == (Loss("nan", "w", "/a", 1, 2, 2), other)

@@ -19,15 +19,7 @@ from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import physics_filter
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
-from pdhef_logtool.model.intervals import (
-    CAR_STD_RAD,
-    CROSSFALL_STD_RAD,
-    DRIVE_SHARE,
-    IDENTIFIED_SHARE,
-    OWN_SHARE,
-    drive_intervals,
-    running_consistency,
-)
+from pdhef_logtool.model import intervals
 from pdhef_logtool.model.priors import coefficients, prior_variations
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
@@ -35,14 +27,9 @@ from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 OWN = default_vehicle().model_copy(update={"name": "mine"})
-FOUND = OWN.model_copy(
-    update={
-        "yaw_inertia_kg_m2": 1700.0,
-        "steer_offset_rad": 0.003,
-        "steering_ratio": 16.5,
-        "sensors": OWN.sensors.model_copy(update={"ay_bias_m_s2": 0.1, "yaw_rate_bias_rad_s": 0.001}),
-    }
-)
+BIASES = {"sensors": OWN.sensors.model_copy(update={"ay_bias_m_s2": 0.1, "yaw_rate_bias_rad_s": 0.001})}
+VALUES = {"yaw_inertia_kg_m2": 1700.0, "steer_offset_rad": 0.003, "steering_ratio": 16.5}
+FOUND = OWN.model_copy(update=BIASES | VALUES)
 VARIED = (FOUND.model_copy(update={"steer_offset_rad": 0.008}), FOUND.with_stiffness(1.0, 0.9))
 NOISE = FilterNoise(r_std={"ay_m_s2": 1.0})
 #: A parameter of a fit: an interval on a fitted vehicle is not causal.
@@ -71,7 +58,7 @@ def tracks_of(name: str, car: Car, signals: Signals) -> tuple[StateTrack, StateT
     """Return the track of an estimator, and the same with its interval."""
     estimator = make_estimator(name, car)
     track = run_estimator(estimator, calibrated_signals(signals, car))
-    return track, drive_intervals(car, [estimator]).apply(track, signals)
+    return track, intervals.drive_intervals(car, [estimator]).apply(track, signals)
 
 
 def spread(vehicles: tuple[VehicleParameters, ...], noise: FilterNoise, signals: Signals) -> np.ndarray:
@@ -99,12 +86,12 @@ def test_an_interval_changes_no_estimate(signals):
 def test_on_a_car_that_was_fitted_to_the_drive_it_is_the_sum_of_its_parts(signals, varied):
     plain, wide = tracks_of("physics", calibrated(varied, 2.0), signals)
     read = CalibratedSignals(corrected_anew(signals, OWN, FOUND), FOUND)
-    consistency = DRIVE_SHARE * driven_consistency(plain, read, FOUND.low_speed_blend_m_s)
+    consistency = intervals.DRIVE_SHARE * driven_consistency(plain, read, FOUND.low_speed_blend_m_s)
     assert consistency > 0.0
     fast, own = plain.vx_m_s > OWN.low_speed_blend_m_s, plain.sideslip_std_rad**2
     square = np.mean((plain.sideslip_rad**2 + own)[fast & plain.valid])
     share = 1.0 + 3.0 * square / (3.0 * own + square)
-    expected = share * plain.vy_std_m_s**2 + 4.0 * (CAR_STD_RAD * plain.vx_m_s) ** 2 + consistency**2
+    expected = share * plain.vy_std_m_s**2 + 4.0 * (intervals.CAR_STD_RAD * plain.vx_m_s) ** 2 + consistency**2
     if varied:
         expected = expected + spread((FOUND, *varied), Posterior(FOUND).noise, signals)
         assert_alike(wide.vy_std_m_s[fast], np.sqrt(expected[fast]))
@@ -116,8 +103,8 @@ def test_a_model_that_explains_nothing_widens_it_by_no_more_than_the_sideslip_it
     plain, wide = tracks_of("physics", calibrated(scale=300.0), signals)
     fast, own = plain.vx_m_s > OWN.low_speed_blend_m_s, plain.sideslip_std_rad**2
     read = CalibratedSignals(corrected_anew(signals, OWN, FOUND), FOUND)
-    consistency = DRIVE_SHARE * driven_consistency(plain, read, FOUND.low_speed_blend_m_s)
-    others = (300.0 * CAR_STD_RAD) ** 2 + (consistency / plain.vx_m_s) ** 2
+    consistency = intervals.DRIVE_SHARE * driven_consistency(plain, read, FOUND.low_speed_blend_m_s)
+    others = (300.0 * intervals.CAR_STD_RAD) ** 2 + (consistency / plain.vx_m_s) ** 2
     most = own + np.mean((plain.sideslip_rad**2 + own)[fast & plain.valid]) + others
     assert (wide.sideslip_std_rad**2 < most)[fast].all()
 
@@ -127,12 +114,13 @@ def test_on_an_identified_car_it_is_the_sum_of_its_parts(signals):
     car = identified()
     plain, wide = tracks_of("physics", car, signals)
     parts = {"physics": PhysicsParts(lag=True)}
-    vehicles = (car.physics_vehicle, *prior_variations(car.physics_vehicle, share=IDENTIFIED_SHARE))
+    vehicles = (car.physics_vehicle, *prior_variations(car.physics_vehicle, share=intervals.IDENTIFIED_SHARE))
     vehicles = tuple(v.model_copy(update=parts) for v in vehicles)
     unknown = replace(signals, friction=np.full(len(signals), np.nan))  # each has its own
-    running = running_consistency(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2)
-    road_m_s = CROSSFALL_STD_RAD / coefficients(car.physics_vehicle)[1] * plain.vx_m_s
-    expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + running**2 + road_m_s**2 + spread(vehicles, NOISE, unknown)
+    running = intervals.running_consistency(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2)
+    road_m_s = intervals.CROSSFALL_STD_RAD / coefficients(car.physics_vehicle)[1] * plain.vx_m_s
+    own = intervals.OWN_SHARE * plain.vy_std_m_s
+    expected = own**2 + running**2 + road_m_s**2 + spread(vehicles, NOISE, unknown)
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
     assert_alike(wide.vy_std_m_s[fast], np.sqrt(expected[fast]))
 
@@ -185,15 +173,15 @@ def test_samples_that_have_not_arrived_change_nothing(at):
     signals, track = _motion()
     late = signals.ready_ns > signals.stamps_ns[at]
     changed = replace(signals, ay_m_s2=np.where(late, 30.0, signals.ay_m_s2))
-    before, after = (running_consistency(track, s, 0.009) for s in (signals, changed))
+    before, after = (intervals.running_consistency(track, s, 0.009) for s in (signals, changed))
     np.testing.assert_array_equal(before[: at + 1], after[: at + 1])
     assert not np.array_equal(before, after)
 
 
 def test_a_wrong_sideslip_contradicts_the_sensors():
     signals, track = _motion()
-    right = running_consistency(track, signals, 0.0)[200:440]
-    wrong = running_consistency(replace(track, vy_m_s=0.5 * track.vy_m_s), signals, 0.0)[200:440]
+    right = intervals.running_consistency(track, signals, 0.0)[200:440]
+    wrong = intervals.running_consistency(replace(track, vy_m_s=0.5 * track.vy_m_s), signals, 0.0)[200:440]
     # Half of a swing of 0.3 m/s at 3 rad/s is lost; the high-pass of 0.3 s passes ωτ / √(1 + ω²τ²) = 0.67 of it.
     expected = 0.15 / np.sqrt(2.0) * 0.67
     assert np.all(right < 0.1 * expected)
@@ -205,7 +193,7 @@ def test_a_sensor_that_the_estimator_reports_as_faulty_widens_nothing():
     stuck = np.arange(900) >= 200
     signals = replace(signals, yaw_rate_rad_s=np.where(stuck, 0.4, signals.yaw_rate_rad_s))
     told = replace(track, reason=np.where(stuck, STUCK_YAW_RATE, 0))
-    blind, seeing = (running_consistency(t, signals, 0.009)[300:440] for t in (track, told))
+    blind, seeing = (intervals.running_consistency(t, signals, 0.009)[300:440] for t in (track, told))
     assert np.all(seeing < 0.1 * blind)
 
 

@@ -42,13 +42,9 @@ class Browser:
         flags = [f for f in _FLAGS if f != "--disable-gpu"] + list(_WEBGL) if webgl else _FLAGS
         command = [CHROMIUM, *flags, f"--user-data-dir={self._folder.name}", f"--window-size={width},{height}"]
         shell = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out} '
-        self._process = subprocess.Popen(
-            ["bash", "-c", shell, "bash", *command, "about:blank"],
-            pass_fds=(theirs_in, theirs_out),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        words = ["bash", "-c", shell, "bash", *command, "about:blank"]
+        alone = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+        self._process = subprocess.Popen(words, pass_fds=(theirs_in, theirs_out), **alone)
         os.close(theirs_in)
         os.close(theirs_out)
         self._buffer, self._number, self._session = b"", 0, None

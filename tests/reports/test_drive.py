@@ -97,14 +97,9 @@ def test_without_usable_estimates_the_page_says_so_and_shows_the_rest(tmp_path, 
 
 def plan_of(*outcomes: str) -> dict:
     """Return the plan of a report with one requirement per outcome."""
-    return {
-        "file": "plan.toml",
-        "requirements": [
-            {"id": f"SR-{i}", "label": "sideslip RMSE ≤ 0.5°", "outcome": outcome, "reason": f"reason {i}",
-             "next": f"do {i}"}
-            for i, outcome in enumerate(outcomes)
-        ],
-    }  # fmt: skip
+    texts = [{"id": f"SR-{i}", "reason": f"reason {i}", "next": f"do {i}"} for i in range(len(outcomes))]
+    named = [{"label": "sideslip RMSE ≤ 0.5°", "outcome": outcome} for outcome in outcomes]
+    return {"file": "plan.toml", "requirements": [a | b for a, b in zip(texts, named, strict=True)]}
 
 
 def test_the_first_screen_has_answer_verdicts_what_was_tested_the_worst_place_and_next_steps_in_this_order(tmp_path):
@@ -196,22 +191,16 @@ def hostile_run(folder: Path) -> Path:
     name = HOSTILE[0].replace("/", "_")
     all_of_it = " ".join(HOSTILE[:-1])
     when = {"start_ns": START_NS, "end_ns": START_NS + 10**9}
-    return write_run(
-        folder,
-        tracks,
-        name,
-        outcome=f"lost: {all_of_it}",
-        warnings=list(HOSTILE),
-        remarks=list(HOSTILE),
-        losses=[{"kind": "gap", "what": h, "where": h, "count": 1, "severity": "lost", **when} for h in HOSTILE],
-        segments=[{"name": h, "text": h, **when} for h in HOSTILE],
-        checks=[
-            {"name": h, "subject": h, "verdict": "failed", "evidence": h, "remedy": h, "waived": False} for h in HOSTILE
-        ],
-        versions=dict.fromkeys(HOSTILE, all_of_it),
-        metadata=dict(zip(HOSTILE, HOSTILE, strict=True)),
-        vehicle={"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False, "low_speed_blend_m_s": 3.0},
-    )
+    check = {"verdict": "failed", "waived": False}
+    said = {
+        "warnings": list(HOSTILE), "remarks": list(HOSTILE),
+        "losses": [{"kind": "gap", "what": h, "where": h, "count": 1, "severity": "lost", **when} for h in HOSTILE],
+        "segments": [{"name": h, "text": h, **when} for h in HOSTILE],
+        "checks": [dict.fromkeys(("name", "subject", "evidence", "remedy"), h) | check for h in HOSTILE],
+        "versions": dict.fromkeys(HOSTILE, all_of_it), "metadata": dict(zip(HOSTILE, HOSTILE, strict=True)),
+    }  # fmt: skip
+    vehicle = {"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False, "low_speed_blend_m_s": 3.0}
+    return write_run(folder, tracks, name, outcome=f"lost: {all_of_it}", vehicle=vehicle, **said)
 
 
 def test_hostile_names_are_text_and_nothing_is_written_outside(tmp_path):

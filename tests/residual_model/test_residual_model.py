@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -100,11 +101,7 @@ def test_baselines_come_with_the_model(saved):
 @pytest.mark.parametrize(
     ("file", "damage"),
     [
-        *(
-            (f"{folder}{bundles.WEIGHTS_FILE}", how)
-            for folder in ("", f"{bundles.PURE_LSTM_FOLDER}/")
-            for how in ("missing", "another's")
-        ),
+        *product((bundles.WEIGHTS_FILE, f"{bundles.PURE_LSTM_FOLDER}/{bundles.WEIGHTS_FILE}"), ("missing", "other's")),
         (bundles.DOCUMENT_FILE, "cut"),
         (bundles.DOCUMENT_FILE, {"version": 99}),
         (bundles.DOCUMENT_FILE, {"features": ["truth"] * 8}),
@@ -122,7 +119,7 @@ def test_a_damaged_network_or_baseline_is_one_clear_error(saved, file, damage):
         path.unlink()
     elif damage == "cut":
         path.write_text("{")
-    elif damage == "another's":
+    elif damage == "other's":
         random_network(9).save(saved / "other")
         shutil.copy(saved / "other" / bundles.WEIGHTS_FILE, path)
     else:

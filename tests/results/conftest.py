@@ -34,6 +34,8 @@ def circle():
         cov = np.tile(np.array([[0.04, 0.001, 0.0], [0.001, 0.09, 0.002], [0.0, 0.002, 0.0004]]), (n, 1, 1))
         estimate = name != "truth"
         nis = np.where(at % 7 == 3, np.nan, 1.5 + 0.001 * at) if estimate else np.full(n, np.nan)
+        pose = {"x_m": RADIUS_M * np.sin(course), "y_m": RADIUS_M * (1 - np.cos(course)), "yaw_rad": course - beta}
+        of_estimates = {"sideslip_std_rad": 0.03, "network_trust": 0.25, "r_scale": 1.25}
         return make_track(
             name,
             stamps_ns,
@@ -41,13 +43,9 @@ def circle():
             vy_m_s=SPEED_M_S * np.sin(beta),
             yaw_rate_rad_s=np.full(n, rate) + bias,
             ay_m_s2=np.full(n, SPEED_M_S * rate),
-            x_m=RADIUS_M * np.sin(course),
-            y_m=RADIUS_M * (1 - np.cos(course)),
-            yaw_rad=course - beta,
             covariance=cov if covariance and estimate else np.empty((0, 3, 3)),
-            sideslip_std_rad=np.full(n, 0.03) if estimate else np.full(n, np.nan),
-            network_trust=np.full(n, 0.25) if estimate else np.full(n, np.nan),
-            r_scale=np.full(n, 1.25) if estimate else np.full(n, np.nan),
+            **pose,
+            **{column: np.full(n, value if estimate else np.nan) for column, value in of_estimates.items()},
             nis=nis,
             nis_dof=np.where(np.isfinite(nis), 2.0, np.nan),
             friction=np.full(n, 0.85),

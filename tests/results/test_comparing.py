@@ -42,14 +42,9 @@ def test_the_same_run_is_equal_and_nothing_else_is_looked_at(tmp_path):
 
 def test_drives_pair_by_signals_then_content_then_name(tmp_path):
     a = [entry("slim"), entry("moved"), entry("same"), entry("gone"), entry("twin1"), entry("twin2")]
-    b = [
-        entry("full", signals_sha256=digest("signals slim")),
-        entry("renamed", signals_sha256=None, sha256=digest("file moved")),
-        entry("same", signals_sha256=None, sha256=None),
-        entry("new"),
-        entry("twin1"),
-        entry("twin2"),
-    ]
+    b = [entry("full", signals_sha256=digest("signals slim")), entry("same", signals_sha256=None, sha256=None)]
+    b.append(entry("renamed", signals_sha256=None, sha256=digest("file moved")))
+    b += [entry("new"), entry("twin1"), entry("twin2")]
     for twins in (a, b):
         for twin in twins[4:]:
             twin.update(signals_sha256=digest("twin"))
@@ -120,9 +115,9 @@ def test_what_else_differs_is_said(tmp_path):
     changed = {
         "d0": {"car": {"name": "golf", "sha256": digest("tuned"), "network_sha256": digest("net")}},
         "d1": {"truth_sha256": digest("rtk")},
-        "d2": {"mapping_sha256": digest("scaled"), "signals_sha256": digest("scaled signals")},
         "d3": {"main": "physics"},
         "d4": {"outcome": "lost: a chunk"},
+        "d2": {"mapping_sha256": digest("scaled"), "signals_sha256": digest("scaled signals")},
         "d5": {"signals_sha256": digest("other signals"), "sha256": digest("another file")},
     }
     b = [entry(label, **changed.get(label, {})) for label in TEN]

@@ -101,14 +101,9 @@ def decoded(path: Path, topic: str) -> list:
 
 def test_every_topic_is_there_with_all_messages_in_indexed_chunks(annotated):
     summary = summary_of(annotated)
-    counts = {
-        c.topic: (
-            summary.schemas[c.schema_id].name if c.schema_id else None,
-            c.message_encoding,
-            summary.statistics.channel_message_counts[c.id],
-        )
-        for c in summary.channels.values()
-    }
+    types = {0: None} | {number: schema.name for number, schema in summary.schemas.items()}
+    n_of = summary.statistics.channel_message_counts
+    counts = {c.topic: (types[c.schema_id], c.message_encoding, n_of[c.id]) for c in summary.channels.values()}
     assert counts == TOPICS and len(summary.channels) == len(TOPICS)
     assert Counter(topic for topic, *_ in messages(annotated)) == {topic: n for topic, (_, _, n) in TOPICS.items()}
     assert summary.statistics.message_start_time == 1_700_000_000_000_000_123

@@ -194,13 +194,9 @@ WORST = Requirement("R1", "No bad drive", "sideslip_rad", limit=0.02, statistic=
 def judged_alone(*errors: float | None, strict: bool = False, title: str = "") -> PlanVerdicts:
     """Return one verdict per error of the only drive, in rad; None: the drive has no figure."""
     requirements = tuple(replace(WORST, id=f"R{i}") for i in range(len(errors)))
-    judged = [
-        judge_values(
-            r,
-            [] if e is None else [DriveValue(JudgedDrive("a.mcap", None), "pd-hef", e, 100, seconds=60.0, metres=1e3)],
-        )
-        for r, e in zip(requirements, errors, strict=True)
-    ]
+    drive = JudgedDrive("a.mcap", None)
+    known = [e if e is None else DriveValue(drive, "pd-hef", e, 100, seconds=60.0, metres=1e3) for e in errors]
+    judged = [judge_values(r, [v] if v else []) for r, v in zip(requirements, known, strict=True)]
     return PlanVerdicts(ValidationPlan(requirements, title, "plan.toml"), tuple(judged), strict)
 
 

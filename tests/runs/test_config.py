@@ -184,9 +184,8 @@ def test_the_metadata_of_a_log_names_its_car(fleet, sample_logs_dir):
     shutil.copy(sample_logs_dir / "dlc.mcap", fleet / "fleet/mini/day/mini_1.mcap")
     golf, mini = (log_metadata(fleet / f"fleet/{n}/day/{n}_1.mcap") for n in ("golf", "mini"))
     assert golf["truthsim.manoeuvre"] == golf["manoeuvre"] != mini["manoeuvre"]
-    text = (
-        f'[metadata."truthsim.manoeuvre"]\n"{golf["manoeuvre"]}" = "golf.toml"\n"{mini["manoeuvre"]}" = "mini.toml"\n'
-    )
+    named = f'"{golf["manoeuvre"]}" = "golf.toml"\n"{mini["manoeuvre"]}" = "mini.toml"'
+    text = f'[metadata."truthsim.manoeuvre"]\n{named}\n'
     assert cars_of(fleet, text) == EACH
 
 

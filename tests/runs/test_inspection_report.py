@@ -42,18 +42,10 @@ def small_log(n: int = 3000, period_ms: int = 10) -> FakeLog:
     stamps = T0 + np.arange(n, dtype=np.int64) * period_ms * 1_000_000
     stamps[1001:] += 1_500_000_000
     rng = np.random.default_rng(0)
-    imu = FakeTopic(
-        "sensor_msgs/msg/Imu",
-        stamps + 3_000_000,
-        {
-            "header.stamp": stamps,
-            "linear_acceleration.x": rng.normal(size=n),
-            "linear_acceleration.y": rng.normal(2.0, 3.0, size=n),
-            "angular_velocity.z": rng.normal(size=n),
-        },
-        publish_time_ns=stamps + 1_000_000,
-    )
-    imu.fields["linear_acceleration.y"][5] = np.nan
+    fields = {"header.stamp": stamps, "linear_acceleration.x": rng.normal(size=n)}
+    fields |= {"linear_acceleration.y": rng.normal(2.0, 3.0, size=n), "angular_velocity.z": rng.normal(size=n)}
+    fields["linear_acceleration.y"][5] = np.nan
+    imu = FakeTopic("sensor_msgs/msg/Imu", stamps + 3_000_000, fields, publish_time_ns=stamps + 1_000_000)
     vendor = FakeTopic("vendor_msgs/msg/Box", stamps[::10] + 3_000_000, {"speed_kmh": np.zeros(len(stamps[::10]))})
     lost = (Loss("truncated", "the file ends early", "memory.mcap", start_ns=int(stamps[-1])),)
     return FakeLog({"/imu": imu, "/vendor": vendor}, lost=lost)

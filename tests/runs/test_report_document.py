@@ -103,9 +103,8 @@ def test_the_errors_have_the_rmse_of_the_figures(estimates):
     for estimator, signal, value in rmse.select("estimator", "signal", "value").iter_rows():
         of_one = errors.filter(pl.col("estimator") == estimator).get_column(f"error_{signal}")
         assert (of_one**2).mean() ** 0.5 == pytest.approx(value, rel=1e-9)
-    assert errors.filter(pl.col("estimator") == "truth").get_column("error_vy_m_s").null_count() == len(
-        errors.filter(pl.col("estimator") == "truth")
-    )
+    truth = errors.filter(pl.col("estimator") == "truth")
+    assert truth.get_column("error_vy_m_s").null_count() == len(truth)
 
 
 def test_records_print_as_one_line(estimates):

@@ -101,10 +101,8 @@ def test_slice_scores_the_slice_alone(sample_logs_dir, tmp_path):
 
 def test_estimates_do_not_depend_on_whether_truth_is_mapped(sample_logs_dir, tmp_path, dlc_run):
     (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING)
-    log, options = (
-        sample_logs_dir / "dlc.mcap",
-        {"mapping": tmp_path / "m.toml", "estimators": ("kinematic", "phy-ukf")},
-    )
+    log = sample_logs_dir / "dlc.mcap"
+    options = {"mapping": tmp_path / "m.toml", "estimators": ("kinematic", "phy-ukf")}
     assert run(log, tmp_path / "a", **options)["truth"]["available"] is False
     figures = set(pl.read_parquet(tmp_path / "a/metrics.parquet")["metric"])
     assert {"nis", "disagreement_rms", "nis_autocorrelation"} <= figures and "rmse" not in figures
@@ -217,11 +215,8 @@ def told(text: str) -> tuple[float, float]:
 def test_the_report_names_the_faults_with_their_times(report):
     assert report["plan"] is None  # nobody gave one, and one drive decides little
     start_ns = report["log"]["start_ns"]
-    found = {
-        (f["sensor"], f["kind"]): ((i["start_ns"] - start_ns) * 1e-9, (i["end_ns"] - start_ns) * 1e-9)
-        for f in report["faults"]
-        for i in f["intervals"]
-    }
+    spans = [((f["sensor"], f["kind"]), i) for f in report["faults"] for i in f["intervals"]]
+    found = {name: ((i["start_ns"] - start_ns) * 1e-9, (i["end_ns"] - start_ns) * 1e-9) for name, i in spans}
     assert found == {fault: pytest.approx(times, abs=0.7) for fault, times in FAULTS.items()}
     # It is reported after it has lasted for 0.05 s.
     assert told(report_markdown(report)) == pytest.approx((START_S, END_S), abs=0.11)
@@ -282,9 +277,8 @@ def test_damage_costs_what_it_hit_and_nothing_else(shared_dir, tmp_path, sound, 
     assert np.mean(difference_deg >= 0.01) < 0.0005
     assert np.nanmax(difference_deg) < 0.02
     start_ns = report["log"]["start_ns"]
-    gaps = {
-        x["where"]: (x["start_ns"] - start_ns, x["end_ns"] - start_ns) for x in report["losses"] if x["kind"] == "gap"
-    }
+    lost = [x for x in report["losses"] if x["kind"] == "gap"]
+    gaps = {x["where"]: (x["start_ns"] - start_ns, x["end_ns"] - start_ns) for x in lost}
     if "disorder" in name:  # its IMU is silent for half a minute
         assert np.divide(gaps["/imu/data.angular_velocity.z"], 1e9) == pytest.approx([135.0, 165.0], abs=0.05)
         assert all(where.startswith("/imu/data") for where in gaps)

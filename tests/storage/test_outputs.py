@@ -258,9 +258,8 @@ def test_an_output_that_is_an_input_is_refused_by_whatever_name(tmp_path):
     for inputs, files, folders in refused:
         with pytest.raises(UsageError, match="which would replace the input"):
             check_no_input(inputs, files, folders)
-    check_no_input(
-        [log, None, tmp_path / "none"], [tmp_path / "free" / "x.mcap", tmp_path / "none2"], [tmp_path / "car"]
-    )
+    free = [tmp_path / "free" / "x.mcap", tmp_path / "none2"]
+    check_no_input([log, None, tmp_path / "none"], free, [tmp_path / "car"])
     check_no_input([folder], [folder / "out" / "report.json"], [folder / "out"])  # beside the files of a log folder
     check_no_input([log], [folder / "report.json"], [tmp_path / "d" / "logs" / "xx"])
 

@@ -12,7 +12,7 @@ from pdhef_logtool.evaluation.smoothing import median_step_ns
 from pdhef_logtool.evaluation.track_errors import scorable
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.interpolation import Bracket
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, Signals
 
 SENSORS = "sensors"
 #: Mark of signals with an estimator input as their ground truth.
@@ -24,7 +24,7 @@ MAX_STEP_S = 0.2
 def carried_speed(signals: Signals) -> FloatArray:
     """Return the speed [N], interpolated linearly between its measurements except across gaps."""
     finite = np.isfinite(signals.speed_m_s)
-    bracket = Bracket(signals.stamps_ns[finite], signals.stamps_ns, round(MAX_STEP_S * 1e9))
+    bracket = Bracket(signals.stamps_ns[finite], signals.stamps_ns, round(MAX_STEP_S * NS_PER_S))
     return bracket.linear(signals.speed_m_s[finite])
 
 
@@ -32,7 +32,7 @@ def _exposure(drive: EvaluatedDrive) -> Iterator[Columns]:
     if (signals := drive.signals) is None:
         return
     speed = np.nan_to_num(driven_speed(signals, drive.truth))
-    step_s = np.full(len(signals), median_step_ns(signals.stamps_ns) * 1e-9)
+    step_s = np.full(len(signals), median_step_ns(signals.stamps_ns) * S_PER_NS)
     yield Columns(SENSORS, "state", {"step_s": step_s, "way_m": np.abs(speed) * step_s})
 
 

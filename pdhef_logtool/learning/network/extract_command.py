@@ -37,7 +37,7 @@ from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car
-from pdhef_logtool.records.errors import EstimatorError, LogError, OutputError, PdhefError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import S_PER_NS, Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
@@ -45,6 +45,7 @@ from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import FleetProgress
+from pdhef_logtool.runs.working import log_identity
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
@@ -277,17 +278,11 @@ def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
 def _with_own_name(log: LogInput, before: Mapping[str, Any], warn: Tell) -> LogInput:
     """Return a log with another name if the dataset contains another log of its name."""
     contents = {as_taken(d["log"]): d["source"]["sha256"] for d in before.get("drives", ())}
-    if as_taken(log.stem) not in contents:
-        return log
-    try:
-        content = identity_of(log)
-    except LogError:
-        return log  # reported when it is read
-    if contents[as_taken(log.stem)] == content:
+    content = log_identity(log) if as_taken(log.stem) in contents else None
+    if content is None or contents[as_taken(log.stem)] == content:
         return log
     names = (d["log"] for d in before["drives"] if d["source"] == {"file": log.path.name, "sha256": content})
-    known = next(names, None)
-    log = with_free_stem(log, contents) if known is None else replace(log, stem=known)
+    log = replace(log, stem=next(names, with_free_stem(log, contents).stem))
     warn(f"{log.path.name}: the dataset contains another log of this name; this one is {log.stem}")
     return log
 

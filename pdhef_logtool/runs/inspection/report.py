@@ -18,8 +18,8 @@ from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.drive.survey import Proposal, apply_proposals, mapping_proposals, survey_log
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.table import all_specs
-from pdhef_logtool.logs.byte_source import WHOLE_BYTES
 from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.constants import WHOLE_BYTES
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
