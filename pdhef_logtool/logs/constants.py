@@ -12,10 +12,8 @@ CONSTANTS: Mapping[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml")
 WHOLE_BYTES: int = CONSTANTS["whole_bytes"]
 #: Letters in ASCII.
 LATIN = str.maketrans(CONSTANTS["latin"])
-_ALPHABETS = {name: dict(pair.split("=") for pair in pairs.split()) for name, pairs in CONSTANTS["alphabets"].items()}
-LETTERS = str.maketrans(
-    {u: latin for a in _ALPHABETS.values() for letter, latin in a.items() for u in (letter, letter.upper())}
-)
+_PAIRS = (pair.split("=") for pairs in CONSTANTS["alphabets"].values() for pair in pairs.split())
+LETTERS = str.maketrans({u: latin for letter, latin in _PAIRS for u in (letter, letter.upper())})
 
 
 def numbered(table: Mapping[str, Any]) -> dict[int, Any]:

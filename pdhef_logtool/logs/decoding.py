@@ -201,8 +201,7 @@ class ChannelDecoder:
         if schema.wire == "protobuf":
             decode = schema.message_class.FromString
         elif schema.wire != "json":
-            function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
-            decode = bind(function, typename=schema.type_name)
+            decode = bind(getattr(schema.store, f"deserialize_{schema.wire}"), typename=schema.type_name)
 
         def tolerant(data: bytes) -> object:
             try:
