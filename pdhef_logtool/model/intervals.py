@@ -112,9 +112,9 @@ class Interval:
         drives = track.valid & (np.abs(track.vx_m_s) > self.filters[0].vehicle.low_speed_blend_m_s)
         if not self.whole_drive or not drives.any():
             return self.scale
-        misfit, own = self.scale**2 - 1.0, track.sideslip_std_rad**2
-        square = float(np.mean((track.sideslip_rad**2 + own)[drives]))
-        return np.asarray(np.sqrt(1.0 + misfit * square / (misfit * own + square)))
+        misfit, variance = self.scale**2 - 1.0, track.sideslip_std_rad**2
+        square = float(np.mean((track.sideslip_rad**2 + variance)[drives]))
+        return np.asarray(np.sqrt(1.0 + misfit * square / (misfit * variance + square)))
 
     def _lateral_velocity(self, physics: VehicleUkf, signals: Signals, number: int) -> FloatArray:
         """Return v_y [N] of a filter, on means of ``number`` samples as its vehicle corrects them.

@@ -225,7 +225,7 @@ def _toml_value(text: str) -> Any:
 
 
 def _read_file(path: Path) -> dict[str, Any]:
-    raw = read_toml(path, "a configuration TOML file", UsageError)
+    raw = read_toml(path, "a configuration TOML file", UsageError, times=("start", "end"))
     for key in _FILES:
         value = raw.get(key)
         if isinstance(value, str):

@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path, PurePath
@@ -34,15 +34,22 @@ DIGEST = "digest"
 _WHOLE = range(-(2**63), 2**64)
 
 
-def read_toml(path: Path, what: str, error: type[PdhefError], remedy: str = "") -> dict[str, Any]:
-    """Return the table of a TOML file; ``what`` names it in the error.
+def read_toml(
+    path: Path, what: str, error: type[PdhefError], remedy: str = "", times: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return the table of a TOML file; ``what`` names it in the error. Entries in ``times`` may be times, as texts.
 
     Raises
     ------
     PdhefError
         Of class ``error``: the file is missing, no UTF-8, no TOML, or nested beyond :data:`MAX_DEPTH`.
     """
-    return _read(path, tomllib.loads, what, error, remedy)
+
+    def parse(text: str) -> dict[str, Any]:
+        document = tomllib.loads(text)
+        return document | {n: str(document[n]) for n in times if isinstance(document.get(n), dt.datetime)}
+
+    return _read(path, parse, what, error, remedy)
 
 
 def read_json(
