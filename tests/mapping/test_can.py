@@ -118,13 +118,8 @@ def _mapping(folder: Path, fields: dict[str, str], more: str = "", dbc: str = DB
     return load_mapping(folder / "mapping.toml")
 
 
-_FIELDS = {
-    "speed_m_s": "can:Motion.Speed",
-    "yaw_rate_rad_s": "can:Motion.YawRate",
-    "ax_m_s2": "can:Extended.Accel",
-    "ay_m_s2": "can:Switched.OnFirst",
-    "friction": "can:Switched.OnThird",
-}
+_FIELDS = {"speed_m_s": "can:Motion.Speed", "yaw_rate_rad_s": "can:Motion.YawRate", "ax_m_s2": "can:Extended.Accel"}
+_FIELDS |= {"ay_m_s2": "can:Switched.OnFirst", "friction": "can:Switched.OnThird"}
 
 
 def _expected(frames: Sequence[Frame], field: str) -> list[tuple[int, float]]:

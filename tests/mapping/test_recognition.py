@@ -50,13 +50,8 @@ def odometry(forward: np.ndarray = FORWARD, left: np.ndarray = LEFT, pose: bool 
 
 
 def fix(status: float = 0.0) -> FakeTopic:
-    return topic(
-        "sensor_msgs/msg/NavSatFix",
-        latitude=48.0 + S * 1e-5,
-        longitude=11.0 + S * 1e-5,
-        altitude=S,
-        status__status=np.full(N, status),
-    )
+    place = {"latitude": 48.0 + S * 1e-5, "longitude": 11.0 + S * 1e-5, "altitude": S}
+    return topic("sensor_msgs/msg/NavSatFix", **place, status__status=np.full(N, status))
 
 
 def found(contents: dict[str, FakeTopic]) -> AutoMapping:

@@ -73,13 +73,9 @@ def test_a_page_draws_all_figures_zooms_all_of_them_and_says_nothing(browser, tm
 
 @pytest.mark.parametrize("kind", ["short", "standstill", "truthless", "failed", "one stamp"])
 def test_odd_drives_say_nothing_in_the_console(browser, tmp_path, kind):
-    tracks = {
-        "short": lambda: drive_tracks(3.0),
-        "standstill": lambda: drive_tracks(speed_m_s=0.0),
-        "truthless": lambda: drive_tracks(truth=False),
-        "failed": list,
-        "one stamp": lambda: drive_tracks(0.0),
-    }[kind]()
+    given = {"short": {"duration_s": 3.0}, "standstill": {"speed_m_s": 0.0}, "truthless": {"truth": False}}
+    given["one stamp"] = {"duration_s": 0.0}
+    tracks = [] if kind == "failed" else drive_tracks(**given[kind])
     opened(browser, page_of(write_run(tmp_path, tracks, outcome="failed: for a test" if kind == "failed" else "ok")))
 
 

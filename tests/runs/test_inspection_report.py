@@ -326,13 +326,9 @@ def write_log(
 def car(count: int = 300) -> dict[str, np.ndarray]:
     time_s = np.arange(count) * 0.05
     yaw_rate = 0.3 * np.sin(time_s)
-    return {
-        "yaw_rate_rad_s": yaw_rate,
-        "ay_mps2": 20.0 * yaw_rate,
-        "steering_angle_deg": np.degrees(yaw_rate * 2.7 / 20.0),
-        "speed_kmh": np.full(count, 72.0) + 0.1 * np.sin(3.0 * time_s),
-        "yaw_rate_2": 1.01 * yaw_rate,
-    }
+    steer, speed = np.degrees(yaw_rate * 2.7 / 20.0), np.full(count, 72.0) + 0.1 * np.sin(3.0 * time_s)
+    columns = {"yaw_rate_rad_s": yaw_rate, "ay_mps2": 20.0 * yaw_rate, "steering_angle_deg": steer}
+    return columns | {"speed_kmh": speed, "yaw_rate_2": 1.01 * yaw_rate}
 
 
 @given(st.lists(_VALUES, min_size=1, max_size=100))
