@@ -20,15 +20,7 @@ from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import VehicleError
-from pdhef_logtool.residual_model.bundle import (
-    DOCUMENT_FILE,
-    NO_MODEL,
-    PHYSICS_MODEL,
-    SHIPPED,
-    SHIPPED_FOLDERS,
-    ModelBundle,
-    load_bundle,
-)
+from pdhef_logtool.residual_model import bundle as bundles
 from pdhef_logtool.residual_model.interface import PlugInModel, load_plug_in, plug_in_names
 from pdhef_logtool.storage.documents import read_toml, validated
 
@@ -61,8 +53,8 @@ class Car:
 
     vehicle: VehicleParameters
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
-    network: ModelBundle | PlugInModel | None = None
-    network_name: str = NO_MODEL
+    network: bundles.ModelBundle | PlugInModel | None = None
+    network_name: str = bundles.NO_MODEL
     network_gain: float | None = None
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
@@ -121,9 +113,9 @@ class Car:
         return self.vehicle if self.fitted_physics is None else self.fitted_physics.values
 
     @property
-    def residual_network(self) -> ModelBundle | PlugInModel | None:
+    def residual_network(self) -> bundles.ModelBundle | PlugInModel | None:
         """The network if its residual is of ``physics``; the paper's network predicts the residual of ``phy-ukf``."""
-        return self.network if self.network is not None and self.network.model == PHYSICS_MODEL else None
+        return self.network if self.network is not None and self.network.model == bundles.PHYSICS_MODEL else None
 
     @property
     def residual_gain(self) -> float:
@@ -175,7 +167,7 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
     if folder is None:
         return VehicleFile(default_vehicle(), None, ()) if source is None else read_vehicle_file(source)
     if not (folder / VEHICLE_FILE).is_file():
-        what = "a network's" if (folder / DOCUMENT_FILE).is_file() else "another"
+        what = "a network's" if (folder / bundles.DOCUMENT_FILE).is_file() else "another"
         expected = f"a car: a folder with {VEHICLE_FILE}, or such a file"
         raise VehicleError(expected=expected, got=f"{what} folder", where=str(folder))
     return read_vehicle_file(folder / VEHICLE_FILE)
@@ -210,21 +202,23 @@ def read_fit(path: Path) -> Fit:
     return validated(Fit, raw, str(path), VehicleError, expected=f"the entries of {what}")
 
 
-def _network_of(folder: Path | None, chosen: Place) -> tuple[str, ModelBundle | PlugInModel | None]:
+def _network_of(folder: Path | None, chosen: Place) -> tuple[str, bundles.ModelBundle | PlugInModel | None]:
     """Return name and network in force; raises ModelError."""
-    name = SHIPPED if chosen is None else str(chosen)
-    if name == NO_MODEL:
-        return NO_MODEL, None
+    name = bundles.SHIPPED if chosen is None else str(chosen)
+    if name == bundles.NO_MODEL:
+        return bundles.NO_MODEL, None
     inside = None if folder is None or folder in SHIPPED_CARS.values() else folder / NETWORK_FOLDER
-    if chosen is None and inside is not None and (inside / DOCUMENT_FILE).is_file():
-        return NETWORK_FOLDER, load_bundle(inside)
-    if name in SHIPPED_FOLDERS:
-        home = SHIPPED_FOLDERS[name]
+    if chosen is None and inside is not None and (inside / bundles.DOCUMENT_FILE).is_file():
+        return NETWORK_FOLDER, bundles.load_bundle(inside)
+    if name in bundles.SHIPPED_FOLDERS:
+        home = bundles.SHIPPED_FOLDERS[name]
         # A source tree without shipped networks still runs the estimators that need none.
-        is_absent = chosen is None and not (home / DOCUMENT_FILE).is_file()
-        return (NO_MODEL, None) if is_absent else (name, load_bundle(home))
+        is_absent = chosen is None and not (home / bundles.DOCUMENT_FILE).is_file()
+        return (bundles.NO_MODEL, None) if is_absent else (name, bundles.load_bundle(home))
     if name in plug_in_names():
         return name, load_plug_in(name)
     # The path may be a car's folder that contains the network.
     home = Path(name)
-    return name, load_bundle(home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home)
+    return name, bundles.load_bundle(
+        home / NETWORK_FOLDER if (home / NETWORK_FOLDER / bundles.DOCUMENT_FILE).is_file() else home
+    )

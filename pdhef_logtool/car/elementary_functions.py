@@ -4,8 +4,6 @@ The functions of the C library are scalar and would take most of a filter's time
 calls, so that the compiler generates vector instructions.
 """
 
-from __future__ import annotations
-
 import math
 
 from pdhef_logtool.compiled.cache import njit

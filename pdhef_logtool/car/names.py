@@ -1,7 +1,5 @@
 """Words that are accepted in place of the path of a car, and the file of its model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 #: Cars of the package, by name.

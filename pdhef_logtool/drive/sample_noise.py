@@ -6,8 +6,6 @@
 * Spikes: samples beyond 6 sigma of a constant-velocity tracker, if the next sample returns.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

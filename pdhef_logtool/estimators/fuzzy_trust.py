@@ -6,8 +6,6 @@ caller chooses. The strength of a rule is the smaller of its two memberships (Ma
 the rules' singletons weighted by strength, which is the centre of gravity of singletons.
 """
 
-from __future__ import annotations
-
 import math
 
 from pdhef_logtool.compiled.cache import njit

@@ -3,8 +3,6 @@
 NumPy's products would load SciPy's BLAS.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit

@@ -17,8 +17,6 @@ to ``h`` [n] and returns its residual and its variance. Gains multiply low-passe
 bias them.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

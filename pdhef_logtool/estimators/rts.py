@@ -13,8 +13,6 @@ The backward pass corrects step k − 1 by the change of step k, with the gain G
 C_k = 0 separates the steps before a restart from those after it. The predictions of step 0 are not used.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit

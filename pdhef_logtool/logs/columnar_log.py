@@ -16,20 +16,12 @@ from types import MappingProxyType
 import numpy as np
 from mcap.records import Attachment, Metadata
 
+from pdhef_logtool.logs import message_schema
 from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
 from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema, concatenate_columns, missing_column
 from pdhef_logtool.logs.definitions import SHIPPED
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, Requests, TopicInfo
-from pdhef_logtool.logs.message_schema import (
-    FieldInfo,
-    MessageSchema,
-    NoSchemaError,
-    SchemaError,
-    Selection,
-    nearest,
-    resolve,
-)
 from pdhef_logtool.logs.recording_span import RecordingSpan, survey
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import KIB, MIB, LimitError
@@ -198,7 +190,7 @@ class ColumnarLog(DriveLog):
             expected = (s for start, end in spans_ns for s in self._to_read(topics, container, start, end))
             container.prefetch({span.index: span for span in expected}.values())
 
-    def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
+    def fields(self, topic: str, *, quiet: bool = False) -> tuple[message_schema.FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty for an encoding without schema.
 
         With ``quiet`` a schema that does not parse is not reported as a loss.
@@ -206,14 +198,14 @@ class ColumnarLog(DriveLog):
         for channel in self._by_topic.get(topic, ()):
             channel.asked |= not quiet
             schema = self._schema(channel)
-            if isinstance(schema, MessageSchema):
+            if isinstance(schema, message_schema.MessageSchema):
                 return schema.fields
         return ()
 
     def unreadable(self, topic: str) -> str:
         """Return why a topic has no readable fields, for example a missing definition; empty if it has some."""
         schemas = [self._schema(channel) for channel in self._by_topic.get(topic, ())]
-        if not schemas or any(isinstance(schema, MessageSchema) for schema in schemas):
+        if not schemas or any(isinstance(schema, message_schema.MessageSchema) for schema in schemas):
             return ""
         return str(schemas[0])
 
@@ -222,7 +214,7 @@ class ColumnarLog(DriveLog):
         messages: list[object] = []
         for channel in self._by_topic.get(topic, ()):
             schema = self._schema(channel)
-            if not isinstance(schema, MessageSchema):
+            if not isinstance(schema, message_schema.MessageSchema):
                 continue
             decode = ChannelDecoder(schema, ()).single_decoder()
             with self.containers[channel.c].meter.running():
@@ -309,7 +301,7 @@ class ColumnarLog(DriveLog):
             self._kept_bytes += small.nbytes
         return block
 
-    def _schema(self, channel: _Channel) -> MessageSchema | SchemaError:
+    def _schema(self, channel: _Channel) -> message_schema.MessageSchema | message_schema.SchemaError:
         """Return the schema of a channel, or the reason why it is unknown. It is parsed once, within the log's time.
 
         All schemas together get the part of the time limit that does not depend on the size of the log.
@@ -325,10 +317,10 @@ class ColumnarLog(DriveLog):
                 channel.schema = channel_schema(
                     record, self.distro, self._payloads(channel), meter.limits, self.definitions
                 )
-        except SchemaError as error:
+        except message_schema.SchemaError as error:
             channel.schema = error
         except LimitError as error:  # of time
-            channel.schema = SchemaError(describe_damage(error)[1])
+            channel.schema = message_schema.SchemaError(describe_damage(error)[1])
         finally:
             self._schemas_s += time.process_time() - started
         return channel.schema
@@ -339,15 +331,15 @@ class ColumnarLog(DriveLog):
         decoders: dict[_Channel, ChannelDecoder] = {}
         problems: list[MappingError] = []
         if topic not in self._by_topic:
-            raise nearest(topic, sorted(self._by_topic), "a topic of the log", self.path)
+            raise message_schema.nearest(topic, sorted(self._by_topic), "a topic of the log", self.path)
         for channel in self._by_topic[topic] if paths else ():
             schema = self._schema(channel)
             try:
-                if isinstance(schema, SchemaError):
+                if isinstance(schema, message_schema.SchemaError):
                     expected = "messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses"
                     remedy = "give its definition with --set msgs=DIR, or map another topic"
                     raise MappingError(expected=expected, got=str(schema), where=topic, remedy=remedy)
-                selections = tuple(resolve(schema, topic, path) for path in paths)
+                selections = tuple(message_schema.resolve(schema, topic, path) for path in paths)
                 decoders[channel] = ChannelDecoder(schema, selections)
             except MappingError as error:
                 problems.append(error)
@@ -424,7 +416,7 @@ class _Channel:
 
     c: int
     record: ChannelRecord
-    schema: MessageSchema | SchemaError | None = None
+    schema: message_schema.MessageSchema | message_schema.SchemaError | None = None
     asked: bool = False
     undecodable: dict[int, IntArray] = field(default_factory=dict)
     failed: dict[int, Loss] = field(default_factory=dict)
@@ -436,9 +428,9 @@ class _Channel:
         if self.asked and (undecodable := sum(map(len, self.undecodable.values()))):
             what = f"{undecodable} messages do not fit the type of their topic"
             yield Loss("undecodable", what, topic, count=undecodable)
-        if isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
+        if isinstance(schema, message_schema.SchemaError) and not isinstance(schema, message_schema.NoSchemaError):
             yield Loss("bad-schema", f"its messages cannot be decoded: {schema}", topic)
-        if isinstance(schema, MessageSchema) and schema.borrowed:
+        if isinstance(schema, message_schema.MessageSchema) and schema.borrowed:
             files = ", ".join(map(str, schema.borrowed))
             what = f"read by {files} of this machine, as the log does not define its type: correct only if they match"
             yield Loss("borrowed-definition", f"{what} the recorded version", topic, severity="note")
@@ -448,7 +440,7 @@ class _Channel:
 class _Plan:
     """How a topic is read: the resolved paths and a decoder per channel."""
 
-    selections: tuple[Selection, ...]
+    selections: tuple[message_schema.Selection, ...]
     decoders: Mapping[_Channel, ChannelDecoder]
 
 

@@ -19,21 +19,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs import message_schema as schemas
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.definitions import SHIPPED, Definitions
-from pdhef_logtool.logs.message_schema import (
-    Array,
-    MessageSchema,
-    Node,
-    NoSchemaError,
-    Scalar,
-    Selection,
-    Struct,
-    bytes_of_text,
-    json_schema,
-    ros_schema,
-    values_at,
-)
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, MIB, LimitError, ResourceLimits
 from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout
 from pdhef_logtool.records.signals import NS_PER_S, IntArray
@@ -56,7 +44,7 @@ def channel_schema(
     examples: Iterable[bytes] = (),
     limits: ResourceLimits = DEFAULT_LIMITS,
     definitions: Definitions = SHIPPED,
-) -> MessageSchema:
+) -> schemas.MessageSchema:
     """Parse the schema of a channel.
 
     Parameters
@@ -74,23 +62,23 @@ def channel_schema(
     """
     if channel.encoding in ("cdr", "ros1"):
         if channel.schema_encoding not in ("ros2msg", "ros2idl", "ros1msg", ""):
-            raise NoSchemaError(f"{channel.encoding} messages with a {channel.schema_encoding!r} schema")
+            raise schemas.NoSchemaError(f"{channel.encoding} messages with a {channel.schema_encoding!r} schema")
         text = channel.schema_data.decode("utf-8", errors="replace")
         if not channel.type_name:
-            raise NoSchemaError("no type name")
-        return ros_schema(
+            raise schemas.NoSchemaError("no type name")
+        return schemas.ros_schema(
             channel.type_name, channel.schema_encoding, text, channel.encoding, distro, limits, definitions
         )
     if channel.encoding == "json":
         data = channel.schema_data if channel.schema_encoding == "jsonschema" else b""
-        return json_schema(channel.type_name, data, examples, limits)
+        return schemas.json_schema(channel.type_name, data, examples, limits)
     if channel.encoding == "protobuf":
         if channel.schema_encoding != "protobuf":
-            raise NoSchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
+            raise schemas.NoSchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
         from pdhef_logtool.logs.protobuf_schema import protobuf_schema
 
         return protobuf_schema(channel.schema_name, channel.schema_data, limits)
-    raise NoSchemaError(f"messages encoded as {channel.encoding!r} are not decoded")
+    raise schemas.NoSchemaError(f"messages encoded as {channel.encoding!r} are not decoded")
 
 
 @dataclass(slots=True)
@@ -100,8 +88,8 @@ class ChannelDecoder:
     ``undecodable`` are the rows of the last block with a payload that does not fit their type (their fields are NaN).
     """
 
-    schema: MessageSchema
-    selections: tuple[Selection, ...]
+    schema: schemas.MessageSchema
+    selections: tuple[schemas.Selection, ...]
     undecodable: list[int] = field(default_factory=list)
     _layouts: list[LayoutReader] = field(default_factory=list)
 
@@ -177,18 +165,20 @@ class ChannelDecoder:
             parts.append({s.path: self._single_column(s, messages, its, most) for s in self.selections})
         return {s.path: concatenate_columns([part[s.path] for part in parts]) for s in self.selections}
 
-    def _single_column(self, selection: Selection, messages: list[Any], rows: IntArray, most: int) -> NDArray[Any]:
+    def _single_column(
+        self, selection: schemas.Selection, messages: list[Any], rows: IntArray, most: int
+    ) -> NDArray[Any]:
         """Return a column of decoded messages, the ``rows`` of a block; arrays have at most this many elements."""
-        parts = [values_at(messages, steps) for steps in selection.components]
+        parts = [schemas.values_at(messages, steps) for steps in selection.components]
         if selection.shape == "array":
             arrays = [self._bounded(selection, *item, most) for item in zip(rows.tolist(), parts[0], strict=True)]
             return _padded(arrays, selection.length)
         columns = [np.array([_number(value) for value in part], np.float64) for part in parts]
         return _column(selection, columns, len(messages))
 
-    def _bounded(self, selection: Selection, row: int, value: Any, most: int) -> NDArray[Any]:
+    def _bounded(self, selection: schemas.Selection, row: int, value: Any, most: int) -> NDArray[Any]:
         """Return the elements of an array; none if too wide."""
-        elements = _numbers(bytes_of_text(value, selection.text) if selection.text else value)
+        elements = _numbers(schemas.bytes_of_text(value, selection.text) if selection.text else value)
         if len(elements) <= most:
             return elements
         self.undecodable.append(row)
@@ -212,19 +202,23 @@ class ChannelDecoder:
         return tolerant
 
 
-def _affordable_bytes(schema: MessageSchema) -> float:
+def _affordable_bytes(schema: schemas.MessageSchema) -> float:
     """Return the largest message for which decoded objects fit the memory: 100 bytes per field of a byte or two."""
     if schema.wire in ("cdr", "ros1") and not _contains_objects(schema.root):
         return math.inf
     return schema.limits.chunk_bytes / {"protobuf": 4, "json": 16}.get(schema.wire, 128)
 
 
-def _contains_objects(node: Node) -> bool:
+def _contains_objects(node: schemas.Node) -> bool:
     """Return whether a type has arrays of objects."""
-    if isinstance(node, Struct):
+    if isinstance(node, schemas.Struct):
         return any(map(_contains_objects, node.members.values()))
-    item = node.item if isinstance(node, Array) else None
-    return isinstance(item, Struct) or item == Scalar("string") or (item is not None and _contains_objects(item))
+    item = node.item if isinstance(node, schemas.Array) else None
+    return (
+        isinstance(item, schemas.Struct)
+        or item == schemas.Scalar("string")
+        or (item is not None and _contains_objects(item))
+    )
 
 
 def _most_columns(rows: int) -> int:
@@ -261,7 +255,7 @@ def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return joined
 
 
-def missing_column(selection: Selection, n: int) -> NDArray[Any]:
+def missing_column(selection: schemas.Selection, n: int) -> NDArray[Any]:
     """Return the column of a path that none of N messages has."""
     if selection.shape == "time":
         return np.full(n, NO_TIME_NS, dtype=np.int64)
@@ -269,7 +263,7 @@ def missing_column(selection: Selection, n: int) -> NDArray[Any]:
     return np.full(n if width is None else (n, width), np.nan)
 
 
-def _column(selection: Selection, parts: Sequence[NDArray[Any] | None], n: int) -> NDArray[Any]:
+def _column(selection: schemas.Selection, parts: Sequence[NDArray[Any] | None], n: int) -> NDArray[Any]:
     """Return a column of N messages from its components, None for one that they lack."""
     if all(part is None for part in parts):
         return missing_column(selection, n)

@@ -25,24 +25,10 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs import container
 from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.constants import WHOLE_BYTES
-from pdhef_logtool.logs.container import (
-    MAX_TIME_NS,
-    MCAP_MAGIC,
-    UNVERIFIED,
-    Block,
-    ChannelRecord,
-    FileContainer,
-    RecordT,
-    Span,
-    SpanDamageError,
-    block_from_lists,
-    describe_damage,
-    items_at_bytes,
-    rows_by_channel,
-)
 from pdhef_logtool.logs.mcap_index import INDEX_PAIR, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.resource_limits import KIB, MIB, LimitError
 from pdhef_logtool.logs.table_file import LogFile
@@ -70,11 +56,11 @@ MESSAGE_HEAD = np.dtype(
 _MESSAGE_BYTES = MESSAGE_HEAD.itemsize - RECORD.size
 
 
-class McapContainer(FileContainer):
+class McapContainer(container.FileContainer):
     """One MCAP 1.0 file; its spans are chunks and runs of unchunked messages, in file order."""
 
     kind = "mcap"
-    magic = MCAP_MAGIC
+    magic = container.MCAP_MAGIC
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
     chunks: list[Extent]
@@ -96,14 +82,17 @@ class McapContainer(FileContainer):
     def _walk(self) -> None:
         source, size = self.source, self.source.size
         indexed = self._indexed_chunks()
-        self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
+        self._has_end = source.read(size - len(container.MCAP_MAGIC), len(container.MCAP_MAGIC)) == container.MCAP_MAGIC
         places = [*sorted(indexed), size]
         self.position = self._read_header()
         for offset in self._places():
             if offset in indexed:
                 self.position = self._add_chunk(*indexed[offset])
                 continue
-            if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
+            if (
+                size - offset == len(container.MCAP_MAGIC)
+                and source.read(offset, len(container.MCAP_MAGIC)) == container.MCAP_MAGIC
+            ):
                 self._closed = True
                 return
             opcode, end = self._record_head(offset)
@@ -132,7 +121,7 @@ class McapContainer(FileContainer):
         opcode, length = RECORD.unpack(self.source.read(offset, RECORD.size))
         return opcode, offset + RECORD.size + length
 
-    def _indexed_chunks(self) -> dict[int, tuple[Extent, Span]]:
+    def _indexed_chunks(self) -> dict[int, tuple[Extent, container.Span]]:
         """Return by their places the chunks that a sound summary describes; request all else of a remote file."""
         source = self.source
         index, self._is_summary_damaged = read_index(source, self.meter.limits)
@@ -148,7 +137,7 @@ class McapContainer(FileContainer):
             source.prefetch(zip([0, *ends], [*starts, source.size], strict=True))
         return {extent.start: (extent, span) for extent, span in index.chunks}
 
-    def _span_by_indexes(self, extent: Extent) -> Span | None:
+    def _span_by_indexes(self, extent: Extent) -> container.Span | None:
         """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
         indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
         if indexes is None:
@@ -159,7 +148,7 @@ class McapContainer(FileContainer):
         falls[[end - 1 for end in ends[:-1]]] = False  # from an index to the next one
         if falls.any():  # some writers sort an index by time
             times = times[np.lexsort((offsets, np.repeat(np.arange(len(parts)), [n for _, n in parts])))]
-        return Span.of((id_, times[end - n : end]) for (id_, n), end in zip(parts, ends, strict=True))
+        return container.Span.of((id_, times[end - n : end]) for (id_, n), end in zip(parts, ends, strict=True))
 
     def _read_header(self) -> int:
         """Read the header record, which is the first one; return its end."""
@@ -202,9 +191,9 @@ class McapContainer(FileContainer):
         elif opcode == Opcode.MESSAGE_INDEX or (
             opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self._data_end)
         ):
-            raise SpanDamageError(f"no record of kind {opcode} is allowed here")
+            raise container.SpanDamageError(f"no record of kind {opcode} is allowed here")
         elif opcode - _FIRST_PRIVATE == Opcode.CHUNK and self._is_chunk(start, end):
-            raise SpanDamageError("a chunk with one wrong bit in its opcode, which makes it a private record")
+            raise container.SpanDamageError("a chunk with one wrong bit in its opcode, which makes it a private record")
         return end
 
     def _payload(self, start: int, end: int) -> bytes:
@@ -247,11 +236,11 @@ class McapContainer(FileContainer):
             places.append(place)
             place = end
         if not places:
-            self.lose_record(offset, SpanDamageError("a message record is too short"))
+            self.lose_record(offset, container.SpanDamageError("a message record is too short"))
             return self._record_head(offset)[1]
         heads = _heads(block, np.array(places, dtype=np.int64))
-        times, rows = _held_times(heads["log"]), rows_by_channel(heads["channel"].astype(np.int64))
-        span = Span.of((id_, times[its]) for id_, its in rows.items())
+        times, rows = _held_times(heads["log"]), container.rows_by_channel(heads["channel"].astype(np.int64))
+        span = container.Span.of((id_, times[its]) for id_, its in rows.items())
         self.add_span(Extent(offset, base + place, base + place, is_chunk=False), span)
         return base + place
 
@@ -265,7 +254,7 @@ class McapContainer(FileContainer):
             index_end = following
         return Extent(start, end, index_end)
 
-    def _add_chunk(self, extent: Extent, claimed: Span | None = None) -> int:
+    def _add_chunk(self, extent: Extent, claimed: container.Span | None = None) -> int:
         """Add a chunk; return the end of its message indexes.
 
         The message indexes describe it if they agree with the summary (``claimed``), or in a file without an end with
@@ -277,7 +266,7 @@ class McapContainer(FileContainer):
             first, last, unpacked, *_ = _CHUNK.unpack(self.source.read(extent.start + RECORD.size, _CHUNK.size))
             fits = named is not None and sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked
             counts = named.counts if named is not None and fits else {}
-            claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, counts)
+            claimed = container.Span(0, min(first, container.MAX_TIME_NS), min(last, container.MAX_TIME_NS) + 1, counts)
         if named is None or (claimed.counts and named.counts != claimed.counts):
             what = f"the message indexes of the chunk at byte {extent.start} are damaged"
             self.lose("bad-record", f"{what}: its messages are found without them")
@@ -317,7 +306,7 @@ class McapContainer(FileContainer):
         """Join channels and schemas once all are known."""
         for id_, channel in self._raw_channels.items():
             schema = self._schemas.get(channel.schema_id, _NO_SCHEMA)
-            self.channels[id_] = ChannelRecord(
+            self.channels[id_] = container.ChannelRecord(
                 id=id_,
                 topic=channel.topic,
                 encoding=channel.message_encoding,
@@ -342,7 +331,7 @@ class McapContainer(FileContainer):
             return
         if self._is_partial and self.source.size > WHOLE_BYTES:
             what = "the CRC of the data section was not verified, as the log is read in parts from its server"
-            self.lost.append(Loss(UNVERIFIED, what, str(self.path), severity="note"))
+            self.lost.append(Loss(container.UNVERIFIED, what, str(self.path), severity="note"))
         elif self._crc(0, self._data_end) != crc:
             what = (
                 "the CRC of the data section does not match: some messages are damaged or missing, and it is "
@@ -364,13 +353,13 @@ class McapContainer(FileContainer):
             crc = crc32(self.source.read(offset, min(_CRC_BLOCK_BYTES, end - offset)), crc)
         return crc
 
-    def prefetch(self, spans: Iterable[Span]) -> None:
+    def prefetch(self, spans: Iterable[container.Span]) -> None:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
         if self.source.is_remote:
             extents = (self.chunks[span.index] for span in spans)
             self.source.prefetch((extent.start, extent.index_end) for extent in extents)
 
-    def _decoded(self, extent: Extent, *, declare: bool) -> Block:
+    def _decoded(self, extent: Extent, *, declare: bool) -> container.Block:
         """Return the messages of a chunk or run; with ``declare``, add the schemas and channels in it.
 
         The message indexes are used only if the chunk contains the messages that they name, and no others.
@@ -392,7 +381,7 @@ class McapContainer(FileContainer):
                 try:
                     self._declare(opcode, content[start:end])
                 except LimitError as error:
-                    self.lose(*describe_damage(error))
+                    self.lose(*container.describe_damage(error))
         return block
 
     def chunk_content(self, record: bytes, end: int) -> bytes:
@@ -402,16 +391,16 @@ class McapContainer(FileContainer):
             head.read(RECORD.size + 2 * _U64.size)  # and times
             size, crc, compression, stored = head.read8(), head.read4(), head.read_prefixed_string(), head.read8()
         except (struct.error, UnicodeDecodeError, McapError) as error:
-            raise SpanDamageError(f"malformed chunk header: {error}") from error
+            raise container.SpanDamageError(f"malformed chunk header: {error}") from error
         start = head.count
         if start + stored > end:
-            raise SpanDamageError("the chunk's records run past its end")
+            raise container.SpanDamageError("the chunk's records run past its end")
         content = decompress(compression, memoryview(record)[start : start + stored], size, self.meter.limits)
         if crc and crc32(content) != crc:
-            raise SpanDamageError("its CRC does not match")
+            raise container.SpanDamageError("its CRC does not match")
         return content
 
-    def _scan(self, content: bytes) -> Block:
+    def _scan(self, content: bytes) -> container.Block:
         """Return the messages among the records of a content; SpanDamageError if it contains anything else."""
         offsets = array("q")
         for opcode, start, _ in _records(content, 0, len(content)):
@@ -419,19 +408,21 @@ class McapContainer(FileContainer):
                 self.meter.check_scan(len(offsets))
                 offsets.append(start - RECORD.size)
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
-                raise SpanDamageError(f"it contains a record of kind {opcode}, which no chunk may")
+                raise container.SpanDamageError(f"it contains a record of kind {opcode}, which no chunk may")
         if not offsets:
-            return block_from_lists(content, *[()] * 6)
+            return container.block_from_lists(content, *[()] * 6)
         block = _gather_messages(content, np.array(offsets, dtype=np.int64))
         if block is None:
-            raise SpanDamageError("its records contradict each other")
+            raise container.SpanDamageError("its records contradict each other")
         return block
 
-    def records(self, kind: type[RecordT]) -> Iterator[RecordT]:
+    def records(self, kind: type[container.RecordT]) -> Iterator[container.RecordT]:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
         for start, end in self._records_at[kind]:
             try:
-                record: RecordT = _parsed(kind, self.source.read(start + RECORD.size, end - start - RECORD.size))
+                record: container.RecordT = _parsed(
+                    kind, self.source.read(start + RECORD.size, end - start - RECORD.size)
+                )
             except Exception as error:  # noqa: BLE001 (the boundary)
                 self.lose_record(start, error)
                 continue
@@ -449,7 +440,7 @@ class McapContainer(FileContainer):
         size = head.read8()
         crc_at = start + head.count + size  # a record may be padded behind its last member
         if crc_at + _U32.size > end:
-            raise SpanDamageError("it runs past its end")
+            raise container.SpanDamageError("it runs past its end")
         (crc,) = _U32.unpack(self.source.read(crc_at, _U32.size))
         if crc and self._crc(start, crc_at) != crc:
             self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
@@ -485,10 +476,10 @@ def _message_indexes(record: bytes, offset: int) -> tuple[list[tuple[int, int]],
 
 def _heads(content: bytes, offset: IntArray) -> NDArray[np.void]:
     """Return the heads of messages at offsets [N]."""
-    return items_at_bytes(content, MESSAGE_HEAD.itemsize)[offset].view(MESSAGE_HEAD)
+    return container.items_at_bytes(content, MESSAGE_HEAD.itemsize)[offset].view(MESSAGE_HEAD)
 
 
-def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
+def _gather_messages(content: bytes, offset: IntArray) -> container.Block | None:
     """Read message headers at known ascending offsets; None if the content has other messages than these."""
     n = len(content)
     if offset.size == 0 or offset[0] < 0 or offset[-1] + MESSAGE_HEAD.itemsize > n:
@@ -500,7 +491,7 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
     ends = offset + (RECORD.size + size)
     if ends.max() > n:
         return None
-    block = Block(
+    block = container.Block(
         buffer=content,
         channel=heads["channel"].astype(np.int64),
         log_time_ns=_held_times(heads["log"]),
@@ -511,23 +502,23 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
     )
     if offset[0] == 0 and ends[-1] == n and (offset[1:] == ends[:-1]).all():
         return block
-    with suppress(SpanDamageError):
+    with suppress(container.SpanDamageError):
         if all(opcode >= _FIRST_PRIVATE or opcode in _DECLARATIONS for opcode, *_ in _other_records(block)):
             return block
     return None
 
 
-def _agree(span: Span, other: Span) -> bool:
+def _agree(span: container.Span, other: container.Span) -> bool:
     """Return whether two spans have the same bounds and counts."""
     return (span.start_ns, span.end_ns, span.counts) == (other.start_ns, other.end_ns, other.counts)
 
 
 def _held_times(times: UintArray) -> IntArray:
     """Return times [N] as int64, those above ``MAX_TIME_NS`` as that."""
-    return np.minimum(times, np.uint64(MAX_TIME_NS)).astype(np.int64)
+    return np.minimum(times, np.uint64(container.MAX_TIME_NS)).astype(np.int64)
 
 
-def _other_records(block: Block) -> list[tuple[int, int, int]]:
+def _other_records(block: container.Block) -> list[tuple[int, int, int]]:
     """Return opcode and extent of the records between the messages of a chunk; SpanDamageError if they fill no gap."""
     starts = np.append(0, block.offset + block.length)
     ends = np.append(block.offset - MESSAGE_HEAD.itemsize, len(block.buffer))
@@ -543,4 +534,4 @@ def _records(content: bytes | memoryview, offset: int, end: int) -> Iterator[tup
         offset += RECORD.size + length
         yield opcode, offset - length, offset
     if offset != end:
-        raise SpanDamageError("its last record is cut")
+        raise container.SpanDamageError("its last record is cut")

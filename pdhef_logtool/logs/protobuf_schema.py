@@ -12,16 +12,7 @@ from functools import lru_cache
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
-from pdhef_logtool.logs.message_schema import (
-    Array,
-    MessageSchema,
-    Node,
-    Scalar,
-    SchemaError,
-    Struct,
-    Unfolding,
-    parsing,
-)
+from pdhef_logtool.logs import message_schema as schemas
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 
 #: Protobuf nests by reference, so that a small file can describe an endless tree.
@@ -30,7 +21,7 @@ _WELL_KNOWN = "google/protobuf/"
 
 
 @lru_cache(maxsize=256)
-def protobuf_schema(type_name: str, data: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> MessageSchema:
+def protobuf_schema(type_name: str, data: bytes, limits: ResourceLimits = DEFAULT_LIMITS) -> schemas.MessageSchema:
     """Parse a serialized ``FileDescriptorSet``.
 
     Parameters
@@ -45,22 +36,22 @@ def protobuf_schema(type_name: str, data: bytes, limits: ResourceLimits = DEFAUL
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
     what = f"the descriptors of {type_name}"
-    with parsing(what):
+    with schemas.parsing(what):
         limits.check("schema_bytes", len(data), what)
         files = descriptor_pb2.FileDescriptorSet.FromString(data)
         pool = descriptor_pool.DescriptorPool()
         by_name = {file.name: file for file in files.file}
-        unfolding = Unfolding(limits, what)
+        unfolding = schemas.Unfolding(limits, what)
         unfolding.enter(len(by_name), 0)
         for name in _in_order(by_name):
             pool.AddSerializedFile(by_name[name].SerializeToString())
         try:
             descriptor = pool.FindMessageTypeByName(type_name.removeprefix("."))
         except KeyError as error:
-            raise SchemaError(f"the descriptors contain no message {type_name}") from error
+            raise schemas.SchemaError(f"the descriptors contain no message {type_name}") from error
         root = _message_node(descriptor, (), unfolding)
         message_class = message_factory.GetMessageClass(descriptor)
-    return MessageSchema(type_name, "protobuf", root, None, message_class, limits)
+    return schemas.MessageSchema(type_name, "protobuf", root, None, message_class, limits)
 
 
 def _in_order(files: dict[str, Any]) -> list[str]:
@@ -75,7 +66,7 @@ def _in_order(files: dict[str, Any]) -> list[str]:
     try:
         return [*TopologicalSorter({name: file.dependency for name, file in files.items()}).static_order()]
     except CycleError as error:
-        raise SchemaError(f"{error.args[1][0]} imports itself") from error
+        raise schemas.SchemaError(f"{error.args[1][0]} imports itself") from error
 
 
 def _well_known_file(name: str, importer: str) -> Any:
@@ -89,33 +80,33 @@ def _well_known_file(name: str, importer: str) -> Any:
         with suppress(ImportError):
             imported = importlib.import_module(f"google.protobuf.{module}_pb2")
             return descriptor_pb2.FileDescriptorProto.FromString(imported.DESCRIPTOR.serialized_pb)
-    raise SchemaError(f"{importer} imports {name}, which the descriptors lack")
+    raise schemas.SchemaError(f"{importer} imports {name}, which the descriptors lack")
 
 
-def _message_node(descriptor: Any, above: tuple[str, ...], unfolding: Unfolding) -> Struct:
+def _message_node(descriptor: Any, above: tuple[str, ...], unfolding: schemas.Unfolding) -> schemas.Struct:
     inside = (*above, descriptor.full_name)
     nodes = {field.name: _field_node(field, inside, unfolding) for field in descriptor.fields}
-    return Struct({name: node for name, node in nodes.items() if node is not None})
+    return schemas.Struct({name: node for name, node in nodes.items() if node is not None})
 
 
-def _field_node(field: Any, inside: tuple[str, ...], unfolding: Unfolding) -> Node | None:
+def _field_node(field: Any, inside: tuple[str, ...], unfolding: schemas.Unfolding) -> schemas.Node | None:
     """Return a field's node; None if it cannot be a column."""
     from google.protobuf.descriptor import FieldDescriptor
 
     unfolding.enter(1, len(inside))
-    node: Node
+    node: schemas.Node
     if field.message_type is not None:
         kind = field.message_type
         if kind.GetOptions().map_entry or kind.full_name in inside or len(inside) >= _MAX_DEPTH:
             return None
         node = _message_node(kind, inside, unfolding)
     elif field.type == FieldDescriptor.TYPE_STRING:
-        node = Scalar("string")
+        node = schemas.Scalar("string")
     elif field.type == FieldDescriptor.TYPE_BYTES:
-        node = Array(Scalar("number", "u1"), None)
+        node = schemas.Array(schemas.Scalar("number", "u1"), None)
     else:
-        node = Scalar("bool" if field.type == FieldDescriptor.TYPE_BOOL else "number")
-    return Array(node, None) if _is_repeated(field) else node
+        node = schemas.Scalar("bool" if field.type == FieldDescriptor.TYPE_BOOL else "number")
+    return schemas.Array(node, None) if _is_repeated(field) else node
 
 
 def _is_repeated(field: Any) -> bool:

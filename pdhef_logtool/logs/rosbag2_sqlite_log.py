@@ -11,19 +11,8 @@ from urllib.parse import quote
 
 import numpy as np
 
+from pdhef_logtool.logs import container
 from pdhef_logtool.logs.byte_source import require_regular
-from pdhef_logtool.logs.container import (
-    MAX_TIME_NS,
-    Block,
-    ChannelRecord,
-    Container,
-    RawMessage,
-    Span,
-    SpanDamageError,
-    block_of,
-    describe_damage,
-    rows_by_channel,
-)
 from pdhef_logtool.logs.resource_limits import MIB, LimitError
 from pdhef_logtool.logs.table_file import LogFile
 from pdhef_logtool.storage.files import scratch_folder
@@ -33,7 +22,7 @@ _PAGE_BYTES = 4 * MIB
 _STEPS_A_CHECK = 100_000  # instructions of SQLite between checks of the time
 
 
-class SqliteContainer(Container):
+class SqliteContainer(container.Container):
     """One rosbag2 database, its topics as channels and pages of rows, in order of their ids, as spans.
 
     A database with a write-ahead log beside it is copied to a temporary folder first, as SQLite would write to it.
@@ -115,7 +104,7 @@ class SqliteContainer(Container):
         for id_, name, type_name, encoding, *rest in self._db.execute(query):
             self.meter.limits.check("channels", len(self.channels) + 1, f"topic {id_}")
             schema_encoding, text = definitions.get(type_name, ("", ""))
-            self.channels[int(id_)] = ChannelRecord(
+            self.channels[int(id_)] = container.ChannelRecord(
                 id=int(id_),
                 topic=str(name),
                 encoding=str(encoding),
@@ -133,17 +122,17 @@ class SqliteContainer(Container):
             for id_, topic, timestamp, length, kind in rows:
                 row_count += 1
                 if topic in self.channels and isinstance(id_, int) and isinstance(timestamp, int) and kind == "blob":
-                    listed.extend((id_, topic, min(timestamp, MAX_TIME_NS), length))
+                    listed.extend((id_, topic, min(timestamp, container.MAX_TIME_NS), length))
                     last = id_
         except sqlite3.Error as error:
-            what = f"the rows after id {last} cannot be read: {describe_damage(self._late or error)[1]}"
+            what = f"the rows after id {last} cannot be read: {container.describe_damage(self._late or error)[1]}"
             self.lose("over-budget" if self._late else "truncated", what, listed[-2] + 1 if listed else None)
         ids, topics, times, lengths = np.frombuffer(listed, np.int64).reshape(-1, 4).T
         ends = np.cumsum(lengths)
         page = ends // _PAGE_BYTES + np.arange(len(ids)) // _PAGE_ROWS
         for part in np.split(np.arange(len(ids)), np.flatnonzero(np.diff(page)) + 1) if len(ids) else ():
-            stamps = ((id_, times[part][its]) for id_, its in rows_by_channel(topics[part]).items())
-            self.spans.append(replace(Span.of(stamps), index=len(self.spans)))
+            stamps = ((id_, times[part][its]) for id_, its in container.rows_by_channel(topics[part]).items())
+            self.spans.append(replace(container.Span.of(stamps), index=len(self.spans)))
             self._pages.append((int(ids[part[0]]), int(ids[part[-1]])))
             self._ends.append(int(ends[part[-1]]))
         if unknown := row_count - len(ids):
@@ -170,11 +159,11 @@ class SqliteContainer(Container):
             what = f"the index of the messages names {max(counts)} rows, {row_count} of them are there"
             self.lose("missing-messages", what, count=missing)
 
-    def extent(self, span: Span) -> tuple[int, int]:
+    def extent(self, span: container.Span) -> tuple[int, int]:
         """Return the bytes of the page's rows, as if the data of all rows lay one behind the other."""
         return (self._ends[span.index - 1] if span.index else 0), self._ends[span.index]
 
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
+    def load(self, span: container.Span, want: frozenset[int] | None = None) -> container.Block:
         """Read one page; see :class:`~pdhef_logtool.logs.container.Container`."""
         first, last = self._pages[span.index]
         wanted = set(self.channels) if want is None else want & set(self.channels)
@@ -186,7 +175,9 @@ class SqliteContainer(Container):
         try:
             rows = self._db.execute(query, (first, last, *sorted(wanted))).fetchall()
         except sqlite3.Error as error:
-            raise self._late or SpanDamageError(str(error)) from error
+            raise self._late or container.SpanDamageError(str(error)) from error
         sound = (row for row in rows if isinstance(row[1], int) and isinstance(row[2], bytes))
-        timed = ((topic, min(timestamp, MAX_TIME_NS), data) for topic, timestamp, data in sound)
-        return block_of(RawMessage(topic, time_ns, time_ns, 0, data) for topic, time_ns, data in timed)
+        timed = ((topic, min(timestamp, container.MAX_TIME_NS), data) for topic, timestamp, data in sound)
+        return container.block_of(
+            container.RawMessage(topic, time_ns, time_ns, 0, data) for topic, time_ns, data in timed
+        )

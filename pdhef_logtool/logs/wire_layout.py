@@ -15,21 +15,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs import message_schema as schemas
 from pdhef_logtool.logs.container import items_at_bytes
-from pdhef_logtool.logs.message_schema import (
-    NO_MEMBERS,
-    Array,
-    MessageSchema,
-    Node,
-    Scalar,
-    SchemaError,
-    Step,
-    Struct,
-    Unknown,
-    parse_path,
-    resolve,
-    ros_schema,
-)
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import NS_PER_S
 
@@ -42,7 +29,7 @@ _CDR_HEAD = np.dtype("<u2")
 _LITTLE_ENDIAN_CDR = 0x0100  # the bytes 0, 1
 _WORD = np.dtype("<u4")
 
-Steps: TypeAlias = tuple[Step, ...]
+Steps: TypeAlias = tuple[schemas.Step, ...]
 
 
 class NoLayoutError(Exception):
@@ -72,7 +59,7 @@ class WireLayout:
     NoLayoutError : the message has none, or ends early.
     """
 
-    def __init__(self, root: Node, wire: str, message: bytes) -> None:
+    def __init__(self, root: schemas.Node, wire: str, message: bytes) -> None:
         self._aligned, self._message = wire == "cdr", message
         if self._aligned and message[:2] != b"\x00\x01":
             raise NoLayoutError("only little-endian CDR version 1 has a layout here")
@@ -98,24 +85,24 @@ class WireLayout:
         self.size += _WORD.itemsize
         return length
 
-    def _place(self, node: Node, steps: Steps) -> None:
+    def _place(self, node: schemas.Node, steps: Steps) -> None:
         # Arrays in arrays multiply.
         self._places += 1
         if self.size > len(self._message) or self._places > _MOST_PLACES:
             raise NoLayoutError("the message ends early, or it has too many places")
-        if isinstance(node, Struct):
+        if isinstance(node, schemas.Struct):
             for name, member in node.members.items():
                 self._place(member, (*steps, name))
-        elif isinstance(node, Array):
+        elif isinstance(node, schemas.Array):
             count = self._length_word() if node.length is None else node.length
-            if isinstance(node.item, Scalar) and node.item.kind != "string":
+            if isinstance(node.item, schemas.Scalar) and node.item.kind != "string":
                 self._place_numbers(node.item, steps, count)
             elif count > UNROLLED_ELEMENTS:
                 raise NoLayoutError("too many elements to unroll")
             else:
                 for i in range(count):
                     self._place(node.item, (*steps, i))
-        elif isinstance(node, Unknown) or (node.code and node.kind == "string"):
+        elif isinstance(node, schemas.Unknown) or (node.code and node.kind == "string"):
             raise NoLayoutError("open places and wide strings have no layout here")
         elif node.kind == "string":
             length = self._length_word()
@@ -123,7 +110,7 @@ class WireLayout:
         else:
             self._place_numbers(node, steps, None)
 
-    def _place_numbers(self, node: Scalar, steps: Steps, count: int | None) -> None:
+    def _place_numbers(self, node: schemas.Scalar, steps: Steps, count: int | None) -> None:
         dtype = np.dtype("<" + node.code)
         if count != 0:
             self._align(dtype.itemsize)
@@ -222,14 +209,14 @@ class CdrEncoder:
     ) -> None:
         self.topic = topic
         try:
-            self.schema: MessageSchema = ros_schema(type_name, "ros2msg", definition, "cdr")
-        except SchemaError as error:
+            self.schema: schemas.MessageSchema = schemas.ros_schema(type_name, "ros2msg", definition, "cdr")
+        except schemas.SchemaError as error:
             raise MappingError(expected=f"a definition of {type_name}", got=str(error), where=topic) from error
         self._texts: dict[Steps, str] = {}
         self._numbers: dict[str, NDArray[np.float64]] = {}
         for path, value in constants.items():
             if isinstance(value, str):
-                self._texts[parse_path(path)] = value
+                self._texts[schemas.parse_path(path)] = value
             else:
                 self._numbers[path] = np.asarray(value, dtype=np.float64)
         self._layouts: dict[tuple[tuple[Steps, int], ...], tuple[WireLayout, bytes]] = {}
@@ -260,7 +247,7 @@ class CdrEncoder:
         """Return the layout for these array widths and a message with only the constants."""
         lengths: dict[Steps, int] = {}
         for path, width in widths.items():
-            selection = resolve(self.schema, self.topic, path)
+            selection = schemas.resolve(self.schema, self.topic, path)
             if selection.shape == "array" and selection.length is None:
                 lengths[selection.components[0]] = width
         key = tuple(sorted(lengths.items(), key=repr))
@@ -271,20 +258,20 @@ class CdrEncoder:
             self._layouts[key] = layout, message[: layout.size]
         return self._layouts[key]
 
-    def _constant(self, node: Node, steps: Steps, lengths: Mapping[Steps, int]) -> Any:
+    def _constant(self, node: schemas.Node, steps: Steps, lengths: Mapping[Steps, int]) -> Any:
         """Return a message, or a part of it, with constant texts, arrays of the given lengths, and zeros."""
-        if isinstance(node, Struct):
+        if isinstance(node, schemas.Struct):
             members = {name: self._constant(member, (*steps, name), lengths) for name, member in node.members.items()}
-            return SimpleNamespace(**({NO_MEMBERS: 0} | members))
-        if isinstance(node, Array):
+            return SimpleNamespace(**({schemas.NO_MEMBERS: 0} | members))
+        if isinstance(node, schemas.Array):
             count = lengths.get(steps, 0) if node.length is None else node.length
-            if isinstance(node.item, Scalar) and node.item.kind != "string":
+            if isinstance(node.item, schemas.Scalar) and node.item.kind != "string":
                 return np.zeros(count, node.item.code)
             return [self._constant(node.item, (*steps, i), lengths) for i in range(count)]
-        return self._texts.get(steps, "") if isinstance(node, Scalar) and node.kind == "string" else 0
+        return self._texts.get(steps, "") if isinstance(node, schemas.Scalar) and node.kind == "string" else 0
 
     def _put(self, layout: WireLayout, rows: NDArray[np.uint8], path: str, values: NDArray[Any]) -> None:
-        selection = resolve(self.schema, self.topic, path)
+        selection = schemas.resolve(self.schema, self.topic, path)
         parts: Sequence[NDArray[Any]] = (values,)
         if selection.shape == "time":
             parts = np.divmod(values, NS_PER_S)

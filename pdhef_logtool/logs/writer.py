@@ -15,23 +15,9 @@ from typing import IO, Any
 
 import numpy as np
 from isal.isal_zlib import crc32
+from mcap import records as mcap_records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, Block, ChannelRecord, items_at_bytes, rows_by_channel
 from pdhef_logtool.logs.definitions import message_definition
@@ -69,21 +55,21 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         import zstandard
 
         self._path, self._compressor = path, zstandard.ZstdCompressor(level=level)
-        self._schemas: dict[tuple[str, str, bytes], Schema] = {}
-        self._channels: list[Channel] = []
+        self._schemas: dict[tuple[str, str, bytes], mcap_records.Schema] = {}
+        self._channels: list[mcap_records.Channel] = []
         self._encoders: dict[str, tuple[int, CdrEncoder]] = {}
         self._sequences: Counter[int] = Counter()
         self._counts: Counter[int] = Counter()
-        self._chunk_indexes: list[ChunkIndex] = []
-        self._attachment_indexes: list[AttachmentIndex] = []
-        self._metadata_indexes: list[MetadataIndex] = []
+        self._chunk_indexes: list[mcap_records.ChunkIndex] = []
+        self._attachment_indexes: list[mcap_records.AttachmentIndex] = []
+        self._metadata_indexes: list[mcap_records.MetadataIndex] = []
         self._crc = 0
         self._at = 0
         self._pending = PendingFile(path)
         with writing(path):
             self._file: IO[bytes] = open_new(self._pending.path)
         self._emit(MCAP_MAGIC)
-        self._emit_record(Header(profile=profile, library=LIBRARY))
+        self._emit_record(mcap_records.Header(profile=profile, library=LIBRARY))
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the file, or remove it if an exception passes."""
@@ -128,7 +114,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         schema = 0
         if record.schema_name or record.schema_encoding:
             schema = self._add_schema(record.schema_name, record.schema_encoding, record.schema_data)
-        channel = Channel(
+        channel = mcap_records.Channel(
             id=self._next_id(self._channels),
             topic=record.topic,
             message_encoding=record.encoding,
@@ -142,7 +128,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
     def _add_schema(self, name: str, encoding: str, data: bytes) -> int:
         key = (name, encoding, data)
         if key not in self._schemas:
-            self._schemas[key] = Schema(id=self._next_id(self._schemas), data=data, encoding=encoding, name=name)
+            self._schemas[key] = mcap_records.Schema(
+                id=self._next_id(self._schemas), data=data, encoding=encoding, name=name
+            )
             self._emit_record(self._schemas[key])
         return self._schemas[key].id
 
@@ -210,7 +198,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             "message_end_time": end_ns,
             "uncompressed_size": len(records),
         }
-        chunk_start, chunk_length = self._emit_record(Chunk(data=stored, uncompressed_crc=crc32(records), **about))
+        chunk_start, chunk_length = self._emit_record(
+            mcap_records.Chunk(data=stored, uncompressed_crc=crc32(records), **about)
+        )
         index_at = self._at
         offsets: dict[int, int] = {}
         index = bytearray()
@@ -223,7 +213,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             self._counts[id_] += len(rows)
         self._emit(bytes(index))
         self._chunk_indexes.append(
-            ChunkIndex(
+            mcap_records.ChunkIndex(
                 chunk_start_offset=chunk_start,
                 chunk_length=chunk_length,
                 message_index_offsets=offsets,
@@ -233,23 +223,23 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             )
         )
 
-    def attachment(self, record: Attachment) -> None:
+    def attachment(self, record: mcap_records.Attachment) -> None:
         """Add a file."""
         start, length = self._emit_record(record)
         about = {name: getattr(record, name) for name in ("create_time", "log_time", "name", "media_type")}
-        index = AttachmentIndex(offset=start, length=length, data_size=len(record.data), **about)
+        index = mcap_records.AttachmentIndex(offset=start, length=length, data_size=len(record.data), **about)
         self._attachment_indexes.append(index)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a record of key-value pairs."""
-        start, length = self._emit_record(Metadata(name=name, metadata=dict(values)))
-        self._metadata_indexes.append(MetadataIndex(offset=start, length=length, name=name))
+        start, length = self._emit_record(mcap_records.Metadata(name=name, metadata=dict(values)))
+        self._metadata_indexes.append(mcap_records.MetadataIndex(offset=start, length=length, name=name))
 
     def close(self) -> None:
         """Write the summary and give the file its name."""
         if self._file.closed:
             return
-        self._emit_record(DataEnd(data_section_crc=self._crc))
+        self._emit_record(mcap_records.DataEnd(data_section_crc=self._crc))
         self._emit_summary()
         try:
             with writing(self._path):
@@ -267,7 +257,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
 
     def _emit_summary(self) -> None:
         start = self._at
-        statistics = Statistics(
+        statistics = mcap_records.Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._channels),
             channel_message_counts=dict(sorted(self._counts.items())),
@@ -282,7 +272,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         summary = _bytes_of(*self._schemas.values(), *self._channels, statistics, *indexes)
         head = struct.pack("<BQQQ", Opcode.FOOTER, FOOTER.size - RECORD.size, start, 0)
         self._emit(summary)
-        self._emit_record(Footer(summary_start=start, summary_offset_start=0, summary_crc=crc32(head, crc32(summary))))
+        self._emit_record(
+            mcap_records.Footer(summary_start=start, summary_offset_start=0, summary_crc=crc32(head, crc32(summary)))
+        )
         self._emit(MCAP_MAGIC)
 
     def _emit(self, data: bytes) -> None:
@@ -295,13 +287,13 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._crc = crc32(data, self._crc)
         self._at += len(data)
 
-    def _emit_record(self, record: McapRecord) -> tuple[int, int]:
+    def _emit_record(self, record: mcap_records.McapRecord) -> tuple[int, int]:
         data, start = _bytes_of(record), self._at
         self._emit(data)
         return start, len(data)
 
 
-def _bytes_of(*records: McapRecord) -> bytes:
+def _bytes_of(*records: mcap_records.McapRecord) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)

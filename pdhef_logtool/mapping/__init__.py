@@ -4,8 +4,6 @@ A mapping states field, scale, offset and time of each signal; without a file, n
 not import the car: a log is mapped before a vehicle is known.
 """
 
-from __future__ import annotations
-
 from pdhef_logtool.mapping.channels import MappedChannels as MappedChannels
 from pdhef_logtool.mapping.channels import merge_losses as merge_losses
 from pdhef_logtool.mapping.channels import read_signals as read_signals

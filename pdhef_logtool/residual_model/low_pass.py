@@ -1,7 +1,5 @@
 """Compiled causal first-order low pass with state."""
 
-from __future__ import annotations
-
 import math
 
 from pdhef_logtool.compiled.cache import njit

@@ -16,16 +16,7 @@ from typing import Self
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.results.opened_run import (
-    JOURNAL_FILE,
-    LOGS,
-    METRICS_FILE,
-    PAGE_FILE,
-    PARTS,
-    REPORT_FILE,
-    TABLES,
-    table_file,
-)
+from pdhef_logtool.results import opened_run
 from pdhef_logtool.runs.drive_outputs import STALE_FILES
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work
 from pdhef_logtool.storage.files import open_new, scratch_folder
@@ -55,8 +46,13 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
             return end
         files = (p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
         # The report is last: it states that the drive is done.
-        names = sorted((n for n in files if "/." not in f"/{n}"), key=lambda n: (n.endswith(f"/{REPORT_FILE}"), n))
-        here, report = f"{LOGS}/{task.log.stem}", f"{LOGS}/{task.log.stem}/{REPORT_FILE}"
+        names = sorted(
+            (n for n in files if "/." not in f"/{n}"), key=lambda n: (n.endswith(f"/{opened_run.REPORT_FILE}"), n)
+        )
+        here, report = (
+            f"{opened_run.LOGS}/{task.log.stem}",
+            f"{opened_run.LOGS}/{task.log.stem}/{opened_run.REPORT_FILE}",
+        )
         try:
             if report in names:
                 stale = {f"{here}/{name}" for name in STALE_FILES}.difference(names)
@@ -66,12 +62,12 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
                 objects.put(name, folder / name)
         except OutputError as error:
             return error
-        needed = [name for name in names if name == report or name.startswith(f"{PARTS}/")]
+        needed = [name for name in names if name == report or name.startswith(f"{opened_run.PARTS}/")]
         return StoredEnd(end, tuple(names), {name: (folder / name).read_bytes() for name in needed})
 
 
 def _is_page(name: str) -> bool:
-    return name == REPORT_FILE or name.endswith(PAGE_FILE)
+    return name == opened_run.REPORT_FILE or name.endswith(opened_run.PAGE_FILE)
 
 
 class StoredOutput(Mirror):
@@ -114,7 +110,7 @@ class StoredOutput(Mirror):
 
     def check_no_input(self, inputs: Iterable[LogInput]) -> None:
         """Refuse logs that lie among the outputs; raises UsageError."""
-        within = f"{self.objects.shown}/{LOGS}/"
+        within = f"{self.objects.shown}/{opened_run.LOGS}/"
         for log in inputs:
             if isinstance(log.path, RemotePlace) and str(log.path).startswith(within):
                 raise UsageError(
@@ -126,8 +122,12 @@ class StoredOutput(Mirror):
 
     def fetch_journal(self) -> None:
         """Fetch the journal of an earlier run, and figures and reports of its drives."""
-        if self.fetch(JOURNAL_FILE) is not None:
-            needed = (n for n in self._names if n.startswith(f"{PARTS}/") or n.endswith(f"/{REPORT_FILE}"))
+        if self.fetch(opened_run.JOURNAL_FILE) is not None:
+            needed = (
+                n
+                for n in self._names
+                if n.startswith(f"{opened_run.PARTS}/") or n.endswith(f"/{opened_run.REPORT_FILE}")
+            )
             self.objects.get_all(sorted(needed), self.folder)
 
     def take(self, stored: StoredEnd | None) -> DriveEnd | None:
@@ -145,7 +145,7 @@ class StoredOutput(Mirror):
     def begin(self) -> None:
         """Upload the journal of the start of the run; remove figures that it does not list."""
         self._put_journal()
-        mirrored = (name for name in self._names if _is_page(name) or name.startswith(f"{PARTS}/"))
+        mirrored = (name for name in self._names if _is_page(name) or name.startswith(f"{opened_run.PARTS}/"))
         gone = sorted(name for name in mirrored if not (self.folder / name).is_file())
         self.objects.remove(gone)
         self._names.difference_update(gone)
@@ -158,8 +158,13 @@ class StoredOutput(Mirror):
     def publish(self) -> None:
         """Upload figures, pages and run.json, and the journal last."""
         self.objects.renew()
-        pages = [p for p in (self.folder / LOGS).glob(f"*/{PAGE_FILE}") if p.stat().st_size]
-        names = (*map(table_file, TABLES), METRICS_FILE, PAGE_FILE, REPORT_FILE)
+        pages = [p for p in (self.folder / opened_run.LOGS).glob(f"*/{opened_run.PAGE_FILE}") if p.stat().st_size]
+        names = (
+            *map(opened_run.table_file, opened_run.TABLES),
+            opened_run.METRICS_FILE,
+            opened_run.PAGE_FILE,
+            opened_run.REPORT_FILE,
+        )
         for path in [*(self.folder / name for name in names), *pages, self.folder / RUN_FILE]:
             if path.is_file() and path.stat().st_size:
                 name = path.relative_to(self.folder).as_posix()
@@ -170,6 +175,6 @@ class StoredOutput(Mirror):
     def _put_journal(self) -> None:
         """Renew the lock and upload the journal; raises OutputError if another command has the lock."""
         self.objects.renew()
-        if (path := self.folder / JOURNAL_FILE).is_file():
-            self.objects.put(JOURNAL_FILE, path)
+        if (path := self.folder / opened_run.JOURNAL_FILE).is_file():
+            self.objects.put(opened_run.JOURNAL_FILE, path)
         self._uploaded_s = time.monotonic()

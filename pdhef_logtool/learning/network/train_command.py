@@ -20,19 +20,7 @@ from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, read_dataset
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.residual_model.bundle import (
-    DOCUMENT_FILE,
-    NO_MODEL,
-    NOMINAL_MODEL,
-    OUTPUT_COUNT,
-    PHYSICS_MODEL,
-    RESIDUAL,
-    WEIGHTS_FILE,
-    ModelBundle,
-    Normalisation,
-    load_bundle,
-    network_folder,
-)
+from pdhef_logtool.residual_model import bundle as bundles
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import ResidualNetwork, State
 from pdhef_logtool.storage.files import write_bytes
@@ -95,7 +83,7 @@ class Recipe:
     patience: int = 10
     seed: int = 0
     period_s: float = 0.01
-    target: str = RESIDUAL
+    target: str = bundles.RESIDUAL
     odd: bool = True  # mirrored pieces are as frequent as originals, and the network is made exactly odd
 
 
@@ -128,7 +116,7 @@ Progress = Callable[[str, float], None]
 
 def normalisation_of(
     sequences: Iterable[FeatureSequence], names: tuple[str, ...], *, odd: bool = False
-) -> Normalisation:
+) -> bundles.Normalisation:
     """Return mean and standard deviation of features and targets over the used samples of training sequences.
 
     With ``odd``, features that change sign under mirroring have a mean of 0.
@@ -143,7 +131,7 @@ def normalisation_of(
     if odd:
         mean[[n in ODD_FEATURES for n in names]] = 0.0
     std, spread = (np.maximum(np.sqrt(np.mean(v**2, axis=0)), 1e-6) for v in (features - mean, target))
-    return Normalisation(*(tuple(column.tolist()) for column in (mean, std, spread)))
+    return bundles.Normalisation(*(tuple(column.tolist()) for column in (mean, std, spread)))
 
 
 def train(
@@ -153,10 +141,10 @@ def train(
     work: Path,
     *,
     test: Iterable[FeatureSequence] = (),
-    init: ModelBundle | None = None,
+    init: bundles.ModelBundle | None = None,
     device: str = "cpu",
     progress: Progress = lambda _text, _share: None,
-) -> tuple[ModelBundle, list[Epoch]]:
+) -> tuple[bundles.ModelBundle, list[Epoch]]:
     """Train a network and return the bundle of the best validation epoch with the loss history.
 
     Parameters
@@ -180,7 +168,7 @@ def train(
             )
     if init is not None:
         recipe = replace(recipe, **{name: getattr(init, name) for name in (*_SHAPE, "target")})
-    empty = ModelBundle(
+    empty = bundles.ModelBundle(
         **{name: getattr(recipe, name) for name in (*_SHAPE, "period_s", "target")},
         normalisation=init.normalisation if init else normalisation_of(training, recipe.feature_names, odd=recipe.odd),
         weights={},
@@ -233,7 +221,7 @@ def _sha256(parts: Iterable[str | torch.Tensor]) -> str:
     return total.hexdigest()
 
 
-def _pieces(s: FeatureSequence, bundle: ModelBundle, steps: int) -> Iterator[_Piece]:
+def _pieces(s: FeatureSequence, bundle: bundles.ModelBundle, steps: int) -> Iterator[_Piece]:
     """Yield the pieces of a sequence as the network of a bundle receives and predicts it.
 
     The weights of a piece are divided by the mean square of its target.
@@ -265,10 +253,10 @@ class _Training:
     history: list[Epoch] = field(default_factory=list)
 
     @classmethod
-    def start(cls, recipe: Recipe, init: ModelBundle | None, signs: FloatArray, device: str) -> _Training:
+    def start(cls, recipe: Recipe, init: bundles.ModelBundle | None, signs: FloatArray, device: str) -> _Training:
         """Return a network with random weights by the seed of a recipe, or with the weights of a bundle."""
         torch.manual_seed(recipe.seed)
-        sizes, outputs = (len(recipe.feature_names), recipe.hidden, recipe.layers), OUTPUT_COUNT[recipe.target]
+        sizes, outputs = (len(recipe.feature_names), recipe.hidden, recipe.layers), bundles.OUTPUT_COUNT[recipe.target]
         network = ResidualNetwork(*sizes, recipe.head, recipe.dropout, outputs=outputs)
         if init is not None:
             network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})
@@ -412,7 +400,7 @@ class TrainResult:
     """Result of the command; ``test_loss`` is the loss on the test drives, None without any."""
 
     model: Path
-    bundle: ModelBundle
+    bundle: bundles.ModelBundle
     history: tuple[Epoch, ...]
     test_loss: float | None
 
@@ -458,12 +446,12 @@ def run_training(
     """
     dataset, output = Path(dataset), local_path(output)
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
-    data = read_dataset(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
-    start = network_folder(NO_MODEL if init is None else init)
-    bundle = None if start is None else load_bundle(start)
+    data = read_dataset(dataset, bundles.NOMINAL_MODEL if paper else bundles.PHYSICS_MODEL)
+    start = bundles.network_folder(bundles.NO_MODEL if init is None else init)
+    bundle = None if start is None else bundles.load_bundle(start)
     if bundle is not None and bundle.model != data.model:
         raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=init)
-    check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
+    check_no_input([start], [output / name for name in (bundles.DOCUMENT_FILE, bundles.WEIGHTS_FILE)])
     with OutputFolder(output):
         return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
 
@@ -483,7 +471,7 @@ def train_on(
     output: Path,
     recipe: Recipe,
     *,
-    init: ModelBundle | None = None,
+    init: bundles.ModelBundle | None = None,
     device: str = "cpu",
     progress: Progress = lambda _text, _share: None,
 ) -> TrainResult:
@@ -578,7 +566,7 @@ class SplitSequences:
             for part in gap_free_runs(rows):
                 weight = weights_of(rows, part)
                 features = np.asarray(rows.features[part], dtype=np.float64)
-                if self.target == RESIDUAL:
+                if self.target == bundles.RESIDUAL:
                     values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None] - offset
                 else:
                     values = np.asarray(rows.truth_velocity[part, 1:2], dtype=np.float64)
