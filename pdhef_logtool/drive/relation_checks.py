@@ -87,10 +87,10 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         return [result(UNIT, "undecided", name, evidence=relations[0].evidence, remedy=remedy)]
     if not any(r.accepts(factors[r.law.text]) for r in usable):
         return [result(UNIT, "undecided", name, evidence=usable[0].evidence, remedy=TEXTS["unexplained"])]
-    return _passed(name, usable, factors)
+    return _passed(name, usable, factors, measured.speed_name)
 
 
-def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) -> list[Check]:
+def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float], pace: str | None) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
     # Wheel radii and wheelbases vary by more; a speed separates mph from km/h, tyres do not.
     foreign = () if name.startswith(("steer", "wheel")) else FOREIGN
@@ -98,6 +98,8 @@ def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) ->
     units |= {f**p for f in foreign for p in (1.0, -1.0)}
     units = {f for f in units if name not in NEEDS["units"] or max(f, 1.0 / f) > 3.0}
     is_open = any(all(r.accepts(factors[r.law.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units)
+    # Wheels of 0.28 m turn with as many rad/s as the car has km/h.
+    is_open |= name.startswith("wheel") and name.endswith("rad_s") and pace == WHEEL_SPEEDS
     return [
         result(SIGN, "passed", name, evidence=best.evidence),
         result(UNIT, "undecided" if is_open else "passed", name, evidence=best.evidence, remedy=_needs(name, "unit")),

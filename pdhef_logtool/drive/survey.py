@@ -15,15 +15,8 @@ from functools import cached_property
 
 from pdhef_logtool.car.assumed_values import assumed_car
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive import checks
 from pdhef_logtool.drive.check_table import result
-from pdhef_logtool.drive.checks import (
-    ay_delay,
-    check_drive,
-    misread_channels,
-    offset_check,
-    sensor_errors,
-    sideslip_offset,
-)
 from pdhef_logtool.drive.delays import LATE_GYRO_S
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.mounting import ACCELERATIONS, RATES, Mounting, find_mounting, find_triads
@@ -59,7 +52,7 @@ class Survey:
     @cached_property
     def checks(self) -> tuple[Check, ...]:
         """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
-        drive_checks = check_drive(self.measured)
+        drive_checks = checks.check_drive(self.measured)
         return (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
 
     @cached_property
@@ -67,7 +60,7 @@ class Survey:
         """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
         if not self.measured.truth:
             return self.checks
-        return (*self.mounted, *check_drive(self.measured.sensors))
+        return (*self.mounted, *checks.check_drive(self.measured.sensors))
 
     @property
     def assumed_car(self) -> VehicleParameters:
@@ -82,9 +75,9 @@ class Survey:
         ----------
         waived : names of checks that are ignored. is_causal : no sensor is refused because of later samples.
         """
-        by_everything = misread_channels(self.checks, waived)
+        by_everything = checks.misread_channels(self.checks, waived)
         refused = {n: why for n, why in by_everything.items() if n.startswith("truth.")}
-        return refused if is_causal else refused | misread_channels(self.sensor_checks, waived)
+        return refused if is_causal else refused | checks.misread_channels(self.sensor_checks, waived)
 
     def with_truth(self, names: Collection[str]) -> Survey:
         """Return the survey with the ground truth of some channels only, for its plan, track and latency."""
@@ -256,7 +249,7 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
         delays["yaw_rate_rad_s"] = latency.gyro_delay_s, latency.reason
     # The delay of a_y is not observable from another axis.
     is_mounted = survey.mounting is None or survey.mounting.is_as_named
-    by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
+    by_truth = checks.ay_delay(checks.sensor_errors(survey.measured.columns), latency) if is_mounted else None
     if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, 3.0 * by_truth[1]):
         delays["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against ground truth"
     for sensor in survey.measured.late:
@@ -269,10 +262,10 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
     """Return corrected ground-truth sources if the sideslip has a constant offset that a mapping can correct."""
     columns, truth = survey.measured.columns, survey.mapping.truth
-    check = None if survey.measured.derived is None else offset_check(columns)
+    check = None if survey.measured.derived is None else checks.offset_check(columns)
     if check is None or check.verdict != "failed":
         return []
-    (offset, _), evidence = sideslip_offset(columns), check.evidence
+    (offset, _), evidence = checks.sideslip_offset(columns), check.evidence
     vx, vy = truth.get("vx_m_s"), truth.get("vy_m_s")
     changed: dict[str, SignalSource] = {}
     if "sideslip_rad" in truth:

@@ -26,14 +26,7 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import median_known
 from pdhef_logtool.drive.correlation import GAP_PERIODS
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS
-from pdhef_logtool.records.geometry import (
-    ecef_from_geodetic,
-    enu_from_ecef_rotation,
-    geodetic_from_ecef,
-    rotation_from_quat,
-    shift_velocity_to_cg,
-    wrap_angle,
-)
+from pdhef_logtool.records import geometry
 from pdhef_logtool.records.interpolation import Bracket
 from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, TRUTH_UNITS, Channel, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -281,7 +274,7 @@ def _find_origin(survey: Mapping[str, Channel]) -> tuple[float, float, float] | 
         ecef = survey["ecef_position_m"].values[:1]
     elif {"lat_deg", "lon_deg"} <= set(survey):
         alt = survey["alt_m"].values[:1] if "alt_m" in survey else np.zeros(1)
-        ecef = ecef_from_geodetic(survey["lat_deg"].values[:1], survey["lon_deg"].values[:1], alt)
+        ecef = geometry.ecef_from_geodetic(survey["lat_deg"].values[:1], survey["lon_deg"].values[:1], alt)
     else:
         return None
     x, y, z = map(float, ecef[0])
@@ -344,7 +337,9 @@ class _Source:
             n, k = self.stamps_ns.shape[0], VECTOR_COLUMNS.get(name, 1)
             return np.full((n, k) if k > 1 else n, np.nan)
         if np.array_equal(channel.stamps_ns, self.stamps_ns):
-            return wrap_angle(channel.values) if name in _ANGLES else channel.values + 0.0  # a copy, without -0
+            return (
+                geometry.wrap_angle(channel.values) if name in _ANGLES else channel.values + 0.0
+            )  # a copy, without -0
         bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * NS_PER_S))
         if name in _ANGLES:
             return bracket.angle(channel.values)
@@ -354,8 +349,8 @@ class _Source:
 
     def _from_ecef(self) -> FloatArray:
         assert self.plan.origin is not None
-        lat_rad, lon_rad, _ = map(float, geodetic_from_ecef(np.array([self.plan.origin]))[0])
-        return enu_from_ecef_rotation(lat_rad, lon_rad)
+        lat_rad, lon_rad, _ = map(float, geometry.geodetic_from_ecef(np.array([self.plan.origin]))[0])
+        return geometry.enu_from_ecef_rotation(lat_rad, lon_rad)
 
     @cached_property
     def position(self) -> FloatArray:
@@ -369,7 +364,9 @@ class _Source:
             ecef = self.column("ecef_position_m")
         else:
             lat, lon = self.column("lat_deg"), self.column("lon_deg")
-            ecef = ecef_from_geodetic(lat, lon, self.column("alt_m") if "alt_m" in self else np.zeros_like(lat))
+            ecef = geometry.ecef_from_geodetic(
+                lat, lon, self.column("alt_m") if "alt_m" in self else np.zeros_like(lat)
+            )
         return _turn(self._from_ecef(), ecef - np.array(self.plan.origin))
 
     @cached_property
@@ -386,7 +383,7 @@ class _Source:
     def _rotation(self) -> FloatArray:
         """Matrices [N, 3, 3] of the quaternion as mapped."""
         quat = self.column("quat_wxyz")
-        return rotation_from_quat(np.where(np.linalg.norm(quat, axis=1, keepdims=True) > 1e-6, quat, np.nan))
+        return geometry.rotation_from_quat(np.where(np.linalg.norm(quat, axis=1, keepdims=True) > 1e-6, quat, np.nan))
 
     def rotation(self, attitude: Attitude) -> FloatArray:
         """Return matrices [N, 3, 3] that turn forward-left-up body vectors into the local ENU frame."""
@@ -447,7 +444,7 @@ def differentiate(
         span = np.maximum(t[:, -1], -t[:, 0])
         y = np.asarray(samples[first] - values[centre][:, None], np.float64)
         if angle:
-            y = wrap_angle(y)
+            y = geometry.wrap_angle(y)
         powers, normal = cubic_equations(t / span[:, None])
         right = np.stack([np.einsum("nk,nk->n", power, y) for power in powers], axis=1)
         slope[centre] = np.linalg.solve(normal, right[:, :, None])[:, 1, 0] / span
@@ -514,7 +511,7 @@ def _body_velocity(source: _Source) -> tuple[FloatArray, FloatArray]:
         vy = vx * np.tan(column("sideslip_rad"))
     elif kind == "v_x, course and yaw":
         says["vy_m_s"] = f"v_x times tan of {name('course_rad')} minus {name('yaw_rad')}"
-        vy = vx * np.tan(wrap_angle(column("course_rad") - column("yaw_rad")))
+        vy = vx * np.tan(geometry.wrap_angle(column("course_rad") - column("yaw_rad")))
     return vx, vy
 
 
@@ -542,7 +539,7 @@ def _velocity_at_cg(source: _Source, vx: FloatArray, vy: FloatArray, rate: Float
         source.says["cg"] = f"velocities left at ({x:g}, {y:g}) m from the CG: no yaw rate to move them by"
         return vx, vy
     source.says["cg"] = f"velocities {_MOVED} from ({x:g}, {y:g}) m"
-    return shift_velocity_to_cg(vx, vy, rate, (x, y))
+    return geometry.shift_velocity_to_cg(vx, vy, rate, (x, y))
 
 
 def _sideslip(source: _Source, vx: FloatArray, vy: FloatArray) -> FloatArray:

@@ -30,16 +30,8 @@ from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
 from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators import unscented
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.estimators.unscented import (
-    cholesky,
-    cross_covariance,
-    draw,
-    moments,
-    padded,
-    reading_moments,
-    update,
-)
 from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
     BANK_TIME_S,
@@ -353,10 +345,10 @@ def predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, 
     rest behind it. Leaves the ``root`` of the former covariance, and the deviations of the moved points in ``away``.
     """
     m = changing(layout)
-    cholesky(P, root)
-    draw(x, root, places, m, points)
+    unscented.cholesky(P, root)
+    unscented.draw(x, root, places, m, points)
     move(points, columns_of(2 * m), over, rate, dt, early, layout, p, f)
-    moments(points, places, m, q, x, P, away)
+    unscented.moments(points, places, m, q, x, P, away)
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -384,10 +376,10 @@ def expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, read
     if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
         ay, S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz)
     else:
-        cholesky(P, root)
-        draw(x, root, places, m, points)
+        unscented.cholesky(P, root)
+        unscented.draw(x, root, places, m, points)
         read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
-        ay, S[Z_AY, Z_AY] = reading_moments(reading, root, m, away, Pxz, Z_AY)
+        ay, S[Z_AY, Z_AY] = unscented.reading_moments(reading, root, m, away, Pxz, Z_AY)
     nu[Z_AY], nu[Z_YAW_RATE], nu[Z_SPEED] = now.ay - ay, now.yaw_rate - x[YAW_RATE], now.speed - x[VX]
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
         for a in range(Pxz.shape[1]):
@@ -445,7 +437,7 @@ def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
 @njit(cache=True, no_cpython_wrapper=True, _nrt=True)
 def likelihood_of(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     """Return the log-likelihood of an innovation without an update."""
-    return update(x.copy(), P.copy(), nu, S.copy(), Pxz.copy(), use)[2]
+    return unscented.update(x.copy(), P.copy(), nu, S.copy(), Pxz.copy(), use)[2]
 
 
 @_inline
@@ -569,7 +561,7 @@ def _filter(window, tuning, model, state, scratch, out, links):  # type: ignore[
             trust_residual(m, q)
             predict(x, P, root, over, rate, now.dt, 0.5, q, layout, places, p, f, points, away)
             if linked:
-                cross_covariance(root, changing(layout), away, out_cross, k)
+                unscented.cross_covariance(root, changing(layout), away, out_cross, k)
                 keep(P, out_predicted_P, k)
             keep_state(x, out_prior, k)
             alive, stands = is_finite(x, P), False
@@ -591,7 +583,7 @@ def _filter(window, tuning, model, state, scratch, out, links):  # type: ignore[
                     for i in range(READINGS):
                         if use[i]:
                             m.rejected[i] = 0.0
-                nis, dof, likelihood = update(x, P, nu, S, Pxz, use)
+                nis, dof, likelihood = unscented.update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k], out_dof[k] = nis, dof
                     if not outside:
@@ -937,16 +929,19 @@ def _expected_ay(x, inputs, model, out):  # type: ignore[no-untyped-def]
 
 def make_scratch(n: int) -> tuple[Any, ...]:
     """Return the arrays of a kernel for ``n`` states that keep nothing between steps, of the readings those from ν."""
-    root, of_readings = padded(n, n), np.zeros((3, READINGS))
+    root, of_readings = unscented.padded(n, n), np.zeros((3, READINGS))
     block = (np.zeros(PLACES * WIDTH), np.zeros((root.shape[1], WIDTH)), np.zeros(WIDTH))
-    covariances, chosen = (np.zeros((READINGS, READINGS)), padded(READINGS, n)), np.zeros((2, READINGS), dtype=np.bool_)
+    covariances, chosen = (
+        (np.zeros((READINGS, READINGS)), unscented.padded(READINGS, n)),
+        np.zeros((2, READINGS), dtype=np.bool_),
+    )
     return root, np.zeros(n), *block, *of_readings, *covariances, *chosen
 
 
 def resume(state: FilterState | None, n: int) -> FilterState:
     """Return a copy of the state before a window, which the kernel updates in place."""
     if state is None:
-        return FilterState(np.zeros(n), np.eye(n, padded(n, n).shape[1]), np.zeros(1, MEMORY))
+        return FilterState(np.zeros(n), np.eye(n, unscented.padded(n, n).shape[1]), np.zeros(1, MEMORY))
     return deepcopy(state)
 
 

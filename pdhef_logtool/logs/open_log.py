@@ -15,13 +15,7 @@ from pdhef_logtool.logs.container import MCAP_MAGIC, Container, describe_damage
 from pdhef_logtool.logs.definitions import dbc_files, read_definitions
 from pdhef_logtool.logs.discovery import names_of_logs
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.logs.formats import (
-    HEAD_BYTES,
-    ROSBAG2_METADATA,
-    ZSTD_MAGIC,
-    recognised_format,
-    what_is_a_log,
-)
+from pdhef_logtool.logs.formats import HEAD_BYTES, ROSBAG2_METADATA, ZSTD_MAGIC, recognised_format, what_is_a_log
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
 from pdhef_logtool.logs.table_file import NO_SETTINGS, LogFile, TableSettings

@@ -176,6 +176,7 @@ def decide_units(fields: Fields) -> None:
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
+    _by_track(fields)
     _by_siblings(fields)
 
 
@@ -246,6 +247,18 @@ def _by_turning(fields: Fields) -> None:
         relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
         if relation.is_clear:
             settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", "relation")
+
+
+def _by_track(fields: Fields) -> None:
+    """Determine the unit of the speed by the track with which wheel speeds of this unit differ in bends."""
+    speed, rate = fields.best("speed"), fields.best("rate")
+    wheels = [f.seen.cells for side in ("rl", "rr") for f in fields.open("wheel speed", side)[:1]]
+    if speed is None or rate is None or len(wheels) < 2 or not agree(wheels[1], speed.seen.cells):
+        return
+    relation = fit(fields.pieces.smooth(wheels[1] - wheels[0]), fields.pieces.smooth(rate.seen.cells))
+    if relation.is_clear:
+        gain = Gain((1, -1), relation.slope / _RELATIONS["track_m"], _RELATIONS["track"])
+        settle((speed, rate), [gain], "the track of its wheels")
 
 
 def _by_siblings(fields: Fields) -> None:

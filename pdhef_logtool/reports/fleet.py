@@ -175,12 +175,7 @@ def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[dict[str,
             kind = f"h{min(level, _LEVELS)}" if spent else "empty"
             cells.append({"kind": kind, "minutes": _time(spent), "rmse_rad": rmse if math.isfinite(rmse) else None})
         made.append((_bin(SPEED_EDGES_M_S, i), cells))
-    return (
-        [_bin(AY_EDGES_M_S2, j) for j in range(columns)],
-        made,
-        int(np.count_nonzero(seconds == 0.0)),
-        seconds.size,
-    )
+    return ([_bin(AY_EDGES_M_S2, j) for j in range(columns)], made, int(np.count_nonzero(seconds == 0.0)), seconds.size)
 
 
 def _reach(edges: Sequence[float], used: Any, least: float) -> int:

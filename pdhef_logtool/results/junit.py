@@ -19,9 +19,7 @@ _NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]"
 
 
 def junit_bytes(
-    verdicts: PlanVerdicts | None,
-    checks: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
-    **compared: Any,
+    verdicts: PlanVerdicts | None, checks: Mapping[str, Sequence[Mapping[str, Any]]] | None = None, **compared: Any
 ) -> bytes:
     """Return JUnit XML in UTF-8; the same verdicts give the same bytes, so that there is no time of day in it.
 

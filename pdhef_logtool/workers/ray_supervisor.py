@@ -37,12 +37,7 @@ _Orders: TypeAlias = tuple[str, Callable[[Any, Tell], Any], Limits, tuple[str, .
 
 
 def supervise_on_ray(
-    work: Callable[[T, Tell], R],
-    items: Iterable[T],
-    *,
-    address: str,
-    limits: Limits,
-    preload: Sequence[str] = (),
+    work: Callable[[T, Tell], R], items: Iterable[T], *, address: str, limits: Limits, preload: Sequence[str] = ()
 ) -> Generator[Ended[T, R], None, None]:
     """Do the work on every item, one for each processor of a cluster at a time, and yield how each ended.
 

@@ -215,15 +215,7 @@ def _rows(
 
 
 #: Modules of this package that export ``METRICS``. Add the name of a new one here.
-MODULES = (
-    "errors",
-    "innovations",
-    "lateral_consistency",
-    "yaw_consistency",
-    "reference",
-    "sensors",
-    "handling",
-)
+MODULES = ("errors", "innovations", "lateral_consistency", "yaw_consistency", "reference", "sensors", "handling")
 
 
 @cache

@@ -26,11 +26,7 @@ MOST_FIELDS = 2000
 _STATISTICS = ("minimum", "mean", "maximum")
 
 
-def fields_of_log(
-    path: LogPlace | str,
-    topic: str | None = None,
-    options: ReadOptions = AS_IT_IS,
-) -> dict[str, Any]:
+def fields_of_log(path: LogPlace | str, topic: str | None = None, options: ReadOptions = AS_IT_IS) -> dict[str, Any]:
     """Return the numeric fields of a topic, or of all, over a few pieces of the log: ``pdhef inspect --fields --json``.
 
     ``topics`` are over ``seconds`` of the log; ``whole`` if that is all of it. A topic has ``fields``, or the
