@@ -105,11 +105,11 @@ class Interval:
             added = running_consistency(track, signals, vehicle.roll_gradient_rad_per_m_s2)
         added = np.hypot(np.nan_to_num(added), self.car_std_rad * track.vx_m_s)
         added = np.hypot(added, self.cg_std_m * track.yaw_rate_rad_s)
-        return widened(track, np.hypot(np.nan_to_num(added), self._spread), slow_m_s, self._own_share(track))
+        return widened(track, np.hypot(np.nan_to_num(added), self._spread), slow_m_s, self._own_share(track, slow_m_s))
 
-    def _own_share(self, track: StateTrack) -> FloatArray | float:
+    def _own_share(self, track: StateTrack, slow_m_s: float) -> FloatArray | float:
         """Return the factor on a track's own 1-sigma, [N] for a whole drive: χ, bounded as described above."""
-        drives = track.valid & (np.abs(track.vx_m_s) > self.filters[0].vehicle.low_speed_blend_m_s)
+        drives = track.valid & (np.abs(track.vx_m_s) > slow_m_s)
         if not self.whole_drive or not drives.any():
             return self.scale
         misfit, variance = self.scale**2 - 1.0, track.sideslip_std_rad**2
