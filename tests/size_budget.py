@@ -64,7 +64,9 @@ def complexity(function: _Function) -> int:
 
 def is_kernel(function: _Function) -> bool:
     """Return whether numba compiles it."""
-    return any(re.search("njit|_compiled", ast.unparse(decorator)) for decorator in function.decorator_list)
+    return any(
+        re.search("njit|_compiled|kernel|inline", ast.unparse(decorator)) for decorator in function.decorator_list
+    )
 
 
 def python_sizes(folder: Path) -> Counter[str]:

@@ -97,6 +97,13 @@ def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
     return compiled
 
 
+# Without reference counts, which are slow: these functions create no arrays.
+_without_arrays = functools.partial(njit, error_model="numpy", fastmath={"contract"}, _nrt=False)
+kernel = _without_arrays(cache=True)
+#: A kernel that compiled code alone calls.
+inner_kernel = _without_arrays(cache=True, no_cpython_wrapper=True)
+inline = _without_arrays(forceinline=True)
+
 #: The cached functions of the modules imported so far.
 _kept: list[Any] = []
 

@@ -18,9 +18,7 @@ from pathlib import Path
 #: The folder that contains the packages: a checkout or ``site-packages``.
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("pdhef_logtool", "truthsim")
-_COMPILED = tuple(
-    b"%s import %s" % names for names in ((b"compiled.cache", b"njit"), (b"numba.extending", b"register_jitable"))
-)
+_COMPILED = (b"compiled.cache import", b"numba.extending import")
 _IMPORT = re.compile(rb"^from ((?:pdhef_logtool|truthsim)[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 
 

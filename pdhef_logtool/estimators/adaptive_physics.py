@@ -32,8 +32,10 @@ import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs
+from pdhef_logtool.estimators.filter_steps import PosteriorSteps
+from pdhef_logtool.estimators.prediction import sideslip_std
 from pdhef_logtool.estimators.vehicle_model import VX
-from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, VehicleUkf, of_car, sideslip_std
+from pdhef_logtool.estimators.vehicle_ukf import FilterState, VehicleUkf, of_car
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack

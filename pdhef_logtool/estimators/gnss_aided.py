@@ -29,9 +29,10 @@ from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import kinematic_filter as f
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import notes_of
+from pdhef_logtool.estimators.prediction import sideslip_std
 from pdhef_logtool.estimators.reference.gnss import LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import RATE_HZ, ROLL_PER_AY_RAD_S2_M, SLOW_S
-from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, sideslip_std
+from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE
 from pdhef_logtool.records.signals import LEAST_DIVISOR, S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance

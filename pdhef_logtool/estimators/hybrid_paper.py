@@ -27,12 +27,14 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import vehicle_ukf as ukf
+from pdhef_logtool.estimators.filter_steps import U_AX, U_AX_KNOWN, U_FRICTION, U_STEER, PosteriorSteps, no_posterior
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.prediction import predict, predicted_track
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.estimators.unscented import update
-from pdhef_logtool.estimators.vehicle_model import NOMINAL, READINGS, VX, Z_AY
+from pdhef_logtool.estimators.unscented import is_finite, update
+from pdhef_logtool.estimators.vehicle_model import NOMINAL, READINGS, VX, Z_AY, process_noise
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
@@ -64,7 +66,7 @@ CHOSEN = Constants(1.0, 0.1, (0.03, 0.1, 0.25), (0.03, 0.06, 0.085), 3.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperSteps(ukf.PosteriorSteps):
+class PaperSteps(PosteriorSteps):
     """Posteriors, and by step, [K]: ``trust`` is β_k, ``r_scale`` R_k / R_0 of a_y.
 
     ``residual_rate`` is the network's at the step, before β.
@@ -117,10 +119,10 @@ def _filter(window, tuning, r0, constants, model, parallel, state, scratch, out,
     root, q, points, away, reading, nu, _, no_r, S, Pxz, _, use = scratch  # R is added when it is adapted
     for k in range(window.dt_s.shape[0]):
         m, a, ok, dt = memory[0], adapted_memory[0], start_ok[k], window.dt_s[k]
-        steer, friction, has_ax = inputs[k, ukf.U_STEER], inputs[k, ukf.U_FRICTION], inputs[k, ukf.U_AX_KNOWN] > 0.0
+        steer, friction, has_ax = inputs[k, U_STEER], inputs[k, U_FRICTION], inputs[k, U_AX_KNOWN] > 0.0
         ay = window.ay[k] if ok else math.nan  # without steering no a_y can be predicted
         speed = window.speed[k] if tuning.rules.use_speed else math.nan
-        now = ukf.StepInputs(dt, steer, inputs[k, ukf.U_AX], has_ax, friction, ok, ok, ay, window.yaw_rate[k], speed)
+        now = ukf.StepInputs(dt, steer, inputs[k, U_AX], has_ax, friction, ok, ok, ay, window.yaw_rate[k], speed)
         out_r_scale[k] = 1.0
         if not math.isfinite(prior[k, VX]):
             m.runs = 0.0
@@ -138,9 +140,9 @@ def _filter(window, tuning, r0, constants, model, parallel, state, scratch, out,
                 a.trust = trust
             over, rate = ukf.held_over_step(now, m), (a.trust * m.rate_vy, a.trust * m.rate_r)
             noise_dt = (1.0 + process_noise_gain * a.trust) * dt  # Eq 26
-            ukf.process_noise(tuning.q_std, over.ax_known, noise_dt, layout, q)
-            ukf.predict(x, P, root, over, rate, dt, 0.0, q, layout, places, p, f, points, away)  # Eq 19
-            alive = ukf.is_finite(x, P)
+            process_noise(tuning.q_std, over.ax_known, noise_dt, layout, q)
+            predict(x, P, root, over, rate, dt, 0.0, q, layout, places, p, f, points, away)  # Eq 19
+            alive = is_finite(x, P)
             out_prior[k] = x
             if alive:
                 ukf.expect(x, P, root, now, rate[0], no_r, layout, places, p, f, points, away, reading, nu, S, Pxz)
@@ -158,7 +160,7 @@ def _filter(window, tuning, r0, constants, model, parallel, state, scratch, out,
                 nis, dof, out_likelihood[k] = update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k], out_dof[k] = nis, dof
-                alive = ukf.is_finite(x, P)
+                alive = is_finite(x, P)
             out_valid[k] = alive and ok
             out_diverged[k] = not alive or ukf.diverges(tuning.rules, x, m)
             if not alive:
@@ -225,7 +227,7 @@ class PaperHybridUkf:
         rate = steps.trust[:, None] * steps.residual_rate
         noise = 1.0 + self.constants.process_noise_gain * steps.trust
         q_std, model = np.array(self.q_std), self.parallel.parameters
-        track = ukf.predicted_track(self.name, steps, ahead, stamps_ns, q_std, model, rate=rate, noise=noise, early=0.0)
+        track = predicted_track(self.name, steps, ahead, stamps_ns, q_std, model, rate=rate, noise=noise, early=0.0)
         return replace(
             track,
             network_trust=np.where(track.valid, steps.trust[ahead.step], np.nan),
@@ -235,7 +237,7 @@ class PaperHybridUkf:
     def filter_steps(
         self,
         signals: Signals,
-        physics: ukf.PosteriorSteps,
+        physics: PosteriorSteps,
         rate: FloatArray,
         state: ukf.FilterState | None = None,
         adapted: np.ndarray[Any, Any] | None = None,
@@ -248,7 +250,7 @@ class PaperHybridUkf:
         after, remembered = ukf.resume(state, n), np.zeros(1, ADAPTED) if adapted is None else adapted.copy()
         signals, slip = believable(signals, self.vehicle.sensors, after.slip)
         parallel = physics.written, nominal.expected_ay(physics.prior, physics.inputs)
-        steps, columns = ukf.no_posterior(signals.stamps_ns, n, rate), (np.empty(count), np.empty(count))
+        steps, columns = no_posterior(signals.stamps_ns, n, rate), (np.empty(count), np.empty(count))
         steps = replace(steps, inputs=physics.inputs)
         window, r0, scratch = ukf.make_window(signals, rate), self.measurement_variance, ukf.make_scratch(n)
         tuning, kept = nominal.tuning._replace(q_std=np.array(self.q_std)), (after[:3], remembered)

@@ -11,6 +11,8 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.estimators import vehicle_ukf as ukf
+from pdhef_logtool.estimators.filter_steps import U_FRICTION, U_SPEED, U_STEER, U_STEER_KNOWN, PosteriorSteps
+from pdhef_logtool.estimators.prediction import rolls_forward
 from pdhef_logtool.estimators.vehicle_model import AX_BIAS, FRONT, REAR, VX, VY, YAW_RATE
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -34,7 +36,7 @@ def run_features(
     *,
     seen: Signals | None = None,
     extra_r: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray, ukf.PosteriorSteps, ukf.FilterState]:
+) -> tuple[FloatArray, FloatArray, PosteriorSteps, ukf.FilterState]:
     """Run the parallel filter over a window; the network sees measurements less the biases that the filter estimates.
 
     Parameters
@@ -51,14 +53,14 @@ def run_features(
     """
     steps, after = physics.run(signals, state, extra_r=extra_r)
     features = make_features(physics, steps, signals if seen is None else seen)
-    steers = steps.inputs[:, ukf.U_STEER_KNOWN] > 0.0
-    features[~(steps.valid & steers & ukf.rolls_forward(steps.x[:, VX], steps.inputs[:, ukf.U_SPEED]))] = np.nan
+    steers = steps.inputs[:, U_STEER_KNOWN] > 0.0
+    features[~(steps.valid & steers & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
     dt_s = signals.steps_s
     dt_s[~np.isfinite(steps.prior[:, VX])] = np.nan
     return features, dt_s, steps, after
 
 
-def make_features(physics: ukf.VehicleUkf, steps: ukf.PosteriorSteps, seen: Signals) -> FloatArray:
+def make_features(physics: ukf.VehicleUkf, steps: PosteriorSteps, seen: Signals) -> FloatArray:
     """Return the features [K, 15] of steps, finite where the filter's state is finite.
 
     The measurements ``seen`` count less the biases that the filter estimates; a missing one is replaced by the
@@ -73,12 +75,12 @@ def make_features(physics: ukf.VehicleUkf, steps: ukf.PosteriorSteps, seen: Sign
     front, rear = x[:, [FRONT, REAR]].T if layout.forces >= 0 else (nothing, nothing)
     ay, rate, ax = seen.ay_m_s2 - of_ay, seen.yaw_rate_rad_s - of_rate, seen.ax_m_s2 - of_ax
     ay = np.where(np.isfinite(ay), ay, physics.expected_ay(x, steps.inputs) - of_ay)
-    rate, friction = np.where(np.isfinite(rate), rate, prior[:, YAW_RATE]), steps.inputs[:, ukf.U_FRICTION]
+    rate, friction = np.where(np.isfinite(rate), rate, prior[:, YAW_RATE]), steps.inputs[:, U_FRICTION]
     after, before = (np.arctan2(state[:, VY], np.maximum(state[:, VX], 0.1)) for state in (x, prior))
     columns = {
         "vx_m_s": x[:, VX],
         "ay_m_s2": ay,
-        "steer_rad": steps.inputs[:, ukf.U_STEER] - of_steer,
+        "steer_rad": steps.inputs[:, U_STEER] - of_steer,
         "yaw_rate_rad_s": rate,
         "delta_yaw_rate_rad_s": rate - prior[:, YAW_RATE],
         "delta_sideslip_rad": after - before,

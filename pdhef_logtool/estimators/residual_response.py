@@ -16,8 +16,8 @@ from collections.abc import Callable
 import numpy as np
 
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, weights_of
+from pdhef_logtool.estimators.filter_steps import LinkedSteps, PosteriorSteps
 from pdhef_logtool.estimators.vehicle_model import VX, VY
-from pdhef_logtool.estimators.vehicle_ukf import LinkedSteps, PosteriorSteps
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 
 #: Constant rate of the run for b, m/s²: small against the forces of a tyre.

@@ -28,8 +28,9 @@ import numpy as np
 
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, forgotten, gather_evidence, mix, weigh
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs
+from pdhef_logtool.estimators.filter_steps import LinkedSteps
 from pdhef_logtool.estimators.rts import smooth_covariances, smooth_states
-from pdhef_logtool.estimators.vehicle_ukf import FilterState, LinkedSteps, VehicleUkf
+from pdhef_logtool.estimators.vehicle_ukf import FilterState, VehicleUkf
 from pdhef_logtool.records.signals import NS_PER_S, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack, concatenate

@@ -21,16 +21,13 @@ import math
 
 import numpy as np
 
-from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.vehicle_model import LANES, WIDTH, columns_of
+from pdhef_logtool.compiled.cache import inline, kernel, njit
+from pdhef_logtool.estimators.vehicle_model import LANES, PLACES, WIDTH, columns_of
 from pdhef_logtool.records.signals import FloatArray
 
 #: Smallest variance on the diagonal of a repaired covariance.
 COVARIANCE_FLOOR = 1e-12
 
-# Without reference counts, which are slow: these functions create no arrays.
-_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
 # Sums in any order, so that the compiler can take several terms at a time.
 _sum = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"}, _nrt=False)
 
@@ -40,7 +37,12 @@ def padded(rows: int, n: int) -> FloatArray:
     return np.zeros((rows, (n + LANES - 1) // LANES * LANES))
 
 
-@_inline
+def block(n: int) -> tuple[FloatArray, FloatArray]:
+    """Return an empty block of sigma points, and the array of their deviations after a model."""
+    return np.zeros(PLACES * WIDTH), np.zeros((padded(n, n).shape[1], WIDTH))
+
+
+@inline
 def _factor(P, root):  # type: ignore[no-untyped-def]
     # Gaussian elimination leaves R times the roots of the pivots; whole rows are faster than those from the diagonal.
     n, positive = P.shape[0], True
@@ -61,7 +63,7 @@ def _factor(P, root):  # type: ignore[no-untyped-def]
     return positive
 
 
-@_compiled
+@kernel
 def cholesky(P, root):  # type: ignore[no-untyped-def]
     """Write the upper Cholesky factor R of P = Rᵀ R [n, n] to ``root``; P is repaired if needed.
 
@@ -96,9 +98,14 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
             P[i, j] = s
 
 
-@_compiled
+@kernel
 def draw(x, root, places, m, points):  # type: ignore[no-untyped-def]
-    """Write the sigma points of the state x [n] with the root [n, n] of its covariance to a block."""
+    """Write the sigma points of the state x [n] with the root [n, n] of its covariance to a block.
+
+    Returns
+    -------
+    columns : of the block, up to whole vectors.
+    """
     spread, columns = math.sqrt(x.shape[0]), columns_of(2 * m)
     for j in range(x.shape[0]):
         first, centre = places[j] * WIDTH, x[j]
@@ -108,6 +115,7 @@ def draw(x, root, places, m, points):  # type: ignore[no-untyped-def]
             away = spread * root[i, j]
             points[first + 1 + 2 * i] = centre + away
             points[first + 2 + 2 * i] = centre - away
+    return columns
 
 
 @_sum
@@ -134,7 +142,7 @@ def _products(away, a, b, weight):  # type: ignore[no-untyped-def]
     return weight * s_0, weight * s_1, weight * s_2, weight * s_3
 
 
-@_inline
+@inline
 def _covariance(root, a, m, away, row):  # type: ignore[no-untyped-def]
     """Return the covariance of state entry a before the model with a result after it, of deviations in a ``row``."""
     s = 0.0
@@ -143,7 +151,7 @@ def _covariance(root, a, m, away, row):  # type: ignore[no-untyped-def]
     return 0.5 / math.sqrt(root.shape[0]) * s
 
 
-@_compiled
+@kernel
 def moments(points, places, m, q, x, P, away):  # type: ignore[no-untyped-def]
     """Write mean [n] and covariance [n, n] of sigma points, with ``q`` [n] added to the variances.
 
@@ -161,7 +169,7 @@ def moments(points, places, m, q, x, P, away):  # type: ignore[no-untyped-def]
         P[a, a] += q[a]
 
 
-@_compiled
+@kernel
 def reading_moments(reading, root, m, away, Pxz, row):  # type: ignore[no-untyped-def]
     """Write a row of P_xz, the covariance of a reading [WIDTH] of sigma points; return its mean and variance.
 
@@ -176,7 +184,7 @@ def reading_moments(reading, root, m, away, Pxz, row):  # type: ignore[no-untype
     return mean, 0.5 / n * s
 
 
-@_compiled
+@kernel
 def cross_covariance(root, m, away, out, k):  # type: ignore[no-untyped-def]
     """Write covariance k [n, n] of the state before a step, with the root, and after it, with its deviations."""
     n = root.shape[0]
@@ -187,7 +195,7 @@ def cross_covariance(root, m, away, out, k):  # type: ignore[no-untyped-def]
                 out[k, a, b] += root[i, a] * root[i, b]
 
 
-@_compiled
+@kernel
 def update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     """Update x [n], P [n, n] in place with the channels of ``use`` (bool [m]).
 
@@ -226,3 +234,19 @@ def update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
             for b in range(P.shape[1]):
                 P[a, b] -= gain * Pxz[i, b]
     return nis, used, -0.5 * (nis + used * math.log(2.0 * math.pi)) - math.log(det)
+
+
+@inline
+def is_finite(x, P):  # type: ignore[no-untyped-def]
+    """Return whether state and variances are numbers; so are all covariances then."""
+    total = 0.0
+    for i in range(x.shape[0]):
+        total += abs(x[i]) + abs(P[i, i])
+    return math.isfinite(total)
+
+
+@inline
+def keep_state(x, out, k):  # type: ignore[no-untyped-def]
+    """Write a state [n] to row k of an output."""
+    for a in range(x.shape[0]):
+        out[k, a] = x[a]

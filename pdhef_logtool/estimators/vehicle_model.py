@@ -39,6 +39,7 @@ from pdhef_logtool.car.elementary_functions import arctangent, sine
 from pdhef_logtool.car.nominal_model import (
     KINEMATIC_TIME_CONSTANT_S,
     MAX_SUBSTEPS,
+    ModelParameters,
     Prepared,
     accelerations,
     dynamic_share,
@@ -48,7 +49,7 @@ from pdhef_logtool.car.nominal_model import (
     substeps,
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.compiled.cache import inline, inner_kernel, kernel, njit
 from pdhef_logtool.records.signals import IntArray
 
 #: Rows of a block: one for each entry that a state may have. The first ``CORE`` are those of every model with axle
@@ -69,6 +70,12 @@ WIDTH = 6 * LANES
 FORCE_SCALE_TIME_S = 2.0
 #: Time constant with which the bank returns to 0 (docs/method.md#physics).
 BANK_TIME_S = 5.0
+#: Spread of the bank, rad: a crowned road has 0.02-0.03, motorway bends to 0.07. Spread of the force scale
+#: (docs/method.md#adaptation).
+BANK_STD, FORCE_SCALE_STD = 0.02, 0.05
+#: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk
+#: (docs/method.md#frame).
+NO_AX_Q_STD = 3.0
 #: Largest product of step and the roll mode's frequency; longer steps are divided.
 _MAX_ROLL_STEP = 0.5
 #: Minimum share of the grip that braking leaves for lateral forces; minimum factor on forces by their scale.
@@ -76,16 +83,12 @@ _LEAST_GRIP, LEAST_FORCE = 0.2, 0.1
 #: Below this roll gradient, rad/(m/s²), roll does not indicate load transfer, which then follows the acceleration.
 LEAST_ROLL_GRADIENT = 1e-3
 
-# Without reference counts, which are slow: these functions create no arrays.
-_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
-_compiled_inside = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
-
 
 class Layout(NamedTuple):
     """Index of each part in a state [n]; −1 if the model lacks the part."""
 
     size: int
+    changing: int  # entries before the sensor biases, which the model neither changes nor depends on
     forces: int  # f_f, and f_r behind it
     roll: int  # φ, and φ̇ behind it
     bank: int
@@ -97,7 +100,7 @@ class Layout(NamedTuple):
     def places(self) -> IntArray:
         """Row in a block of each entry of a state, [n]."""
         rows = [VX, VY, YAW_RATE, AX_BIAS]
-        for index, part in zip(self[1:], _ROWS_OF_PARTS, strict=True):
+        for index, part in zip(self[2:], _ROWS_OF_PARTS, strict=True):
             rows += part if index >= 0 else ()
         return np.array(rows, dtype=np.uint8)
 
@@ -117,7 +120,7 @@ class Layout(NamedTuple):
 
 _ROWS_OF_PARTS = ((FRONT, REAR), (ROLL, ROLL_RATE), (BANK,), (FORCE_SCALE,), (STEER_BIAS,), (AY_BIAS, RATE_BIAS))
 #: The layout of the nominal model.
-NOMINAL = Layout(4, -1, -1, -1, -1, -1, -1)
+NOMINAL = Layout(4, 4, -1, -1, -1, -1, -1, -1)
 
 
 def layout_of(vehicle: VehicleParameters) -> Layout:
@@ -127,7 +130,7 @@ def layout_of(vehicle: VehicleParameters) -> Layout:
     for there, rows in zip(has, _ROWS_OF_PARTS, strict=True):
         indices.append(size if there else -1)
         size += len(rows) if there else 0
-    return Layout(size, *indices)
+    return Layout(size, indices[-1] if parts.biases else size, *indices)
 
 
 class PhysicsParameters(NamedTuple):
@@ -170,6 +173,24 @@ def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
     )
 
 
+class Model(NamedTuple):
+    """Arguments of the compiled models."""
+
+    layout: Layout
+    places: IntArray
+    p: ModelParameters
+    f: PhysicsParameters
+
+
+class HeldInputs(NamedTuple):
+    """Inputs over a step: the mean of its two ends."""
+
+    steer: float
+    ax: float
+    ax_known: bool
+    friction: float
+
+
 class _Step(NamedTuple):
     """Constants of a step of the model with axle forces, common to all points.
 
@@ -185,7 +206,7 @@ class _Step(NamedTuple):
     rear: tuple[float, ...]
 
 
-@_inline
+@inline
 def columns_of(points):  # type: ignore[no-untyped-def]
     """Return the number of columns of a block for a centre and ``points`` others, rounded up to whole vectors."""
     return (points + LANES) // LANES * LANES
@@ -210,7 +231,7 @@ def grip_under_braking(ax, friction, load_per_ax):  # type: ignore[no-untyped-de
     return max(1.0 + load_per_ax * ax, _LEAST_GRIP) * left
 
 
-@_inline
+@inline
 def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
     """Return the constants of a step of ``h`` s at a speed of about ``vx``."""
     kept, tyre_s = 0.0, h
@@ -228,13 +249,13 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@_inline
+@inline
 def force_factor(scale):  # type: ignore[no-untyped-def]
     """Return the factor on the tyres' forces by their scale."""
     return max(LEAST_FORCE, 1.0 + scale)
 
 
-@_inline
+@inline
 def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
     """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x is limited to 1, where the inner wheel lifts."""
     x = min(1.0, abs(f.transfer_per_ay * ay))
@@ -242,7 +263,7 @@ def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
 
 
 # positional: as advance.
-@_inline
+@inline
 def _tyre_forces(points, columns, row, angle, axle, f):  # type: ignore[no-untyped-def]
     """Replace the velocity across an axle, in its ``row``, by the tyres' steady force over the mass in m/s².
 
@@ -265,7 +286,7 @@ def _tyre_forces(points, columns, row, angle, axle, f):  # type: ignore[no-untyp
 
 
 # positional: numbers and records of numbers, which are free of cost in compiled calls.
-@_compiled
+@kernel
 def advance(points, columns, over, dt, layout, p, f):  # type: ignore[no-untyped-def]
     """Advance the first ``columns`` of a block [PLACES · WIDTH], a multiple of ``LANES``, by ``dt`` s; all are finite.
 
@@ -281,7 +302,7 @@ def advance(points, columns, over, dt, layout, p, f):  # type: ignore[no-untyped
 
 
 # positional: as advance.
-@_compiled_inside
+@inner_kernel
 def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
     """Advance states of the model with axle forces in ``n`` steps."""
     h = dt / n
@@ -353,7 +374,7 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
             points[FORCE_SCALE * WIDTH + j] *= scale_kept
 
 
-@_inline
+@inline
 def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance states of the nominal model in ``n`` RK4 steps."""
     c = prepare(over.steer, over.friction, p)
@@ -365,7 +386,7 @@ def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untype
 
 
 # positional: as advance.
-@_compiled
+@kernel
 def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
     """Add the increments of a residual of v̇_y and ṙ over ``dt`` s, times the force scale of each state.
 
@@ -379,7 +400,7 @@ def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
 
 
 # positional: as advance.
-@_compiled
+@kernel
 def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # type: ignore[no-untyped-def]
     """Write the accelerometer's lateral reading in the states of a block to ``out`` [WIDTH], without its bias.
 
@@ -403,7 +424,7 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
 
 
 # positional: as advance.
-@_inline
+@inline
 def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, Pxz):  # type: ignore[no-untyped-def]
     """Write the covariance of the accelerometer's reading with the state to P_xz [3, n]; return its mean and variance.
 
@@ -463,3 +484,28 @@ def planar_ay(x, steer, friction, rate_vy, layout, p):  # type: ignore[no-untype
     force = force_factor(x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     forces = x[FRONT] * math.cos(steer) + x[REAR]
     return w * (forces + force * rate_vy) + (1.0 - w) * x[VX] * x[YAW_RATE]
+
+
+# positional: to hand structures of arrays on at every step would cost as much as the step.
+@inline
+def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[no-untyped-def]
+    """Move the states of a block by the model and the residual, as :func:`predict` describes."""
+    given, vx = rate[0] != 0.0 or rate[1] != 0.0, points[VX * WIDTH]
+    if given:
+        push(points, columns, vx, rate, early * dt, p)
+    advance(points, columns, over, dt, layout, p, f)
+    if given:
+        push(points, columns, vx, rate, (1.0 - early) * dt, p)
+
+
+@inline
+def process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-def]
+    """Write the variance [n] that ``dt`` s add to each entry; without a_x the speed is a random walk too."""
+    for i in range(q.shape[0]):
+        q[i] = q_std[i] * q_std[i] * dt
+    if not ax_known:
+        q[VX] = NO_AX_Q_STD**2 * dt
+    if layout.force_scale >= 0:
+        q[layout.force_scale] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
+    if layout.bank >= 0:
+        q[layout.bank] += BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))

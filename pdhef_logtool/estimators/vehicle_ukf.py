@@ -20,25 +20,36 @@ from __future__ import annotations
 
 import math
 from copy import deepcopy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
+from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.compiled.cache import inline, kernel, njit
 from pdhef_logtool.estimators import unscented
+from pdhef_logtool.estimators.filter_steps import (
+    U_AX,
+    U_AX_KNOWN,
+    U_FRICTION,
+    U_SPEED,
+    U_STEER,
+    U_STEER_KNOWN,
+    LinkedSteps,
+    PosteriorSteps,
+    no_posterior,
+)
+from pdhef_logtool.estimators.prediction import predict, predicted_track
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
-    BANK_TIME_S,
+    BANK_STD,
     CORE,
-    FORCE_SCALE_TIME_S,
+    FORCE_SCALE_STD,
     FRONT,
-    MOTION,
     NOMINAL,
     PLACES,
     READINGS,
@@ -50,21 +61,20 @@ from pdhef_logtool.estimators.vehicle_model import (
     Z_AY,
     Z_SPEED,
     Z_YAW_RATE,
+    HeldInputs,
     Layout,
+    Model,
     PhysicsParameters,
-    advance,
-    columns_of,
     layout_of,
     physics_parameters,
-    planar_ay,
-    push,
+    process_noise,
     quadratic_ay,
     read_ay,
     settle_forces,
 )
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns
-from pdhef_logtool.records.tracks import StateTrack, make_track
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation
+from pdhef_logtool.records.tracks import StateTrack
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -79,17 +89,11 @@ PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
 #: The same of ``physics``, with the axle forces, for cars without fitted noise and as the start of identification, with
 #: lag, load transfer and biases. The present simulator gives 0.078, 0.13, 0.01, 0.062, 0.39.
 PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
-#: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk
-#: (docs/method.md#frame).
-NO_AX_Q_STD = 3.0
 #: 1-sigma at the start and at a standstill of the motion and the a_x bias; NaN: a standstill leaves the entry as it is.
 INITIAL_STD, STANDSTILL_STD = (0.5, 0.5, 0.1, 0.3), (0.02, 0.01, 0.002, math.nan)
 #: The same of the axles' forces over the mass, m/s², of roll (rad) and roll rate (rad/s); the roll rate's walk per √s.
 _FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05
 _ROLL_STD, _STANDSTILL_ROLL_STD, _ROLL_WALK = (0.01, 0.03), (0.005, 0.01), 0.02
-#: Spread of the bank, rad: a crowned road has 0.02-0.03, motorway bends to 0.07. Spread of the force scale
-#: (docs/method.md#adaptation).
-BANK_STD, FORCE_SCALE_STD = 0.02, 0.05
 #: Random walk of the a_y (m/s²), yaw-rate (rad/s) and steering (rad) bias, 1-sigma per square root of second.
 BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: 1-sigma of an unknown steering angle at the start and at most, rad, and its walk per √s (docs/method.md#physics).
@@ -116,14 +120,8 @@ DIVERGED_NIS_RATIO = 25.0
 DIVERGED_NIS_CAP = 4.0 * GATE_SIGMA**2
 DIVERGED_AVERAGE_S = 1.0
 DIVERGED_SIDESLIP_RAD = math.radians(60.0)
-#: If the speed sensor last read more than this, the car does not roll backwards: a v_x below zero is divergence.
-FORWARD_M_S = 0.5
 #: Time of a rejection at its first sample, s; 0 is "the last sample was accepted".
 _JUST_REJECTED_S = 1e-9
-
-# Inputs of a step; a_x is 0 where U_AX_KNOWN is 0. U_SPEED is the last speed sample that was accepted, 0 before any.
-U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED, U_STEER_KNOWN = range(6)
-INPUTS = 6
 
 #: Memory of a filter of the steps before: whether it runs; last inputs, residual and factor on the noise; ages, s;
 #: duration of the standstill, s; mean normalised square of the innovations; last speed sample; largest recent share of
@@ -135,11 +133,6 @@ MEMORY_FIELDS: list[tuple[Any, ...]] = [
 ]
 MEMORY = np.dtype(MEMORY_FIELDS)
 _NOTHING = np.zeros(1, MEMORY)
-
-# Without reference counts, which are slow: these functions create no arrays.
-_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
-_compiled_inside = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"}, _nrt=False)
 
 
 class Window(NamedTuple):
@@ -173,15 +166,6 @@ class Rules(NamedTuple):
     still_yaw_rate_rad_s: float
     limit_gain: float
     limit_lag_m: float
-
-
-class Model(NamedTuple):
-    """Arguments of the compiled models."""
-
-    layout: Layout
-    places: IntArray
-    p: ModelParameters
-    f: PhysicsParameters
 
 
 class Tuning(NamedTuple):
@@ -224,19 +208,10 @@ class StepInputs(NamedTuple):
     speed: float
 
 
-class HeldInputs(NamedTuple):
-    """Inputs over a step: the mean of its two ends."""
-
-    steer: float
-    ax: float
-    ax_known: bool
-    friction: float
-
-
 # ------------------------------------------------------------------------------------------------ one step
 
 
-@_inline
+@inline
 def begin_step(k, window, rules, needs_steer, memory):  # type: ignore[no-untyped-def]
     """Reset after a time gap and zero-order-hold missing inputs. Return the inputs of step k."""
     dt, steers = window.dt_s[k], math.isfinite(window.steer[k])
@@ -262,7 +237,7 @@ def begin_step(k, window, rules, needs_steer, memory):  # type: ignore[no-untype
     return StepInputs(dt, steer, ax, has_ax, friction, steers, steer_ok, window.ay[k], window.yaw_rate[k], speed)
 
 
-@_inline
+@inline
 def held_over_step(now, m):  # type: ignore[no-untyped-def]
     """Return the mean of the inputs at both ends of a step; if a_x is missing at one end, the other end counts."""
     ax = now.ax
@@ -273,12 +248,6 @@ def held_over_step(now, m):  # type: ignore[no-untyped-def]
     return HeldInputs(
         0.5 * (m.steer + now.steer), ax, now.has_ax or m.ax_known > 0.0, 0.5 * (m.friction + now.friction)
     )
-
-
-@_inline
-def held_inputs(inputs, k):  # type: ignore[no-untyped-def]
-    """Return the inputs of step k, held during a prediction."""
-    return HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
 
 
 @njit(cache=True, no_cpython_wrapper=True, _nrt=True)
@@ -303,20 +272,7 @@ def starts(now, unknown_steer, tuning, model, x, P, memory):  # type: ignore[no-
     return True
 
 
-@_inline
-def process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-def]
-    """Write the variance [n] that ``dt`` s add to each entry; without a_x the speed is a random walk too."""
-    for i in range(q.shape[0]):
-        q[i] = q_std[i] * q_std[i] * dt
-    if not ax_known:
-        q[VX] = NO_AX_Q_STD**2 * dt
-    if layout.force_scale >= 0:
-        q[layout.force_scale] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
-    if layout.bank >= 0:
-        q[layout.bank] += BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
-
-
-@_inline
+@inline
 def trust_residual(m, q):  # type: ignore[no-untyped-def]
     """Reduce the variance [n] of v_y and yaw rate by the residual's factor, unless the innovations contradict it."""
     agrees = min(1.0, max(0.0, (LOUD_NIS - m.nis) / (LOUD_NIS - QUIET_NIS)))
@@ -325,7 +281,7 @@ def trust_residual(m, q):  # type: ignore[no-untyped-def]
     q[YAW_RATE] *= factor * factor
 
 
-@_inline
+@inline
 def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-untyped-def]
     """Return the factor on the process noise of the axle forces, 1 in the linear range, and how they lag beyond it."""
     most = friction * (p.front_D_n + p.rear_D_n) / p.mass_kg
@@ -337,48 +293,21 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
-@_compiled_inside
-def predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, away):  # type: ignore[no-untyped-def]
-    """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
-
-    The share ``early`` of the residual's increment comes before the model's step (Strang splitting: half of it), the
-    rest behind it. Leaves the ``root`` of the former covariance, and the deviations of the moved points in ``away``.
-    """
-    m = changing(layout)
-    unscented.cholesky(P, root)
-    unscented.draw(x, root, places, m, points)
-    move(points, columns_of(2 * m), over, rate, dt, early, layout, p, f)
-    unscented.moments(points, places, m, q, x, P, away)
-
-
-# positional: to hand structures of arrays on at every step would cost as much as the step.
-@_inline
-def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[no-untyped-def]
-    """Move the states of a block by the model and the residual, as :func:`predict` describes."""
-    given, vx = rate[0] != 0.0 or rate[1] != 0.0, points[VX * WIDTH]
-    if given:
-        push(points, columns, vx, rate, early * dt, p)
-    advance(points, columns, over, dt, layout, p, f)
-    if given:
-        push(points, columns, vx, rate, (1.0 - early) * dt, p)
-
-
-# positional: to hand structures of arrays on at every step would cost as much as the step.
-@_inline
+@inline
 def expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, reading, nu, S, Pxz):  # type: ignore[no-untyped-def]
     """Write the innovation [3], NaN for missing samples, the lower triangle of its covariance with R, and P_xz [3, n].
 
     ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
     the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
     """
-    m, s, n, first = changing(layout), layout.force_scale, x.shape[0], layout.sensor_bias
+    m, s, n, first = layout.changing, layout.force_scale, x.shape[0], layout.sensor_bias
     least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
     if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
         ay, S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz)
     else:
         unscented.cholesky(P, root)
-        unscented.draw(x, root, places, m, points)
-        read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+        columns = unscented.draw(x, root, places, m, points)
+        read_ay(points, columns, now.steer, now.friction, rate_vy, layout, p, f, reading)
         ay, S[Z_AY, Z_AY] = unscented.reading_moments(reading, root, m, away, Pxz, Z_AY)
     nu[Z_AY], nu[Z_YAW_RATE], nu[Z_SPEED] = now.ay - ay, now.yaw_rate - x[YAW_RATE], now.speed - x[VX]
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
@@ -399,13 +328,7 @@ def expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, read
         S[i, i] += r[i]
 
 
-@_inline
-def changing(layout):  # type: ignore[no-untyped-def]
-    """Return the number of entries before the sensor biases, which the model neither changes nor depends on."""
-    return layout.sensor_bias if layout.sensor_bias >= 0 else layout.size
-
-
-@_inline
+@inline
 def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
     """Return whether the gate opens and a sample is outside, the number of samples, and the sum of their squares.
 
@@ -440,7 +363,7 @@ def likelihood_of(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     return unscented.update(x.copy(), P.copy(), nu, S.copy(), Pxz.copy(), use)[2]
 
 
-@_inline
+@inline
 def settle(now, seen, squares, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
     """Average the normalised squared innovations, and contain the motion at rest; return whether the car is at rest."""
     if seen > 0:
@@ -464,7 +387,7 @@ def settle(now, seen, squares, rules, standstill_std, x, P, m):  # type: ignore[
     return True
 
 
-@_inline
+@inline
 def diverges(rules, x, m):  # type: ignore[no-untyped-def]
     """Return whether innovations remain far beyond their covariance, or the motion is impossible.
 
@@ -475,14 +398,14 @@ def diverges(rules, x, m):  # type: ignore[no-untyped-def]
     return m.nis > DIVERGED_NIS_RATIO or slides or reverses
 
 
-@_inline
+@inline
 def remember(k, now, residual_rate, m):  # type: ignore[no-untyped-def]
     """Keep inputs and residual of step k for the next one."""
     m.steer, m.ax, m.ax_known, m.friction = now.steer, now.ax, 1.0 if now.has_ax else 0.0, now.friction
     m.rate_vy, m.rate_r = residual_rate[k, 0], residual_rate[k, 1]
 
 
-@_inline
+@inline
 def finish_step(k, now, window, rules, m, inputs):  # type: ignore[no-untyped-def]
     """Keep inputs and residual of step k for the next one, and write its row of the inputs [K, 6]."""
     remember(k, now, window.residual_rate, m)
@@ -495,23 +418,7 @@ def finish_step(k, now, window, rules, m, inputs):  # type: ignore[no-untyped-de
     inputs[k, U_STEER_KNOWN] = 1.0 if m.steer_age <= rules.steer_hold_s else 0.0
 
 
-@_inline
-def is_finite(x, P):  # type: ignore[no-untyped-def]
-    """Return whether state and variances are numbers; so are all covariances then."""
-    total = 0.0
-    for i in range(x.shape[0]):
-        total += abs(x[i]) + abs(P[i, i])
-    return math.isfinite(total)
-
-
-@_inline
-def keep_state(x, out, k):  # type: ignore[no-untyped-def]
-    """Write a state [n] to row k of an output."""
-    for a in range(x.shape[0]):
-        out[k, a] = x[a]
-
-
-@_inline
+@inline
 def keep(P, out, k):  # type: ignore[no-untyped-def]
     """Write a covariance [n, n] to row k of an output."""
     for a in range(P.shape[0]):
@@ -522,34 +429,81 @@ def keep(P, out, k):  # type: ignore[no-untyped-def]
 # ------------------------------------------------------------------------------------------------ a window
 
 
-@_compiled
+@inline
+def unknown_steering_as_input(bias, rules, x, m):  # type: ignore[no-untyped-def]
+    """Return whether the steering was unknown in the step before; its likeliest angle is then the input."""
+    was_unknown = bias >= 0 and m.runs > 0.0 and m.steer_age > rules.steer_hold_s
+    if was_unknown:
+        m.steer -= x[bias]
+        x[bias] = 0.0
+    return was_unknown
+
+
+@inline
+def steering_walk(bias, was_unknown, steer_std, tuning, p, x, P, m):  # type: ignore[no-untyped-def]
+    """Return whether the steering is unknown, and write the walk of its error; known again, it has its bias only."""
+    unknown = bias >= 0 and m.steer_age > tuning.rules.steer_hold_s
+    if bias >= 0:
+        tuning.q_std[bias] = UNKNOWN_STEER_WALK if unknown else steer_std
+        if unknown and x[VX] < p.blend_high_m_s and P[bias, bias] > UNKNOWN_STEER_STD**2:
+            tuning.q_std[bias] = 0.0  # a slow car shows no steering
+    if was_unknown and not unknown:
+        P[bias, :] = 0.0
+        P[:, bias] = 0.0
+        P[bias, bias] = tuning.initial_std[bias] ** 2
+    return unknown
+
+
+# positional: to hand structures of arrays on at every step would cost as much as the step.
+@inline
+def correct(k, now, rate_vy, extra_r, tuning, model, x, P, m, scratch, out, predicted_P):  # type: ignore[no-untyped-def]
+    """Update state and covariance with the samples of step k that pass the gate; return whether the car is at rest.
+
+    Writes innovations, NIS and likelihood of the step, and P⁻ again where an open gate inflates it.
+    """
+    root, _, points, away, reading, nu, at_gate, r, S, Pxz, given, use = scratch
+    _, _, _, out_nis, out_dof, out_likelihood, out_nu, _, _, _ = out
+    layout, places, p, f = model
+    for i in range(READINGS):
+        r[i] = tuning.r_std[i] * tuning.r_std[i] + (extra_r[k, i] if i < Z_SPEED else 0.0)
+    expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, reading, nu, S, Pxz)
+    opens, outside, seen, squares = gate(now, m, nu, S, at_gate, given, use)
+    for i in range(READINGS):
+        if given[i]:
+            out_nu[k, i] = nu[i]
+    if outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
+        out_likelihood[k] = likelihood_of(x, P, at_gate, S, Pxz, given)
+    if opens:
+        P *= GATE_INFLATION
+        if predicted_P.shape[0] > 0:  # to a smoother the inflation is process noise of the step that led here
+            keep(P, predicted_P, k)
+        expect(x, P, root, now, rate_vy, r, layout, places, p, f, points, away, reading, nu, S, Pxz)
+        for i in range(READINGS):
+            if use[i]:
+                m.rejected[i] = 0.0
+    nis, dof, likelihood = unscented.update(x, P, nu, S, Pxz, use)
+    if dof > 0:
+        out_nis[k], out_dof[k] = nis, dof
+        if not outside:
+            out_likelihood[k] = likelihood
+    return settle(now, seen, squares, tuning.rules, tuning.standstill_std, x, P, m)
+
+
+@kernel
 def _filter(window, tuning, model, state, scratch, out, links):  # type: ignore[no-untyped-def]
     """Filter one window; ``state`` is updated in place. ``links`` are of length 0 if not requested."""
-    q_std, r_std, initial_std, standstill_std, rules = tuning
-    layout, places, p, car = model
-    x, P, memory = state
-    root, q, points, away, reading, nu, at_gate, r, S, Pxz, given, use = scratch
-    out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
+    q_std, rules, (layout, places, p, car), (x, P, memory) = tuning.q_std, tuning.rules, model, state
+    root, q, points, away = scratch[:4]
+    out_x, out_P, out_inputs, _, _, _, _, out_valid, out_diverged, out_prior = out
     out_linked, out_predicted_P, out_cross = links
     linked, bias = out_linked.shape[0] > 0, layout.steer_bias
     front_std, rear_std = (q_std[FRONT], q_std[REAR]) if layout.forces >= 0 else (0.0, 0.0)
     steer_std = q_std[bias]
     for k in range(window.dt_s.shape[0]):
         m = memory[0]
-        was_unknown = bias >= 0 and m.runs > 0.0 and m.steer_age > rules.steer_hold_s
-        if was_unknown:  # the likeliest angle is the input
-            m.steer -= x[bias]
-            x[bias] = 0.0
+        was_unknown = unknown_steering_as_input(bias, rules, x, m)
         now = begin_step(k, window, rules, bias < 0, memory)
-        unknown = bias >= 0 and m.steer_age > rules.steer_hold_s
-        if bias >= 0:
-            q_std[bias] = UNKNOWN_STEER_WALK if unknown else steer_std
-            if unknown and x[VX] < p.blend_high_m_s and P[bias, bias] > UNKNOWN_STEER_STD**2:
-                q_std[bias] = 0.0  # a slow car shows no steering
-        if was_unknown and not unknown:
-            P[bias, :] = 0.0
-            P[:, bias] = 0.0
-            P[bias, bias] = initial_std[bias] ** 2
+        unknown = steering_walk(bias, was_unknown, steer_std, tuning, p, x, P, m)
         if m.runs == 0.0:
             out_valid[k] = starts(now, unknown, tuning, model, x, P, memory)
         else:
@@ -561,35 +515,13 @@ def _filter(window, tuning, model, state, scratch, out, links):  # type: ignore[
             trust_residual(m, q)
             predict(x, P, root, over, rate, now.dt, 0.5, q, layout, places, p, f, points, away)
             if linked:
-                unscented.cross_covariance(root, changing(layout), away, out_cross, k)
+                unscented.cross_covariance(root, layout.changing, away, out_cross, k)
                 keep(P, out_predicted_P, k)
-            keep_state(x, out_prior, k)
-            alive, stands = is_finite(x, P), False
+            unscented.keep_state(x, out_prior, k)
+            alive, stands = unscented.is_finite(x, P), False
             if alive:
-                for i in range(READINGS):
-                    r[i] = r_std[i] * r_std[i] + (window.extra_r[k, i] if i < Z_SPEED else 0.0)
-                expect(x, P, root, now, rate[0], r, layout, places, p, f, points, away, reading, nu, S, Pxz)
-                opens, outside, seen, squares = gate(now, m, nu, S, at_gate, given, use)
-                for i in range(READINGS):
-                    if given[i]:
-                        out_nu[k, i] = nu[i]
-                if outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
-                    out_likelihood[k] = likelihood_of(x, P, at_gate, S, Pxz, given)
-                if opens:
-                    P *= GATE_INFLATION
-                    if linked:  # to a smoother the inflation is process noise of the step that led here
-                        keep(P, out_predicted_P, k)
-                    expect(x, P, root, now, rate[0], r, layout, places, p, f, points, away, reading, nu, S, Pxz)
-                    for i in range(READINGS):
-                        if use[i]:
-                            m.rejected[i] = 0.0
-                nis, dof, likelihood = unscented.update(x, P, nu, S, Pxz, use)
-                if dof > 0:
-                    out_nis[k], out_dof[k] = nis, dof
-                    if not outside:
-                        out_likelihood[k] = likelihood
-                stands = settle(now, seen, squares, rules, standstill_std, x, P, m)
-                alive = is_finite(x, P)
+                stands = correct(k, now, rate[0], window.extra_r, tuning, model, x, P, m, scratch, out, out_predicted_P)
+                alive = unscented.is_finite(x, P)
             # Without steering, a_y and yaw rate the motion is unknown: the filter ends, and waits for them.
             determined = alive and not (unknown and P[bias, bias] > MAX_STEER_STD**2)
             out_valid[k] = determined and now.steer_ok
@@ -599,100 +531,8 @@ def _filter(window, tuning, model, state, scratch, out, links):  # type: ignore[
             elif linked:
                 out_linked[k] = not stands
         finish_step(k, now, window, rules, m, out_inputs)
-        keep_state(x, out_x, k)
+        unscented.keep_state(x, out_x, k)
         keep(P, out_P, k)
-
-
-@_compiled
-def _predict_outputs(due, held, q_std, early, model, scratch, out):  # type: ignore[no-untyped-def]
-    """Predict the steps ``due`` with their inputs held; rows without a step (−1) are unchanged.
-
-    Over a latency the model is nearly linear: the covariance is J P Jᵀ + Q. J is of differences away from 0, which are
-    mirrored with the state.
-    """
-    step, horizon_s = due
-    held_x, held_P, inputs, residual_rate, noise = held
-    out_x, out_P, out_ay = out
-    layout, places, p, f = model
-    (x, q, JP), J, points = scratch
-    n, m, away = held_x.shape[1], changing(layout), 1e-4  # in the unit of each entry
-    for row in range(step.shape[0]):
-        k, dt = step[row], horizon_s[row]
-        if k < 0 or not is_finite(held_x[k], held_P[k]):
-            continue
-        P, over, rate = held_P[k], held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
-        for a in range(n):
-            x[a] = held_x[k, a]
-        for a in range(MOTION):
-            for b in range(MOTION):
-                out_P[row, a, b] = P[a, b]
-        if dt > 0.0:
-            process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
-            for j in range(n):
-                points[places[j] * WIDTH : (places[j] + 1) * WIDTH] = x[j]
-                if j < m:
-                    points[places[j] * WIDTH + 1 + j] += math.copysign(away, x[j])
-            move(points, columns_of(m), over, rate, dt, early, layout, p, f)
-            for a in range(MOTION):
-                JP[:] = 0.0
-                for i in range(m):
-                    J[a, i] = (points[a * WIDTH + 1 + i] - points[a * WIDTH]) / math.copysign(away, x[i])
-                    for j in range(m):
-                        JP[j] += J[a, i] * P[i, j]
-                for b in range(a + 1):
-                    s = q[a] if a == b else 0.0
-                    for j in range(m):
-                        s += JP[j] * J[b, j]
-                    out_P[row, a, b] = out_P[row, b, a] = s
-            for j in range(n):
-                x[j] = points[places[j] * WIDTH]
-        keep_state(x, out_x, row)
-        out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
-
-
-# ------------------------------------------------------------------------------------------------ records
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PosteriorSteps(StepColumns):
-    """Filter posteriors on measurement time: [K] each, state [K, n], covariance [K, n, n], inputs [K, 6].
-
-    ``prior`` [K, n] is the state before the update, NaN where the filter starts. ``residual_rate``
-    [K, 2] is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
-    """
-
-    stamps_ns: IntArray
-    x: FloatArray
-    P: FloatArray
-    inputs: FloatArray
-    nis: FloatArray
-    nis_dof: FloatArray
-    log_likelihood: FloatArray
-    innovation: FloatArray
-    valid: BoolArray
-    diverged: BoolArray
-    prior: FloatArray
-    residual_rate: FloatArray
-
-    @property
-    def written(self) -> tuple[Any, ...]:
-        """The columns that a kernel writes: all but the first and the last."""
-        return tuple(getattr(self, f.name) for f in fields(PosteriorSteps)[1:-1])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinkedSteps(StepColumns):
-    """Posteriors of a forward pass, and the links between them for a smoother; of length 0 if not requested.
-
-    ``linked`` [K]: the state follows from that of the step before; not at a start, a failure or a standstill.
-    ``predicted_P`` [K, n, n] is the covariance before the update, with the inflation by an opened gate; ``cross``
-    [K, n, n] the covariance between the state of the step before (rows) and the predicted state (columns).
-    """
-
-    posterior: PosteriorSteps
-    linked: BoolArray
-    predicted_P: FloatArray
-    cross: FloatArray
 
 
 def make_window(
@@ -708,81 +548,6 @@ def make_window(
     columns += [default if column is None else column for column, default in given]
     # Numba would compile the kernel again for a read-only column, or one number for all steps.
     return Window._make(np.require(column, requirements=["C", "W"]) for column in columns)
-
-
-def no_posterior(stamps_ns: IntArray, n: int, residual_rate: FloatArray) -> PosteriorSteps:
-    """Return steps of ``n`` states for a kernel to write to, with no estimate in them."""
-    count = len(stamps_ns)
-    return PosteriorSteps(
-        stamps_ns=stamps_ns,
-        x=np.empty((count, n)),
-        P=np.empty((count, n, n)),
-        inputs=np.empty((count, INPUTS)),
-        nis=np.full(count, np.nan),
-        nis_dof=np.zeros(count),
-        log_likelihood=np.zeros(count),
-        innovation=np.full((count, READINGS), np.nan),
-        valid=np.zeros(count, dtype=np.bool_),
-        diverged=np.zeros(count, dtype=np.bool_),
-        prior=np.full((count, n), np.nan),
-        residual_rate=residual_rate,
-    )
-
-
-def predicted_track(
-    name: str,
-    steps: PosteriorSteps,
-    ahead: Extrapolation,
-    stamps_ns: IntArray,
-    q_std: FloatArray,
-    model: Model,
-    *,
-    rate: FloatArray,
-    noise: FloatArray,
-    early: float = 0.5,
-) -> StateTrack:
-    """Return the track of steps [K], predicted to the scored stamps [M] with their inputs held.
-
-    ``rate`` [K, 2] is the residual, ``noise`` [K] a factor on the time over which process noise adds up.
-    """
-    step, count, n = ahead.step, len(stamps_ns), model.layout.size
-    x, covariance, ay = np.full((count, n), np.nan), np.full((count, MOTION, MOTION), np.nan), np.full(count, np.nan)
-    due = (np.where(ahead.usable, step, -1), ahead.horizon_s)
-    held = (steps.x, steps.P, steps.inputs, rate, noise)
-    scratch = tuple(np.zeros((3, n))), np.zeros((MOTION, n)), np.zeros(PLACES * WIDTH)
-    _predict_outputs(due, held, q_std, early, model, scratch, (x, covariance, ay))
-    usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[step, U_SPEED])
-    return make_track(
-        name,
-        stamps_ns,
-        vx_m_s=x[:, VX].copy(),
-        vy_m_s=x[:, VY].copy(),
-        yaw_rate_rad_s=x[:, YAW_RATE].copy(),
-        ay_m_s2=ay,
-        covariance=covariance,
-        sideslip_std_rad=sideslip_std(x[:, VX], x[:, VY], covariance),
-        r_scale=np.ones(count),
-        nis=np.where(usable, steps.nis[step], np.nan),
-        nis_dof=np.where(usable, steps.nis_dof[step], 0.0),
-        friction=np.where(usable, steps.inputs[step, U_FRICTION], np.nan),
-        valid=usable,
-        diverged=usable & steps.diverged[step],
-        **{column: np.where(usable, x[:, i], np.nan) for column, i in model.layout.named.items()},
-    )
-
-
-def rolls_forward(vx_m_s: FloatArray, last_speed_m_s: FloatArray) -> BoolArray:
-    """Return where v_x [N] does not contradict the last speed sample: the sideslip would be at 180 degrees there."""
-    against: BoolArray = (vx_m_s < 0.0) & (last_speed_m_s > FORWARD_M_S)
-    return ~against
-
-
-def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the 1-sigma of β = atan2(v_y, v_x) in rad, [N], to first order from the covariance [N, ≥2, ≥2]."""
-    v2 = np.maximum(vx_m_s**2 + vy_m_s**2, 1e-6)
-    gx, gy = -vy_m_s / v2, vx_m_s / v2
-    variance = gx**2 * covariance[:, VX, VX] + gy**2 * covariance[:, VY, VY] + 2.0 * gx * gy * covariance[:, VX, VY]
-    return np.sqrt(np.maximum(variance, 0.0))
 
 
 # ------------------------------------------------------------------------------------------------ the estimator
@@ -929,13 +694,17 @@ def _expected_ay(x, inputs, model, out):  # type: ignore[no-untyped-def]
 
 def make_scratch(n: int) -> tuple[Any, ...]:
     """Return the arrays of a kernel for ``n`` states that keep nothing between steps, of the readings those from ν."""
-    root, of_readings = unscented.padded(n, n), np.zeros((3, READINGS))
-    block = (np.zeros(PLACES * WIDTH), np.zeros((root.shape[1], WIDTH)), np.zeros(WIDTH))
-    covariances, chosen = (
-        (np.zeros((READINGS, READINGS)), unscented.padded(READINGS, n)),
-        np.zeros((2, READINGS), dtype=np.bool_),
+    of_readings, chosen = np.zeros((3, READINGS)), np.zeros((2, READINGS), dtype=np.bool_)
+    covariances = np.zeros((READINGS, READINGS)), unscented.padded(READINGS, n)
+    return (
+        unscented.padded(n, n),
+        np.zeros(n),
+        *unscented.block(n),
+        np.zeros(WIDTH),
+        *of_readings,
+        *covariances,
+        *chosen,
     )
-    return root, np.zeros(n), *block, *of_readings, *covariances, *chosen
 
 
 def resume(state: FilterState | None, n: int) -> FilterState:

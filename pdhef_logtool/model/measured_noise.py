@@ -14,8 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from pdhef_logtool.car.parts import MEASUREMENTS
+from pdhef_logtool.estimators.filter_steps import PosteriorSteps
 from pdhef_logtool.estimators.vehicle_model import VY
-from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, VehicleUkf
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, rms
 from pdhef_logtool.evaluation.metrics.yaw_consistency import yaw_rate_errors
 from pdhef_logtool.records.signals import FloatArray

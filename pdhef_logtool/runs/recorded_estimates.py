@@ -17,7 +17,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, one_log, read_drive
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
-from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
+from pdhef_logtool.estimators.prediction import sideslip_std
 from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.requirement_blocks import requirement_blocks
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool.learning.network.dataset import Dataset
-from pdhef_logtool.learning.network.train_command import Recipe, gap_free_runs, train_on, weights_of
+from pdhef_logtool.learning.network.train_command import Recipe, gap_free_runs, train_on
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER
 from pdhef_logtool.residual_model.features import FEATURES
@@ -86,7 +86,7 @@ def _training_sequences(data: Dataset) -> Iterable[SideslipSequence]:
         rows = drive.load()
         for part in gap_free_runs(rows):
             vx, vy = np.asarray(rows.truth_velocity[part], dtype=np.float64).T
-            used = (weights_of(rows, part) > 0.0) & (vx >= slowest) & np.isfinite(vy)
+            used = (rows.training_weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
             yield SideslipSequence(
                 features=np.asarray(rows.features[part], dtype=np.float64),
                 dt_s=np.concatenate([[np.nan], np.diff(rows.stamps_ns[part]) * 1e-9]),

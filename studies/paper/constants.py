@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.filter_steps import PosteriorSteps
 from pdhef_logtool.estimators.hybrid_paper import Constants, PaperHybridUkf
 from pdhef_logtool.estimators.parallel_physics import run_features
-from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, nominal_filter
+from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from studies.defaults.paper_drives import plan_drives

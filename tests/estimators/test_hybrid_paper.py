@@ -79,13 +79,10 @@ def numpy_reference(signals: Signals, bundle: ModelBundle, constants: Constants)
         mean = wm @ rows
         return mean, (rows - mean).T @ (wc[:, None] * (rows - mean))
 
-    def predict(x, P, steer, ax, mu, dt, residual, beta, has_ax, linear=False):
-        away = np.vstack([np.zeros(4), np.diag(np.copysign(1e-4, x))])
-        chi = x + away if linear else points(x, P)
-        moved = np.array([np.append(runge_kutta(c[:3], steer, ax - c[3], mu, dt), c[3]) for c in chi])
+    def predict(x, P, steer, ax, mu, dt, residual, beta, has_ax):
+        moved = np.array([np.append(runge_kutta(c[:3], steer, ax - c[3], mu, dt), c[3]) for c in points(x, P)])
         moved[:, 1:3] += beta * residual * dt
-        J = (moved[1:5] - moved[0]).T / np.diag(away[1:])
-        x, P = (moved[0], J @ P @ J.T) if linear else moments(moved)
+        x, P = moments(moved)
         std = q.copy()
         if not has_ax:
             std[0] = 3.0
@@ -139,7 +136,7 @@ def numpy_reference(signals: Signals, bundle: ModelBundle, constants: Constants)
         x, P, beta, r_scale = steps[k]
         has_ax = bool(np.isfinite(ax[k]))
         mu = signals.friction[k]
-        x, P = predict(x, P, steer[k], ax[k] if has_ax else 0.0, mu, t[m] - t[k], rate[k], beta, has_ax, True)
+        x, P = predict(x, P, steer[k], ax[k] if has_ax else 0.0, mu, t[m] - t[k], rate[k], beta, has_ax)
         out["vx"][m], out["vy"][m], out["r"][m] = x[:3]
         out["beta"][m], out["r_scale"][m], out["vy_var"][m] = beta, r_scale, P[1, 1]
         out["ay"][m] = forces(*x[:3], steer[k], mu)[0] + beta * rate[k, 0]

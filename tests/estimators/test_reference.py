@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from reference_car import FRONT_M, REAR_M, START_NS, Drive, drive, tanh_tyre, with_noise
 
 from pdhef_logtool.estimators import kinematic_filter as kinematics
+from pdhef_logtool.estimators.prediction import sideslip_std
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer
-from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 PRIOR = ReferencePrior(REAR_M, REAR_M + FRONT_M, ay_gain=1.0)

@@ -8,11 +8,12 @@ from reference_car import drive, rolling_drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import stepwise, vehicle_ukf
+from pdhef_logtool.estimators.filter_steps import U_SPEED
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.open_loop import OpenLoop
 from pdhef_logtool.estimators.speed_slip import TIMEOUT_S, believable
-from pdhef_logtool.estimators.vehicle_ukf import U_SPEED, VehicleUkf, nominal_filter
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import Signals
 

@@ -15,7 +15,7 @@ from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import vehicle_model as model
-from pdhef_logtool.estimators.vehicle_ukf import HeldInputs
+from pdhef_logtool.estimators.vehicle_model import HeldInputs
 
 pytestmark = pytest.mark.slow
 

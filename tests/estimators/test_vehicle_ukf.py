@@ -15,10 +15,11 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import vehicle_ukf
+from pdhef_logtool.estimators.filter_steps import PosteriorSteps
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import Options, make_estimator
-from pdhef_logtool.estimators.vehicle_model import LANES, PLACES, WIDTH, advance, physics_parameters
-from pdhef_logtool.estimators.vehicle_ukf import HeldInputs, PosteriorSteps, VehicleUkf, nominal_filter
+from pdhef_logtool.estimators.vehicle_model import LANES, PLACES, WIDTH, HeldInputs, advance, physics_parameters
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter
 from pdhef_logtool.records.signals import Signals
 
 VEHICLE = default_vehicle()

@@ -179,7 +179,7 @@ def test_what_is_not_chosen_teaches_nothing_and_only_what_leads_to_the_chosen_is
     rows = arrays(2000, chosen=chosen, weight=weight)
     (run,) = training.gap_free_runs(rows)
     assert run == slice(700 - training.LEAD_STEPS, 741)
-    assert training.weights_of(rows, run).sum() == 2.0
+    assert rows.training_weight[run].sum() == 2.0
     cut = replace(rows, segment=np.where(np.arange(2000) < 720, 0, 1))
     assert list(training.gap_free_runs(cut)) == [slice(700 - training.LEAD_STEPS, 720)], (
         "what is left behind the cut is too short"

@@ -15,9 +15,10 @@ from made_models import full_network, random_network
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
+from pdhef_logtool.estimators.filter_steps import U_FRICTION, U_STEER, no_posterior
 from pdhef_logtool.estimators.parallel_physics import make_features
 from pdhef_logtool.estimators.vehicle_model import FRONT, REAR
-from pdhef_logtool.estimators.vehicle_ukf import U_FRICTION, U_STEER, VehicleUkf, no_posterior
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model import bundle as bundles

@@ -11,6 +11,7 @@ import numpy as np
 
 from pdhef_logtool.estimators import kinematic_filter as s
 from pdhef_logtool.estimators import rts
+from pdhef_logtool.estimators.prediction import sideslip_std
 from pdhef_logtool.estimators.reference.gnss import (
     first_guess,
     gnss_follows_imu,
@@ -19,7 +20,6 @@ from pdhef_logtool.estimators.reference.gnss import (
     without_jumps,
 )
 from pdhef_logtool.estimators.reference.inputs import ANTENNA_Y_STD_M, LINEAR_FRICTION, RATE_HZ, knots, sensor_noise
-from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import LEAST_DIVISOR, S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import INDEPENDENT_SHARE, REFERENCE, StateTrack, make_track

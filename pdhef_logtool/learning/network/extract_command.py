@@ -387,9 +387,7 @@ def _extract(job: _Job, progress: Progress) -> DriveResult:
             "end_s": end_s,
             "duration_s": float(rows.stamps_ns[-1] - rows.stamps_ns[0]) * S_PER_NS,
             "rows": len(rows),
-            "usable_rows": int(
-                np.count_nonzero(rows.weight > 0.0 if rows.chosen is None else rows.weight * rows.chosen > 0.0)
-            ),
+            "usable_rows": int(np.count_nonzero(rows.training_weight)),
             "truth": truth,
             "friction_from": drive.friction.label,
             "losses": [asdict(x) for x in drive.losses],

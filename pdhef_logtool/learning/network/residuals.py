@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.drive.truth import differentiate
 from pdhef_logtool.estimators import vehicle_model as ukf_model
+from pdhef_logtool.estimators.filter_steps import U_AX, U_FRICTION, U_STEER
 from pdhef_logtool.estimators.parallel_physics import run_features
-from pdhef_logtool.estimators.vehicle_ukf import U_AX, U_FRICTION, U_STEER, HeldInputs, VehicleUkf
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
@@ -84,6 +85,11 @@ class ResidualRows:
         """Return the number of rows."""
         return int(self.stamps_ns.shape[0])
 
+    @property
+    def training_weight(self) -> FloatArray:
+        """Weight of the chosen rows, 0 of the others, [N]."""
+        return np.asarray(self.weight * self.chosen, dtype=np.float64)
+
 
 @njit(cache=True)
 def _run_model(stamps_ns, states, inputs, good, max_step_s, model, out):  # type: ignore[no-untyped-def]
@@ -99,7 +105,7 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, out):  # type
             run[0] = 0.0
             continue
         x = states[k].copy()
-        over = HeldInputs(
+        over = ukf_model.HeldInputs(
             0.5 * (inputs[k, U_STEER] + inputs[k + 1, U_STEER]),
             0.5 * (inputs[k, U_AX] + inputs[k + 1, U_AX]),
             True,

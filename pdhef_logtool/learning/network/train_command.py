@@ -505,18 +505,13 @@ def gap_free_runs(drive: ResidualRows) -> Iterable[slice]:
     """
     piece = drive.segment
     if not drive.chosen.all():
-        near = _near(drive.chosen & (drive.weight > 0.0))
+        near = _near(drive.training_weight > 0.0)
         piece = np.cumsum(np.diff(near, prepend=near[:1]) | (np.diff(piece, prepend=piece[:1]) != 0))
     edges = [0, *(np.flatnonzero(np.diff(piece)) + 1).tolist(), drive.stamps_ns.shape[0]]
     for a, b in pairwise(edges):
         is_complete = np.isfinite(drive.features[a:b]).all()
-        if b - a >= MIN_SEQUENCE_STEPS and is_complete and weights_of(drive, slice(a, b)).sum() > 0.0:
+        if b - a >= MIN_SEQUENCE_STEPS and is_complete and drive.training_weight[a:b].sum() > 0.0:
             yield slice(a, b)
-
-
-def weights_of(drive: ResidualRows, part: slice) -> FloatArray:
-    """Return the weights of a part of a drive, 0 for rows that are not selected."""
-    return np.asarray(drive.weight[part] * drive.chosen[part], dtype=np.float64)
 
 
 def _near(chosen: BoolArray) -> BoolArray:
@@ -564,7 +559,7 @@ class SplitSequences:
             rows = drive.load()
             offset = steering_offset(rows, self.data.vehicle(drive)) if self.odd else np.zeros(2)
             for part in gap_free_runs(rows):
-                weight = weights_of(rows, part)
+                weight = rows.training_weight[part]
                 features = np.asarray(rows.features[part], dtype=np.float64)
                 if self.target == bundles.RESIDUAL:
                     values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None] - offset
