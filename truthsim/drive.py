@@ -198,9 +198,9 @@ def simulate_drive(
     Raises
     ------
     UsageError
-        The manoeuvre is unknown.
+        The manoeuvre is unknown, or a value is outside the range of the simulator.
     SimulationError
-        A value is outside the simulator's range, or the car spun.
+        The car spun.
     """
     chosen = MANOEUVRES.get(manoeuvre)
     if chosen is None:
@@ -285,7 +285,7 @@ def _check(
 ) -> None:
     def require(holds: bool, where: str, expected: str, got: float) -> None:
         if not holds:
-            raise SimulationError(expected=expected, got=f"{got:g}", where=where)
+            raise UsageError(expected=expected, got=f"{got:g}", where=where)
 
     top = min(250.0, chosen.top_speed_km_h)
     require(10.0 <= speed_km_h <= top, f"speed of {chosen.name}", f"10 to {top:g} km/h", speed_km_h)

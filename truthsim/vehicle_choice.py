@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from pdhef_logtool.records.errors import SimulationError
+from pdhef_logtool.records.errors import UsageError
 from truthsim.randomisation import randomise
 from truthsim.vehicle import Vehicle
 from truthsim.vehicle_files import load_vehicle
@@ -22,7 +22,7 @@ def choose_vehicle(text: str) -> Vehicle:
 
     Raises
     ------
-    SimulationError
+    UsageError
         The vehicle is unknown, or a change is wrong.
     """
     name, *changes = text.split(",")
@@ -37,8 +37,8 @@ def choose_vehicle(text: str) -> Vehicle:
     return vehicle
 
 
-def _wrong(text: str, expected: str) -> SimulationError:
-    return SimulationError(
+def _wrong(text: str, expected: str) -> UsageError:
+    return UsageError(
         expected=expected, got=repr(text), where="vehicle", remedy="for example sedan, suv~7 or sedan,mass=1.2,cg=0.1"
     )
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pdhef_logtool.records.errors import SimulationError
+from pdhef_logtool.records.errors import SimulationError, UsageError
 from truthsim import manoeuvres
 from truthsim.drive import reference_steer_rad, simulate_drive
 from truthsim.vehicle import Vehicle
@@ -78,7 +78,7 @@ def test_severe_lane_change_stays_between_the_cones(speed_km_h):
     assert np.all(drive.truth["y_m"] >= low - 0.1) and np.all(drive.truth["y_m"] <= high + 0.1)
     # Coasting through, and faster than the standard's course can be driven is refused.
     assert drive.truth["vx_m_s"][-1] < speed_km_h / 3.6 - 0.1
-    with pytest.raises(SimulationError, match="70"):
+    with pytest.raises(UsageError, match="70"):
         simulate_drive("dlc-3888-2", speed_km_h=90.0)
 
 
@@ -152,6 +152,6 @@ def test_a_spin_is_dropped_unless_asked_for():
     ],
 )
 def test_bad_requests_are_one_clear_line(name, options, words):
-    with pytest.raises(SimulationError) as caught:
+    with pytest.raises(UsageError) as caught:
         simulate_drive(name, **options)
     assert all(word in str(caught.value) for word in words)
