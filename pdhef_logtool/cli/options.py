@@ -114,6 +114,7 @@ def run_config(options: dict[str, Any]) -> RunConfig:
     """
     from pdhef_logtool.runs.config import load_config, parse_assignments
 
-    flags = {key: value for key, value in options.items() if value not in (None, [])}
-    assigned = parse_assignments(flags.pop("assignments", ()))
-    return load_config(flags.pop("config_file", None), assigned | flags)
+    assigned = parse_assignments(options.pop("assignments", None) or ())
+    path = options.pop("config_file", None)
+    flags = {k: ",".join(v) if isinstance(v, list) else v for k, v in options.items() if v not in (None, [])}
+    return load_config(path, assigned | flags)

@@ -10,8 +10,9 @@ D, the leaky sum of the changes of v̂_y,i beyond that, is the error that the es
 fast (``LINEAR_S``) in the linear range of the tyres, where only one solution exists and D would accumulate bank, bias
 and noise. It is slow (``LIMIT_S``) near the limit of grip, and while the flag is set, so that a return to the right
 solution clears the flag. The flag is set while abs D exceeds v̂_x times ``ON_RAD``, and cleared below v̂_x times
-``OFF_RAD``. Both limits are increased by ``NOISE_SIGMAS`` of the white noise of the sensors in D, as the vehicle file
-states it, or larger as the drive shows it.
+``OFF_RAD``, or below ``SIGMAS`` of what the sensors may contribute to D: their white noise, as the vehicle file states
+it, or larger as the drive shows it; and the bank of the road and an error of the accelerometer's gain (its own, or of
+the roll gradient), which act in one direction for as long as D remembers.
 
 Not detected: an estimate that is wrong from its start, or drifts more slowly than the leak forgets. Errors of
 accelerometer or gyro are attributed to the estimate, except for missing and stuck samples, which are not judged.
@@ -27,8 +28,9 @@ import numpy as np
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators.vehicle_model import BANK_STD
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import BoolArray, Signals
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, release
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -37,14 +39,16 @@ LINEAR_S, LIMIT_S = 0.5, 3.0
 #: Shares of the grip, abs a_y / (μ g), between which the leak changes from fast to slow.
 GRIP_LOW, GRIP_HIGH = 0.5, 0.7
 GRIP_SMOOTHING_S, GRIP_HOLD_S = 0.1, 1.0
-#: Tolerance for the noise in D, in standard deviations.
-NOISE_SIGMAS = 3.0
+#: Tolerance for noise, bank and gain in D, in standard deviations, and that of the gain of a_y.
+SIGMAS, AY_GAIN_STD = 3.0, 0.04
 #: Smallest speed in the limit of D, as a multiple of the low-speed blend.
 LEAST_SPEED_BLENDS = 3.0
 
 # Entries of the memory.
-D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW, GRIP, FRICTION, VAR = range(15)
-MEMORY_SIZE = 15
+D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW, GRIP, FRICTION, VAR, STEADY = range(
+    16
+)
+MEMORY_SIZE = 16
 
 
 #: The noise of the sensors is that of the vehicle file.
@@ -56,25 +60,16 @@ def watched_track(
 ) -> StateTrack:
     """Return a track [N] with ``diverged`` set also where the sensors contradict it.
 
-    Estimates without a covariance are not monitored: they make no claim about their accuracy. ``noise`` : of the
-    measurements as the drive shows it, if it is larger than in the vehicle file.
-    """
-    if track.covariance.shape[0] == 0:
-        return track
-    return replace(track, diverged=track.diverged | (wrong_branch(track, signals, vehicle, noise) & track.valid))
-
-
-def wrong_branch(
-    track: StateTrack, signals: Signals, vehicle: VehicleParameters, noise: FilterNoise = AS_STATED
-) -> BoolArray:
-    """Return where a track departs from the sensors' motion, [N].
-
-    Computed on measurement time; a scored stamp has the flag of the newest step that had arrived.
+    Computed on measurement time; a scored stamp has the flag of the newest step that had arrived. Estimates without a
+    covariance are not monitored: they make no claim about their accuracy.
 
     Parameters
     ----------
     track, signals : [N] at the same stamps.
+    noise : of the measurements as the drive shows it, if it is larger than in the vehicle file.
     """
+    if track.covariance.shape[0] == 0:
+        return track
     signals = without_impossible(signals)
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
     flags = np.empty(len(signals), dtype=np.bool_)
@@ -87,7 +82,7 @@ def wrong_branch(
     )  # fmt: skip
     _watch(motion, car, np.zeros(MEMORY_SIZE), flags)
     released = release(signals.ready_ns, signals.stamps_ns)
-    return np.asarray(flags[released.step] & released.arrived, dtype=np.bool_)
+    return replace(track, diverged=track.diverged | (flags[released.step] & released.arrived & track.valid))
 
 
 @njit(cache=True)
@@ -129,7 +124,7 @@ def _watch(motion, car, memory, flags):  # type: ignore[no-untyped-def]
 
         r = rate[k] if math.isfinite(rate[k]) else memory[GYRO]
         if not valid[k] or not math.isfinite(vx[k]) or not math.isfinite(vy[k]):
-            memory[D] = memory[VAR] = memory[FLAG] = memory[HAS_LAST] = 0.0
+            memory[D] = memory[VAR] = memory[STEADY] = memory[FLAG] = memory[HAS_LAST] = 0.0
             flags[k] = False
             continue
         vx_imu, vy_imu = vx[k] - imu_y * r, vy[k] + imu_x * r
@@ -139,14 +134,17 @@ def _watch(motion, car, memory, flags):  # type: ignore[no-untyped-def]
                 sensed = 0.5 * (before_ay + memory[AY]) / tilt - turned
                 memory[D] += (vy_imu - memory[VY]) - sensed * step
                 memory[VAR] += ((ay_std / tilt) ** 2 + (vx_imu * gyro_std) ** 2) * step * step
+                memory[STEADY] += math.hypot(GRAVITY_M_S2 * BANK_STD, AY_GAIN_STD * memory[AY_SLOW]) * step
             near = min(max((memory[GRIP] - GRIP_LOW) / (GRIP_HIGH - GRIP_LOW), 0.0), 1.0)
             if memory[FLAG] > 0.0:
                 near = 1.0
             keep = math.exp(-step * ((1.0 - near) / LINEAR_S + near / LIMIT_S))
             memory[D] *= keep
             memory[VAR] *= keep * keep
+            memory[STEADY] *= keep
         memory[VX], memory[VY], memory[HAS_LAST] = vx_imu, vy_imu, 1.0
         angle = OFF_RAD if memory[FLAG] > 0.0 else ON_RAD
-        limit = angle * max(vx[k], least_speed) + NOISE_SIGMAS * math.sqrt(memory[VAR])
+        by_sensors = SIGMAS * math.sqrt(memory[VAR] + memory[STEADY] ** 2)
+        limit = max(angle * max(vx[k], least_speed), by_sensors)
         memory[FLAG] = 1.0 if abs(memory[D]) > limit else 0.0
         flags[k] = memory[FLAG] > 0.0

@@ -35,8 +35,7 @@ def fuzzy_trust(deviation_m_s2, intensity, deviation_tops_m_s2, intensity_tops):
         return math.nan
     columns = memberships(deviation_m_s2, deviation_tops_m_s2)
     rows = memberships(intensity, intensity_tops)
-    total = 0.0
-    strengths = 0.0
+    total = strengths = 0.0
     for i in range(3):
         for j in range(3):
             strength = min(rows[i], columns[j])

@@ -25,8 +25,7 @@ def _kinematic(window, leak_s, hold_s, zero, state, values, rates, valid):  # ty
         advance_speed(state, dt[k], ax[k], speed[k], hold_s)
         is_complete = math.isfinite(state[0]) and math.isfinite(yaw_rate[k]) and math.isfinite(ay[k])
         if not dt[k] <= RESTART_GAP_S or not math.isfinite(state[2]) or abs(state[0]) < zero:
-            state[2] = 0.0
-            state[3] = 0.0
+            state[2] = state[3] = 0.0
         else:
             state[2] += state[3] * dt[k]
         vy_dot = ay[k] - state[0] * yaw_rate[k] - state[2] / leak_s if is_complete else 0.0

@@ -104,8 +104,7 @@ def predicted_track(
 
 def rolls_forward(vx_m_s: FloatArray, last_speed_m_s: FloatArray) -> BoolArray:
     """Return where v_x [N] does not contradict the last speed sample: the sideslip would be at 180 degrees there."""
-    against: BoolArray = (vx_m_s < 0.0) & (last_speed_m_s > FORWARD_M_S)
-    return ~against
+    return np.asarray(~((vx_m_s < 0.0) & (last_speed_m_s > FORWARD_M_S)), dtype=np.bool_)
 
 
 def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -63,10 +63,10 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir, tm
     run = ("run", sample_logs_dir / "dlc.mcap", "-o", tmp_path, "--keep", "estimates", "--no-report", "-e")
     document = json.loads(called(*run, "zero", "--json").stdout)
     assert document["logs"][0]["report"] == json.loads((tmp_path / "logs/dlc/report.json").read_text())
-    result = called(*run, "zero,phy-ukf")
+    result = called(*run, "zero", "-e", "phy-ukf")
     assert document["exit_code"] == 0
     assert result.returncode == 0
-    assert "phy-ukf" in result.stdout
+    assert "\n phy-ukf " in result.stdout and "\n zero " in result.stdout
     assert "default sedan (no car given)" in " ".join(result.stdout.split())
     assert "warning" not in result.stdout + result.stderr  # the sample log must not cause warnings
     assert "truth" in result.stdout
