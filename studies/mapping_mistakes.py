@@ -1,29 +1,33 @@
 """Eight kinds of mistakes in a mapping × every signal: how many are named with the right remedy.
 
-``python -m studies.mapping_mistakes [LOG ...]`` counts them over logs, by default the sample logs, as ``pdhef inspect
---mapping`` states them. A mistake is *named* if a failed check of its signal has the factor or the axis that undoes it
-in its remedy, *refused* if the mapping file is, *stopped* if a check of its signal fails with another remedy, *other*
-if another signal fails instead, *silent* if its checks pass, and *open* if they are undecided.
+``python -m studies.mapping_mistakes [--car] [LOG ...]`` counts them over logs, by default the sample logs, as ``pdhef
+inspect --mapping`` states them; with ``--car``, as ``pdhef run --car`` does with the published vehicle file of a
+recorded drive. A mistake is *named* if a failed check of its signal has the factor or the axis that undoes it in its
+remedy, *refused* if the mapping file is, *stopped* if a check of its signal fails with another remedy, *other* if
+another signal fails instead, *silent* if its checks pass, and *open* if they are undecided.
 """
 
 from __future__ import annotations
 
+import argparse
 import copy
 import re
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pdhef_logtool import PdhefError, inspect_log
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.mapping.mapping_file import load_mapping
 from studies.gates.tool import Tool
 from studies.pages import ROOT, read_toml, write_toml
-from studies.peers.drives import PEER_DRIVES, mapping_table
+from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 
 _UNITS = {"57.3": 57.3, "9.81": 9.81, "3.6": 3.6}
 FACTORS = {f"x{n}": f for n, f in _UNITS.items()} | {f"/{n}": 1.0 / f for n, f in _UNITS.items()} | {"sign": -1.0}
@@ -33,7 +37,7 @@ SAMPLES = ("dlc", "fishhook", "step", "sweep", "road")
 #: The source that is read instead of a signal's; two axes of an accelerometer, and of a velocity, are exchanged.
 OTHER: dict[str, str] = read_toml(Path(__file__).with_suffix(".toml"))
 EXCHANGED = {"ax_m_s2", "ay_m_s2", "truth.vx_m_s", "truth.vy_m_s"}
-_UNDOES = re.compile(r"scale(?: in the mapping)?(?: by| =) ([-+.\de]+)")
+_UNDOES = re.compile(r"scale(?: in the mapping)? (by|=) ([-+.\de]+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,17 +81,21 @@ def mistaken(mapping: dict[str, Any], subject: str, kind: str) -> dict[str, Any]
     return wrong
 
 
-def verdict(checks: Sequence[dict[str, Any]], subject: str, kind: str) -> str:
-    """Return the verdict of checks on a mistake, as in the module."""
+def verdict(checks: Sequence[dict[str, Any]], subject: str, kind: str, scale: float = 1.0) -> str:
+    """Return the verdict of checks on a mistake, as in the module; ``scale`` is the right one."""
     related = (subject, "truth.sideslip_rad") if subject == "truth.vy_m_s" else (subject,)
     mine = [c for c in checks if c["subject"].startswith(related)]
     failed = [c for c in mine if c["verdict"] == "failed"]
     if failed and kind == AXIS:
         return "named" if any(c["name"].endswith((".axis", ".mounting")) for c in failed) else "stopped"
     if failed:
-        found = [float(m[1]) for c in failed for m in _UNDOES.finditer(c["remedy"])]
-        # The remedy is a factor, or the scale itself, which is 1 in sample logs.
-        return "named" if any(abs(f * FACTORS[kind] - 1.0) < 0.05 or f == 1.0 for f in found[:1]) else "stopped"
+        # The remedy is a factor, or the scale itself.
+        found = [
+            float(m[2]) * (FACTORS[kind] if m[1] == "by" else 1.0 / scale)
+            for c in failed
+            for m in _UNDOES.finditer(c["remedy"])
+        ]
+        return "named" if any(abs(f - 1.0) < 0.05 for f in found[:1]) else "stopped"
     if any(c["verdict"] == "failed" for c in checks):
         return "other"
     decided = [c for c in mine if c["name"].endswith((".sign", ".unit", ".axis"))]
@@ -117,29 +125,49 @@ def outcomes(
             yield Outcome(log.stem, subject, kind, "refused")
             continue
         checks = [c for c in checks if not c["verdict"] == sound.get(c["name"]) == "failed"]
+        table, prefix = _place(subject)
+        source = next(source for n, source in mapping[table].items() if n.startswith(prefix))
+        scale = float(np.ravel(source.get("scale", 1.0))[0])
         bad = tuple(c for c in checks if c["verdict"] != "passed")
-        yield Outcome(log.stem, subject, kind, verdict(checks, subject, kind), bad)
+        yield Outcome(log.stem, subject, kind, verdict(checks, subject, kind, scale), bad)
 
 
 def look_at(log: Path, mapping: Path) -> Sequence[dict[str, Any]]:
     """Return the checks that ``pdhef inspect`` shows."""
-    checks: list[dict[str, Any]] = inspect_log(log, mapping=mapping).to_dict()["checks"]
-    return checks
+    return list(inspect_log(log, mapping=mapping).to_dict()["checks"])
+
+
+def look_at_with_car(log: Path, mapping: Path) -> Sequence[dict[str, Any]]:
+    """Return the checks with the published vehicle file of a recorded drive, without one for other logs."""
+    if (peer := peer_of(log)) is None:
+        return look_at(log, mapping)
+    car = Car.load(write_toml(mapping.with_suffix(".car.toml"), vehicle_table(peer)))
+    with read_drive(log, car, load_mapping(mapping)) as drive:
+        return [asdict(check) for check in drive.plan.checks]
+
+
+def peer_of(log: Path) -> PeerDrive | None:
+    """Return the recorded drive of a log, None for other logs."""
+    return next((drive for drive in PEER_DRIVES if drive.log == log.name), None)
 
 
 def recognised(log: Path, folder: Path) -> dict[str, Any]:
     """Return the mapping file of a log: the known one of a recorded drive, else the recognised one."""
-    peer = next((drive for drive in PEER_DRIVES if drive.log == log.name), None)
+    peer = peer_of(log)
     return Tool(ROOT, folder).mapping(log) if peer is None else mapping_table(peer)
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str] | None) -> int:
     """Count the outcomes over logs and print those that are not named."""
-    paths = [Path(a).resolve() for a in arguments] or [ROOT / "sample_logs" / f"{name}.mcap" for name in SAMPLES]
+    parser = argparse.ArgumentParser(prog="python -m studies.mapping_mistakes", description=main.__doc__)
+    parser.add_argument("--car", action="store_true", help="with the published vehicle files of recorded drives")
+    parser.add_argument("logs", nargs="*", type=Path, default=[ROOT / "sample_logs" / f"{n}.mcap" for n in SAMPLES])
+    options = parser.parse_args(arguments)
+    look, paths = look_at_with_car if options.car else look_at, [path.resolve() for path in options.logs]
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for outcome in (o for path in paths for o in outcomes(look_at, path, recognised(path, folder), folder)):
+        for outcome in (o for path in paths for o in outcomes(look, path, recognised(path, folder), folder)):
             counts[outcome.verdict] += 1
             if outcome.verdict not in ("named", "refused"):
                 print(f"{outcome.log} {outcome.signal} {outcome.kind}: {outcome.verdict}", flush=True)
@@ -151,4 +179,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    raise SystemExit(main(None))

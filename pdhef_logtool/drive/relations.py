@@ -269,7 +269,10 @@ def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relati
         by_rate = replace(by_rate, gains=lengths, typical=typical)
         either = [r for use in (pace.moving, gentle) for r in compare(by_rate, curvature, steer, use)]
         # Sliding front tyres break the relation at large angles, and noise breaks it at small ones.
-        yield from _best([replace(r, moves=r.correlation == 0.0 and is_turning) for r in either])  # dead sensor
+        best = _best([replace(r, moves=r.correlation == 0.0 and is_turning) for r in either])  # dead sensor
+        if vehicle is not None and abs(best[0].correlation if best else 0.0) < LENGTHS["rolling"]:
+            lengths = lengths[0] * LENGTHS["sliding"][0], lengths[1] * LENGTHS["sliding"][1]
+        yield from (replace(r, law=replace(by_rate, gains=lengths)) for r in best)
         if "ay_m_s2" in columns:
             by_ay = replace(by_ay, gains=(1.0 / lengths[1], 1.0 / lengths[0]), typical=1.0 / typical)
             yield from compare(by_ay, steer * speed**2, columns["ay_m_s2"], gentle)

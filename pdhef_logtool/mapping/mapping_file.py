@@ -345,17 +345,13 @@ def _lines(record: SignalSource | QualityGate | CanSettings) -> list[str]:
     entries = ((f.name, getattr(record, f.name), f.default) for f in fields(record) if f.name != "name")
     given = {name: value for name, value, default in entries if value != default or name == "scale"}
     if isinstance(record, CanSettings):
-        given["dbc"] = [*map(_path_text, record.dbc)]
+        given["dbc"] = [p.absolute().as_posix() if p.exists() else p.name for p in record.dbc]
     return [f"{name} = {toml_value(value)}" for name, value in given.items()]
 
 
 def entries_of(source: SignalSource, *names: str) -> str:
     """Return entries of a source's table in one line, for a remedy."""
     return ", ".join(f"{name} = {toml_value(getattr(source, name))}" for name in names)
-
-
-def _path_text(path: Path) -> str:
-    return path.absolute().as_posix() if path.exists() else path.name
 
 
 def _comment(text: str) -> list[str]:

@@ -298,7 +298,8 @@ def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders
         An output is an input, also by another name or link, or an input is in a folder that would be replaced.
     """
     read = {identity: path for given in inputs if given is not None for identity, path in _identities(given)}
-    within = {i: path for path in read.values() for parent in _lineage(path) if (i := _identity(parent)) is not None}
+    places = {path: Path(os.path.realpath(path)) for path in read.values()}
+    within = {i: p for p, real in places.items() for f in (real, *real.parents) if (i := _identity(f)) is not None}
     for output, inputs_by_identity in [*((f, read) for f in files), *((f, within) for f in folders)]:
         identity = _identity(output)
         if identity is not None and identity in inputs_by_identity:
@@ -323,11 +324,6 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except (OSError, ValueError):
         return None
     return status.st_dev, status.st_ino
-
-
-def _lineage(path: Path) -> Iterator[Path]:
-    real = Path(os.path.realpath(path))
-    yield from (real, *real.parents)
 
 
 def _holder(file: Path) -> str | None:

@@ -28,6 +28,7 @@ from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
 from studies.pages import write_toml
 from tests.drive.test_checks import checks_of, drive
+from truthsim.drive import simulate_drive, write_drive
 
 VEHICLE = default_vehicle().model_copy(update={"mass_kg": default_vehicle().mass_kg + 1.0})
 TEXT = "truth.vy_m_s against the rear axle of the vehicle file"
@@ -267,6 +268,21 @@ def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(sample_logs_dir, tmp_pa
             run_with(path, wrong, tmp_path / "out")
     else:
         assert run_with(path, wrong, tmp_path / "out") == code
+
+
+@pytest.mark.parametrize(("kind", "factor"), [("x3.6", "0.277778"), ("/3.6", "3.6")])
+def test_a_vehicle_file_decides_the_scale_of_the_steering(sample_logs_dir, tmp_path, mapping_of, kind, factor):
+    path = sample_logs_dir / "dlc.mcap"
+    wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), "steer_rad", kind))
+    with read_drive(path, sample_logs_dir / "vehicle.toml", wrong) as drive:
+        (check,) = (c for c in drive.plan.checks if c.name == "steer_rad.unit")
+        assert check.verdict == "failed" and f"multiply its scale in the mapping by {factor}" in check.remedy
+
+
+def test_sliding_on_ice_is_no_wrong_scale_of_the_steering(sample_logs_dir, tmp_path):
+    write_drive(simulate_drive("dlc-3888-2", friction=0.15, seed=11, keep_spins=True), log := tmp_path / "ice.mcap")
+    with read_drive(log, sample_logs_dir / "vehicle.toml") as drive:
+        assert not [c.name for c in drive.plan.checks if c.verdict == "failed"]
 
 
 def test_a_waived_check_stops_nothing(sample_logs_dir, tmp_path, mapping_of):
