@@ -32,6 +32,7 @@ from pdhef_logtool.records.signals import (
     GNSS,
     GNSS_COMPONENTS,
     GNSS_POSITION,
+    LEAST_DIVISOR,
     NS_PER_S,
     S_PER_NS,
     WHEELS,
@@ -321,7 +322,7 @@ def _grid_channel(periods: Mapping[str, float | None]) -> str:
     if fastest < 1e-5:  # no sensor of a car is so fast
         raise MappingError(
             expected="stamps of at most 100,000 samples a second",
-            got=f"{1.0 / max(fastest, 1e-9):.3g} samples a second",
+            got=f"{1.0 / max(fastest, LEAST_DIVISOR):.3g} samples a second",
             where="alignment",
             remedy="give the unit of the times in their column's name (time_s) or as stamp_unit in a mapping file",
         )
