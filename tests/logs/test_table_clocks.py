@@ -271,7 +271,7 @@ def test_layouts(name, text, topic, field, values, tmp_path):
         ("Скорость, км/ч", "Скорость", "км/ч"),
         ("Speed (km/h)", "Speed", "km/h"),
         ("Brake in use", "Brake in use", ""),
-        ("a, b", "a, b", ""),
+        ("a, b", "a, b", ""), ("a_x[m|s2]", "a_x", "m|s2"),
     ],
 )
 def test_units_in_titles(title, name, unit):
