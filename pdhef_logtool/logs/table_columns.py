@@ -37,9 +37,9 @@ PATTERNS: Mapping[str, re.Pattern[str]] = {name: re.compile(text) for name, text
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
 _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS_NS}
-#: Products and quotients of units, with exponents.
+#: Products and quotients of units, with exponents; | where names are paths.
 _SYMBOL = rf"(?:{'|'.join(map(re.escape, CONSTANTS['table_units']['symbols'].split()))})(?:\^?\**[-+]?\d|[⁻¹²³]+)?"
-_COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/·.]|\bper\b|\s)\s*{_SYMBOL})+")
+_COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/|·.]|\bper\b|\s)\s*{_SYMBOL})+")
 #: Words, and single letters as symbols, of the Greek alphabet; a dot above the symbol of a quantity.
 _GREEK_WORD, _GREEK, _DOT = re.compile("[Ͱ-Ͽ]{3,}"), re.compile("[Ͱ-Ͽ]"), re.compile("(?<=[xyvψβ])\u0307")
 
@@ -81,7 +81,7 @@ def is_unit(text: str) -> bool:
 
 def split_unit(text: str) -> tuple[str, str]:
     """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); without a unit, it is empty."""
-    if "|" in text:
+    if "|" in text and "[" not in text:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
     for name in ("unit_behind", "unit_in_brackets"):

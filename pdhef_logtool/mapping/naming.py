@@ -182,7 +182,7 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
         return None
     column = int(index[1]) if (index := re.search(r"\[(\d+)\]$", leaf)) else None
     named = f"{leaf}_{plain_unit(unit_text)}" if unit_text else leaf
-    of_leaf = _strength_of_leaf(leaf_words, inner, named, has_unit=bool(unit_text))
+    of_leaf = _strength_of_leaf(leaf_words, inner, named, unit_text)
     if of_leaf is None:
         return None
     scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
@@ -191,7 +191,7 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
         if quantity := _quantity(words, leaf_words, column, strength, named):
             return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
     # The topic's name describes its fields only if the leaf identifies no quantity, and if it names measurements.
-    last = topic.rpartition("/")[2]
+    last = re.sub("(?i)g_?sensor", "accelerometer", topic.rpartition("/")[2])  # of any unit
     if NOT_VALUES & _described(words_of(last)) or not all(w in _BARE or not w.isalpha() for w in leaf_words):
         return None
     named_by = leaf_words if set(leaf_words) - COUNTING else tuple(w for w in words_of(last) if w not in COUNTING)
@@ -209,17 +209,17 @@ def _described(leaf_words: tuple[str, ...]) -> set[str]:
 _TURNING = frozenset({"rate", "velocity", "velocities", "gyro", "gyroscope"})
 
 
-def _strength_of_leaf(
-    leaf_words: tuple[str, ...], inner: tuple[str, ...], named: str, *, has_unit: bool
-) -> float | None:
-    """Return the strength of a leaf alone: less for a v without a unit, None for a voltage.
+def _strength_of_leaf(leaf_words: tuple[str, ...], inner: tuple[str, ...], named: str, unit_text: str) -> float | None:
+    """Return the strength of a leaf alone: less for a v without a unit, None for one in volts, N m or %.
 
     The yaw of a rate and the v (values) of an inertial sensor are no quantities: 0.
     """
+    if plain_unit(unit_text) in _WORDS["other_units"]:
+        return None
     if leaf_words == ("v",) and (_TURNING | {"accel", "acceleration", "accelerometer"}) & set(inner):
         return 0.0
     if "v" in leaf_words and set(leaf_words) <= _WORDS["of_v"] and not unit_of(named, "speed")[0]:
-        return None if has_unit else 0.8 if {"ego", "veh", "vehicle", "car"} & set(leaf_words) else 0.6
+        return None if unit_text else 0.8 if {"ego", "veh", "vehicle", "car"} & set(leaf_words) else 0.6
     return 0.0 if leaf_words == ("yaw",) and _TURNING & set(inner) else 1.0
 
 

@@ -269,7 +269,7 @@ def test_layouts(name, text, topic, field, values, tmp_path):
         ("v / (km/h)", "v", "km/h"),
         ("Gierrate in °/s", "Gierrate", "°/s"),
         ("Скорость, км/ч", "Скорость", "км/ч"),
-        ("Speed (km/h)", "Speed", "km/h"),
+        ("Speed [km|h]", "Speed", "km|h"),
         ("Brake in use", "Brake in use", ""),
         ("a, b", "a, b", ""),
     ],
