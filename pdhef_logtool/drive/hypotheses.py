@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.mapping.naming import CACHED_NAMES, G_M_S2
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.mapping.naming import CACHED_NAMES
+from pdhef_logtool.records.geometry import DEGREES, GRAVITY_M_S2
+from pdhef_logtool.records.signals import LEAST_DIVISOR, BoolArray, FloatArray
 
 #: Least correlation at which a gain gives information (the true gain is between the two regressions), least Fisher z
 #: of the correlation, and least number of independent samples (3 s).
@@ -34,7 +35,7 @@ FACTORS: dict[str, list[tuple[float, str]]] = TABLE["factors"]
 UNITS: dict[str, list[str]] = TABLE["units"]
 _TYPICAL = {factor for unit, factors in FACTORS.items() if unit.startswith("typical") for factor, _ in factors}
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
-FOREIGN = (180.0 / math.pi, G_M_S2, 3.6)
+FOREIGN = (DEGREES, GRAVITY_M_S2, 3.6)
 #: Logarithms of factors that differ by less are one unit (km/h and mph are 0.48 apart). A range of gains with a smaller
 #: ratio of its ends rules out all units but one; wider ranges are lengths of any car.
 SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
@@ -135,7 +136,7 @@ class Relation:
         A NaN factor means a wrong field, for which any gain is possible.
         """
         gains = factors[:, None] * (self.blocks or (self.gain,))
-        low, high = (math.log(max(e, 1e-12)) for e in self.law.gains)
+        low, high = (math.log(max(e, LEAST_DIVISOR)) for e in self.law.gains)
         with np.errstate(divide="ignore"):
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
@@ -370,7 +371,7 @@ def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tup
     least, gains = 0.3 * float(reference.std()), []
     for a, b in zip(np.array_split(reference, blocks), np.array_split(measured, blocks), strict=True):
         spread_a, spread_b = float(a.std()), float(b.std())
-        if a.size < 2 or min(spread_a - least, spread_b) <= 1e-12:
+        if a.size < 2 or min(spread_a - least, spread_b) <= LEAST_DIVISOR:
             continue
         correlation = float(np.mean((a - a.mean()) * (b - b.mean()))) / (spread_a * spread_b)
         if abs(correlation) >= MIN_CORRELATION:

@@ -27,7 +27,7 @@ from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, FloatArray
 
 #: Below this mean acceleration, the sensor's software has subtracted gravity.
 COMPENSATED_M_S2 = 3.0
@@ -315,8 +315,8 @@ def _turned(
     power = float(np.var(level[used])) / 2.0
     unexplained = spread**2 * (1.0 - len(errors) / (2.0 * samples)) / power if power > 0.0 else 1.0
     correlation = math.sqrt(max(0.0, 1.0 - unexplained))
-    error = math.degrees(math.sqrt(unexplained / (2.0 * samples)) / max(correlation, 1e-9))
-    turn_error = math.degrees(math.hypot(imaginary * cosine_error, real * sine_error) / max(gain, 1e-9) ** 2)
+    error = math.degrees(math.sqrt(unexplained / (2.0 * samples)) / max(correlation, LEAST_DIVISOR))
+    turn_error = math.degrees(math.hypot(imaginary * cosine_error, real * sine_error) / max(gain, LEAST_DIVISOR) ** 2)
     tilt_error = math.degrees(math.hypot(*errors[-2:]) / GRAVITY_M_S2)
     by_blocks = (turn_error, tilt_error) if samples >= ASKEW_SAMPLES else (math.inf, math.inf)
     sign, said = _sign_of(np.where(gentle_at(speed * rate, moving), rate, np.nan), references)

@@ -14,7 +14,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_SAMPLES, TABLE, Law, Relation, block_gains, kind_of
 from pdhef_logtool.mapping.naming import CACHED_NAMES
-from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, WHEELS, BoolArray, FloatArray
 
 LENGTHS: dict[str, Any] = TABLE["lengths"]
 MOST: dict[str, float] = TABLE["most"]
@@ -141,10 +141,10 @@ def compare(law: Law, predicted: FloatArray, measured: FloatArray, use: BoolArra
         return []
     a, b = predicted[use] - predicted[use].mean(), measured[use] - measured[use].mean()
     spread_a, spread_b = float(a.std()), float(b.std())
-    if max(spread_a, spread_b) <= 1e-12:
+    if max(spread_a, spread_b) <= LEAST_DIVISOR:
         return []
     both = (max(spread_a, spread_b) if law.either else spread_a) > law.moves
-    if min(spread_a, spread_b) <= 1e-12:
+    if min(spread_a, spread_b) <= LEAST_DIVISOR:
         return [Relation(law, 0.0, float("nan"), samples, both)]
     if math.isfinite(law.bias):  # below the disturbances, both sides follow the road
         samples *= min(1.0, max(spread_a, spread_b) / (DISTURBED * law.bias)) ** 2
@@ -227,7 +227,7 @@ def _lengths(pace: _Pace, vehicle: VehicleParameters | None) -> dict[str, tuple[
     if "ay_m_s2" in columns:
         ay, rate = (columns[n] for n in ("ay_m_s2", "yaw_rate_rad_s"))
         finite = np.isfinite(ay) & np.isfinite(rate)
-        paces.append(float(ay[finite].std() / max(rate[finite].std(), 1e-9)) if finite.any() else FAST_M_S)
+        paces.append(float(ay[finite].std() / max(rate[finite].std(), LEAST_DIVISOR)) if finite.any() else FAST_M_S)
     gradient = max(0.0, vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction))
     low, high = (f * (vehicle.wheelbase_m + gradient * min(*paces, FAST_M_S) ** 2) for f in LENGTHS["file"])
     return {

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.interpolation import Bracket
-from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray, IntArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, NS_PER_S, S_PER_NS, FloatArray, IntArray
 
 #: Number and length of the pieces of the log to read; a shorter log is read whole.
 PIECES = 8
@@ -197,7 +197,7 @@ def _usual(values: FloatArray) -> tuple[float, float]:
     if finite.shape[0] == 0:
         return 0.0, 0.0
     low, high = np.quantile(finite, _USUAL)
-    room = 3.0 * max(float(high - low), 1e-9)
+    room = 3.0 * max(float(high - low), LEAST_DIVISOR)
     return float(low) - room, float(high) + room
 
 
@@ -217,7 +217,7 @@ def fit(y: FloatArray, x: FloatArray) -> Fit:
     a, b = (np.clip(values, *np.quantile(values, _USUAL)) for values in (y[use], x[use]))
     da, db = a - a.mean(), b - b.mean()
     sa, sb = float(np.sqrt(np.mean(da * da))), float(np.sqrt(np.mean(db * db)))
-    if not (sa > 1e-12 and sb > 1e-12):
+    if not (sa > LEAST_DIVISOR and sb > LEAST_DIVISOR):
         return Fit()
     both = float(np.mean(da * db))
     return Fit(both / (sb * sb), both / (sa * sb))

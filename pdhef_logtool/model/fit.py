@@ -36,7 +36,7 @@ from pdhef_logtool.model import equations, priors
 from pdhef_logtool.model.descent import descend, linearised
 from pdhef_logtool.model.driving import STEP_S, Driving
 from pdhef_logtool.records.running_mean import running_mean
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, FloatArray
 
 #: Frequency limit of the comparison of model and sensors.
 CUTOFF_HZ = 4.0
@@ -112,7 +112,7 @@ def fit_car(driving: Driving, vehicle_file: VehicleParameters, earlier: Sequence
 def level_of(driving: Driving) -> float:
     """Return the RMS of a_y, m/s², weighted by its square, so that straight driving hardly contributes."""
     ay2 = driving.columns[equations.AY, driving.settled] ** 2
-    return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
+    return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), LEAST_DIVISOR))
 
 
 def peak_reached(driving: Driving, vehicle_file: VehicleParameters) -> float:
@@ -192,8 +192,8 @@ class CarFit:
         rms = self.rms(theta)
         measured, modelled = (of[:, self._kept] for of in (self._columns[equations.YAW_RATE :], self._out))
         for row, name in ((equations.OF_RATE, "yaw rate"), (equations.OF_AY, "lateral acceleration")):
-            share = rms[row] / max(float(np.sqrt(np.mean(measured[row] ** 2))), 1e-9)
-            gain = float(modelled[row] @ measured[row]) / max(float(modelled[row] @ modelled[row]), 1e-9)
+            share = rms[row] / max(float(np.sqrt(np.mean(measured[row] ** 2))), LEAST_DIVISOR)
+            gain = float(modelled[row] @ measured[row]) / max(float(modelled[row] @ modelled[row]), LEAST_DIVISOR)
             is_noise = 1.0 / LARGEST_GAIN < gain < LARGEST_GAIN
             if share > LARGEST_SHARE and rms[row] > ERROR_STD[row] and not is_noise:
                 return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible", False

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.estimators import kinematic_filter as s
 from pdhef_logtool.estimators.reference.inputs import RATE_HZ
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, BoolArray, FloatArray, IntArray
 
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
@@ -124,7 +124,7 @@ def increments(rows: FloatArray, sampled: IntArray, delay_s: float) -> tuple[Com
     by_gnss = np.diff(rows[sampled, s.GNSS_EAST] + 1j * rows[sampled, s.GNSS_NORTH])
     n = round(HEADING_WINDOW_S * RATE_HZ / max(1.0, float(np.median(np.diff(sampled)))))
     largest = 2.0 * np.median(np.abs(by_gnss)) + 0.1
-    products = by_gnss * np.conj(by_imu) * np.minimum(1.0, largest / np.maximum(np.abs(by_gnss), 1e-9)) ** 2
+    products = by_gnss * np.conj(by_imu) * np.minimum(1.0, largest / np.maximum(np.abs(by_gnss), LEAST_DIVISOR)) ** 2
     sums = np.cumsum(np.concatenate([[0.0], products]))
     k = np.arange(len(products))
     around = sums[np.minimum(k + n, len(products))] - sums[np.maximum(k - n, 0)]

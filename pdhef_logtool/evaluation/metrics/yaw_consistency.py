@@ -11,7 +11,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, described, rms
 from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, FloatArray
 
 #: Longest step of its integration: the yaw motion of any car has time constants above 20 ms at 3 m/s and more.
 _STEP_S = 0.004
@@ -31,9 +31,9 @@ def yaw_rate_errors(calibrated: CalibratedSignals, vys: Iterable[FloatArray]) ->
     """Yield the modelled minus the measured yaw rate [N], rad/s, for each v_y [N], m/s, NaN where there is none."""
     signals, vehicle, delay_s = calibrated
     t, rate = signals.stamps_ns, signals.yaw_rate_rad_s
-    steer = np.interp(t - round(delay_s * 1e9), t, signals.steer_rad)
+    steer = np.interp(t - round(delay_s * NS_PER_S), t, signals.steer_rad)
     friction = np.where(np.isfinite(signals.friction), signals.friction, vehicle.assumed_friction)
-    dt = np.diff(t, prepend=t[:1]) * 1e-9
+    dt = np.diff(t, prepend=t[:1]) * S_PER_NS
     dt[dt > MAX_STEP_S] = np.nan
     speed, axles = carried_speed(signals), _axles(vehicle)
     # 1/m²: the inverse square of the radius of gyration.
