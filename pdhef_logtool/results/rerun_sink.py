@@ -176,7 +176,7 @@ class _Drawing:
         """Send something without a time."""
         self.recording.log(entity, what, static=True, strict=True)
 
-    def draw_track(self, track: StateTrack, truth: StateTrack | None, place: str, rgb: tuple[int, int, int]) -> None:
+    def draw_track(self, track: StateTrack, truth: StateTrack | None, place: str, rgb: tuple[int, ...]) -> None:
         """Draw a track with its errors and its way."""
         band = [] if track.name == TRUTH else [f"{track.name} 95 %"] * 2
         widths = [2.0 if track.name == TRUTH else 1.5, 0.75, 0.75]
