@@ -229,7 +229,7 @@ class _Drawing:
             ]
             self._send(entity, times_ns[rows], sent)
 
-    def _draw_path(self, track: StateTrack, place: str, rgb: tuple[int, int, int]) -> None:
+    def _draw_path(self, track: StateTrack, place: str, rgb: tuple[int, ...]) -> None:
         # North is drawn up: the y axis of Rerun's 2D views points down.
         plan = np.stack([track.x_m, -track.y_m], axis=1)
         has_plan = np.isfinite(plan).all(axis=1) & track.valid
