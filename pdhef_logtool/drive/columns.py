@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from pdhef_logtool.records.interpolation import Bracket
-from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, Channel, FloatArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, NS_PER_S, S_PER_NS, BoolArray, Channel, FloatArray
 from pdhef_logtool.records.student import student_quantile
 
 MS_PER_S = 1e3
@@ -51,7 +51,7 @@ def without_spikes(channel: Channel) -> Channel:
     Values are limited to 1e12, and values below 1e-12 are set to 0, so that their squares are finite.
     """
     values = np.clip(channel.values, -1e12, 1e12)
-    values[np.abs(values) < 1e-12] = 0.0
+    values[np.abs(values) < LEAST_DIVISOR] = 0.0
     channel = replace(channel, values=values).take(np.isfinite(values))
     low, middle, high = np.quantile(channel.values, (0.005, 0.5, 0.995)) if len(channel) else (0.0, 0.0, 0.0)
     out = np.abs(channel.values - middle) > SPIKE_RANGES * max(high - low, 1e-9)
@@ -143,7 +143,7 @@ def fit(
         return None
     a, b = matrix[usable], measured[usable]
     scale = np.linalg.norm(a, axis=0)
-    if (scale <= 1e-12).any() or np.linalg.cond(a / scale) > 1e4:
+    if (scale <= LEAST_DIVISOR).any() or np.linalg.cond(a / scale) > 1e4:
         return None
     coefficients = np.linalg.lstsq(a / scale, b, rcond=None)[0] / scale
     spread = float(np.sqrt(np.mean((b - a @ coefficients) ** 2) * samples / (samples - len(regressors))))

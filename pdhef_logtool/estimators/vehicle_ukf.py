@@ -72,7 +72,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     read_ay,
     settle_forces,
 )
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -121,7 +121,7 @@ DIVERGED_NIS_CAP = 4.0 * GATE_SIGMA**2
 DIVERGED_AVERAGE_S = 1.0
 DIVERGED_SIDESLIP_RAD = math.radians(60.0)
 #: Time of a rejection at its first sample, s; 0 is "the last sample was accepted".
-_JUST_REJECTED_S = 1e-9
+_JUST_REJECTED_S = S_PER_NS
 
 #: Memory of a filter of the steps before: whether it runs; last inputs, residual and factor on the noise; ages, s;
 #: duration of the standstill, s; mean normalised square of the innovations; last speed sample; largest recent share of

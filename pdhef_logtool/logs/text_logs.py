@@ -367,7 +367,8 @@ def _with_hemispheres(columns: dict[str, Any]) -> dict[str, Any]:
         for name in names[:1] if sides else ():
             size = columns[name]
             if np.nanmax(size, initial=0.0) > 180.0:
-                size = size // 100.0 + size % 100.0 / 60.0
+                degrees, minutes = np.divmod(size, 100.0)
+                size = degrees + minutes / 60.0
             columns[name] = np.where((sides[0] == letters[1]).fill_null(value=False).to_numpy(), -size, size)
     return columns
 

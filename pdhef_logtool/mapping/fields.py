@@ -15,8 +15,8 @@ import numpy as np
 
 from pdhef_logtool.mapping.candidates import Field, leaf_group, place_of, triad_of
 from pdhef_logtool.mapping.evidence import EVIDENCE, Fit, Pieces, fit, ratio, spread
-from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY
-from pdhef_logtool.records.geometry import DEGREE_M
+from pdhef_logtool.mapping.naming import VOCABULARY
+from pdhef_logtool.records.geometry import DEGREE_M, GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
 
 _RELATIONS, _UNITS, _GRAVITY, _GROUND = (EVIDENCE[name] for name in ("relations", "units", "gravity", "ground"))
@@ -190,10 +190,14 @@ def _by_gravity(fields: Fields) -> None:
             means = {axis: float(np.nanmean(f.seen.values)) for axis, f in axes.items()}
             size = math.hypot(*means.values())
             for item in axes.values() if size > 0.0 else ():
-                settle((item,), [Gain((1,), size / G_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
+                settle((item,), [Gain((1,), size / GRAVITY_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
             up = max(means, key=lambda axis: abs(means[axis]))
             is_upright = abs(means[up]) > _GRAVITY["upright"] * size
-            if len(means) > 1 and is_upright and abs(size * axes["z"].scale / G_M_S2 - 1.0) < _GRAVITY["near_1_g"]:
+            if (
+                len(means) > 1
+                and is_upright
+                and abs(size * axes["z"].scale / GRAVITY_M_S2 - 1.0) < _GRAVITY["near_1_g"]
+            ):
                 _turn(fields, axes, f"{'-' if means[up] < 0.0 else '+'}{up}")
     # Beside an accelerometer, an acceleration without gravity is computed from it, or is of the earth's axes.
     sensing = {item.topic.name for item in fields.candidates if item.has_gravity}

@@ -18,12 +18,10 @@ from pathlib import Path
 from typing import TypeAlias
 
 from pdhef_logtool.logs.constants import LATIN, LETTERS
-from pdhef_logtool.records.geometry import GRAVITY_M_S2
 
 #: Size of the cache of meanings: the drives of a fleet have the same names.
 CACHED_NAMES = 8192
 #: Standard gravity, the unit g of accelerations.
-G_M_S2 = GRAVITY_M_S2
 
 #: Words, units and rules for names.
 VOCABULARY = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))

@@ -19,10 +19,11 @@ from pdhef_logtool.mapping.evidence import EVIDENCE, Pieces, Seen
 from pdhef_logtool.mapping.fields import Fields, path_velocity
 from pdhef_logtool.mapping.joints import is_joints, joint_names
 from pdhef_logtool.mapping.mapping_file import missing_signals
-from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command, words_of
+from pdhef_logtool.mapping.naming import VOCABULARY, is_command, words_of
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors, plain_type
 from pdhef_logtool.mapping.weighing import Weighing, weigh
+from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray, has_gnss
 
 #: Sources by signal.
@@ -515,7 +516,7 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         also = ", its rates in deg/s, as no car turns so fast in rad/s" if in_deg else ""
         reason = f"its accelerations are in g, as gravity is 1{also}; its type's unit is m/s²"
         draft.doubt("imu", (imu.name,), imu.name, reason)
-    draft.take(draft.signals, imu, *_FORCES[:2], scale=G_M_S2 if in_g else 1.0)
+    draft.take(draft.signals, imu, *_FORCES[:2], scale=GRAVITY_M_S2 if in_g else 1.0)
     yaw, *others = _RATES
     turns = [yaw, *(name for name in others if draft.span(gyro, name) > 0.0)]  # fillers are constant
     draft.take(draft.signals, gyro, *turns, scale=float(np.radians(1.0)) if in_deg else 1.0)

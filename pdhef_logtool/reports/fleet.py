@@ -12,9 +12,9 @@ from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import LEAST_DIVISOR, FloatArray
 from pdhef_logtool.reports.charts import INK, BarsFigure, Charts, Interval, IntervalsFigure, against, colour
-from pdhef_logtool.reports.page import render
+from pdhef_logtool.reports.page import duration, render
 from pdhef_logtool.reports.pages import Page
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, LEAST_DRIVES, Distribution, Fleet, Space, read_fleet
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
@@ -141,7 +141,7 @@ def _told(fleet: Fleet) -> list[Distribution]:
 
 def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return edges [B + 1] and counts [B]; values beyond the quantile are in the last bar."""
-    most = max(float(np.quantile(values, _MOST_SHARE)), 1e-6)
+    most = max(float(np.quantile(values, _MOST_SHARE)), LEAST_DIVISOR)
     bars = int(np.clip(2.0 * math.sqrt(len(values)), 5, _MOST_BARS))
     edges = np.linspace(0.0, most, bars + 1)
     counts, _ = np.histogram(np.minimum(values, most), edges)
@@ -173,7 +173,8 @@ def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[dict[str,
             # Times differ by orders of magnitude: a level is a factor of three.
             level = max(0, _LEVELS + math.floor(math.log(spent / most, 3.0))) if spent else 0
             kind = f"h{min(level, _LEVELS)}" if spent else "empty"
-            cells.append({"kind": kind, "minutes": _time(spent), "rmse_rad": rmse if math.isfinite(rmse) else None})
+            time = duration(spent) if spent else ""
+            cells.append({"kind": kind, "minutes": time, "rmse_rad": rmse if math.isfinite(rmse) else None})
         made.append((_bin(SPEED_EDGES_M_S, i), cells))
     return ([_bin(AY_EDGES_M_S2, j) for j in range(columns)], made, int(np.count_nonzero(seconds == 0.0)), seconds.size)
 
@@ -185,11 +186,3 @@ def _reach(edges: Sequence[float], used: Any, least: float) -> int:
 
 def _bin(edges: Sequence[float], i: int) -> str:
     return f"{edges[i]:g}–{edges[i + 1]:g}" if i + 1 < len(edges) else f"above {edges[i]:g}"
-
-
-def _time(seconds: float) -> str:
-    if not seconds:
-        return ""
-    if seconds < 60.0:
-        return f"{seconds:.0f} s" if seconds >= 1.0 else "< 1 s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"

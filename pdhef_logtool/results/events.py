@@ -211,7 +211,7 @@ def _spans(stamps_ns: IntArray, mask: BoolArray, least_s: float, pad_s: float) -
     """Return the rows [first, last) of the runs in a mask [N] that last long enough, joined where their pads touch."""
     joined: list[tuple[int, int]] = []
     for first, last in runs(stamps_ns, mask):
-        if (stamps_ns[last - 1] - stamps_ns[first]) * S_PER_NS < least_s - 1e-9:
+        if (stamps_ns[last - 1] - stamps_ns[first]) * S_PER_NS < least_s - S_PER_NS:
             continue
         if joined and (stamps_ns[first] - stamps_ns[joined[-1][1] - 1]) * S_PER_NS <= 2.0 * pad_s:
             joined[-1] = (joined[-1][0], last)

@@ -59,7 +59,7 @@ def test_a_run_with_everything_says_everything(tmp_path):
     assert '<a href="logs/d7/report.html">d7</a>' in page
     assert "the log has no ground truth" in page and "3 bytes (expected: a log)." in page
     assert "<h3>road" in page
-    assert 'class="empty"' in page and "16 min" in page
+    assert 'class="empty"' in page and "16.5 min" in page
     for key in ("worst", "medians", "spread", "against"):
         assert f'data-figure="{key}"' in page
 
