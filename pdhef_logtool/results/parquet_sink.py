@@ -229,12 +229,9 @@ def _values(array: pa.Array) -> Any:
     """Return numbers or texts [N], NaN for null; ``Array.to_numpy`` would import an installed pandas."""
     if pa.types.is_dictionary(array.type):
         return np.array(array.dictionary.to_pylist(), dtype=object)[_values(array.indices)]
-    validity, data = array.buffers()
-    rows = slice(array.offset, array.offset + len(array))
-    values = np.frombuffer(data, array.type.to_pandas_dtype())[rows]
-    if not array.null_count:
-        return values
-    return np.where(np.unpackbits(np.frombuffer(validity, np.uint8), bitorder="little")[rows], values, np.nan)
+    if array.null_count:
+        return np.array(array.to_pylist(), dtype=np.float64)
+    return np.frombuffer(array.buffers()[1], array.type.to_pandas_dtype())[array.offset : array.offset + len(array)]
 
 
 @contextmanager

@@ -65,6 +65,10 @@ def errors_of(track: StateTrack, truth: StateTrack, signal: str, has_truth: Bool
     return values
 
 
+def _p95(error: FloatArray) -> float:
+    return float(np.percentile(np.abs(error), 95.0))
+
+
 MAX_LAG_S = 0.3
 MIN_LAG_CORRELATION = 0.5
 #: More driving does not make the lag more certain than the sampling of the signals.
@@ -108,7 +112,7 @@ METRICS = described(
     rmse=(rms, "error"),
     mae=(lambda e: float(np.mean(np.abs(e))), "error"),
     bias=(mean, "signed"),
-    p95_abs=(lambda e: float(np.percentile(np.abs(e), 95.0)), "error"),
+    p95_abs=(_p95, "error"),
     max_abs=(lambda e: float(np.max(np.abs(e))), "error"),
     rmse_relative=(lambda e, truth: rms(e) / rms(truth) if truth.any() else float("nan"), "error", "truth"),
     coverage95=(lambda std, e: float(np.mean(np.abs(e) <= NORMAL_95 * std)), "std", "error"),
