@@ -286,23 +286,19 @@ def _find_attitude(source: _Source) -> Attitude:
     velocity = source.velocity
     frames: tuple[Literal["ENU", "ECEF", "NED"], ...]
     frames = ("ENU", "NED") if source.plan.origin is None else ("ENU", "ECEF", "NED")
-    bodies: tuple[Literal["FLU", "FRD"], ...] = ("FLU", "FRD")
     best, best_score = Attitude(frames[0], "FLU"), -np.inf
-    for frame, body in [(f, b) for f in frames for b in bodies]:
-        rotation = source.rotation(Attitude(frame, body))
-        score = (1.0 if median_known(rotation[:, 2, 2]) > 0.5 else -1.0) + _forward_share(rotation, velocity)
-        if score > best_score + 0.05:
-            best, best_score = Attitude(frame, body), score
+    speed = np.linalg.norm(velocity, axis=1)
+    moving = speed > 1.0  # NaN compares False
+    direction = velocity[moving] / speed[moving, None]
+    for frame in frames:
+        rotation = source.rotation(Attitude(frame, "FLU"))
+        up, forward = median_known(rotation[:, 2, 2]), median_known((rotation[moving, :, 0] * direction).sum(axis=1))
+        score = (1.0 if abs(up) > 0.5 else -1.0) + forward
+        if score > best_score + 0.05:  # FRD axes have the same x, and the opposite z
+            best, best_score = Attitude(frame, "FRD" if up < -0.5 else "FLU"), score
     left_up = source.rotation(best)[:, 2, 1]
     rolls = np.abs(left_up - median_known(left_up)) > 1e-6  # otherwise only a heading; NaN compares False
     return replace(best, has_roll=bool(rolls.any()))
-
-
-def _forward_share(rotation: FloatArray, velocity: FloatArray) -> float:
-    """Return the median of v_x / |v| in body axes while the car moves; 0 without motion."""
-    speed = np.linalg.norm(velocity, axis=1)
-    moving = speed > 1.0  # NaN compares False
-    return median_known((rotation[moving, :, 0] * velocity[moving]).sum(axis=1) / speed[moving])
 
 
 # ---- columns on the ground-truth clock ----
@@ -413,13 +409,6 @@ def _turn(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.stack([(matrix[i] * vectors).sum(axis=1) for i in range(3)], axis=1)
 
 
-def cubic_equations(u: FloatArray) -> tuple[list[FloatArray], FloatArray]:
-    """Return the powers 0 to 3 of times [N, k], each [N, k], and the normal matrices [N, 4, 4] of a cubic in them."""
-    powers = [np.ones_like(u), u, u * u, u * u * u]
-    moments = [np.einsum("nk,nk->n", powers[i // 2], powers[i - i // 2]) for i in range(7)]
-    return powers, np.stack([np.stack(moments[i : i + 4], axis=1) for i in range(4)], axis=1)
-
-
 def differentiate(
     stamps_ns: IntArray, values: FloatArray, half_window: int, max_gap_ns: int, *, angle: bool = False
 ) -> FloatArray:
@@ -445,7 +434,10 @@ def differentiate(
         y = np.asarray(samples[first] - values[centre][:, None], np.float64)
         if angle:
             y = geometry.wrap_angle(y)
-        powers, normal = cubic_equations(t / span[:, None])
+        u = t / span[:, None]
+        powers = [np.ones_like(u), u, u * u, u * u * u]
+        moments = [np.einsum("nk,nk->n", powers[i // 2], powers[i - i // 2]) for i in range(7)]
+        normal = np.stack([np.stack(moments[i : i + 4], axis=1) for i in range(4)], axis=1)
         right = np.stack([np.einsum("nk,nk->n", power, y) for power in powers], axis=1)
         slope[centre] = np.linalg.solve(normal, right[:, :, None])[:, 1, 0] / span
     return slope

@@ -141,7 +141,7 @@ def _filter(window, tuning, r0, constants, model, parallel, state, scratch, out,
             over, rate = ukf.held_over_step(now, m), (a.trust * m.rate_vy, a.trust * m.rate_r)
             noise_dt = (1.0 + process_noise_gain * a.trust) * dt  # Eq 26
             process_noise(tuning.q_std, over.ax_known, noise_dt, layout, q)
-            predict(x, P, root, over, rate, dt, 0.0, q, layout, places, p, f, points, away)  # Eq 19
+            predict(x, P, root, over, rate, dt, 0.0, q, layout, places, p, f, points, away, x.shape[0])  # Eq 19
             alive = is_finite(x, P)
             out_prior[k] = x
             if alive:

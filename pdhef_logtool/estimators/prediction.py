@@ -18,8 +18,8 @@ FORWARD_M_S = 0.5
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @inner_kernel
-def predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, away):  # type: ignore[no-untyped-def]
-    """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
+def predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, away, count):  # type: ignore[no-untyped-def]
+    """Move state and covariance of its first ``count`` entries by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
     The share ``early`` of the residual's increment comes before the model's step (Strang splitting: half of it), the
     rest behind it. Leaves the ``root`` of the former covariance, and the deviations of the moved points in ``away``.
@@ -28,7 +28,7 @@ def predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, 
     unscented.cholesky(P, root)
     columns = unscented.draw(x, root, places, m, points)
     move(points, columns, over, rate, dt, early, layout, p, f)
-    unscented.moments(points, places, m, q, x, P, away)
+    unscented.moments(points, places, m, q, x, P, away, count)
 
 
 @kernel
@@ -52,7 +52,7 @@ def _predict_outputs(due, held, q_std, early, model, scratch, out):  # type: ign
                 P[a, b] = held_P[k, a, b]
         if dt > 0.0:
             process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
-            predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, away)
+            predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, away, 3)
         unscented.keep_state(x, out_x, row)
         for a in range(3):
             for b in range(3):

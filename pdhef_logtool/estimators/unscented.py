@@ -152,18 +152,19 @@ def _covariance(root, a, m, away, row):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def moments(points, places, m, q, x, P, away):  # type: ignore[no-untyped-def]
+def moments(points, places, m, q, x, P, away, count):  # type: ignore[no-untyped-def]
     """Write mean [n] and covariance [n, n] of sigma points, with ``q`` [n] added to the variances.
 
-    ``away`` [n, WIDTH] are the deviations of the points, with rows of zeros up to whole vectors.
+    ``away`` [n, WIDTH] are the deviations of the points, with rows of zeros up to whole vectors. ``count``: only the
+    covariance of the first entries is needed.
     """
     n, columns = x.shape[0], columns_of(2 * m)
     for j in range(n):
         x[j] = _deviate(points, places[j] * WIDTH, columns, n, away, j)
-    for a in range(m):
+    for a in range(min(m, count)):
         for b in range(a // LANES * LANES, P.shape[1], LANES):
             P[a, b], P[a, b + 1], P[a, b + 2], P[a, b + 3] = _products(away, a, b, 0.5 / n)
-    for a in range(n):
+    for a in range(count):
         for b in range(min(a, m)):
             P[a, b] = P[b, a]
         P[a, a] += q[a]

@@ -513,7 +513,7 @@ def _filter(window, tuning, model, state, scratch, out, links):  # type: ignore[
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
             trust_residual(m, q)
-            predict(x, P, root, over, rate, now.dt, 0.5, q, layout, places, p, f, points, away)
+            predict(x, P, root, over, rate, now.dt, 0.5, q, layout, places, p, f, points, away, x.shape[0])
             if linked:
                 unscented.cross_covariance(root, layout.changing, away, out_cross, k)
                 keep(P, out_predicted_P, k)

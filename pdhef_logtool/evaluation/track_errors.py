@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray
@@ -58,8 +55,3 @@ def total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArra
     if not np.isfinite(of_truth).any():
         return std
     return np.asarray(np.hypot(std, np.nan_to_num(of_truth, nan=0.0)), dtype=np.float64)
-
-
-def selected(values: NDArray[Any], mask: BoolArray) -> NDArray[Any]:
-    """Return the values [N] of a mask [N]; a view if the mask is True everywhere."""
-    return values if mask.all() else values[mask]

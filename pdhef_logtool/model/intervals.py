@@ -200,8 +200,8 @@ def _in_blocks(signals: Signals) -> tuple[Signals, int, IntArray]:
         if column.dtype.kind != "f":
             return column[:, -1]
         finite = np.isfinite(column)
-        total = np.where(finite, column, 0.0).sum(axis=1)
-        return np.divide(total, finite.sum(axis=1), out=np.full(total.shape, np.nan), where=finite.any(axis=1))
+        total, samples = np.where(finite, column, 0.0).sum(axis=1), finite.sum(axis=1)
+        return np.divide(total, samples, out=np.full(total.shape, np.nan), where=samples > 0)
 
     columns = {name: blocks(name) for name in SIGNAL_COLUMNS}
     return Signals(**columns, available=signals.available), number, (np.arange(len(signals)) + 1) // number - 1

@@ -221,9 +221,17 @@ def read_rows(path: Path, columns: list[str], wanted: Mapping[str, Collection[st
             use = np.ones(len(batch), np.bool_)
             for name, texts in wanted.items():
                 is_wanted = np.array([text in texts for text in batch[name].dictionary.to_pylist()], np.bool_)
-                use &= is_wanted[batch[name].indices.to_numpy()]
-            picked = (column.to_numpy(zero_copy_only=False)[use].tolist() for column in batch.select(columns))
-            yield from zip(*picked, strict=True)
+                use &= is_wanted[_values(batch[name].indices)]
+            yield from zip(*(_values(column)[use].tolist() for column in batch.select(columns)), strict=True)
+
+
+def _values(array: pa.Array) -> Any:
+    """Return numbers or texts [N], NaN for null; ``Array.to_numpy`` would import an installed pandas."""
+    if pa.types.is_dictionary(array.type):
+        return np.array(array.dictionary.to_pylist(), dtype=object)[_values(array.indices)]
+    if array.null_count:
+        return np.array(array.to_pylist(), dtype=np.float64)
+    return np.frombuffer(array.buffers()[1], array.type.to_pandas_dtype())[array.offset : array.offset + len(array)]
 
 
 @contextmanager

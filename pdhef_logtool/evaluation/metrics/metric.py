@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.statistics import gathered
-from pdhef_logtool.evaluation.track_errors import selected
 from pdhef_logtool.evaluation.units import SIGNALS, read_unit
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -191,12 +190,13 @@ def _rows(
     """Yield the rows of one signal of one estimator in a segment."""
 
     @cache
-    def known(name: str) -> BoolArray:
-        return np.asarray(np.isfinite(columns.values[name][place]))
+    def known(first: str) -> _Place:
+        finite = np.isfinite(columns.values[first][place])
+        return place if finite.all() else np.arange(len(columns.values[first]))[place][finite]
 
     @cache
     def where_known(name: str, first: str) -> NDArray[Any]:
-        return selected(columns.values[name][place], known(first))
+        return columns.values[name][known(first)]
 
     of_family: dict[str, float] = {}
     estimator, signal = columns.estimator, columns.signal
