@@ -81,7 +81,7 @@ def mistaken(mapping: dict[str, Any], subject: str, kind: str) -> dict[str, Any]
     return wrong
 
 
-def verdict(checks: Sequence[dict[str, Any]], subject: str, kind: str, scale: float = 1.0) -> str:
+def verdict(checks: Sequence[dict[str, Any]], subject: str, kind: str, scale: float) -> str:
     """Return the verdict of checks on a mistake, as in the module; ``scale`` is the right one."""
     related = (subject, "truth.sideslip_rad") if subject == "truth.vy_m_s" else (subject,)
     mine = [c for c in checks if c["subject"].startswith(related)]
@@ -126,10 +126,9 @@ def outcomes(
             continue
         checks = [c for c in checks if not c["verdict"] == sound.get(c["name"]) == "failed"]
         table, prefix = _place(subject)
-        source = next(source for n, source in mapping[table].items() if n.startswith(prefix))
-        scale = float(np.ravel(source.get("scale", 1.0))[0])
+        scales = (source.get("scale", 1.0) for n, source in mapping[table].items() if n.startswith(prefix))
         bad = tuple(c for c in checks if c["verdict"] != "passed")
-        yield Outcome(log.stem, subject, kind, verdict(checks, subject, kind, scale), bad)
+        yield Outcome(log.stem, subject, kind, verdict(checks, subject, kind, float(np.ravel(next(scales))[0])), bad)
 
 
 def look_at(log: Path, mapping: Path) -> Sequence[dict[str, Any]]:

@@ -9,10 +9,10 @@ converges to the wrong one agrees with all its sensors, so that its normalized i
 D, the leaky sum of the changes of v̂_y,i beyond that, is the error that the estimate accumulated recently. The leak is
 fast (``LINEAR_S``) in the linear range of the tyres, where only one solution exists and D would accumulate bank, bias
 and noise. It is slow (``LIMIT_S``) near the limit of grip, and while the flag is set, so that a return to the right
-solution clears the flag. The flag is set while abs D exceeds v̂_x times ``ON_RAD``, and cleared below v̂_x times
-``OFF_RAD``, or below ``SIGMAS`` of what the sensors may contribute to D: their white noise, as the vehicle file states
-it, or larger as the drive shows it; and the bank of the road and an error of the accelerometer's gain (its own, or of
-the roll gradient), which act in one direction for as long as D remembers.
+solution clears the flag. The flag is set where abs D exceeds both v̂_x times ``ON_RAD`` (``OFF_RAD`` while it is set)
+and ``SIGMAS`` standard deviations of what the sensors contribute to D: their white noise, as the vehicle file states
+it, or larger as the drive shows it; the bank of the road; and an error of the accelerometer's gain (its own, or of the
+roll gradient). The last two act in one direction for as long as D remembers.
 
 Not detected: an estimate that is wrong from its start, or drifts more slowly than the leak forgets. Errors of
 accelerometer or gyro are attributed to the estimate, except for missing and stuck samples, which are not judged.
@@ -45,10 +45,8 @@ SIGMAS, AY_GAIN_STD = 3.0, 0.04
 LEAST_SPEED_BLENDS = 3.0
 
 # Entries of the memory.
-D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW, GRIP, FRICTION, VAR, STEADY = range(
-    16
-)
-MEMORY_SIZE = 16
+D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE = range(8)
+GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW, GRIP, FRICTION, VAR, STEADY = range(8, 16)
 
 
 #: The noise of the sensors is that of the vehicle file.
@@ -80,7 +78,7 @@ def watched_track(
         vehicle.assumed_friction, tilt, *noise.measurement_std(sensors)[:2], *vehicle.imu_position_m[:2],
         LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s, sensors.imu_hold_s, float(sensors.stuck_samples),
     )  # fmt: skip
-    _watch(motion, car, np.zeros(MEMORY_SIZE), flags)
+    _watch(motion, car, np.zeros(STEADY + 1), flags)
     released = release(signals.ready_ns, signals.stamps_ns)
     return replace(track, diverged=track.diverged | (flags[released.step] & released.arrived & track.valid))
 

@@ -7,7 +7,7 @@ import numpy as np
 from pdhef_logtool.compiled.cache import inner_kernel, kernel
 from pdhef_logtool.estimators import unscented
 from pdhef_logtool.estimators.filter_steps import U_AX, U_AX_KNOWN, U_FRICTION, U_SPEED, U_STEER, PosteriorSteps
-from pdhef_logtool.estimators.vehicle_model import VX, VY, YAW_RATE, HeldInputs, Model, move, planar_ay, process_noise
+from pdhef_logtool.estimators.vehicle_model import MOTION, VX, VY, HeldInputs, Model, move, planar_ay, process_noise
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -52,10 +52,10 @@ def _predict_outputs(due, held, q_std, early, model, scratch, out):  # type: ign
                 P[a, b] = held_P[k, a, b]
         if dt > 0.0:
             process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
-            predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, away, 3)
+            predict(x, P, root, over, rate, dt, early, q, layout, places, p, f, points, away, MOTION)
         unscented.keep_state(x, out_x, row)
-        for a in range(3):
-            for b in range(3):
+        for a in range(MOTION):
+            for b in range(MOTION):
                 out_P[row, a, b] = P[a, b]
         out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
 
@@ -77,21 +77,22 @@ def predicted_track(
     ``rate`` [K, 2] is the residual, ``noise`` [K] a factor on the time over which process noise adds up.
     """
     step, count, n = ahead.step, len(stamps_ns), model.layout.size
-    x, covariance, ay = np.full((count, n), np.nan), np.full((count, 3, 3), np.nan), np.full(count, np.nan)
+    x, covariance, ay = np.full((count, n), np.nan), np.full((count, MOTION, MOTION), np.nan), np.full(count, np.nan)
     due = (np.where(ahead.usable, step, -1), ahead.horizon_s)
     held = (steps.x, steps.P, steps.inputs, rate, noise)
     scratch = (np.zeros(n), unscented.padded(n, n), unscented.padded(n, n), np.zeros(n), *unscented.block(n))
     _predict_outputs(due, held, q_std, early, model, scratch, (x, covariance, ay))
     usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[step, U_SPEED])
+    vx, vy, yaw_rate = x[:, :MOTION].T.copy()
     return make_track(
         name,
         stamps_ns,
-        vx_m_s=x[:, VX].copy(),
-        vy_m_s=x[:, VY].copy(),
-        yaw_rate_rad_s=x[:, YAW_RATE].copy(),
+        vx_m_s=vx,
+        vy_m_s=vy,
+        yaw_rate_rad_s=yaw_rate,
         ay_m_s2=ay,
         covariance=covariance,
-        sideslip_std_rad=sideslip_std(x[:, VX], x[:, VY], covariance),
+        sideslip_std_rad=sideslip_std(vx, vy, covariance),
         r_scale=np.ones(count),
         nis=np.where(usable, steps.nis[step], np.nan),
         nis_dof=np.where(usable, steps.nis_dof[step], 0.0),

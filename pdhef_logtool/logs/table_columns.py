@@ -37,7 +37,7 @@ PATTERNS: Mapping[str, re.Pattern[str]] = {name: re.compile(text) for name, text
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
 _UNITS = frozenset(CONSTANTS["table_units"]["spellings"].split()) | {*TIME_UNITS_NS}
-#: Products and quotients of units, with exponents; | where names are paths.
+#: Products and quotients of units, with exponents; titles that are paths have | in place of the slash.
 _SYMBOL = rf"(?:{'|'.join(map(re.escape, CONSTANTS['table_units']['symbols'].split()))})(?:\^?\**[-+]?\d|[⁻¹²³]+)?"
 _COMPOUND = re.compile(rf"{_SYMBOL}(?:\s*(?:[*/|·.]|\bper\b|\s)\s*{_SYMBOL})+")
 #: Words, and single letters as symbols, of the Greek alphabet; a dot above the symbol of a quantity.

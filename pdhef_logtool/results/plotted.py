@@ -102,13 +102,14 @@ REFERENCE_COLOUR = 0x999933
 _OTHERS = (0xD55E00, 0x0072B2, 0xE69F00, 0x009E73, 0xCC79A7, 0x56B4E9)
 
 
-def colour_rgb(name: str, colours: Mapping[str, int]) -> tuple[int, ...]:
+def colour_rgb(name: str, colours: Mapping[str, int]) -> tuple[int, int, int]:
     """Return red, green, blue (0 to 255) of a track; ``colours`` are 0xRRGGBB by estimator.
 
     A name that is not there always gets the same colour of the palette.
     """
     packed = {"truth": _TRUTH, **colours}.get(name, _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)])
-    return tuple(packed.to_bytes(3))
+    red, green, blue = packed.to_bytes(3)
+    return red, green, blue
 
 
 #: Levels of rcl_interfaces/msg/Log.

@@ -176,7 +176,7 @@ class _Drawing:
         """Send something without a time."""
         self.recording.log(entity, what, static=True, strict=True)
 
-    def draw_track(self, track: StateTrack, truth: StateTrack | None, place: str, rgb: tuple[int, ...]) -> None:
+    def draw_track(self, track: StateTrack, truth: StateTrack | None, place: str, rgb: tuple[int, int, int]) -> None:
         """Draw a track with its errors and its way."""
         band = [] if track.name == TRUTH else [f"{track.name} 95 %"] * 2
         widths = [2.0 if track.name == TRUTH else 1.5, 0.75, 0.75]
@@ -229,7 +229,7 @@ class _Drawing:
             ]
             self._send(entity, times_ns[rows], sent)
 
-    def _draw_path(self, track: StateTrack, place: str, rgb: tuple[int, ...]) -> None:
+    def _draw_path(self, track: StateTrack, place: str, rgb: tuple[int, int, int]) -> None:
         # North is drawn up: the y axis of Rerun's 2D views points down.
         plan = np.stack([track.x_m, -track.y_m], axis=1)
         has_plan = np.isfinite(plan).all(axis=1) & track.valid

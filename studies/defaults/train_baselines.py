@@ -84,9 +84,10 @@ def _training_sequences(data: Dataset) -> Iterable[SideslipSequence]:
             continue
         slowest = data.vehicle(drive).low_speed_blend_m_s
         rows = drive.load()
+        weight = rows.training_weight
         for part in gap_free_runs(rows):
             vx, vy = np.asarray(rows.truth_velocity[part], dtype=np.float64).T
-            used = (rows.training_weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
+            used = (weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
             yield SideslipSequence(
                 features=np.asarray(rows.features[part], dtype=np.float64),
                 dt_s=np.concatenate([[np.nan], np.diff(rows.stamps_ns[part]) * 1e-9]),

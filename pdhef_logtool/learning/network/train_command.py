@@ -503,14 +503,14 @@ def gap_free_runs(drive: ResidualRows) -> Iterable[slice]:
 
     With a selection of rows, runs end with a selected stretch and begin :data:`LEAD_STEPS` before it.
     """
-    piece = drive.segment
+    piece, weight = drive.segment, drive.training_weight
     if not drive.chosen.all():
-        near = _near(drive.training_weight > 0.0)
+        near = _near(weight > 0.0)
         piece = np.cumsum(np.diff(near, prepend=near[:1]) | (np.diff(piece, prepend=piece[:1]) != 0))
     edges = [0, *(np.flatnonzero(np.diff(piece)) + 1).tolist(), drive.stamps_ns.shape[0]]
     for a, b in pairwise(edges):
         is_complete = np.isfinite(drive.features[a:b]).all()
-        if b - a >= MIN_SEQUENCE_STEPS and is_complete and drive.training_weight[a:b].sum() > 0.0:
+        if b - a >= MIN_SEQUENCE_STEPS and is_complete and weight[a:b].sum() > 0.0:
             yield slice(a, b)
 
 
@@ -558,8 +558,9 @@ class SplitSequences:
         for drive in (d for d in self.data.drives if d.entry["split"] == self.split):
             rows = drive.load()
             offset = steering_offset(rows, self.data.vehicle(drive)) if self.odd else np.zeros(2)
+            weights = rows.training_weight
             for part in gap_free_runs(rows):
-                weight = rows.training_weight[part]
+                weight = weights[part]
                 features = np.asarray(rows.features[part], dtype=np.float64)
                 if self.target == bundles.RESIDUAL:
                     values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None] - offset
