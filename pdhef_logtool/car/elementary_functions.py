@@ -6,7 +6,7 @@ calls, so that the compiler generates vector instructions.
 
 import math
 
-from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.compiled.cache import inline
 
 _TAN_PI_8 = 0.41421356237309503
 _TAN_3_PI_8 = 2.414213562373095
@@ -18,11 +18,8 @@ _PI_REST = 1.2246467991473532e-16
 #: Adding and subtracting this value rounds to the nearest integer.
 _ROUND = 1.5 * 2.0**52
 
-# No check of divisors, which would be a branch; a·b + c may be one instruction.
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
-
-@_inline
+@inline
 def arctangent(y, x):  # type: ignore[no-untyped-def]
     """Return atan(y / x) in rad for x > 0, to 3e-16.
 
@@ -49,7 +46,7 @@ def arctangent(y, x):  # type: ignore[no-untyped-def]
     return -value if y < 0.0 else value
 
 
-@_inline
+@inline
 def sine(x):  # type: ignore[no-untyped-def]
     """Return sin(x) for |x| up to 1e4 rad, to 3e-16.
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from pdhef_logtool.car.elementary_functions import arctangent, sine
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.compiled.cache import inline, njit
 
 #: Time constant of the approach to the kinematic model, s: short for a car, long compared to a 10 ms step.
 KINEMATIC_TIME_CONSTANT_S = 0.1
@@ -21,8 +21,6 @@ BLEND_START_SHARE = 0.5
 #: Largest product of step and fastest pole of an RK4 step; longer steps are divided.
 MAX_STEP_TIMES_POLE = 1.0
 MAX_SUBSTEPS = 32
-
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
 class ModelParameters(NamedTuple):
@@ -84,7 +82,7 @@ def dynamic_share(vx, p):  # type: ignore[no-untyped-def]
     return min(1.0, max(0.0, w))
 
 
-@_inline
+@inline
 def prepare(steer, friction, p):  # type: ignore[no-untyped-def]
     """Return the constants of the model at a steering angle and a friction."""
     return Prepared(
@@ -100,7 +98,7 @@ def prepare(steer, friction, p):  # type: ignore[no-untyped-def]
 
 
 # positional: numbers of one point in an inner loop for vectorization.
-@_inline
+@inline
 def magic_formula(v, vy, r, angle, c, p):  # type: ignore[no-untyped-def]
     """Return F_yf/m and F_yr/m of the tyres in m/s² (Eq 2-4), each along its own axle."""
     front = c.b_front * (angle - arctangent(vy + p.front_m * r, v))
@@ -110,7 +108,7 @@ def magic_formula(v, vy, r, angle, c, p):  # type: ignore[no-untyped-def]
     return c.peak_front * sine(p.front_C * front), c.peak_rear * sine(p.rear_C * rear)
 
 
-@_inline
+@inline
 def accelerations(vx, vy, r, steer, c, p):  # type: ignore[no-untyped-def]
     """Return (F_yf cos δ + F_yr)/m in m/s² and (l_f F_yf cos δ − l_r F_yr)/I_z in rad/s² (Eq 1-4)."""
     ff, fr = magic_formula(max(vx, p.blend_low_m_s), vy, r, steer, c, p)
@@ -118,7 +116,7 @@ def accelerations(vx, vy, r, steer, c, p):  # type: ignore[no-untyped-def]
     return ff + fr, c.inertia * (p.front_m * ff - p.rear_m * fr)
 
 
-@_inline
+@inline
 def derivative(vx, vy, r, ax, steer, c, p):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r] (Eq 1-4, blended to the kinematic model at low speed).
 
@@ -161,7 +159,7 @@ def substeps(vx, dt, friction, p):  # type: ignore[no-untyped-def]
 
 
 # positional: numbers of one point in an inner loop for vectorization.
-@_inline
+@inline
 def rk4_step(vx, vy, r, ax, steer, h, c, p):  # type: ignore[no-untyped-def]
     """Return [v_x, v_y, r] after an RK4 step of ``h`` s with constant inputs."""
     g, sixth = 0.5 * h, h / 6.0

@@ -97,7 +97,8 @@ def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
     return compiled
 
 
-# Without reference counts, which are slow: these functions create no arrays.
+# Without reference counts, which are slow: these functions create no arrays. Divisors are not checked, which would be a
+# branch; a·b + c may be one instruction.
 _without_arrays = functools.partial(njit, error_model="numpy", fastmath={"contract"}, _nrt=False)
 kernel = _without_arrays(cache=True)
 #: A kernel that compiled code alone calls.

@@ -20,7 +20,7 @@ import numpy as np
 
 from pdhef_logtool.mapping.naming import CACHED_NAMES
 from pdhef_logtool.records.geometry import DEGREES, GRAVITY_M_S2
-from pdhef_logtool.records.signals import LEAST_DIVISOR, BoolArray, FloatArray
+from pdhef_logtool.records.signals import KM_H, LEAST_DIVISOR, BoolArray, FloatArray
 
 #: Least correlation at which a gain gives information (the true gain is between the two regressions), least Fisher z
 #: of the correlation, and least number of independent samples (3 s).
@@ -35,7 +35,7 @@ FACTORS: dict[str, list[tuple[float, str]]] = TABLE["factors"]
 UNITS: dict[str, list[str]] = TABLE["units"]
 _TYPICAL = {factor for unit, factors in FACTORS.items() if unit.startswith("typical") for factor, _ in factors}
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
-FOREIGN = (DEGREES, GRAVITY_M_S2, 3.6)
+FOREIGN = (DEGREES, GRAVITY_M_S2, KM_H)
 #: Logarithms of factors that differ by less are one unit (km/h and mph are 0.48 apart). A range of gains with a smaller
 #: ratio of its ends rules out all units but one; wider ranges are lengths of any car.
 SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0

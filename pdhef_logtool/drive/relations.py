@@ -48,8 +48,8 @@ DISTURBED = 0.6
 _STEERING = ("steer_rad", "steering_wheel_rad")
 #: Above this, sideslip times lateral acceleration is not small compared to the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
-#: Least share of v_x in the speed if the heading is right.
-AHEAD_SHARE = 0.9
+#: Least share of v_x in the speed if the heading is right; quantile that stands for the largest value.
+AHEAD_SHARE, HIGH = 0.9, 0.9
 #: Least ratio of the square of a position's scale to its standard error: along an axis on which the car hardly moves,
 #: noise reached 4.6 in 500 drives.
 SHOWN_STD = 8.0
@@ -220,7 +220,7 @@ def _lengths(pace: _Pace, vehicle: VehicleParameters | None) -> dict[str, tuple[
     columns, speed = pace.columns, pace.speed
     if vehicle is None:
         finite = np.abs(speed[np.isfinite(speed)])
-        is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, 0.9) < FULL_SIZE_M_S[1]
+        is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, HIGH) < FULL_SIZE_M_S[1]
         lengths = LENGTHS["full_size"] if is_full_size else LENGTHS
         return {name: tuple(lengths[name]) for name in _STEERING}
     paces = [median_known(np.abs(c)) for c in (speed, columns.get("truth.vx_m_s")) if c is not None]
@@ -247,7 +247,7 @@ def effective_wheelbase_m(columns: Mapping[str, FloatArray], speed_name: str | N
     steer, rate, speed = (values[use] for values in (columns["steer_rad"], columns["yaw_rate_rad_s"], pace.speed))
     if not steer.size:
         return math.nan
-    angle, curvature, turning, fast = np.quantile(np.abs([steer, rate / speed, rate, speed]), 0.9, axis=1).tolist()
+    angle, curvature, turning, fast = np.quantile(np.abs([steer, rate / speed, rate, speed]), HIGH, axis=1).tolist()
     is_known = turning > DRIVEN["yaw_rate_rad_s"] and fast < FULL_SIZE_M_S[0]
     return float(f"{angle / curvature:.3g}") if is_known else math.nan
 

@@ -171,16 +171,14 @@ def mix(weights: FloatArray, tracks: Sequence[StateTrack]) -> StateTrack:
     likeliest = np.argmax(w, axis=1)
     mixed: dict[str, Any] = {name: x[:, i].copy() for i, name in enumerate(names)}
 
-    def of_likeliest(name: str) -> Any:
-        return np.choose(likeliest, [getattr(t, name) for t in tracks])
-
+    for name in ("nis", "nis_dof", "friction", "diverged"):
+        mixed[name] = np.choose(likeliest, [getattr(t, name) for t in tracks])
     return replace(
         tracks[0],
         **mixed,
         sideslip_rad=np.arctan2(x[:, 1], x[:, 0]),
         covariance=P,
         sideslip_std_rad=sideslip_std(x[:, 0], x[:, 1], P),
-        **{name: of_likeliest(name) for name in ("nis", "nis_dof", "friction", "diverged")},
         valid=any_valid,
     )
 

@@ -21,10 +21,11 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.smoothing import runs, smooth
-from pdhef_logtool.records.signals import S_PER_NS, BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import KM_H, S_PER_NS, BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
 
-_STEP_NS, _STEP_S = 20_000_000, 0.02
+#: Step of the grid, and rows of half a second.
+_STEP_NS, _STEP_S, _HALF_S_ROWS = 20_000_000, 0.02, 25
 #: The zero of the steering is computed from one row in this many.
 _ZERO_EVERY = 10
 
@@ -192,7 +193,7 @@ def _measured(run: _Run, name: str, a: int, b: int) -> Manoeuvre:
     ay, rate, angle = (float(np.abs(column[a:b]).max()) for column in (run.ay, run.yaw_rate, run.steer))
     side = "left" if steer[int(np.argmax(np.abs(steer) >= 0.5 * angle))] >= 0.0 else "right"
     text = (
-        f"{side}, from {speed * 3.6:.0f} km/h, |a_y| to {ay:.1f} m/s², yaw rate to {np.degrees(rate):.0f}°/s, "
+        f"{side}, from {speed * KM_H:.0f} km/h, |a_y| to {ay:.1f} m/s², yaw rate to {np.degrees(rate):.0f}°/s, "
         f"road-wheel angle to {np.degrees(angle):.1f}°"
     )
     start_ns, end_ns = (run.start_ns + row * _STEP_NS for row in (a, b))
@@ -339,7 +340,7 @@ def _steps(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]
         if len(held) < held_rows:
             continue
         level = float(np.median(held))
-        before = side[max(swing.start - 25, 0) : settle]
+        before = side[max(swing.start - _HALF_S_ROWS, 0) : settle]
         rise = np.flatnonzero(before >= 0.9 * level), np.flatnonzero(before <= 0.1 * level)
         tolerance = _tolerance(level, float(run.gain[settle]))
         if not rise[0].size or not rise[1].size or np.abs(held - level).max() > tolerance:
@@ -380,7 +381,7 @@ def _circles(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, in
                 turned_rad = abs(float(run.yaw_rate[start:end].sum())) * _STEP_S
                 if turned_rad >= RULES.circle_rad and (end - start) * _STEP_S >= RULES.circle_s:
                     yield "steady-circle", start, end
-                start = max(end, start + 25)
+                start = max(end, start + _HALF_S_ROWS)
 
 
 def _slowing(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
@@ -402,7 +403,7 @@ def _slowing(run: _Run, swings: Sequence[_Swing]) -> Iterator[tuple[str, int, in
         if turn < RULES.turn_m_s2 or not _steady_before(run, onset, pre, ahead):
             continue
         over = run.ax[onset : onset + round(RULES.longest_slowing_s / _STEP_S)] > before[row] - 0.5 * fall
-        over[:25] = False
+        over[:_HALF_S_ROWS] = False
         end = onset + (int(np.argmax(over)) if over.any() else len(over))
         if (end - onset) * _STEP_S >= RULES.slowing_s:
             braked = fall >= min(RULES.brake_m_s2, max(RULES.gentle_brake_m_s2, RULES.brake_share * turn))

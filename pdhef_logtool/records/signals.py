@@ -14,8 +14,8 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
 S_PER_NS, NS_PER_S = 1e-9, 1_000_000_000
-#: Divisors that may be 0 are at least this.
-LEAST_DIVISOR = 1e-12
+#: Divisors that may be 0 are at least this; km/h of 1 m/s.
+LEAST_DIVISOR, KM_H = 1e-12, 3.6
 
 WHEELS = ("fl", "fr", "rl", "rr")
 

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.compiled.cache import inline, njit
 
 Float32Array: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 
@@ -22,7 +22,6 @@ SIDES = 2
 _TILE_STEPS = 128
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 # tanh(x) = x P(x²) / Q(x²) for |x| < 8 with a relative error of 1e-8: the rational function of least error (iterated
 # weighted least squares). The rounding error of float32 is ten times larger.
@@ -34,7 +33,7 @@ _Q1, _Q2, _Q3, _Q4 = (np.float32(q) for q in (0.46777823615, 0.026164435329905, 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 
-@_inline
+@inline
 def _tanh(x):  # type: ignore[no-untyped-def]
     x = min(max(x, -_LIMIT), _LIMIT)
     s = x * x

@@ -20,10 +20,10 @@ from difflib import get_close_matches
 import polars as pl
 
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import KM_H, BoolArray, FloatArray
 
 #: Units of a condition: the unit of our columns, and the factor from it.
-_UNITS = {"_deg": ("_rad", math.degrees(1.0)), "_deg_s": ("_rad_s", math.degrees(1.0)), "_km_h": ("_m_s", 3.6)}
+_UNITS = {"_deg": ("_rad", math.degrees(1.0)), "_deg_s": ("_rad_s", math.degrees(1.0)), "_km_h": ("_m_s", KM_H)}
 #: Operators and functions of one row.
 _WORDS = frozenset(
     """

@@ -39,8 +39,8 @@ DOT_STEP_NS, LONG_DOT_STEP_NS = 50_000_000, 500_000_000
 #: Steps between rows of a long drive, for tracks visible at first and for others.
 LONG_STEP_NS, OTHERS_STEP_NS = 100_000_000, 200_000_000
 
-#: Rows of a chunk.
-_CHUNK_ROWS = 6000
+#: Rows of a chunk, and width of a line.
+_CHUNK_ROWS, _LINE_POINTS = 6000, 1.5
 
 
 _HEALTH = (
@@ -179,7 +179,7 @@ class _Drawing:
     def draw_track(self, track: StateTrack, truth: StateTrack | None, place: str, rgb: tuple[int, int, int]) -> None:
         """Draw a track with its errors and its way."""
         band = [] if track.name == TRUTH else [f"{track.name} 95 %"] * 2
-        widths = [2.0 if track.name == TRUTH else 1.5, 0.75, 0.75]
+        widths = [2.0 if track.name == TRUTH else _LINE_POINTS, *[0.75] * 2]
         colours = [rgb, *[(*rgb, 110)] * len(band)]
         style = rr.SeriesLines(names=[track.name, *band], colors=colours, widths=widths[: len(colours)])
         self._log_static(f"/{place}", style)
@@ -242,7 +242,9 @@ class _Drawing:
         if len(shown):
             self._send(f"/plan/{place}/now", track.stamps_ns[shown], rr.Points2D.columns(positions=plan[shown]))
         lines = _strips(np.where(has_plan[:, None], plan, np.nan))
-        self._log_static(f"/plan/{place}", rr.LineStrips2D(lines, colors=[rgb], radii=[rr.Radius.ui_points(1.5)]))
+        self._log_static(
+            f"/plan/{place}", rr.LineStrips2D(lines, colors=[rgb], radii=[rr.Radius.ui_points(_LINE_POINTS)])
+        )
 
     def draw_reasons(self, track: StateTrack) -> None:
         """Draw each reason as a state that is active in its intervals."""
@@ -320,7 +322,7 @@ def _track_view(component: str, title: str, places: Sequence[str], *, legend: bo
 
 
 def _input_view(plot: Plot) -> rrb.TimeSeriesView:
-    style = rr.SeriesLines(names=[plot.title], colors=[(0x56, 0xB4, 0xE9)], widths=[1.5])
+    style = rr.SeriesLines(names=[plot.title], colors=[colour_rgb(plot.name, {})], widths=[_LINE_POINTS])
     return _plot_view(plot.title, {"/inputs": [_line_of(f"{_SIGNALS}:{plot.name}", style)]}, legend=False)
 
 
