@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -28,7 +28,9 @@ from pdhef_logtool.drive.relations import (
 )
 from pdhef_logtool.drive.truth import TruthTrack, channel_of, derive_truth
 from pdhef_logtool.mapping.candidates import UNIT_NOT_GIVEN
+from pdhef_logtool.mapping.naming import vector_of
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
+from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import GNSS, GNSS_POSITION, WHEELS, Channel, FloatArray
 
@@ -37,6 +39,8 @@ WHEEL_SPEEDS = "wheel_speeds"
 _EAST_NORTH = ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")
 #: Positions of a receiver east and north, m.
 _PATH = ("gnss_path.east", "gnss_path.north")
+#: Components of a vector along and across.
+_VECTORS = (("ax_m_s2", "ay_m_s2"), ("truth.vx_m_s", "truth.vy_m_s"))
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 
@@ -147,10 +151,20 @@ def measure(
     of_truth = {n: (s.topic, s.paths) for n, s in sources.items() if n.startswith("truth.")}
     read = [[of_truth[n] for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
+    related += [r for r in _scales_of_vectors(sources) if not r.accepts()]
     scales, mapping = {n: s.scale for n, s in sources.items()}, mapping or SignalMapping()
     open_units = frozenset(c.subject for c in mapping.checks if UNIT_NOT_GIVEN in c.evidence)
     of_mapping = mapping.open_signs, open_units
     return Measured(signals, truth, derived, columns, speed_name, tuple(related), vehicle, scales, *of_mapping)
+
+
+def _scales_of_vectors(sources: Mapping[str, SignalSource]) -> Iterator[Relation]:
+    """Yield the relation between the scales of two components of one vector."""
+    for other, name in _VECTORS:
+        a, b = (sources.get(n) for n in (other, name))
+        if a and b and a.topic == b.topic and {*map(vector_of, a.paths)} == {*map(vector_of, b.paths)}:
+            gain = float(np.linalg.norm(b.scale) / np.linalg.norm(a.scale))
+            yield Relation(law("vector", name=name, other=other), 1.0, gain, math.inf)
 
 
 def drive_columns(

@@ -252,6 +252,11 @@ def _matches(rule: _Rule, tokens: set[str]) -> bool:
     return all(tokens.isdisjoint(words) != wanted for wanted, words in rule)
 
 
+def vector_of(path: str) -> tuple[str, ...]:
+    """Return the words of a field but its axis: components of one vector have the same."""
+    return tuple("" if word in _AXES or re.fullmatch(r"\d+|v[xyz]", word) else word for word in words_of(path))
+
+
 _TRAITS = tuple((trait, _rule(text)) for trait, texts in VOCABULARY["traits"].items() for text in texts)
 #: Quantities by the first matching rule; empty: no quantity. A part ``@axis`` or ``@corner`` is read from the name.
 _QUANTITIES: tuple[tuple[_Rule, tuple[str, ...]], ...] = tuple(

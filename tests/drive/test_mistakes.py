@@ -198,6 +198,29 @@ def test_exchanged_degrees_of_a_place_are_named_as_such():
     assert {c.subject for c in found if c.verdict == "failed" and c.subject != "ay_m_s2"} == {"truth.y_m"}
 
 
+@pytest.mark.parametrize(
+    ("fields", "scale", "is_named"),
+    [
+        (("twist.linear.x", "twist.linear.y"), 1.0 / 3.6, True),
+        (("v_long", "v_lat"), 9.80665, True),
+        (("velocity[0]", "velocity[1]"), -1.02, False),
+        (("v_long_kmh", "v_lat_mps"), 1.0 / 3.6, False),
+    ],
+)
+def test_components_of_one_vector_have_one_unit(fields, scale, is_named):
+    """Nothing else shows the unit of a lateral velocity without a gyro and an accelerometer."""
+    signals, truth = with_truth(VEHICLE, scale)
+    signals, truth = (
+        {n: its[n] for n in names} for its, names in ((signals, ["speed_m_s"]), (truth, ["vx_m_s", "vy_m_s"]))
+    )
+    sources = zip(truth, fields, (1.0, scale), strict=True)
+    mapping = Mapping({}, {n: SignalSource(n, "/truth", field, scale=s) for n, field, s in sources})
+    checks = check_drive(measure(signals, truth, derive_truth(truth), VEHICLE, mapping))
+    failed = {c.name: c.remedy for c in checks if c.verdict == "failed"}
+    assert list(failed) == ["truth.vy_m_s.unit"] * is_named
+    assert all("scale = 1" in remedy for remedy in failed.values())
+
+
 @pytest.mark.parametrize("factor", [1.0, np.pi / 180.0, 180.0 / np.pi, -1.0])
 def test_a_heading_turns_as_the_gyro_does(factor):
     signals, truth = with_truth(VEHICLE, 1.0)
