@@ -1,7 +1,5 @@
 """``python -m pdhef_logtool`` is ``pdhef``."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import os

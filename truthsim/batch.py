@@ -3,8 +3,6 @@
 A drive on disk that matches its manifest entry is kept, so that an interrupted batch can be resumed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence

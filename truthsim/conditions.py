@@ -8,8 +8,6 @@ manifest contains the change. Recorded drives and independent simulators, the ta
 here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Simulate a drive: plan, scale, drive, measure; and write it as a recorder's log."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Driver model: path preview, speed control, planned stops, human lag."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

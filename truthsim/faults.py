@@ -20,8 +20,6 @@ What: a message (``imu``, ``steering``, ``wheels``, ``rtk``, ``all`` for the thr
 in the given order to the finished readings; samples outside of a fault's interval and field are unchanged.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ This module shares no code with the simulation: gradients are closed forms; freq
 linear equations of the single-track model with relaxing tyres, a rolling body and axles that roll on their tyres.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ A manoeuvre is planned for a speed, a friction, a seed, a duration and a scale. 
 reaches 0.3 g (FMVSS 126 and NHTSA's fishhook), which is measured first; or the course.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache

@@ -1,7 +1,5 @@
 """Simulate a plan: driver and vehicle in one compiled loop."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 ``randomise`` draws from the table ``SPREADS``. A draw that oversteers is repeated, as no such car is sold.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2

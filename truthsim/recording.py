@@ -1,7 +1,5 @@
 """Turn the columns of a drive into the topics of its log."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The road under the car: friction of each wheel, bank and grade, read from a plan's road table."""
 
-from __future__ import annotations
-
 from numba.extending import register_jitable
 
 from pdhef_logtool.records.signals import FloatArray

@@ -4,8 +4,6 @@ Radii, superelevation, crossfall and grades follow common road design guides (to
 bends of 60 to 600 m, motorway curves of 700 m and more; crossfall 2 %, superelevation to 7 %, grades to 7 %).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

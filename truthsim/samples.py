@@ -3,8 +3,6 @@
 This holds on one machine; results on another processor may differ in the last digits of floating-point values.
 """
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import sys

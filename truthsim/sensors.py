@@ -4,8 +4,6 @@ Numbers are from the paper's experiment (docs/method.md#sensors). Every error so
 that a change of one does not affect the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -6,8 +6,6 @@ its own with it. Cells of manoeuvre × speed × friction at the edge of the rang
 used for training.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path

@@ -7,8 +7,6 @@ scales the peak and only a small power of it the stiffness. Transients are the s
 (σ/|V_x|) ṡ + s = s_steady, with the forces then read at the relaxed slip.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -13,8 +13,6 @@ The interface of a vehicle is the lower half of the file: ``STATE_SIZE``, :func:
 :func:`observe` with ``OBSERVED``. Other modules do not access the state vector.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

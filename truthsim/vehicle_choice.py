@@ -5,8 +5,6 @@ with seed 7), ``sedan,mass=1.2,cg=0.1``. Changes: ``mass`` (factor, inertias wit
 ``height`` (of the CG, factor), ``stiffness`` (of all tyres' cornering, factor), ``tyres`` (tyres of another vehicle).
 """
 
-from __future__ import annotations
-
 import math
 
 from pdhef_logtool.records.errors import UsageError

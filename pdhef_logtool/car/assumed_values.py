@@ -5,8 +5,6 @@ scale with the wheelbase, times with its square root, and axle stiffness with th
 standard deviation over vehicles, which a calibration uses as its prior and intervals must cover.
 """
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Callable, Mapping

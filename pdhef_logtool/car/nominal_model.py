@@ -5,8 +5,6 @@ low-speed limit, the model therefore blends to the kinematic single-track model,
 approach r = v_x tan δ / L and v_y = l_r r with a short time constant.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

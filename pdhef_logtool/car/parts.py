@@ -4,8 +4,6 @@ Each part contains the digest of its inputs. If an input has changed, the part i
 warning: noise for other tyres can triple the error.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """The car of a drive as fitted to the sensors of the drive, without ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -3,8 +3,6 @@
 A new folder is written beside the old one and exchanged with it, so that a reader sees one of the two.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress

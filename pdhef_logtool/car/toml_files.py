@@ -1,7 +1,5 @@
 """TOML files of a car: reading vehicle.toml, and writing it and the parts of a car's folder."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The command line ``pdhef``: each command parses, calls one public function, and prints."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import io

@@ -1,7 +1,5 @@
 """``pdhef compare``, ``events`` and ``query``: differences between runs, events within one, SQL on their tables."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Help texts in panels: commands and options under the headings of their groups."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

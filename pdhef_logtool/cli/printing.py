@@ -1,7 +1,5 @@
 """Terminal output from the templates of ``templates/``, in the markup of Rich."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from itertools import groupby

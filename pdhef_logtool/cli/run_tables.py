@@ -1,7 +1,5 @@
 """Output of ``pdhef run`` and ``pdhef metrics``: the selected estimate as text, a table, output files, the plan."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias

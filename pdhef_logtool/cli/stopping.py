@@ -1,7 +1,5 @@
 """Ctrl-C and termination: the first request ends a command in order, the second one at once."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from typing import Any

@@ -8,8 +8,6 @@ In each place, the code is in a folder that is named after the digest of all sou
 process with a new digest removes the folders of other sources of this installation.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

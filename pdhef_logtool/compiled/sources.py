@@ -4,8 +4,6 @@ Numba's own cache identifies a function by its file and ignores the files of the
 compiled code is kept under one digest, so that code of other sources is never loaded.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -1,7 +1,5 @@
 """The table of checks (``checks.toml``): their limits and texts, and the verdict on a value."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Low-passed channels on one even grid, and regressions with standard errors from the number of independent samples."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise

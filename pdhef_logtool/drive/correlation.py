@@ -1,7 +1,5 @@
 """The shift between two signals, by the peak of their cross-correlation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache

@@ -5,8 +5,6 @@ is larger than for correct sensors. Only the difference of the rear wheel speeds
 pairs also differ by sideslip, pitch and the vehicle's response; they detect only large delays.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Source of the friction of a run. All estimators, networks and segments use the same friction."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum

@@ -5,8 +5,6 @@ the distance of the rescaled gains from the plausible range. The distance is bou
 wheel spin or a bank change some blocks only, and a wrong unit changes all. Probabilities are exp(-energy), normalised.
 """
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence

@@ -151,8 +151,9 @@ def measure(
     of_truth = {n: (s.topic, s.paths) for n, s in sources.items() if n.startswith("truth.")}
     read = [[of_truth[n] for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    related += [r for r in _scales_of_vectors(sources) if not r.accepts()]
     scales, mapping = {n: s.scale for n, s in sources.items()}, mapping or SignalMapping()
+    if mapping.origin == "file":  # recognised scales are those of the units that the log states
+        related += [r for r in _scales_of_vectors(sources) if not r.accepts()]
     open_units = frozenset(c.subject for c in mapping.checks if UNIT_NOT_GIVEN in c.evidence)
     of_mapping = mapping.open_signs, open_units
     return Measured(signals, truth, derived, columns, speed_name, tuple(related), vehicle, scales, *of_mapping)

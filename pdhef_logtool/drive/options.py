@@ -1,7 +1,5 @@
 """Options for reading a log (slice, sensors, ground truth, friction), and the formats of times."""
 
-from __future__ import annotations
-
 import datetime as dt
 import re
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ In a car, mounting, delays, clocks and parameters are known from earlier drives 
 Offline they come from the log itself, so that estimates depend on later samples. With a model file they do not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping as Mapped
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Reading of a drive: a log is opened for a car, mapped and planned, then read as a whole."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path

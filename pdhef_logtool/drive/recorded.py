@@ -1,7 +1,5 @@
 """A whole drive in memory: the log's channels as its plan reads them, aligned, with ground truth at the same stamps."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Collection

@@ -3,8 +3,6 @@
 The posterior of all mistakes (:mod:`~pdhef_logtool.drive.hypotheses`) decides which signals fail.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

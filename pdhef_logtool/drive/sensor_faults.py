@@ -15,8 +15,6 @@ Real noise has long tails, so that more samples are weighted down or dropped tha
 samples are noisy, spikes beyond a long tail, and silence that lasts.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

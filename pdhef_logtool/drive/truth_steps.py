@@ -7,8 +7,6 @@ the variance of what remains, increased for its correlation from block to block 
 road resembles a bias and a gain of a_y, but begins slowly, while the samples of a changed sensor step.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.drive.check_table import TABLE

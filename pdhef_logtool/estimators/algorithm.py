@@ -7,8 +7,6 @@ its field, so that a new option with a default changes no identity. An option th
 with its name and options.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

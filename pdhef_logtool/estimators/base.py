@@ -5,8 +5,6 @@ scored stamps. :mod:`~.latency_compensation` determines for all estimators which
 and how far it is extrapolated.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 

@@ -5,8 +5,6 @@ steps: step k of a causal estimator is the same for any samples after k. The che
 state with the samples behind a few stamps masked, and compares the steps before them.
 """
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any

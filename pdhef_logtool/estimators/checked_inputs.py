@@ -4,8 +4,6 @@ The parallel filter runs on the sound samples, and the residual model receives t
 sample in a burst of noise. Without a model there is no parallel filter and no residual.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

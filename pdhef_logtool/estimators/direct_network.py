@@ -6,8 +6,6 @@ v_x is the parallel filter's, the yaw rate the gyro's. Over the latency, v_x and
 stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -18,8 +18,6 @@ Not detected: an estimate that is wrong from its start, or drifts more slowly th
 accelerometer or gyro are attributed to the estimate, except for missing and stuck samples, which are not judged.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Posteriors of a filter on measurement time, the columns that kernels write."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 

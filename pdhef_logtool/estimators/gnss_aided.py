@@ -14,8 +14,6 @@ The wrapped filter is better than a course in most driving. Therefore
   unless GNSS contradicts it by more than three standard deviations (non-negative garrote, Breiman 1995).
 """
 
-from __future__ import annotations
-
 import math
 from copy import deepcopy
 from dataclasses import dataclass, replace

@@ -15,8 +15,6 @@ Details that the paper omits are as in ``phy-ukf``: state [v_x, v_y, r, b_ax], Q
 and gaps. It has no gate of innovations, no standstill and no roll correction, as in the paper.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """``kinematic``: lateral velocity by integrating v̇_y = a_y − v_x r, with a leak against drift."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

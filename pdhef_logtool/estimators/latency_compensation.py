@@ -7,8 +7,6 @@ over the whole latency t - t_k. An estimator returns steps and has no part in th
 A smoother (:class:`~.base.Smoother`) reads later samples: it has each estimate at its own stamp.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, cast

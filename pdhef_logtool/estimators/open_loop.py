@@ -1,7 +1,5 @@
 """``open-loop``: the nominal model with steering and measured speed as inputs, without correction by other sensors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

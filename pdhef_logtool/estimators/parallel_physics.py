@@ -4,8 +4,6 @@ The bundle of a network names the filter that it was trained with: ``physics``, 
 and the baselines, which are frozen.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.car.car import Car

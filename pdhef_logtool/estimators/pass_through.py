@@ -1,7 +1,5 @@
 """``zero`` (β = 0) and ``zero:no-lateral`` (the unchanged sensors): baselines for all estimators."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ The network acts on the car that it was trained for; without such a network the 
 ``physics``.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from pdhef_logtool.car.car import Car

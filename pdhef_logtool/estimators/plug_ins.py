@@ -1,7 +1,5 @@
 """Isolation of estimators of other packages: their errors, their output, and their writes to shared data."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout

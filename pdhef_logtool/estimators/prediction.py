@@ -1,7 +1,5 @@
 """The time update of the vehicle filter, and its tracks: steps predicted to the scored stamps with inputs held."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.compiled.cache import inner_kernel, kernel

@@ -1,7 +1,5 @@
 """Names of estimators: a preset, with an option after a colon, such as ``pd-hef:gain=1``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 #: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.

@@ -9,8 +9,6 @@ with the covariances P, P⁻ after and before the update and the cross covarianc
 smoother). b is the difference to a run with a constant rate, less the share of A.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -17,8 +17,6 @@ A drive is smoothed in blocks of ``block_s``, each with all steps up to the end 
 bounded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce

@@ -17,8 +17,6 @@ the sensor reads zero, and below some speed there are no pulses: steps into and 
 recovery is no slip either: the speed of spinning wheels falls while the car accelerates.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Inputs and outputs shared by the simple baselines, and the measured speed between its samples."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

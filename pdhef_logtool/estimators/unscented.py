@@ -15,8 +15,6 @@ they have alone are at the centre in all other entries, and a block has the firs
 Covariances and roots may have further columns up to whole vectors (:func:`padded`), which are zero.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -28,8 +28,6 @@ the mean of the forces at both ends. The method is of second order in the step e
 lag, bank, force scale, and the load transfer without roll), and stable for any lag.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

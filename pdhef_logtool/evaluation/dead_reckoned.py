@@ -6,8 +6,6 @@ the lateral distance, in the ground-truth axes, at the end of each second. Secon
 pose or a gap are excluded.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.records.geometry import dead_reckon

@@ -1,7 +1,5 @@
 """The places of the largest sideslip errors of a drive, at least a second apart, without the start of the estimate."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

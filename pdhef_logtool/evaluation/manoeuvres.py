@@ -7,8 +7,6 @@ at half its peak. All rules are mirror symmetric. The thresholds are in ``manoeu
 docs/metrics.md too.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

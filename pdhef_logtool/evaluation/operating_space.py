@@ -5,8 +5,6 @@ contains them, otherwise from the sensors; the acceleration is smoothed to 1 Hz.
 that cells of a fleet can be added.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Stamps with the bit of a reason that are at most ``RUN_GAP_S`` apart form one in
 seconds gives one interval, even if single samples change.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Metric of each requirement in blocks of 10 s of one drive, for confidence bounds from few drives."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Verdict on one requirement: PASS, FAIL or INCONCLUSIVE by confidence bounds, with margin and exposure."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -19,8 +19,6 @@ manoeuvres            :mod:`~pdhef_logtool.evaluation.manoeuvres`, from sensors 
 ====================  ==================================================================================================
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

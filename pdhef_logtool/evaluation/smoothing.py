@@ -1,7 +1,5 @@
 """Series at irregular stamps: zero-phase smoothing, gap-free runs, and held measurements."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.records.signals import NS_PER_S, S_PER_NS, BoolArray, FloatArray, IntArray

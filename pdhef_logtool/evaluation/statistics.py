@@ -17,8 +17,6 @@ do. The median of the log ratios limits the influence of single drives. Its boun
 test, with a variance multiplied by the design effect.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

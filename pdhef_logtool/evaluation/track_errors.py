@@ -1,7 +1,5 @@
 """Errors of an estimate against ground truth at the same stamps, and the stamps that are scored."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.records.geometry import wrap_angle

@@ -1,7 +1,5 @@
 """Scored signals with their labels and units, and the units for display and input."""
 
-from __future__ import annotations
-
 import math
 
 from pdhef_logtool.records.geometry import DEGREES

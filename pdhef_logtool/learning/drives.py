@@ -1,7 +1,5 @@
 """Settings and drives of the learning commands: selection, reading, and the record of each drive."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Mapping, Sequence

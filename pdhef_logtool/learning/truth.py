@@ -1,7 +1,5 @@
 """Sideslip for training: ground truth, or on request the sideslip reference of a log without ground truth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

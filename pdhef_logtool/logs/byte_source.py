@@ -4,8 +4,6 @@ Files are not mapped into memory: if another process truncates a file while it i
 not end this process. Bytes that were read stay valid after the file is closed.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

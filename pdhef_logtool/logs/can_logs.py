@@ -3,8 +3,6 @@
 BLF and ASC state the local time of the recorder without its zone; it is read as UTC.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import re
 import struct

@@ -1,7 +1,5 @@
 """Numbers of file formats and clocks: ``constants.toml``."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path

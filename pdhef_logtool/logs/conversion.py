@@ -3,8 +3,6 @@
 The type contains a field for each column, with the unit of the source in its comment, which reading takes up again.
 """
 
-from __future__ import annotations
-
 import re
 from contextlib import closing
 from dataclasses import replace

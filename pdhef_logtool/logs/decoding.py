@@ -7,8 +7,6 @@ resolved once per channel, never per message.
 A quaternion struct (members x, y, z, w) read as a whole gives the columns w, x, y, z; x, y, z structs keep that order.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence

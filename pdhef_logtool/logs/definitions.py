@@ -1,7 +1,5 @@
 """Message definitions: of logs without any the user's, an installed ROS's, and a few that are shipped (``schemas``)."""
 
-from __future__ import annotations
-
 import os
 import re
 import zipfile

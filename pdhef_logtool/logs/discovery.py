@@ -1,7 +1,5 @@
 """Find the logs that a command line names, and give each a name for tables and output folders."""
 
-from __future__ import annotations
-
 import glob
 import hashlib
 import os

@@ -4,8 +4,6 @@ Variables outside of structs are one topic for each length. A vector of times in
 is their clock. Sparse matrices, objects and, in HDF5, values in other files are refused.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct

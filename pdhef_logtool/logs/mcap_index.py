@@ -3,8 +3,6 @@
 An index is used only if it is complete and its sums equal the statistics of the file.
 """
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping

@@ -5,8 +5,6 @@ decompressed when the file is opened, so that a file without a summary, with cha
 with a cut end reads like any other. All records between the chunks are visited; every CRC is checked.
 """
 
-from __future__ import annotations
-
 import struct
 from array import array
 from bisect import bisect_right

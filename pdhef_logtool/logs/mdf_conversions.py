@@ -4,8 +4,6 @@
 exponential and logarithmic types of MDF 3 are not supported, as readers disagree on which is which.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable, Sequence
 from functools import partial

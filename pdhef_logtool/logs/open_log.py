@@ -1,7 +1,5 @@
 """The one way in: open any supported log by its content."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace

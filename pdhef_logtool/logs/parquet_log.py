@@ -1,7 +1,5 @@
 """Parquet files: one table of all row groups. Structs become columns of their fields."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

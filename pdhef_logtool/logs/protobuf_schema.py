@@ -5,8 +5,6 @@ is its default (0), whereas an absent sub-message, an unset ``optional`` and the
 set one are absent (NaN). Maps and types that contain themselves have no place among columns and are left out.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from functools import lru_cache
 from graphlib import CycleError, TopologicalSorter

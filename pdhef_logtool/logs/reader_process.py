@@ -7,8 +7,6 @@ answers with JSON and plain arrays, so that a file that takes over its reader ca
 reader that dies costs its file, or the column that it was reading.
 """
 
-from __future__ import annotations
-
 import atexit
 import json
 import os

@@ -3,8 +3,6 @@
 The files are one recording if their times overlap and their columns differ; otherwise each file is a drive.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace

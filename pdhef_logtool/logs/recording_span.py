@@ -12,8 +12,6 @@ boot splits a recording in two; a clock that is set back records the same times 
 A sound log keeps all messages, and its first and last log time.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ A log's server may be malicious: a redirect could make this machine send request
 target of each redirect is checked, and also the addresses of each connection, as names can change in between.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 from typing import Any

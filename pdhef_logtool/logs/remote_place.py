@@ -1,7 +1,5 @@
 """Location of a remote log: a URL, and the part of it that may be printed."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cached_property

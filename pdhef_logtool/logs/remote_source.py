@@ -8,8 +8,6 @@ Missing blocks that follow each other are one request of at most 8 MB; four requ
 compared with the state of the object when it was opened.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import os

@@ -3,8 +3,6 @@
 Bags without an index are walked like any other, so that an unindexed bag gives every message of its complete chunks.
 """
 
-from __future__ import annotations
-
 import struct
 from array import array
 from collections import Counter

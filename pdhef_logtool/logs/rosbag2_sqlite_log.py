@@ -1,7 +1,5 @@
 """rosbag2 SQLite databases as a container: opened immutable, pages of rows as spans; no file is written beside it."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from array import array

@@ -4,8 +4,6 @@ Messages of an MCAP keep schema, topic, encoding, channel metadata, both times, 
 metadata records are copied too. Bags and rosbag2 databases keep their bytes and definitions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 

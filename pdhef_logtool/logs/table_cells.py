@@ -1,7 +1,5 @@
 """Numbers of a column of texts, with an account of its cells: numbers, empty cells and unreadable cells."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ shows, is mirrored. JSON lines: an object a line, with a key for each column, or
 time; keys of objects inside of objects are joined by dots.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import datetime as dt

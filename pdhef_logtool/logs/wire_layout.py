@@ -5,8 +5,6 @@ column by column instead of message by message. Alignment follows CDR version 1:
 size counted from after the 4-byte encapsulation header. ROS 1 packs without alignment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace

@@ -4,8 +4,6 @@ Every file has zstd chunks, message indexes, statistics, a summary and CRCs: oth
 schemas are written before the first chunk that uses them and again in the summary.
 """
 
-from __future__ import annotations
-
 import contextlib
 import struct
 from collections import Counter

@@ -5,8 +5,6 @@ is *taken* if the evidence for it, in log odds (``evidence.toml``), is positive 
 unit or sign is uncertain, an undecided check records this. Other candidates are listed in the mapping as comments.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence

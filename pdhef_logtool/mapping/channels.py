@@ -1,7 +1,5 @@
 """Mapped fields into channels: SI values on the log's clock, cleaned, with every dropped sample counted."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from collections.abc import Mapping as Mapped

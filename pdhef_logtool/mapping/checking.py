@@ -1,7 +1,5 @@
 """Check a mapping against a log: missing names with near matches, and the stamp of each source."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Choose the mapping for one log: the given mapping, or the recognised one with its ambiguities."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

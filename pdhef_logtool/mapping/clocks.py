@@ -1,7 +1,5 @@
 """Convert stamps to the log's clock: offset and drift of device clocks, and plausibility of the transport delay."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Find recorded estimates of other estimators, by flags ``[SIGNAL=]TOPIC[.FIELD]`` or by tables."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Units have a posterior, given gravity, other speeds, a_x ≈ v̇ and a_y ≈ v r.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Joints of a vehicle model (``sensor_msgs/JointState``): the messages, not the type, give the joint of each number."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo

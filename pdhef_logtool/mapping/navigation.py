@@ -6,8 +6,6 @@ mostly moves in the direction of its heading, this follows from a comparison wit
 A source that also has a heading (two antennas, INS) or sideslip is ground truth, and never an input of an estimator.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -3,8 +3,6 @@
 Fields with a quantity by name take part in the relations; the likelihood that decides their units decides these, too.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

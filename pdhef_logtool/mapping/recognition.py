@@ -1,7 +1,5 @@
 """Mapping by well-known message types; every ambiguity is reported."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Levenberg-Marquardt descent for fits to drives, with robust errors, adaptive scales and normal priors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 

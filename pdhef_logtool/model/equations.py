@@ -8,8 +8,6 @@ v_y and r separately at any speed, so that the model cannot spin, and low freque
 The yaw rate is slowly corrected, so that the effect of disturbances that the driver compensates decays.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -20,8 +20,6 @@ Mass and position of the centre of gravity come from the file. Parameters that a
 their prior and widen the interval.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy

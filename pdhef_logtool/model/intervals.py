@@ -17,8 +17,6 @@ fitted to it, otherwise as available online (:func:`running_consistency`). The v
 velocity. Estimates are unchanged.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

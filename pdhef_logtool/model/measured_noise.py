@@ -6,8 +6,6 @@ raised to the robust spread of the innovations, but only as far as the model sti
 the model is wrong, more noise makes the estimate follow it. See docs/method.md#self-calibration.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

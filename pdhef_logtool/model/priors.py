@@ -5,8 +5,6 @@ file's value, the peak force is a parameter. The prior of the tyres is a mixture
 driven tyres, or softer ones, and cars on tarmac differ by a factor of two.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Check of a log, its ground truth or its vehicle file: passed, failed, or undecided (not observable)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 

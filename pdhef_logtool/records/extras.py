@@ -1,7 +1,5 @@
 """Optional packages, which an extra of the installation contains."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Angles, quaternions, lever arms, the local ENU frame and dead reckoning."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.records.signals import S_PER_NS, FloatArray, IntArray

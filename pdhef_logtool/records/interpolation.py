@@ -1,7 +1,5 @@
 """Linear interpolation between the two samples around each stamp, except across gaps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Counts of the samples of each mapped signal in a log: used, or dropped for a named reason."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal

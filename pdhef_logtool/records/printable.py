@@ -4,8 +4,6 @@ Names of topics, files and cars and the content of documents are third-party dat
 warning, and a line break could fake one. All results and errors for users are escaped.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass

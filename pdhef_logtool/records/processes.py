@@ -1,7 +1,5 @@
 """Unique names of processes, and detection of dead processes."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import hashlib

@@ -1,7 +1,5 @@
 """Readings that are impossible for a ground vehicle."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

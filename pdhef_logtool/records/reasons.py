@@ -3,8 +3,6 @@
 The bits are written to estimates.parquet and ``pdhef_msgs/VehicleStateEstimate``; their meaning must not change.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 # The bits of the yaw rate are the bits of a_y, shifted left by one.

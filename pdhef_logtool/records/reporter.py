@@ -1,7 +1,5 @@
 """Progress, warnings and notes of a running command, each as a line for users."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The running mean of columns."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.records.signals import LEAST_DIVISOR, FloatArray

@@ -1,7 +1,5 @@
 """Quantiles of Student's t without SciPy, because its import takes longer than processing a short log."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from statistics import NormalDist

@@ -1,7 +1,5 @@
 """Figures of a page as records, and the document from which the page's script draws them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, NamedTuple

@@ -1,7 +1,5 @@
 """The page of a comparison of two runs, and of the history of several."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

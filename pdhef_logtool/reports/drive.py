@@ -1,7 +1,5 @@
 """The page of one drive."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 

@@ -3,8 +3,6 @@
 The page decodes it (``decode`` of ``report.js``): 36,000 cells of two values take 50 to 120 kB.
 """
 
-from __future__ import annotations
-
 import base64
 import zlib
 from dataclasses import dataclass

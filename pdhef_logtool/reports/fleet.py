@@ -1,7 +1,5 @@
 """The page of a whole run: errors over drives, ranking, effects of conditions, operating range, failures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -4,8 +4,6 @@ Texts are escaped by jinja and :func:`~pdhef_logtool.records.printable.printable
 Content-Security-Policy allows its own scripts and style by their digests and forbids everything else.
 """
 
-from __future__ import annotations
-
 import base64
 import datetime as dt
 import hashlib

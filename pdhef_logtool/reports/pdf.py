@@ -3,8 +3,6 @@
 The document is an HTML file with the figures of the pages, printed by a headless Chromium.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -9,8 +9,6 @@ Linear residual models take signals of the same table after four causal low-pass
 that it is odd and has no constant.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

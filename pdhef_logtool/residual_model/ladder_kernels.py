@@ -1,7 +1,5 @@
 """Compiled code of residual models: features, residual and distance of steps (:mod:`~.ladder`)."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@
 uses low-passed features; its coefficients partly compensate the delay of the low pass.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """ST-ResNet: LSTM with a fully connected head that predicts the nominal model's residual (Eq 11-17, Table 1)."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 from pdhef_logtool.records.extras import required

@@ -1,7 +1,5 @@
 """Clips: one MCAP per event, with the messages of the source around it and our tracks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from contextlib import closing
 from dataclasses import replace

@@ -3,8 +3,6 @@
 A compared figure is a requirement on run B with run A as the baseline. Figures are read from the tables of the runs.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

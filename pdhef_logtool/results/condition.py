@@ -8,8 +8,6 @@ Columns in rad are also available in deg, columns in m/s in km/h. NaN is a missi
 value is neither true nor false.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 import re

@@ -1,7 +1,5 @@
 """Where in the drives of a run a condition is true: rows of drive, start, end and peak."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence

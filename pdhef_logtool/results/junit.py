@@ -3,8 +3,6 @@
 An INCONCLUSIVE requirement is a skipped test. Checks that did not pass are properties: they fail no test.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """foxglove.json and plotjuggler.xml: what to plot of an annotated log, to be opened in Foxglove or PlotJuggler."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path

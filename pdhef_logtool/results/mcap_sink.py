@@ -1,7 +1,5 @@
 """annotated.mcap: the source log with our topics merged in by log time, or our topics alone (sidecar)."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

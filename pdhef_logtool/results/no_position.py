@@ -1,7 +1,5 @@
 """Outputs of ``--no-position``: no pose, no topic that may contain a place, no metadata, and no name of a file."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace

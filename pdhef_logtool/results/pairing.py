@@ -3,8 +3,6 @@
 Differences of the runs besides figures: cars, mappings, signals, ground truth, configuration, versions.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """estimates.parquet (wide, a row per stamp and estimator), and Arrow schemas from the schema files of the package."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

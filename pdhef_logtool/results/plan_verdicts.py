@@ -3,8 +3,6 @@
 The baseline of a requirement can be another run: run A of a comparison, or an earlier output.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

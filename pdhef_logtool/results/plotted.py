@@ -1,7 +1,5 @@
 """What recordings draw: values of a track, limits of the 95 % interval, errors, colours, and events as log lines."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterable, Mapping, Sequence

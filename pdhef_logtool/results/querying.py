@@ -1,7 +1,5 @@
 """Questions about the tables of runs, in the SQL of Polars."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """recording.rrd: plots, uncertainty confidence intervals, plan view, events and the text report, with a blueprint."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """report.json of one log, run.json of a run, and the report as Markdown; plain records in, plain JSON out."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import platform

@@ -3,8 +3,6 @@
 The report's document is the only source, so that terminal, report.json, Markdown and recording agree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache

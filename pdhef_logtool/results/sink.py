@@ -1,7 +1,5 @@
 """Records and rounding that all output files share."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pdhef_logtool.evaluation.manoeuvres import Event as Event

@@ -4,8 +4,6 @@ A drive leaves its rows of all tables in one part, a Parquet file of one row wit
 a run that is interrupted has lost nothing. :func:`write_tables` concatenates parts, a few at a time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack

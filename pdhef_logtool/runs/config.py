@@ -1,7 +1,5 @@
 """Configuration of a run: flags override ``pdhef.toml``, which overrides defaults."""
 
-from __future__ import annotations
-
 import datetime as dt
 import tomllib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The one way to estimate: estimators over a drive, with divergence, intervals and poses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The verdicts of a validation plan on one drive and on all drives of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The plan of a run of several logs: their labels, the settings, and which drives are done already."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """One log from start to end: read, estimate, score, judge, write. Several logs: :mod:`~.fleet`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath

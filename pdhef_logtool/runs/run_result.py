@@ -1,7 +1,5 @@
 """The result of a run and of each of its logs."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any

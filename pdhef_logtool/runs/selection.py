@@ -3,8 +3,6 @@
 See docs/method.md#selection.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple

@@ -5,8 +5,6 @@ command, which keeps them with the journal and the pages in a local folder. The 
 ends, at most every 30 s, and all files at the end of the run.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

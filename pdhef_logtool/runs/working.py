@@ -1,7 +1,5 @@
 """The work on one drive of a run: :func:`run_drive` writes the drive's files and returns a small record."""
 
-from __future__ import annotations
-
 import os
 import platform
 import time

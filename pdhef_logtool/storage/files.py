@@ -1,7 +1,5 @@
 """Files that appear only when they are complete, and the error for a place that cannot be written."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import hashlib

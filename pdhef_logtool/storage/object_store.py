@@ -3,8 +3,6 @@
 Credentials come from the environment. Errors of a store are OutputErrors, which name the URL without credentials.
 """
 
-from __future__ import annotations
-
 import re
 import weakref
 from collections.abc import Iterable, Iterator

@@ -4,8 +4,6 @@ A change is written into a hidden folder beside the folder that it replaces, the
 killed at any point, the old or the new folder is complete. Remains of a killed command are removed by the next one.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

@@ -1,7 +1,5 @@
 """TOML documents of nested mappings, lists, numbers and strings."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping

@@ -4,8 +4,6 @@ Linux only. Files and network are refused by Landlock (kernel 5.13 and later, ne
 limits of memory and time and the empty working folder remain.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import struct

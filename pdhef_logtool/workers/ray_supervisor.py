@@ -4,8 +4,6 @@ A task is a supervised worker on a node that Ray chooses: a worker that dies, ha
 outcome, so that Ray repeats a task only if its node is lost.
 """
 
-from __future__ import annotations
-
 import atexit
 import itertools
 import logging

@@ -8,8 +8,6 @@ Each worker has its own connection. In a pool with one pipe and lock for all (pe
 dies in the middle of a message, or with the lock, costs all others.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

@@ -11,8 +11,6 @@ roll sensor φ is observed as 0 with 10°, as there while the localizer is not v
 because a log may contain the road-wheel angle.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

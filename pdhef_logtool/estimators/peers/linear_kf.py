@@ -9,8 +9,6 @@ R is the white noise of the sensors, w has 1000 times the white noise of the ste
 gives the noise of the sensors.
 """
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Base of the peers: samples with a short history, and the rates of v_y for the latency compensation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Linear single track over [v_y, r] with the road-wheel angle δ as input (Riekert and Schunck 1940): ẋ = A x + B δ."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from pdhef_logtool.car.vehicle import VehicleParameters

@@ -12,8 +12,6 @@ the longitudinal axle forces are not measured; two wheel speeds became one. Wher
 86°: otherwise it finds the falling part of the tyre curve in slow, tight bends and diverges for good.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -9,8 +9,6 @@ Differences: without a roll sensor, a_y contains the roll angle; T is equal to t
 simulated drives.
 """
 
-from __future__ import annotations
-
 import math
 
 from pdhef_logtool.compiled.cache import njit

@@ -1,7 +1,5 @@
 """GNSS for the sideslip reference: its plausibility, its delay, its multipath errors, and a first estimate."""
 
-from __future__ import annotations
-
 import math
 from typing import TypeAlias
 

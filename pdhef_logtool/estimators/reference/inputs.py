@@ -1,7 +1,5 @@
 """Inputs of the sideslip reference at its knots: sensor means, values and noise, and the error of the axle law."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

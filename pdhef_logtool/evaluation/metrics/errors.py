@@ -6,8 +6,6 @@ truth without it is not scored. ``lag_s`` is the delay of an estimate after grou
 without that shift and a constant.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -7,8 +7,6 @@ coherence); ISO 4138:2021 (understeer gradient); ISO 3888-2:2011 (entry speed of
 in a turn, against the circle before it); 49 CFR 571.126, S5.2.1 to S5.2.3 (sine with dwell).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import NamedTuple, TypeAlias
 

@@ -1,7 +1,5 @@
 """Consistency of a filter's covariance with its errors and innovations, signal ``state``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

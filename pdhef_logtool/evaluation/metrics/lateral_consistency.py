@@ -1,7 +1,5 @@
 """``d2``, lateral kinematic consistency: change of the estimated v_y over 2 s minus the integral of a_y − v_x r."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Definition of a metric: columns of a drive and a formula over their values in a segment."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Comparison of estimates with one another and with the sideslip reference, for drives without ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import combinations
 

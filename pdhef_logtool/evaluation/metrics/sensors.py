@@ -1,7 +1,5 @@
 """Duration and distance of each segment of a drive (estimator ``sensors``), and the mark ``not_independent``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``yaw_consistency``: yaw rate of the car's tyres at the estimated v_y and the measured steering, against the gyro."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 

@@ -8,8 +8,6 @@ entry of the manifest, so that the files of an interrupted command remain usable
 do not belong to the dataset. A later call extends the manifest and replaces entries with the same log and slice.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

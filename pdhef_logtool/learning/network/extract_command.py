@@ -1,7 +1,5 @@
 """``pdhef extract``: read logs, compute residuals, split by drive, and write a residual dataset."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence

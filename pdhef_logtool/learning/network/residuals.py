@@ -18,8 +18,6 @@ increments, so that fast motion explained by the model is not attenuated; only t
 the window contains a gap.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, TypeAlias

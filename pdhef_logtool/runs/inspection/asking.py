@@ -1,7 +1,5 @@
 """A mapping by questions: for each signal the selected field, its alternatives, and the user's answer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace

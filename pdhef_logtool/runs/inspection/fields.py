@@ -1,7 +1,5 @@
 """All numeric fields of a log: type, rate, and minimum, mean and maximum."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing

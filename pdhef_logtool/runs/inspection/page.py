@@ -1,7 +1,5 @@
 """An inspection as an HTML page: each signal with its candidate fields, clocks, checks, and the mapping to paste."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
