@@ -1,7 +1,5 @@
 """Offline sideslip estimation, scoring and annotation of drive logs: the public interface (docs/api.md)."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

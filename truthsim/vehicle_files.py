@@ -5,8 +5,6 @@ A file contains every value of ``truthsim.vehicle.Vehicle`` by its name, with th
 forgotten value would belong to another car.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -74,7 +72,7 @@ class _Checked(BaseModel):
     model_config = _STRICT
 
     @model_validator(mode="after")
-    def _hangs_together(self) -> _Checked:
+    def _hangs_together(self) -> "_Checked":
         value: Any = self
         unsprung = 2.0 * (value.front_unsprung_mass_kg + value.rear_unsprung_mass_kg)
         _require(unsprung < 0.5 * value.mass_kg, "the unsprung masses together must be below half of mass_kg")

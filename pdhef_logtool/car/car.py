@@ -5,8 +5,6 @@ it, ``train`` the folder ``network``. The shipped car has ``fit.toml`` (:mod:`~.
 ``vehicle.toml`` is a car without parts. A part of another vehicle file is not used, and the car has a note.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -68,7 +66,7 @@ class Car:
         return f"<Car {self.vehicle.name}: {self.source or 'default'}, network {self.network_name}>"
 
     @classmethod
-    def load(cls, path: Place = None, *, network: Place = None, sensors: Place = None) -> Car:
+    def load(cls, path: Place = None, *, network: Place = None, sensors: Place = None) -> "Car":
         """Read a car.
 
         Parameters
@@ -143,7 +141,7 @@ class Car:
         return share * self.vehicle.cg_to_rear_axle_m
 
     @property
-    def calibrated_car(self) -> Car:
+    def calibrated_car(self) -> "Car":
         """The car with the vehicle as calibrated on the log; the same car without a calibration."""
         calibrated = self.self_calibrated
         if calibrated is None:
@@ -157,7 +155,7 @@ class Car:
             self_calibrated=None,
         )
 
-    def with_noise(self, name: str, noise: FilterNoise) -> Car:
+    def with_noise(self, name: str, noise: FilterNoise) -> "Car":
         """Return the car with different noise of one filter."""
         return replace(self, noise={**self.noise, name: noise})
 

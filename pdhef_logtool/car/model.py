@@ -4,8 +4,6 @@ Every run writes one of its drive; ``pdhef learn`` pools drives. In a car's fold
 ``pdhef run --model FILE`` takes the sensors from it as well, so that no estimate depends on later samples.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -68,7 +66,7 @@ class CarModel(Record):
         entries |= self.model_dump(mode="json", exclude_defaults=True, exclude={"sensors"})
         return toml_text(entries | ({"sensors": self.sensors} if self.sensors else {}), head)
 
-    def over(self, other: CarModel | None) -> CarModel:
+    def over(self, other: "CarModel | None") -> "CarModel":
         """Return this model with the entries of another one that it lacks."""
         if other is None:
             return self

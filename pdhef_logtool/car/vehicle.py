@@ -1,7 +1,5 @@
 """Vehicle parameters: validated records of vehicle.toml."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Iterator
@@ -73,7 +71,7 @@ class AxleTyre(Record):
         return self.cornering_stiffness_n_per_rad is not None or self.reference_friction is not None
 
     @model_validator(mode="after")
-    def _one_form(self) -> AxleTyre:
+    def _one_form(self) -> "AxleTyre":
         magic = [v is not None for v in (self.B, self.C, self.D_n, self.E)]
         stiffness = self.cornering_stiffness_n_per_rad is not None
         if not (all(magic) and not stiffness) and not (stiffness and not any(magic)):
@@ -221,7 +219,7 @@ class VehicleParameters(Record):
     tyres: Tyres
 
     @model_validator(mode="after")
-    def _entries_agree(self) -> VehicleParameters:
+    def _entries_agree(self) -> "VehicleParameters":
         axles = ("cg_to_front_axle_m", "cg_to_rear_axle_m")
         wrong = [
             f"{', '.join(self._told(e) for e in (*entries.split(), *axles))} contradict one another: {what} is "
@@ -306,7 +304,7 @@ class VehicleParameters(Record):
         b, c, d, _ = self.magic_formula(front, friction)
         return b * c * d
 
-    def with_stiffness(self, front: float, rear: float) -> VehicleParameters:
+    def with_stiffness(self, front: float, rear: float) -> "VehicleParameters":
         """Return the vehicle with the cornering stiffness of its axles multiplied; peak forces stay."""
 
         def tyre(of: AxleTyre, factor: float) -> AxleTyre:

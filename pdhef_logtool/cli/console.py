@@ -1,7 +1,5 @@
 """Output to the user: results on stdout, messages on stderr."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -44,7 +42,7 @@ _SHOWN = {ord(private): chr(sign) for sign, private in _PROTECTED.items()}
 _MOST_SIGNS = 5000
 
 
-def stdout() -> Console:
+def stdout() -> "Console":
     """Return a console of stdout without markup."""
     from rich.console import Console
 
@@ -66,7 +64,7 @@ def protected(value: object) -> str:
     return str(value).translate(_PROTECTED)
 
 
-def marked_up(markup: str) -> Text:
+def marked_up(markup: str) -> "Text":
     """Return a text in the markup of Rich."""
     from rich.text import Text
 
@@ -75,7 +73,7 @@ def marked_up(markup: str) -> Text:
     return text
 
 
-def table(*heads: str, rows: Iterable[Iterable[Any]] = (), title: str = "") -> Table:
+def table(*heads: str, rows: Iterable[Iterable[Any]] = (), title: str = "") -> "Table":
     """Return a table of rows, with rules below its title if it has one.
 
     Signs before a head, which is in the markup of Rich: ``>`` for a column of numbers, ``<`` to wrap texts instead of
@@ -102,7 +100,7 @@ def table(*heads: str, rows: Iterable[Iterable[Any]] = (), title: str = "") -> T
     return made
 
 
-def named_lines(texts: Iterable[tuple[str | Text, str | Text]]) -> Table:
+def named_lines(texts: "Iterable[tuple[str | Text, str | Text]]") -> "Table":
     """Return a line per text, after its name."""
     from rich.table import Table
 
@@ -153,7 +151,7 @@ def print_json(document: Any) -> None:
     print(text if text.replace("\n", "").isprintable() else "".join(signs))  # noqa: T201
 
 
-def show(result: _Shown, output: Callable[[_Shown, Console], None] | str, **fields: Any) -> None:
+def show(result: _Shown, output: "Callable[[_Shown, Console], None] | str", **fields: Any) -> None:
     """Print a result as a JSON document, or by a function or a template; it is the template's field ``r``."""
     if as_json:
         print_json(result if isinstance(result, Mapping) else result.to_dict())
@@ -165,7 +163,7 @@ def show(result: _Shown, output: Callable[[_Shown, Console], None] | str, **fiel
         output(all_printable(result), stdout())
 
 
-def finish(result: _Shown, output: Callable[[_Shown, Console], None] | str, **fields: Any) -> NoReturn:
+def finish(result: _Shown, output: "Callable[[_Shown, Console], None] | str", **fields: Any) -> NoReturn:
     """Print a result as :func:`show` does, and exit with its exit code or 0."""
     show(result, output, **fields)
     raise typer.Exit(getattr(result, "exit_code", EXIT_OK))

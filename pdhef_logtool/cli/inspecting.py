@@ -1,7 +1,5 @@
 """``pdhef inspect`` and ``map``: the contents of a log and their mapping to signals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +26,7 @@ def inspect(
     log: str,
     topic: str | None = None,
     *,
-    config: RunConfig,
+    config: "RunConfig",
     write_mapping: Path | None = None,
     report: Path | None = None,
     fields: bool = False,
@@ -50,7 +48,7 @@ def inspect(
         topic_fields = fields_of_log(_place(log, config), topic, config.read_options)
         console.finish(topic_fields, "fields")
 
-    def write_files(inspection: Inspection, open_log: DriveLog) -> None:
+    def write_files(inspection: "Inspection", open_log: "DriveLog") -> None:
         if write_mapping is not None:
             write_mapping_file(inspection, write_mapping)
             console.say(f"mapping written to {write_mapping}")
@@ -64,7 +62,7 @@ def inspect(
     console.finish(inspection, render_inspection)
 
 
-def render_inspection(inspection: Inspection, out: Console) -> None:
+def render_inspection(inspection: "Inspection", out: "Console") -> None:
     """Print an inspection: its tables, then its findings."""
     from rich.table import Table
     from rich.text import Text
@@ -90,7 +88,7 @@ def _short(field: str) -> str:
 
 
 @options.command()
-def map_(log: str, *, config: RunConfig, output: Path = Path("mapping.toml")) -> None:
+def map_(log: str, *, config: "RunConfig", output: Path = Path("mapping.toml")) -> None:
     """Build a mapping file interactively.
 
     Without a terminal, the file contains the recognised signals, and all candidates as comments.
@@ -107,14 +105,14 @@ def map_(log: str, *, config: RunConfig, output: Path = Path("mapping.toml")) ->
     console.say(f"mapping written to {output}")
 
 
-def _place(log: str, config: RunConfig) -> LogPlace:
+def _place(log: str, config: "RunConfig") -> "LogPlace":
     """Return the place of the log of an argument."""
     from pdhef_logtool.logs.discovery import one_place
 
     return one_place(log, private_redirects=config.allow_private_redirects)
 
 
-def _inspect(log: str, config: RunConfig, **given: Any) -> Inspection:
+def _inspect(log: str, config: "RunConfig", **given: Any) -> "Inspection":
     """Inspect the log of an argument as configured."""
     from pdhef_logtool.runs.inspection.report import inspect_log
 

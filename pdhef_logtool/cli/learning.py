@@ -1,7 +1,5 @@
 """``pdhef learn``, ``extract``, ``train``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +10,7 @@ if TYPE_CHECKING:
 
 
 @options.command()
-def learn(logs: list[str], *, output: Path, config: RunConfig, split: str | None = None) -> None:
+def learn(logs: list[str], *, output: Path, config: "RunConfig", split: str | None = None) -> None:
     """Learn a car from its drives: parameters for later drives and, with ground truth, a residual."""
     from pdhef_logtool.learning.drives import LearnSettings
     from pdhef_logtool.learning.learn import learn as learn_car
@@ -28,7 +26,7 @@ def extract(
     logs: list[str],
     *,
     output: Path,
-    config: RunConfig,
+    config: "RunConfig",
     split: str | None = None,
     model: str = "physics",
     where: str | None = None,

@@ -1,7 +1,5 @@
 """Commands from functions: ``commands.toml`` describes their parameters; shared options become the configuration."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable
 from functools import cache, wraps
@@ -104,7 +102,7 @@ def _described(parameter: Parameter, text: dict[str, str]) -> Parameter:
     return parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=annotation)
 
 
-def run_config(options: dict[str, Any]) -> RunConfig:
+def run_config(options: dict[str, Any]) -> "RunConfig":
     """Return the configuration from the shared options of a command line (None = not set).
 
     Raises

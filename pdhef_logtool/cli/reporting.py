@@ -1,7 +1,5 @@
 """``pdhef report``: the pages of a finished run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -41,7 +39,7 @@ def report(
     raise typer.Exit(result.exit_code)
 
 
-def open_page(result: WrittenPages) -> None:
+def open_page(result: "WrittenPages") -> None:
     """Open the page of the run, or of its only log, in the browser; without a browser, print the path."""
     import webbrowser
 

@@ -1,7 +1,5 @@
 """``pdhef run``, ``metrics``, ``view`` and ``plan init``: estimate, score recorded estimates, show recordings."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading
@@ -34,7 +32,7 @@ def run(
     logs: list[str],
     *,
     output: str,
-    config: RunConfig,
+    config: "RunConfig",
     junit: Path | None = None,
     report: bool = True,
     jobs: int = 1,
@@ -60,7 +58,7 @@ def run(
 def metrics(
     log: str,
     *,
-    config: RunConfig,
+    config: "RunConfig",
     estimate: list[str] | None = None,
     truth: list[str] | None = None,
     name: str | None = None,
@@ -102,7 +100,7 @@ def view(output: str, *, log: list[str] | None = None, web: bool = False, catalo
     raise typer.Exit(open_viewer(recordings, web=web))
 
 
-def _finish(result: RunResult) -> NoReturn:
+def _finish(result: "RunResult") -> NoReturn:
     """Print and exit; failed requirements, and failures that the exit code does not show, are printed on stderr."""
     from pdhef_logtool.cli.run_tables import render_fleet, render_run
 

@@ -1,7 +1,5 @@
 """``pdhef simulate`` (drives of truthsim), ``convert`` (any log to MCAP) and ``compile`` (code of runs in advance)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -109,7 +107,7 @@ def _list_manoeuvres() -> None:
 
 
 @options.command()
-def convert(log: str, *, config: RunConfig, output: Path = Path("drive.mcap")) -> None:
+def convert(log: str, *, config: "RunConfig", output: Path = Path("drive.mcap")) -> None:
     """Convert a log of any format to MCAP."""
     from pdhef_logtool.logs.conversion import convert_log
     from pdhef_logtool.logs.discovery import one_place

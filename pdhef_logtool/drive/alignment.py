@@ -15,8 +15,6 @@ Rules
 * A channel is read by its stamps if all of its samples arrive too late to wait for.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -134,7 +132,7 @@ class AlignmentPlan:
         names = {c.target for c in self.channels}
         return frozenset(names | ({"speed_m_s"} if self.speed_from != "none" else set()))
 
-    def without(self, refused: Mapping[str, str]) -> AlignmentPlan:
+    def without(self, refused: Mapping[str, str]) -> "AlignmentPlan":
         """Return the plan without the channels in ``refused`` (name: reason). The grid keeps its stamps."""
         channels = tuple(c for c in self.channels if c.name not in refused)
         unused = {**dict(self.unused), **{c.name: refused[c.name] for c in self.channels if c.name in refused}}

@@ -7,8 +7,6 @@ to compare.
 Signs and units are decided by a posterior (:mod:`~.relation_checks`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -103,7 +101,7 @@ class CheckedDrive:
         return None if name is None or name in self.wrong else self.columns[name]
 
     @cached_property
-    def errors(self) -> SensorErrors:
+    def errors(self) -> "SensorErrors":
         """The errors of the sensors by ground truth; unknown without it, or if it is wrong."""
         return sensor_errors(self.columns) if self.measured.derived and not self.wrong & _TRUTH else SensorErrors()
 

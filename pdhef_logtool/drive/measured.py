@@ -1,7 +1,5 @@
 """Signals and ground truth of a drive on one grid, and the kinematic relations between them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -76,7 +74,7 @@ class Measured:
         return ("truth.lon_deg", "truth.lat_deg") if is_place else ("truth.x_m", "truth.y_m")
 
     @cached_property
-    def sensors(self) -> Measured:
+    def sensors(self) -> "Measured":
         """The columns and relations of the signals alone."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
         if len(columns) == len(self.columns) and not self.truth:
@@ -85,7 +83,7 @@ class Measured:
         relations = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
         return replace(self, truth={}, derived=None, columns=columns, speed_name=speed, relations=relations)
 
-    def without(self, names: Iterable[str]) -> Measured:
+    def without(self, names: Iterable[str]) -> "Measured":
         """Return the measurements without these columns, which have no relations."""
         gone = set(names)
         columns = {n: c for n, c in self.columns.items() if n not in gone}

@@ -5,8 +5,6 @@ car's axes, the level accelerations are (v̇, v r). A complex regression gives t
 the sensor's axes to these; its correlation, gain and error decide whether the mounting is accepted.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator
@@ -227,7 +225,7 @@ def find_mounting(measured: Measured, triads: tuple[Triad, Triad] | None, mappin
     return replace(mounting, confident=mounting.confident and is_sure)
 
 
-def _is_shown(turn: _Turn, measured: Measured) -> bool:
+def _is_shown(turn: "_Turn", measured: Measured) -> bool:
     """Return whether another measurement of the yaw rate, the speed or the steering confirms a rotation.
 
     Steering that counts to the left confirms gravity, and is no evidence against it: its sign is no standard.

@@ -1,7 +1,5 @@
 """Relations between signals by rigid-body kinematics and rolling wheels: their sides, and ``relations.toml``."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -88,7 +86,7 @@ class _Pace:
     gentle: BoolArray
 
     @classmethod
-    def of(cls, columns: Mapping[str, FloatArray], name: str) -> _Pace:
+    def of(cls, columns: Mapping[str, FloatArray], name: str) -> "_Pace":
         """Return the pace by a column."""
         speed, yaw = columns[name], columns.get("yaw_rate_rad_s")
         moving = _moving(columns, speed)

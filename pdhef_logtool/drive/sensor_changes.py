@@ -21,8 +21,6 @@ The decision is made ``DECIDED_CELLS`` after the change, from samples up to then
 causal estimators stay causal.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -113,7 +111,7 @@ class Cells(NamedTuple):
     speed: FloatArray
     ax: FloatArray
 
-    def changed(self, column: str, kind: str, by: float) -> Cells:
+    def changed(self, column: str, kind: str, by: float) -> "Cells":
         """Return the cells with a change of the bias or gain of one column."""
         values = getattr(self, column)
         return self._replace(**{column: values + by if kind == "jump" else values * (1.0 + by)})

@@ -5,8 +5,6 @@ certain; a mapping file is only checked, and its corrections are proposals, each
 order of their application does not matter.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterator, Sequence
 from collections.abc import Mapping as Mapped
@@ -79,7 +77,7 @@ class Survey:
         refused = {n: why for n, why in by_everything.items() if n.startswith("truth.")}
         return refused if is_causal else refused | checks.misread_channels(self.sensor_checks, waived)
 
-    def with_truth(self, names: Collection[str]) -> Survey:
+    def with_truth(self, names: Collection[str]) -> "Survey":
         """Return the survey with the ground truth of some channels only, for its plan, track and latency."""
         truth = {n: c for n, c in self.measured.truth.items() if n in names}
         derived = _derived(truth, self.measured.vehicle or default_vehicle())
@@ -156,7 +154,7 @@ def _derived(truth: Mapped[str, Channel], vehicle: VehicleParameters) -> TruthTr
     return None if track.plan is None else track
 
 
-def _certain_proposals(survey: Survey, *, is_mounting_blind: bool) -> tuple[list[Proposal], str]:
+def _certain_proposals(survey: Survey, *, is_mounting_blind: bool) -> "tuple[list[Proposal], str]":
     """Return the next correction of a recognised mapping, and its kind: ``mounting``, ``sign`` or ``unit``.
 
     Documented units, signs and axes are corrected without ground truth.
@@ -171,7 +169,7 @@ def _certain_proposals(survey: Survey, *, is_mounting_blind: bool) -> tuple[list
     return _rescaled(mapping, explained_factors(documented, most=1)), "unit"
 
 
-def _corrected(proposal: Proposal) -> Check:
+def _corrected(proposal: "Proposal") -> Check:
     entries = entries_of(proposal.source, "field", "scale")
     return result("SIGNAL.corrected", "failed", proposal.subject, evidence=proposal.evidence, entries=entries)
 

@@ -12,8 +12,6 @@ Derivations (``TruthTrack.derivation`` contains the ones in use):
   slope at the centre; NaN where the window crosses a gap or the end of the data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -281,7 +279,7 @@ def _find_origin(survey: Mapping[str, Channel]) -> tuple[float, float, float] | 
     return x, y, z
 
 
-def _find_attitude(source: _Source) -> Attitude:
+def _find_attitude(source: "_Source") -> Attitude:
     """Choose frame and body axes such that z points up and the car moves along x; ENU and FLU when in doubt."""
     velocity = source.velocity
     frames: tuple[Literal["ENU", "ECEF", "NED"], ...]

@@ -21,8 +21,6 @@ filter only if drives of the car have shown its benefit, because an additional s
 without identified parts has F1 alone. The output is the mixture of all, its covariance with their differences.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -275,6 +273,6 @@ class AdaptivePhysics:
         return replace(track, name=self.name, **columns)
 
 
-def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
+def build(name: str, car: "Car", options: "Options") -> AdaptivePhysics:
     """Return ``physics`` of a car."""
     return AdaptivePhysics(of_car(car, use_speed=options.use_speed), name=name)

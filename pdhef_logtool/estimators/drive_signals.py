@@ -5,8 +5,6 @@ differ in steering ratio and offset, biases, and gain of the gyro. Without a fri
 that the log or earlier drives determine have at least the friction that the lateral acceleration until then needed.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -32,7 +30,7 @@ class DriveSignals:
     noise: FilterNoise = AS_STATED
 
     @classmethod
-    def of(cls, signals: Signals, car: Car) -> DriveSignals:
+    def of(cls, signals: Signals, car: Car) -> "DriveSignals":
         """Return the read-only tables of signals [N] that were read with the vehicle file of a car."""
         posterior = car.self_calibrated
         noise = AS_STATED if posterior is None else FilterNoise(r_std=dict(posterior.r_std))

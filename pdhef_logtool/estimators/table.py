@@ -40,8 +40,6 @@ receives read-only signals, and its errors are contained (:mod:`~.plug_ins`). Ex
     SPEC = Spec("half-slip", "half of the sideslip without tyre slip", build, NEEDS, 0x123456)
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Collection, Sequence
@@ -91,7 +89,7 @@ class Spec:
 
     name: str
     text: str
-    build: str | Callable[[str, Car, Options], Estimator]
+    build: "str | Callable[[str, Car, Options], Estimator]"
     needs: frozenset[str]
     colour: int
     causal: bool = True
@@ -104,7 +102,7 @@ class Spec:
         """Return the required signals that a log does not provide."""
         return sorted(self.needs - available | (self.one_of if self.one_of.isdisjoint(available) else frozenset()))
 
-    def missing(self, car: Car) -> str:
+    def missing(self, car: "Car") -> str:
         """Return why it cannot run on a car, empty if it can."""
         if self.name == OPEN_LOOP and car.self_calibrated is None:
             return "the log has not calibrated its car"
@@ -125,7 +123,7 @@ class Spec:
             return "the network has no such baseline (docs/estimators.md)"
         return ""
 
-    def make(self, car: Car, options: Options) -> Estimator:
+    def make(self, car: "Car", options: Options) -> "Estimator":
         """Build the estimator; compiled code is only imported here.
 
         Raises
@@ -264,7 +262,7 @@ def check_names(names: Sequence[str]) -> None:
         raise UsageError(expected=expected, got=", ".join(wrong) or "none", where="--estimators")
 
 
-def all_names(car: Car, group: str = ALL_ESTIMATORS) -> tuple[str, ...]:
+def all_names(car: "Car", group: str = ALL_ESTIMATORS) -> tuple[str, ...]:
     """Return the estimators of a group: those that find all required parts in the car.
 
     Baselines and physics first, then estimators with a network.
@@ -273,18 +271,18 @@ def all_names(car: Car, group: str = ALL_ESTIMATORS) -> tuple[str, ...]:
     return tuple(s.name for s in sorted(suited, key=lambda s: bool(s.network)))
 
 
-def make_estimator(name: str, car: Car, options: Options | None = None) -> Estimator:
+def make_estimator(name: str, car: "Car", options: Options | None = None) -> "Estimator":
     """Build an estimator by its name; raises UsageError if the car lacks a required part."""
     return spec_of(name).make(car, options or Options())
 
 
 def runnable(
     names: Sequence[str],
-    car: Car,
+    car: "Car",
     available: frozenset[str],
     options: Options | None = None,
     refused: Collection[str] = (),
-) -> tuple[list[Estimator], list[Skipped]]:
+) -> "tuple[list[Estimator], list[Skipped]]":
     """Build the estimators that car and log allow; return these, and the skipped ones with their reasons.
 
     Parameters

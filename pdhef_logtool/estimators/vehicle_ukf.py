@@ -16,8 +16,6 @@ Without steering for longer than it may be held, its error is a state that walks
 and yaw rate then determine v_y. ``phy-ukf`` waits for the steering instead.
 """
 
-from __future__ import annotations
-
 import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -722,7 +720,7 @@ def nominal_filter(vehicle: VehicleParameters, *, use_speed: bool = True, name: 
     return VehicleUkf(vehicle, "nominal", PHY_UKF_Q_STD, use_speed=use_speed, name=name)
 
 
-def build_nominal(name: str, car: Car, options: Options) -> VehicleUkf:
+def build_nominal(name: str, car: "Car", options: "Options") -> VehicleUkf:
     """Return the frozen ``phy-ukf`` of a car, or its variant ``tuned`` with the car's noise and the roll correction."""
     nominal = nominal_filter(car.vehicle, use_speed=options.use_speed, name=name)
     if name != TUNED:
@@ -747,7 +745,7 @@ def physics_filter(
     )
 
 
-def of_car(car: Car, *, use_speed: bool = True) -> VehicleUkf:
+def of_car(car: "Car", *, use_speed: bool = True) -> VehicleUkf:
     """Return ``physics`` of a car, with its identified parts and noise where the car has them.
 
     A car without identified parts is a static single track with the sensors' noise. If no drive with ground

@@ -1,7 +1,5 @@
 """The validation plan: requirements on the error of an estimate, read strictly from plan.toml."""
 
-from __future__ import annotations
-
 import math
 import re
 import textwrap
@@ -56,7 +54,7 @@ class ExposureNeed(Record):
     minutes: NonNegative = 0.0
 
     @model_validator(mode="after")
-    def _agrees(self) -> ExposureNeed:
+    def _agrees(self) -> "ExposureNeed":
         for bounds, step in ((self.speed_m_s, 5.0), (self.ay_m_s2, 1.0), (self.friction, None)):
             off_grid = bounds is not None and step is not None and any(b % step for b in bounds)
             if bounds is not None and (off_grid or not 0.0 <= bounds[0] < bounds[1]):

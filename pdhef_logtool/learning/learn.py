@@ -4,8 +4,6 @@ The posterior of each drive informs later drives (:mod:`pdhef_logtool.model.prio
 give a residual, which is chosen on held-out driving (:mod:`~.learn`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -140,7 +138,7 @@ def _learnt(
 
 
 def _without_truth(
-    records: Sequence[DriveRecord], drives: Sequence[OpenedDrive], car: Car
+    records: Sequence[DriveRecord], drives: "Sequence[OpenedDrive]", car: Car
 ) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
     """Return the records of drives without ground truth, their model, and figures."""
     fits = [None if d.driving is None else fit_car(d.driving, car.vehicle) for d in drives]

@@ -4,8 +4,6 @@ A signal's bits are gathered from the few bytes that contain it, for all frames 
 b is bit b mod 8 of byte b div 8. A message is identified by bus and identifier, in J1939 by its parameter group (PGN).
 """
 
-from __future__ import annotations
-
 import re
 import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -74,14 +72,14 @@ class Frames:
     data: NDArray[np.uint8]
 
     @classmethod
-    def of_table(cls, table: Table) -> Frames:
+    def of_table(cls, table: "Table") -> "Frames":
         """Return the frames of a table that :meth:`table` made."""
         rows = slice(0, len(table.stamps_ns))
         names = [f.path for f in table.fields if not f.path.startswith("data[")]
         parts = {name: np.asarray(table.load(name, rows)).astype(np.int64) for name in names}
         return cls(table.stamps_ns, parts, np.nan_to_num(table.load("data", rows)).astype(np.uint8))
 
-    def table(self, name: str) -> Table:
+    def table(self, name: str) -> "Table":
         """Return the frames as they are, with NaN behind the length."""
         from pdhef_logtool.logs.table_log import Table
 
@@ -122,12 +120,12 @@ class Decoder:
     """
 
     frames: Frames
-    databases: Sequence[tuple[str, Database]]
+    databases: "Sequence[tuple[str, Database]]"
     names: Collection[str]
     lost: list[Loss]
     column_losses: dict[tuple[str, str], list[Loss]]
 
-    def tables(self) -> Iterator[Table]:
+    def tables(self) -> "Iterator[Table]":
         """Yield a table for each message, bus and source address of the frames, with signals and units.
 
         If several databases define an identifier, the database with the most of its messages on the bus is used. The
@@ -167,7 +165,7 @@ class Decoder:
             what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > _SHOWN)}"
             self.lost.append(Loss("unknown-frame", what, names, count=count, severity="note"))
 
-    def _messages(self, message: Message, ending: str, rows: IntArray, *, is_j1939: bool) -> Iterator[Table]:
+    def _messages(self, message: "Message", ending: str, rows: IntArray, *, is_j1939: bool) -> "Iterator[Table]":
         """Yield the tables of a message from one sender, without the signals that no frame contains."""
         from pdhef_logtool.logs.table_log import Table
 
@@ -193,7 +191,7 @@ class Decoder:
                 yield Table(name, self.frames.stamps_ns[its], fields, load, f"can/msg/{message.name}")
 
     def _loader(
-        self, name: str, signals: Mapping[str, Signal], data: NDArray[np.uint8], lengths: IntArray, *, is_j1939: bool
+        self, name: str, signals: "Mapping[str, Signal]", data: NDArray[np.uint8], lengths: IntArray, *, is_j1939: bool
     ) -> Callable[[str, slice], FloatArray]:
         """Return the loader of columns. A column is decoded once, for all frames; missing values are NaN."""
         columns: dict[str, FloatArray] = {}
@@ -220,7 +218,7 @@ class Decoder:
         return load
 
 
-def has_j1939_identifier(message: Message) -> bool:
+def has_j1939_identifier(message: "Message") -> bool:
     """Return whether the DBC states J1939 for a message, by its frame format or the null address in its identifier."""
     is_null_address = message.frame_id & _BYTE == _CAN["null_address"]
     return message.is_extended_frame and (message.protocol == "j1939" or is_null_address)
@@ -237,7 +235,7 @@ def _is_broadcast(identifier: int) -> bool:
     return identifier >> 2 * BYTE_BITS & _BYTE >= int(_CAN["broadcast"])
 
 
-def described_sources(database: Database, sources: Iterable[Source]) -> dict[Source, Message]:
+def described_sources(database: "Database", sources: Iterable[Source]) -> "dict[Source, Message]":
     """Return the messages of a database by source.
 
     A 29-bit identifier that is not in the database is compared by PGN: with J1939 messages, and with messages with a
@@ -255,7 +253,7 @@ def described_sources(database: Database, sources: Iterable[Source]) -> dict[Sou
     return {source: message for source, message in matches.items() if message is not None}
 
 
-def _bytes_of(signal: Signal) -> tuple[int, int, int]:
+def _bytes_of(signal: "Signal") -> tuple[int, int, int]:
     """Return first and last byte of a signal, and the number of unused low bits in its least significant byte.
 
     Its start is the least significant bit of a little-endian signal, the most significant one of a big-endian signal.
@@ -269,12 +267,12 @@ def _bytes_of(signal: Signal) -> tuple[int, int, int]:
     return first, last, BYTE_BITS * (last + 1) - end
 
 
-def bytes_of(signal: Signal) -> int:
+def bytes_of(signal: "Signal") -> int:
     """Return how many bytes a frame needs to contain a signal."""
     return _bytes_of(signal)[1] + 1
 
 
-def raw_bits(data: NDArray[np.uint8], signal: Signal) -> NDArray[np.uint64]:
+def raw_bits(data: NDArray[np.uint8], signal: "Signal") -> NDArray[np.uint64]:
     """Gather the unsigned integer of a signal of at most 64 bits from frames uint8 [N, k] that contain it."""
     first, last, skipped = _bytes_of(signal)
     value = np.zeros(data.shape[0], np.uint64)
@@ -296,7 +294,7 @@ def are_sent(data: NDArray[np.uint8], lengths: IntArray, selectors: Selectors) -
     return sent
 
 
-def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = False) -> FloatArray:
+def signal_values(data: NDArray[np.uint8], signal: "Signal", *, is_j1939: bool = False) -> FloatArray:
     """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N].
 
     The result is NaN for raw values that mean "not available" or "error": by their name in the DBC, or by SAE J1939-71
@@ -322,7 +320,7 @@ def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = F
     return values
 
 
-def leaves_range(values: FloatArray, signal: Signal) -> tuple[NDArray[np.bool_], bool]:
+def leaves_range(values: FloatArray, signal: "Signal") -> tuple[NDArray[np.bool_], bool]:
     """Return which values [N] are outside of the range in the DBC, and whether this range is plausible.
 
     A range is implausible if many distinct values are outside.
@@ -335,13 +333,13 @@ def leaves_range(values: FloatArray, signal: Signal) -> tuple[NDArray[np.bool_],
     return outside, len(np.unique(values[outside])) <= allowed
 
 
-def fit_of(database: Database, sent: frozenset[int]) -> float:
+def fit_of(database: "Database", sent: frozenset[int]) -> float:
     """Return the number of identifiers of a bus that a database defines, times their share of its definitions."""
     defined = sum(m.frame_id in sent for m in database.messages)
     return defined**2 / max(1, len(database.messages))
 
 
-def signal_groups(message: Message) -> Iterator[tuple[str, list[Signal], Selectors]]:
+def signal_groups(message: "Message") -> "Iterator[tuple[str, list[Signal], Selectors]]":
     """Yield groups of signals that are sent together: the suffix of their topic, the signals, their multiplexers."""
     by_name = {s.name: s for s in message.signals}
     groups: dict[Selectors, list[Signal]] = {}
@@ -352,7 +350,7 @@ def signal_groups(message: Message) -> Iterator[tuple[str, list[Signal], Selecto
         yield "".join(f"_{selector.name}_{values[0]}" for selector, values in selectors), signals, selectors
 
 
-def selectors_of(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tuple[Signal, tuple[int, ...]]]:
+def selectors_of(signal: "Signal", by_name: "Mapping[str, Signal]") -> "Iterator[tuple[Signal, tuple[int, ...]]]":
     """Yield the multiplexers above a signal and the values under which it is sent."""
     seen: set[str] = set()
     while signal.multiplexer_ids and signal.name not in seen:
@@ -364,7 +362,7 @@ def selectors_of(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tupl
         signal = selector
 
 
-def load_dbc(path: Path) -> Database:
+def load_dbc(path: Path) -> "Database":
     """Read a DBC file; raises MappingFileError for any other file."""
     try:
         state = path.stat()
@@ -381,7 +379,7 @@ def _no_dbc(path: Path, got: str) -> MappingFileError:
 
 
 @lru_cache(maxsize=16)
-def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
+def _load_cached(path: Path, _modified_ns: int, _size: int) -> "Database":
     import cantools
     from cantools.database.can import Database
 

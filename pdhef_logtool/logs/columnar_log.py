@@ -1,7 +1,5 @@
 """A drive log over one or several containers: columns of the fields asked for, in windows of log time."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections import Counter
@@ -104,7 +102,7 @@ class ColumnarLog(DriveLog):
         return (*self._opened_lost, *self.recording_span.losses, *of_containers, *of_channels)
 
     @property
-    def messages(self) -> ColumnarLog | None:
+    def messages(self) -> "ColumnarLog | None":
         """The log itself."""
         return self
 
@@ -222,7 +220,7 @@ class ColumnarLog(DriveLog):
                 messages += [decode(payload) for payload in islice(payloads, most - len(messages))]
         return [message for message in messages if message is not None]
 
-    def _payloads(self, channel: _Channel) -> Iterator[bytes]:
+    def _payloads(self, channel: "_Channel") -> Iterator[bytes]:
         """Yield the messages of a channel, undecoded."""
         id_ = channel.record.id
         for span in self.containers[channel.c].spans:
@@ -301,7 +299,7 @@ class ColumnarLog(DriveLog):
             self._kept_bytes += small.nbytes
         return block
 
-    def _schema(self, channel: _Channel) -> message_schema.MessageSchema | message_schema.SchemaError:
+    def _schema(self, channel: "_Channel") -> message_schema.MessageSchema | message_schema.SchemaError:
         """Return the schema of a channel, or the reason why it is unknown. It is parsed once, within the log's time.
 
         All schemas together get the part of the time limit that does not depend on the size of the log.
@@ -325,7 +323,7 @@ class ColumnarLog(DriveLog):
             self._schemas_s += time.process_time() - started
         return channel.schema
 
-    def _plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:
+    def _plan(self, topic: str, paths: tuple[str, ...]) -> "_Plan":
         if (topic, paths) in self._plans:
             return self._plans[topic, paths]
         decoders: dict[_Channel, ChannelDecoder] = {}
@@ -361,7 +359,7 @@ class ColumnarLog(DriveLog):
                 yield span
 
     def _read_span(
-        self, plans: Mapping[str, _Plan], c: int, span: Span, start_ns: int | None, end_ns: int | None
+        self, plans: "Mapping[str, _Plan]", c: int, span: Span, start_ns: int | None, end_ns: int | None
     ) -> Iterator[Columns]:
         """Yield the columns of the requested topics in a span, by channel."""
         channels = self.containers[c].channels
@@ -384,7 +382,7 @@ class ColumnarLog(DriveLog):
             if columns is not None:
                 yield columns
 
-    def _decode(self, plan: _Plan, channel: _Channel, span: Span, block: Block, rows: IntArray) -> Columns | None:
+    def _decode(self, plan: "_Plan", channel: "_Channel", span: Span, block: Block, rows: IntArray) -> Columns | None:
         """Decode some messages of a channel. Any error of a decoder is a loss of these messages."""
         decoder, id_, topic = plan.decoders.get(channel), channel.record.id, channel.record.topic
         try:

@@ -1,7 +1,5 @@
 """Decompression of chunks, messages and files, up to the declared size and the resource limits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -122,7 +120,7 @@ def _zstd(stored: _Bytes, size: int) -> bytes:
         raise SpanDamageError(str(error)) from error
 
 
-def _zstd_decompressor() -> zstandard.ZstdDecompressor:
+def _zstd_decompressor() -> "zstandard.ZstdDecompressor":
     """Return the decompressor of this thread: it is slow to make and not thread-safe."""
     import zstandard
 

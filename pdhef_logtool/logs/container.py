@@ -1,7 +1,5 @@
 """Common interface of container formats: channels, spans of messages, and blocks of undecoded messages."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -72,7 +70,7 @@ class Span:
     times: Mapping[int, IntArray] | None = None
 
     @classmethod
-    def of(cls, channels: Iterable[tuple[int, IntArray]]) -> Span:
+    def of(cls, channels: Iterable[tuple[int, IntArray]]) -> "Span":
         """Return the span of messages with these channels and log times [N] in file order; a channel may repeat."""
         times: dict[int, IntArray] = {}
         for id_, its in channels:
@@ -112,17 +110,17 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
-    def take(self, rows: slice | IntArray | BoolArray) -> Block:
+    def take(self, rows: slice | IntArray | BoolArray) -> "Block":
         """Return some of the messages."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
-    def split(self, before_ns: float) -> tuple[Block, Block]:
+    def split(self, before_ns: float) -> "tuple[Block, Block]":
         """Return the messages before a time and the others; they ascend in log time."""
         n = int(np.searchsorted(self.log_time_ns, before_ns))
         return self.take(slice(n)), self.take(slice(n, None))
 
     @staticmethod
-    def merged(parts: Sequence[Block], head: int = 0) -> Block:
+    def merged(parts: "Sequence[Block]", head: int = 0) -> "Block":
         """Return messages in order of log time, of equal times in the given order, one behind the other in memory.
 
         ``head``: bytes that are left free before each message.
@@ -140,7 +138,7 @@ class Block:
             first += len(part)
         return Block(buffer.data, channel, log_time, publish_time, sequence, offset, length)
 
-    def without_large(self, most: int) -> Block:
+    def without_large(self, most: int) -> "Block":
         """Return the block without payloads above ``most`` bytes."""
         large = self.length > most
         if not large.any():

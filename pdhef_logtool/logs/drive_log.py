@@ -5,8 +5,6 @@ listed in :mod:`~pdhef_logtool.logs.formats`. Features of some logs only (copies
 capabilities: properties that are None by default.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -124,7 +122,7 @@ class DriveLog(ABC):
         return self.recording_span.end_ns
 
     @property
-    def messages(self) -> ColumnarLog | None:
+    def messages(self) -> "ColumnarLog | None":
         """The log as messages with bytes that can be copied to another file; None: it has columns only."""
         return None
 

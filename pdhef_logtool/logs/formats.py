@@ -12,8 +12,6 @@ A package adds formats by entry points of the group ``pdhef.log_formats``; each 
     FORMAT = LogFormat("a NumPy archive", "npz_log:open_npz", (".npz",), b"PK", needs_suffix=True)
 """
 
-from __future__ import annotations
-
 import pkgutil
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -71,7 +69,7 @@ class LogFormat:
             return head.startswith(self.magic) and name.lower().endswith((*self.suffixes, *self.named))
         return head.startswith(self.magic)
 
-    def open(self, file: LogFile) -> DriveLog | Container:
+    def open(self, file: LogFile) -> "DriveLog | Container":
         """Open a file."""
         if self.libraries is not None:
             from pdhef_logtool.logs.reader_process import open_tables

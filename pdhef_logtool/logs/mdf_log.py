@@ -4,8 +4,6 @@ A group of bus logging becomes a topic ``can`` of raw frames. ``asammdf`` opens 
 :mod:`~pdhef_logtool.logs.mdf_conversions` converts them.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import logging
 import re
@@ -212,7 +210,7 @@ class _Group:
     number : of the group among ``groups``, which are all of the file.
     """
 
-    def __init__(self, file: TableFile, source: Any, number: int, groups: Sequence[_Group]) -> None:
+    def __init__(self, file: TableFile, source: Any, number: int, groups: "Sequence[_Group]") -> None:
         self._file, self._source, self._number, self._groups = file, source, number, groups
         self._version, self._group = 4 if str(source.version) >= "4" else 3, source.groups[number]
         self._block, self._channels = self._group.channel_group, self._group.channels

@@ -1,7 +1,5 @@
 """Message types as trees of nodes, for all schema languages, and dotted paths resolved against them."""
 
-from __future__ import annotations
-
 import base64
 import difflib
 import functools
@@ -66,7 +64,7 @@ class Scalar:
 class Struct:
     """Named members in the order of the wire."""
 
-    members: Mapping[str, Node]
+    members: "Mapping[str, Node]"
 
     @property
     def time(self) -> tuple[str, str] | None:
@@ -87,7 +85,7 @@ class Struct:
 class Array:
     """Elements of one type; ``length`` is None for a sequence."""
 
-    item: Node
+    item: "Node"
     length: int | None
 
 
@@ -124,7 +122,7 @@ class MessageSchema:
         return tuple(replace(f, unit=_stated_unit(self.units, f.path)) for f in leaves(self.root))
 
     @functools.cached_property
-    def store(self) -> Typestore:
+    def store(self) -> "Typestore":
         """The decoder of single ROS messages, which takes long to generate; it decodes none if its code is invalid."""
         from rosbags.typesys import Stores, get_typestore
 

@@ -4,8 +4,6 @@ A hundred bytes of a third-party file can declare gigabytes, and a short schema 
 far above the files of recorders and far below a machine's capacity; one factor raises all (``--set budget=FACTOR``).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,7 +59,7 @@ class ResourceLimits:
     seconds: float = 5.0
     seconds_per_mib: float = 20.0
 
-    def times(self, factor: float) -> ResourceLimits:
+    def times(self, factor: float) -> "ResourceLimits":
         """Return limits that are higher by a factor."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return ResourceLimits(**{name: type(value)(value * factor) for name, value in values.items()})

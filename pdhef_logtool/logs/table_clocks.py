@@ -4,8 +4,6 @@ Evidence, in this order: the unit that the file states; the magnitude, since onl
 other clocks of the file; rates and durations of usual recordings.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import math
 import re
@@ -330,7 +328,7 @@ def _to_utc(stamps: IntArray, has_time: BoolArray) -> IntArray:
 # ---- texts ----
 
 
-def text_clock(texts: Series, dates: Series | None = None) -> Clock:
+def text_clock(texts: "Series", dates: "Series | None" = None) -> Clock:
     """Return the clock of texts [N]: ISO 8601, other dates with a time, or times of day; ``dates``: of their days.
 
     Day and month have one order in the whole column. Numbers above 12 decide it; then the shorter recording; otherwise
@@ -369,7 +367,7 @@ _WORDS = frozenset({"mark", "half", "sign", "fraction"})
 _MONTHS = [names.replace(" ", "|") for names in _CLOCKS["months"]]
 
 
-def _numbered_months(texts: Series) -> Series:
+def _numbered_months(texts: "Series") -> "Series":
     """Return texts [N] in which a named month is a number between day and year, and dates of digits have marks."""
     compact, *named = (CONSTANTS["patterns"][name] for name in ("compact_date", "named_month", "month_first"))
     if texts.drop_nulls().head(1).str.contains(compact).any():

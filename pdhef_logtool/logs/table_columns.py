@@ -1,7 +1,5 @@
 """Shared parts of the table formats: names and units of columns, times, and tables of columns on one clock."""
 
-from __future__ import annotations
-
 import math
 import re
 import unicodedata
@@ -106,7 +104,7 @@ class Sheet:
     """
 
     name: str
-    columns: Mapping[str, NDArray[Any] | Series]
+    columns: "Mapping[str, NDArray[Any] | Series]"
     units: Mapping[str, str]
     type_name: str = ""
 
@@ -260,7 +258,7 @@ def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float
     return replace(clock, columns=frozenset(columns))
 
 
-def _numbers(column: NDArray[Any] | Series) -> FloatArray:
+def _numbers(column: "NDArray[Any] | Series") -> FloatArray:
     if isinstance(column, np.ndarray):
         return column.astype(np.float64)
     return np.full(len(column), np.nan)
@@ -321,7 +319,7 @@ def by_times(name: str, columns: dict[str, Any], units: dict[str, str]) -> Itera
         yield Sheet(f"{name}_{number}", {t: columns[t][there] for t in titles[begin:end]}, units)
 
 
-def _ascends(column: NDArray[Any] | Series) -> bool:
+def _ascends(column: "NDArray[Any] | Series") -> bool:
     return isinstance(column, np.ndarray) and bool((np.diff(column[np.isfinite(column)]) > 0).all())
 
 
@@ -353,7 +351,7 @@ def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
     return (signal, value, unit) if is_long else None
 
 
-def _rows_by(texts: Series) -> dict[str, IntArray]:
+def _rows_by(texts: "Series") -> dict[str, IntArray]:
     """Return the rows of each text of a column."""
     import polars as pl
 
@@ -375,7 +373,7 @@ def _of_kinds(sheet: Sheet, stamps: IntArray, used: frozenset[str]) -> Iterator[
 
 
 def _of_long_form(
-    sheet: Sheet, stamps: IntArray, signal: Series, value: NDArray[Any], units: Any
+    sheet: Sheet, stamps: IntArray, signal: "Series", value: NDArray[Any], units: Any
 ) -> Iterator[tuple[Sheet, IntArray]]:
     """Yield the signals of a table with a row for each value; signals with equal times are one sheet."""
     rows_of = _rows_by(signal)

@@ -4,8 +4,6 @@ A reader of a table format (CSV, Parquet, MAT, MDF, BLF, ...) is a function ``Ta
 separate process (:mod:`~pdhef_logtool.logs.reader_process`), which has an open file and limits, and no path.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -94,10 +92,10 @@ class Tables:
     """Contents of a file: its kind for reports (``csv``, ``mdf-4``, ...), its tables, and its losses."""
 
     kind: str
-    tables: Sequence[Table]
+    tables: "Sequence[Table]"
     losses: Sequence[Loss] = field(default=())
 
-    def of_group(self, group: str, where: str) -> Tables:
+    def of_group(self, group: str, where: str) -> "Tables":
         """Return the tables of a group; raises LogError if there are none."""
         names = [table.name for table in self.tables]
         its = [

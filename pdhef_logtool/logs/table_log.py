@@ -1,7 +1,5 @@
 """A log of columns without messages, for formats of tables (CSV, MDF, MAT, ...)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -50,7 +48,7 @@ class Table:
         columns: Mapping[str, NDArray[Any]],
         units: Mapping[str, str] | None = None,
         type_name: str = "",
-    ) -> Table:
+    ) -> "Table":
         """Return a table of numbers [N] that are in memory, with the unit of each column where one is known."""
         fields = tuple(FieldInfo(path, "number", unit=(units or {}).get(path, "")) for path in columns)
         return cls(name, stamps_ns, fields, lambda path, rows: columns[path][rows], type_name)
@@ -89,7 +87,7 @@ class TableLog(DriveLog):
         files = file.path.rglob("*") if file.path.is_dir() else (file.path,)
         self.size = sum(path.stat().st_size for path in files)
 
-    def decode_frames(self, databases: Sequence[tuple[str, Database]]) -> None:
+    def decode_frames(self, databases: "Sequence[tuple[str, Database]]") -> None:
         """Add a table for each message of DBC files, given with their names, that raw CAN frames of the log contain."""
         from pdhef_logtool.logs.can_decoding import CAN_TYPE, Decoder, Frames
 

@@ -6,8 +6,6 @@ topic. Recognition examines one view per message (:func:`decoded_frames`). DBC f
 attached to the log.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -82,7 +80,7 @@ def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
     return CanSignalLog(log, views, mapping.can)
 
 
-def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> CanSignalLog | None:
+def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> "CanSignalLog | None":
     """Return a log with a view for each message of its DBC files that occurs in the topics of frames, or None.
 
     If several files define an identifier, the file named like the topic decides, else the one with most identifiers.
@@ -108,13 +106,13 @@ def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> CanSignalLog |
     return CanSignalLog(log, views, settings) if views else None
 
 
-def _identifiers(log: DriveLog, topic: str, paths: _FramePaths) -> frozenset[int]:
+def _identifiers(log: DriveLog, topic: str, paths: "_FramePaths") -> frozenset[int]:
     """Return the identifiers of a topic's frames in pieces of the log."""
     seen = Pieces(log).read([(topic, paths.parts["id"])]).values()
     return frozenset(int(i) & dbc.ID_BITS for its in seen for i in np.unique(its.values[np.isfinite(its.values)]))
 
 
-def _buses(log: DriveLog, view: _CanView) -> list[int]:
+def _buses(log: DriveLog, view: "_CanView") -> list[int]:
     """Return the buses of a message in a log of frames alone; other logs usually have a topic for each bus."""
     is_frames = any(t.name == view.topic and t.type_name == dbc.CAN_TYPE for t in log.topics)
     if not is_frames or "bus" not in {f.path for f in log.fields(view.topic)}:
@@ -145,8 +143,8 @@ class _CanView:
 
     topic: str
     paths: _FramePaths
-    message: Message
-    signals: Mapping[str, Signal]
+    message: "Message"
+    signals: "Mapping[str, Signal]"
     selectors: dbc.Selectors
     unflagged_may_be_extended: bool
 
@@ -293,7 +291,7 @@ def _payload(frames: Columns, paths: _FramePaths, rows: IntArray) -> tuple[NDArr
 
 
 def _make_view(
-    source: SignalSource, paths: _FramePaths | str, databases: Sequence[tuple[Path, Database]]
+    source: SignalSource, paths: _FramePaths | str, databases: "Sequence[tuple[Path, Database]]"
 ) -> _CanView | str:
     """Return the view of a source, or a text that describes the error."""
     if isinstance(paths, str):

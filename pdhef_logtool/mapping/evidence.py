@@ -1,7 +1,5 @@
 """Statistics of fields in short pieces of a log: values on a common time grid, and relations between them."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -65,7 +63,7 @@ class Seen:
     make_grid: Callable[[], tuple[FloatArray, float]]
 
     @classmethod
-    def of(cls, values: FloatArray, cells: FloatArray, rate_hz: float) -> Seen:
+    def of(cls, values: FloatArray, cells: FloatArray, rate_hz: float) -> "Seen":
         """Return computed values with their means on the grid."""
         return cls(values, lambda: (cells, rate_hz))
 

@@ -1,7 +1,5 @@
 """mapping.toml: strict reading, and writing ready to edit (docs/formats.md#mappingtoml)."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from collections.abc import Mapping as MappingABC
 from dataclasses import fields, replace
@@ -252,7 +250,7 @@ def contradictions(mapping: Mapping) -> list[str]:
 
 
 def mapping_to_toml(
-    mapping: Mapping, comments: MappingABC[str, str] | None = None, alternatives: Sequence[Candidate] = ()
+    mapping: Mapping, comments: MappingABC[str, str] | None = None, alternatives: "Sequence[Candidate]" = ()
 ) -> str:
     """Write a mapping as TOML that is ready to edit; ``load_mapping`` returns the same sources.
 
@@ -289,7 +287,7 @@ def mapping_to_toml(
     return "\n".join(lines) + "\n"
 
 
-def _missing_lines(mapping: Mapping, notes: MappingABC[str, str], alternatives: Sequence[Candidate]) -> list[str]:
+def _missing_lines(mapping: Mapping, notes: MappingABC[str, str], alternatives: "Sequence[Candidate]") -> list[str]:
     """Return commented examples of the missing signals."""
     lines: list[str] = []
     missing = missing_signals(mapping)
@@ -317,7 +315,7 @@ def _example(section: str, name: str) -> list[str]:
     return ["#", *(f"# {line}" for line in _table(section, SignalSource(name, "/...", "...")))]
 
 
-def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate]) -> list[str]:
+def _alternative_lines(section: str, name: str, candidates: "Sequence[Candidate]") -> list[str]:
     """Return commented tables of the best candidates that are not taken."""
     names = _STEERING if name in _STEERING else (name,)
     mine = [c for c in candidates if c.section == section and c.source.name in names and not c.taken]

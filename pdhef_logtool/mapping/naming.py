@@ -4,8 +4,6 @@ Names are split into words (``WheelSpd_FL``, ``steeringangle``, ``latAccelG``) b
 spellings of recorders are accepted.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib
@@ -222,7 +220,7 @@ def _strength_of_leaf(leaf_words: tuple[str, ...], inner: tuple[str, ...], named
 
 
 def _with_unit(
-    quantity: _Quantity, strength: float, where: str, inner: tuple[str, ...], names: tuple[str, ...]
+    quantity: "_Quantity", strength: float, where: str, inner: tuple[str, ...], names: tuple[str, ...]
 ) -> Meaning | None:
     """Return the meaning with the unit from the leaf or its struct (``names``); None for a rotational speed."""
     name, part, kind = quantity

@@ -1,7 +1,5 @@
 """Records of a mapping: source of each signal of a log, and its conversion to SI."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
@@ -192,7 +190,7 @@ class Mapping:
     open_signs: tuple[tuple[str, ...], ...] = ()
     file: str = field(default="", compare=False, repr=False)
     recorder: tuple[tuple[str, str], ...] = ()
-    recorders: tuple[Mapping, ...] = ()
+    recorders: "tuple[Mapping, ...]" = ()
     rate_hz: float | None = None
     group: str = ""
 
@@ -208,7 +206,7 @@ class Mapping:
         tables = {name: value for name in ("rate_hz", "group") if (value := getattr(self, name))}
         return digest(jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality, **tables}))
 
-    def changed(self, change: Callable[[SignalSource], SignalSource]) -> Mapping:
+    def changed(self, change: Callable[[SignalSource], SignalSource]) -> "Mapping":
         """Return the mapping with the result of ``change`` for each source of a signal or of ground truth."""
         return self.with_sources({name: change(source) for name, source in self.by_subject.items()})
 
@@ -224,7 +222,7 @@ class Mapping:
         """Signals by name, and ground truth by ``truth.NAME``."""
         return {**self.signals, **{f"truth.{name}": source for name, source in self.truth.items()}}
 
-    def with_sources(self, changed: dict[str, SignalSource], notes: Iterable[str] = ()) -> Mapping:
+    def with_sources(self, changed: dict[str, SignalSource], notes: Iterable[str] = ()) -> "Mapping":
         """Return the mapping with other sources, named as in :attr:`by_subject`, and further notes."""
         every = self.by_subject | changed
         truth = {n.removeprefix("truth."): s for n, s in every.items() if n.startswith("truth.")}

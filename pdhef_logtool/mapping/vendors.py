@@ -1,7 +1,5 @@
 """Documented message types of vendors: ``vendors.toml`` and user files in the same format."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -45,7 +43,7 @@ class _FieldTable(_Entry):
         return SignalSource(self.signal or self.truth, "", self.field, scale=self.scale, offset=self.offset)
 
     @model_validator(mode="after")
-    def _is_one_quantity(self) -> _FieldTable:
+    def _is_one_quantity(self) -> "_FieldTable":
         source = self.source
         problem = problem_of(source)
         if bool(self.signal) == bool(self.truth):
@@ -64,7 +62,7 @@ class _Table(_Entry):
     has: frozenset[str] = frozenset()
     fields: tuple[_FieldTable, ...]
 
-    def documented(self, page: str, left_out: str = "", without: frozenset[str] = frozenset()) -> VendorType:
+    def documented(self, page: str, left_out: str = "", without: frozenset[str] = frozenset()) -> "VendorType":
         signals, truth = (tuple(f.source for f in self.fields if getattr(f, of)) for of in ("signal", "truth"))
         return VendorType(signals, truth, page, left_out, self.has, without)
 

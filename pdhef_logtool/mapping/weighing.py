@@ -4,8 +4,6 @@ Signals of recognised types are fixed anchors, to which candidates are compared.
 or a sign; an open point becomes an undecided check with a remedy.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -75,7 +73,7 @@ def weigh(
     signals: Mapping[str, SignalSource],
     truth: Mapping[str, SignalSource],
     vendors: Vendors,
-) -> Weighing:
+) -> "Weighing":
     """Select fields for the missing signals, and for ground truth if there is none.
 
     Parameters

@@ -3,8 +3,6 @@
 See docs/method.md#self-calibration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -48,7 +46,7 @@ class DriveModel:
     posterior: Posterior | None = None
 
     @classmethod
-    def fit(cls, drive: Drive) -> DriveModel:
+    def fit(cls, drive: Drive) -> "DriveModel":
         """Return the model of a drive by its option ``model``; no ground truth is used.
 
         ``auto`` fits the car to the drive. With a model file the car has the parameters of earlier drives, with ``off``
@@ -74,7 +72,7 @@ class DriveModel:
         return cls.of(drive, replace(posterior, r_std=r_std)) if r_std else model
 
     @classmethod
-    def of(cls, drive: Drive, posterior: Posterior | None = None) -> DriveModel:
+    def of(cls, drive: Drive, posterior: Posterior | None = None) -> "DriveModel":
         """Return the model of a drive with a posterior of its car."""
         car, friction = drive.car, drive.friction
         reached = None if posterior is None else posterior.reached_friction
@@ -129,7 +127,7 @@ def lacking(drive: Drive) -> list[str]:
     return [name for name in _NEEDS if name not in drive.available]
 
 
-def read_driving(drive: Drive) -> Driving:
+def read_driving(drive: Drive) -> "Driving":
     """Return the driving of a drive for the calibration; its ground truth is not used.
 
     Raises EstimatorError without a stamp.

@@ -1,7 +1,5 @@
 """Data of a drive for the fit of its car: sensors on an even grid, in stretches of driving."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -59,7 +57,7 @@ class Driving:
             inside[first + round(SETTLE_S / STEP_S) : last] = True
         return inside
 
-    def informative(self) -> Driving:
+    def informative(self) -> "Driving":
         """Return the same grid with at most :data:`MOST_S` of driving: the pieces in which a_y varies most."""
         if self.seconds <= MOST_S:
             return self

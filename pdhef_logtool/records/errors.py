@@ -1,7 +1,5 @@
 """Exceptions of the package; each error has the parts expected, got, where and remedy."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from pdhef_logtool.records.printable import printable
@@ -37,7 +35,7 @@ class PdhefError(Exception):
             self.exit_code = EXIT_USAGE
         super().__init__(str(self))
 
-    def __reduce__(self) -> tuple[partial[PdhefError], tuple[()]]:
+    def __reduce__(self) -> "tuple[partial[PdhefError], tuple[()]]":
         """Pickle all parts, for other processes."""
         parts = {"expected": self.expected, "got": self.got, "where": self.where, "remedy": self.remedy}
         return partial(type(self), missing=self.missing, **parts), ()

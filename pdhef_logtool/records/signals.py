@@ -1,7 +1,5 @@
 """Named signals: columns on their own clocks, and their aligned form on the IMU's stamps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, TypeAlias
@@ -113,12 +111,12 @@ class Channel:
         """Return the number of samples."""
         return int(self.stamps_ns.shape[0])
 
-    def take(self, which: slice | BoolArray) -> Channel:
+    def take(self, which: slice | BoolArray) -> "Channel":
         """Return the samples of a slice or of a mask [N]."""
         stamps, arrival, values = self.stamps_ns[which], self.arrival_ns[which], self.values[which]
         return Channel(self.name, self.unit, self.source, stamps, arrival, values)
 
-    def between(self, start_ns: int, end_ns: int | None = None) -> Channel:
+    def between(self, start_ns: int, end_ns: int | None = None) -> "Channel":
         """Return the samples with stamps in [start_ns, end_ns); ``end_ns`` None includes the last one."""
         first = int(np.searchsorted(self.stamps_ns, start_ns))
         return self.take(slice(first, None if end_ns is None else int(np.searchsorted(self.stamps_ns, end_ns))))
@@ -189,23 +187,23 @@ class Signals:
         """Duration before each stamp, [N]; NaN at the start of a drive."""
         return step_durations_s(np.append(self.before_ns, self.stamps_ns))[len(self.before_ns) :]
 
-    def rows(self, start: int, end: int) -> Signals:
+    def rows(self, start: int, end: int) -> "Signals":
         """Return the stamps [start, end)."""
         before_ns = self.stamps_ns[start - 1 : start] if start else self.before_ns
         return replace(self._with(lambda column: column[start:end]), before_ns=before_ns)
 
-    def copy(self) -> Signals:
+    def copy(self) -> "Signals":
         """Return the same signals in arrays that may be written."""
         return self._with(np.ndarray.copy)
 
-    def read_only(self) -> Signals:
+    def read_only(self) -> "Signals":
         """Return the same signals in views that cannot be written."""
         signals = self._with(np.ndarray.view)
         for name in SIGNAL_COLUMNS:
             getattr(signals, name).setflags(write=False)
         return signals
 
-    def _with(self, function: Callable[[Any], Any]) -> Signals:
+    def _with(self, function: Callable[[Any], Any]) -> "Signals":
         """Return the signals with a function of each column."""
         return replace(self, **{name: function(getattr(self, name)) for name in SIGNAL_COLUMNS})
 

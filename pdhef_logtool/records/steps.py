@@ -1,7 +1,5 @@
 """Steps on measurement time and their availability at scored stamps, which makes estimates causal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Self
@@ -54,7 +52,7 @@ class Release:
     step: IntArray
     arrived: BoolArray
 
-    def rows(self, part: slice, first_step: int) -> Release:
+    def rows(self, part: slice, first_step: int) -> "Release":
         """Return the stamps of a slice, with steps counted from ``first_step``."""
         return Release(self.step[part] - first_step, self.arrived[part])
 
@@ -90,7 +88,7 @@ class Extrapolation(Release):
     usable: BoolArray
 
     @classmethod
-    def none(cls, valid: BoolArray) -> Extrapolation:
+    def none(cls, valid: BoolArray) -> "Extrapolation":
         """Return no extrapolation: the stamps are those of the steps [K]."""
         count = len(valid)
         return cls(np.arange(count), np.ones(count, np.bool_), np.zeros(count), valid)

@@ -1,7 +1,5 @@
 """The state track, the record of estimates and ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -120,17 +118,17 @@ class StateTrack:
             if c not in OPTIONAL_COLUMNS or len(getattr(self, c)) == len(self)
         }
 
-    def rows(self, start: int, end: int) -> StateTrack:
+    def rows(self, start: int, end: int) -> "StateTrack":
         """Return the rows [start, end)."""
         n = len(self)
         columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
         return StateTrack(name=self.name, **{c: v[start:end] if len(v) == n else v for c, v in columns.items()})
 
-    def between(self, start_ns: int, end_ns: int) -> StateTrack:
+    def between(self, start_ns: int, end_ns: int) -> "StateTrack":
         """Return the stamps in [start_ns, end_ns)."""
         return self.rows(*np.searchsorted(self.stamps_ns, (start_ns, end_ns)).tolist())
 
-    def without_sideslip_below(self, speed_m_s: float) -> StateTrack:
+    def without_sideslip_below(self, speed_m_s: float) -> "StateTrack":
         """Return the track with sideslip NaN where its speed is lower and has no direction."""
         vy = np.where(np.isfinite(self.vy_m_s), self.vy_m_s, 0.0)
         slow = np.hypot(self.vx_m_s, vy) < speed_m_s

@@ -1,7 +1,5 @@
 """Write the pages of a finished run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -29,7 +27,7 @@ class Page:
     """
 
     html: bytes
-    charts: Charts
+    charts: "Charts"
     wrong: str = ""
     document: dict[str, Any] | None = None
     key_figures: dict[str, Any] | None = None

@@ -1,7 +1,5 @@
 """Model bundle: ``weights.safetensors`` and ``model.json`` in one folder, without pickle."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -104,9 +102,9 @@ class ModelBundle(NetworkDesign):
 
     weights: dict[str, np.ndarray[Any, np.dtype[np.float32]]] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
-    pure_lstm: ModelBundle | None = None
+    pure_lstm: "ModelBundle | None" = None
     linear_regression: LinearModel | None = None
-    paper_network: ModelBundle | None = None
+    paper_network: "ModelBundle | None" = None
 
     @cached_property
     def sha256(self) -> str:
@@ -147,14 +145,14 @@ class ModelBundle(NetworkDesign):
         return limited
 
     @cached_property
-    def _network(self) -> ForwardPass:
+    def _network(self) -> "ForwardPass":
         from pdhef_logtool.residual_model.forward_pass import ForwardPass  # compiled code is imported on demand
 
         return ForwardPass.of(self.weights, self.layers, self.head)
 
     def run(
-        self, features: FloatArray, starts: BoolArray, carry: NetworkState | None
-    ) -> tuple[FloatArray, NetworkState | None]:
+        self, features: FloatArray, starts: BoolArray, carry: "NetworkState | None"
+    ) -> "tuple[FloatArray, NetworkState | None]":
         """Return residual rates [N, 2] in m/s² and rad/s² after each step, or v_y [N, 1] in m/s; and the state.
 
         The state is None at the start of a sequence (docs/method.md#network).
@@ -180,20 +178,20 @@ class ModelBundle(NetworkDesign):
         return np.clip(out * np.array(self.normalisation.target_std), -limits, limits), carry
 
     def residual(
-        self, features: FloatArray, dt_s: FloatArray, state: NetworkState | None
-    ) -> tuple[Residual, NetworkState | None]:
+        self, features: FloatArray, dt_s: FloatArray, state: "NetworkState | None"
+    ) -> "tuple[Residual, NetworkState | None]":
         """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
         rate, after = self.run(features, np.isnan(dt_s), state)
         return Residual(rate, np.ones(len(rate))), after
 
     def lateral_velocity(
-        self, features: FloatArray, dt_s: FloatArray, state: NetworkState | None
-    ) -> tuple[FloatArray, NetworkState | None]:
+        self, features: FloatArray, dt_s: FloatArray, state: "NetworkState | None"
+    ) -> "tuple[FloatArray, NetworkState | None]":
         """Return v_y [N] of such a network and the state after; ``dt_s`` [N] is NaN where a sequence starts."""
         output, after = self.run(features, np.isnan(dt_s), state)
         return output[:, 0], after
 
-    def _sequence(self, scaled: FloatArray, carry: NetworkState | None) -> tuple[FloatArray, NetworkState]:
+    def _sequence(self, scaled: FloatArray, carry: "NetworkState | None") -> "tuple[FloatArray, NetworkState]":
         """Run a sequence of normalised features [N, k] and, for an ``odd`` network, its mirror image."""
         # Features that change their sign have a mean of 0, so that normalised values change it too.
         mirror = scaled * self.signs if self.odd else np.zeros_like(scaled)

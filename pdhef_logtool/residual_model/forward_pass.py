@@ -4,8 +4,6 @@ Training uses PyTorch; runs do not need it and agree to 1e-5 (a test checks this
 through the state, so that windows do not change the result. The order of sums does not depend on the BLAS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -111,7 +109,7 @@ class ForwardPass:
     hidden: int
 
     @classmethod
-    def of(cls, weights: dict[str, Float32Array], layers: int, head: Sequence[int]) -> ForwardPass:
+    def of(cls, weights: dict[str, Float32Array], layers: int, head: Sequence[int]) -> "ForwardPass":
         """Convert the weights of a bundle; ``layers`` of the LSTM, widths of the ``head`` without its last layer."""
         stacked = []
         for n in range(layers):

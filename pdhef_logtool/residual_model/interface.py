@@ -41,8 +41,6 @@ divided into calls::
     MODEL = Gru()
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -68,7 +66,7 @@ class Residual(NamedTuple):
     gain: FloatArray
 
     @classmethod
-    def zero(cls, count: int) -> Residual:
+    def zero(cls, count: int) -> "Residual":
         """Return no residual for ``count`` steps."""
         return cls(np.zeros((count, 2)), np.zeros(count))
 

@@ -8,8 +8,6 @@ Region of validity: a gain per step, 1 within the region of the training drives 
 and on the whitened distance d² = zᵀ (Σ + ρ I)⁻¹ z, divided by its 98 % quantile over the training drives.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -64,7 +62,7 @@ class LadderModel(BaseModel):
     largest_m_s2: Annotated[float, Field(ge=0)]
 
     @model_validator(mode="after")
-    def _one_size(self) -> LadderModel:
+    def _one_size(self) -> "LadderModel":
         random, count = len(self.phases), ODD_COUNT + len(self.phases)
         shapes = (
             (self.scale, ODD_COUNT), (self.even_mean, EVEN_COUNT), (self.even_scale, EVEN_COUNT),
@@ -85,7 +83,7 @@ class LadderModel(BaseModel):
         return digest(self.model_dump(mode="json"))
 
     @cached_property
-    def _arrays(self) -> tuple[Basis, FloatArray, FloatArray]:
+    def _arrays(self) -> "tuple[Basis, FloatArray, FloatArray]":
         """Basis of the features, weights and whitening."""
         from pdhef_logtool.residual_model.ladder_kernels import Basis
 

@@ -6,8 +6,6 @@ The fit includes one constant per drive, which is discarded, because it may be a
 sensor. With sums over blocks instead of samples, all fits of the cross-validation are small linear systems.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -123,7 +121,7 @@ class _Problem:
     drives: IntArray
     whole: FloatArray
 
-    def only(self, columns: int) -> _Problem:
+    def only(self, columns: int) -> "_Problem":
         """Return the problem with only the first features."""
         kept = [*range(columns + 1), -1]
         return _Problem(self.blocks[:, kept][:, :, kept], self.drives, self.whole[:, kept][:, :, kept])

@@ -5,8 +5,6 @@ Scores use drives with ground truth that is independent of the estimator; other 
 Intervals take the dependence of drives of one day, car or route into account.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter
@@ -139,7 +137,7 @@ class Fleet:
     ranking: tuple[Rank, ...]
     least_to_rank: int
     dependence: statistics.Dependence
-    breakdowns: tuple[Breakdown, ...]
+    breakdowns: "tuple[Breakdown, ...]"
     space: Space | None
     failed: tuple[Failures, ...]
     losses: tuple[Failures, ...]

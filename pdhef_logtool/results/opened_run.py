@@ -3,8 +3,6 @@
 run.json contains its own digest and the sha256 of the files that are read back.
 """
 
-from __future__ import annotations
-
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -96,7 +94,7 @@ class OpenedLog:
         """Return the selected estimator of the drive, or an empty string."""
         return str(self.entry.get("main") or "")
 
-    def estimates(self) -> pl.LazyFrame | None:
+    def estimates(self) -> "pl.LazyFrame | None":
         """Return estimates.parquet lazily, or None if it does not exist."""
         import polars as pl
 
@@ -122,7 +120,7 @@ class OpenedRun:
         """Folder or URL of the run, for messages."""
         return str(self.folder) if self.mirror is None else self.mirror.objects.shown
 
-    def table(self, name: str) -> pl.LazyFrame:
+    def table(self, name: str) -> "pl.LazyFrame":
         """Return one of :data:`TABLES`, read when collected; raises OutputError for a file that is not as written."""
         import polars as pl
 

@@ -1,7 +1,5 @@
 """Which car each log of a run had: one for all, or a car a log by ``cars.toml`` (docs/car.md)."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -59,7 +57,7 @@ class RunCars:
     _read: dict[Path | None, Car] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, config: RunConfig, warn: Callable[[str], None]) -> RunCars:
+    def of(cls, config: RunConfig, warn: Callable[[str], None]) -> "RunCars":
         """Return the cars that a configuration names.
 
         Raises

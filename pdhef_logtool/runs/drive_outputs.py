@@ -1,7 +1,5 @@
 """The output files of a drive, and run.json."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -63,7 +61,7 @@ class DriveOutputs:
     """
 
     def __init__(
-        self, folders: tuple[FolderTransaction, Path], run: PreparedDrive, estimated: Estimated, main: MainFacts
+        self, folders: tuple[FolderTransaction, Path], run: "PreparedDrive", estimated: "Estimated", main: "MainFacts"
     ) -> None:
         (self._change, self._run_folder), self._run, self._main = folders, run, main
         self._signals, names, self._is_copy = estimated.signals, run.names, run.config.annotation == "full"
@@ -74,7 +72,7 @@ class DriveOutputs:
         order = dict.fromkeys([main.name, PHYSICS, *filter(None, [main.naive]), *main.shown])
         self._shown = [name for name in order if name in names][:2]
 
-    def annotated(self) -> AbstractContextManager[AnnotatedMcap | None]:
+    def annotated(self) -> "AbstractContextManager[AnnotatedMcap | None]":
         """Return the annotated log as a context, None if it is not requested; add remarks of the drive."""
         config, drive = self._run.config, self._run.drive
         left_out = self._left_out() if config.no_position else None
@@ -195,7 +193,7 @@ def write_run(
     output: Path,
     config: dict[str, Any],
     results: Sequence[LogResult],
-    verdicts: PlanVerdicts | None,
+    verdicts: "PlanVerdicts | None",
     network: tuple[str, str] | None = None,
     remaining: int = 0,
 ) -> None:

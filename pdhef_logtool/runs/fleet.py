@@ -4,8 +4,6 @@ Each drive is in the journal (:mod:`~.journal`) before the next one counts. At e
 written from the journal and the drives' parts of the tables. No report and no figure is kept in memory.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import time
@@ -193,7 +191,7 @@ def _prepare(
     work: Work,
     reporter: Reporter,
     stored: StoredOutput | None,
-) -> _Fleet:
+) -> "_Fleet":
     """Plan a run of several logs; raises UsageError and OutputError before anything is written."""
     config, many = job.config, len(inputs) > FEW_LOGS
     limits = schedule.limits or _given_limits(config)

@@ -1,7 +1,5 @@
 """Estimates and figures of one drive as polars frames, for notebooks and scripts; a run writes the same rows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -50,7 +48,7 @@ class Estimates:
         """Input of the estimators."""
         return self.estimated.signals
 
-    def frame(self, *, errors: bool = False) -> pl.DataFrame:
+    def frame(self, *, errors: bool = False) -> "pl.DataFrame":
         """Return the tracks as rows of estimates.parquet, in SI units.
 
         Parameters
@@ -77,7 +75,7 @@ class Estimates:
         axes.legend()
         return axes
 
-    def _errors(self, track: StateTrack) -> dict[str, pl.Expr]:
+    def _errors(self, track: StateTrack) -> "dict[str, pl.Expr]":
         """Return the errors of a track by column; the ground truth has none."""
         import polars as pl
 
@@ -115,7 +113,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     return Estimates(drive, model, estimated, tracks, estimated.algorithms, tuple(skipped))
 
 
-def score(estimates: Estimates) -> pl.DataFrame:
+def score(estimates: Estimates) -> "pl.DataFrame":
     """Return the figures of estimates as rows of metrics.parquet; without ground truth those that need none.
 
     >>> from pdhef_logtool import Car, read_drive

@@ -6,8 +6,6 @@ as a digest, so that no folder names are published, with size and time of change
 again to identify it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -47,7 +45,7 @@ class Place:
     changed_ns: int
 
     @classmethod
-    def of(cls, log: LogInput) -> Place:
+    def of(cls, log: LogInput) -> "Place":
         """Return the place of a log; of one that is not there no bytes."""
         if isinstance(log.path, RemotePlace):
             return cls(_key(log.path.identity, log.span_s), _ELSEWHERE, 0)
@@ -122,7 +120,7 @@ class Journal:
     _end: int = 0
 
     @classmethod
-    def read(cls, folder: Path) -> Journal:
+    def read(cls, folder: Path) -> "Journal":
         """Return the journal of a folder, empty if there is none; damaged lines are ignored and counted.
 
         Raises

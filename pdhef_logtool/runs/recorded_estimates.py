@@ -4,8 +4,6 @@ The scored stamps are the estimate's own. Ground truth is interpolated to them, 
 the log has an IMU; the sensors, which only cut the drive into segments, are interpolated to them too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
@@ -216,7 +214,7 @@ def _score_drive(
     return LogResult(outcome, folder, report, tuple(whole.rows), part=part)
 
 
-def _read(drive: Drive, sources: Sequence[EstimateSource]) -> tuple[list[RecordedEstimate], list[Loss]]:
+def _read(drive: Drive, sources: Sequence[EstimateSource]) -> "tuple[list[RecordedEstimate], list[Loss]]":
     """Read the estimates; mark ground truth that equals a channel of an estimate as dependent in the drive's plan."""
     plan, recorded, losses = drive.plan, [], list[Loss]()
     for source in sources:
@@ -271,7 +269,7 @@ def _drive_at(drive: Drive, truth: TruthTrack | None, stamps_ns: IntArray) -> Wh
 
 
 def _score(
-    run: estimating.PreparedDrive, recorded: RecordedEstimate, estimated: estimating.Estimated, equal: dict[str, str]
+    run: estimating.PreparedDrive, recorded: "RecordedEstimate", estimated: estimating.Estimated, equal: dict[str, str]
 ) -> estimating.Evaluation:
     """Score an estimate at its own stamps; add to ``equal`` the ground truth that equals it."""
     drive, track, truth = run.drive, recorded.track, estimated.truth

@@ -1,7 +1,5 @@
 """The sideslip reference of a drive: conditions, inputs, and its entry in the report."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -32,7 +30,7 @@ _NEEDS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 class DriveReference:
     """Result of the reference: ``estimator``, None if refused, and the entry of the report (``document``)."""
 
-    estimator: ReferenceEstimator | None
+    estimator: "ReferenceEstimator | None"
     document: dict[str, Any]
 
 
@@ -62,7 +60,7 @@ def reference_of(drive: Drive, model: DriveModel, config: RunConfig) -> DriveRef
     return DriveReference(estimator, _document(spans, refused))
 
 
-def prior_of(model: DriveModel) -> ReferencePrior:
+def prior_of(model: DriveModel) -> "ReferencePrior":
     """Return the prior of the reference: the geometry of the car's file, sensors as the log calibrated them.
 
     Without calibration or ground truth, the position of the accelerometer is not verified if no file gives one.
@@ -97,7 +95,7 @@ def prior_of(model: DriveModel) -> ReferencePrior:
     return ReferencePrior(vehicle.cg_to_rear_axle_m, vehicle.wheelbase_m, **prior)
 
 
-def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[SideslipReference]:
+def _spans(drive: Drive, prior: "ReferencePrior", *, use_gnss: bool) -> "Iterator[SideslipReference]":
     """Yield the reference of a drive span by span; of two that overlap the earlier one ends in the middle."""
     from pdhef_logtool.estimators.reference.drive import refer
 
@@ -117,7 +115,7 @@ def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[S
         )
 
 
-def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any]:
+def _document(spans: "Sequence[SideslipReference]", refused: str) -> dict[str, Any]:
     """Return the entry of report.json, with the parameters of the longest span."""
     longest = max(spans, key=lambda span: len(span.stamps_ns), default=None)
     knots = sum(len(span.stamps_ns) for span in spans)

@@ -3,8 +3,6 @@
 A document of our own contains the digest of its other entries (:func:`seal`), by which its reader notices any change.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import hashlib
 import json
@@ -198,7 +196,7 @@ def _unknown(name: str, names: Iterable[str], table: str) -> str:
     return "unknown" + (f", known are {', '.join(names)}" if 0 < len(names) <= 12 else "")
 
 
-def one_of(names: Iterable[str]) -> AfterValidator:
+def one_of(names: Iterable[str]) -> "AfterValidator":
     """Return the check that a text, for instance a key, is one of ``names``; the error names the most similar one."""
     from pydantic import AfterValidator
     from pydantic_core import PydanticCustomError
@@ -217,7 +215,7 @@ def _at(table: str, name: str) -> str:
     return f"{table}.{name}" if table and name else table or name or "file"
 
 
-def _problems(error: ValidationError, model: type, raw: object, table: str) -> list[str]:
+def _problems(error: "ValidationError", model: type, raw: object, table: str) -> list[str]:
     texts_by_entry: dict[str, list[str]] = {}
     for e in error.errors(include_url=False, include_input=False):
         place, value = _place(e["loc"], raw, missing=e["type"].startswith("missing"))

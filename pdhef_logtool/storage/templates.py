@@ -1,7 +1,5 @@
 """Jinja templates of texts and files; callers fill their fields."""
 
-from __future__ import annotations
-
 import sys
 from contextlib import suppress
 from functools import cache
@@ -13,7 +11,7 @@ if TYPE_CHECKING:
 
 
 @cache
-def environment(folder: Path) -> Environment:
+def environment(folder: Path) -> "Environment":
     """Return the one environment of the templates in a folder; fields of XML and HTML are escaped."""
     from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, StrictUndefined, select_autoescape
 
@@ -37,7 +35,7 @@ def environment(folder: Path) -> Environment:
     )
 
 
-def template(path: Path, **context: Any) -> Template:
+def template(path: Path, **context: Any) -> "Template":
     """Return a template; ``context``: functions and constants that it uses."""
     return environment(path.parent).get_template(path.name, globals=context)
 

@@ -6,8 +6,6 @@ creates no file. It works in threads, in daemonic processes and in forks of a pr
 have several. Its children end with it, and their processor time counts as the command's.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import importlib
@@ -60,7 +58,7 @@ class Child:
 
     connection: Connection
     pid: int
-    server: ForkServer
+    server: "ForkServer"
 
     def end(self) -> int | None:
         """End the process and return its exit code, below zero a signal; None if its server is dead."""

@@ -1,7 +1,5 @@
 """The sideslip reference of one drive: priors, smoothing with and without GNSS, rejection, its track."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
@@ -99,7 +97,7 @@ class SideslipReference:
     with_gnss: bool
     refused: str = ""
 
-    def between(self, start_ns: int | None, end_ns: int | None) -> SideslipReference:
+    def between(self, start_ns: int | None, end_ns: int | None) -> "SideslipReference":
         """Return the knots in [start_ns, end_ns]; None for an open end."""
         first = 0 if start_ns is None else int(np.searchsorted(self.stamps_ns, start_ns))
         last = len(self.stamps_ns) if end_ns is None else int(np.searchsorted(self.stamps_ns, end_ns, side="right"))

@@ -1,7 +1,5 @@
 """``pdhef train``: train a model bundle on a dataset, with loss history and resumption."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -253,7 +251,7 @@ class _Training:
     history: list[Epoch] = field(default_factory=list)
 
     @classmethod
-    def start(cls, recipe: Recipe, init: bundles.ModelBundle | None, signs: FloatArray, device: str) -> _Training:
+    def start(cls, recipe: Recipe, init: bundles.ModelBundle | None, signs: FloatArray, device: str) -> "_Training":
         """Return a network with random weights by the seed of a recipe, or with the weights of a bundle."""
         torch.manual_seed(recipe.seed)
         sizes, outputs = (len(recipe.feature_names), recipe.hidden, recipe.layers), bundles.OUTPUT_COUNT[recipe.target]

@@ -1,7 +1,5 @@
 """Inspection of a log: topics, rates, gaps, clocks, mapped and missing signals, implausible values."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -59,7 +57,7 @@ class Steps:
     starts_ns: IntArray
 
     @classmethod
-    def of(cls, parts: Sequence[IntArray]) -> Steps:
+    def of(cls, parts: Sequence[IntArray]) -> "Steps":
         """Return the steps within each part, int64 [K] ascending; a step from one part to the next is left out."""
         steps = [np.diff(part) * S_PER_NS for part in parts]
         starts = [part[:-1] for part in parts]
