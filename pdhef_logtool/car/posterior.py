@@ -72,7 +72,7 @@ class Posterior:
 
     @property
     def noise(self) -> FilterNoise:
-        """Noise of ``physics`` on ``vehicle``."""
+        """Noise of the estimator ``physics`` for the calibrated vehicle."""
         ay_std = max(AY_STD, self.vehicle.sensors.ay_std_m_s2)
         return FilterNoise(q_std=Q_STD, r_std={"ay_m_s2": ay_std, **self.r_std}, limit_gain=LIMIT_GAIN)
 

@@ -29,7 +29,7 @@ def watch() -> None:
 
 
 def came() -> Stopped | None:
-    """Return the request to end, None without one."""
+    """Return the signal that asked this process to end; None before one came."""
     return _came
 
 

@@ -283,7 +283,7 @@ def known_hypotheses(
 
 
 def opened(mistake: Hypothesis, open_units: frozenset[str]) -> Hypothesis:
-    """Return a mistake, as a likely one if it is another unit of signals whose unit is an assumption."""
+    """Return a mistake, as a likely one if it is another unit of signals with an assumed unit."""
     is_open = mistake.kind == "unit" and " is in " in mistake.words and mistake.factors.keys() <= open_units
     return replace(mistake, kind="open unit") if is_open else mistake
 

@@ -51,7 +51,7 @@ class Measured:
     signals, truth : mapped channels by name. derived : ground truth at the CG, if any.
     columns : [N] by name; names of ground truth begin with ``truth.``. speed_name : the column used as the speed.
     vehicle : from a file; None without a file. scales : scales of the mapping, by name.
-    open_signs : groups of signals with an undocumented common sign. open_units : signals whose unit is an assumption.
+    open_signs : groups of signals with an undocumented common sign. open_units : signals with an assumed unit.
     is_mounted : whether the drive confirms the IMU's mounting.
     """
 

@@ -46,7 +46,7 @@ DISTURBED = 0.6
 _STEERING = ("steer_rad", "steering_wheel_rad")
 #: Above this, sideslip times lateral acceleration is not small compared to the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
-#: Least share of v_x in the speed if the heading is right; quantile that stands for the largest value.
+#: Least share of v_x in the speed if the heading is right; quantile used as the largest value.
 AHEAD_SHARE, HIGH = 0.9, 0.9
 #: Least ratio of the square of a position's scale to its standard error: along an axis on which the car hardly moves,
 #: noise reached 4.6 in 500 drives.
@@ -155,7 +155,7 @@ def compare(law: Law, predicted: FloatArray, measured: FloatArray, use: BoolArra
     correlation = (correlation * spread_a * spread_b + of_means[0] * of_means[1]) / (rms_a * rms_b)
     # The ratio of the sizes lies between the two regressions, because either side may be noisy.
     gain = float(np.copysign(rms_b / rms_a, correlation))
-    # The gain of a block with fewer samples is random, and a block on a circle has none.
+    # The gain of a block with fewer samples is random; on a circle it is undefined.
     by_means = abs(of_means[0]) > spread_a
     blocks = () if by_means else block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
     return [Relation(law, correlation, gain, samples, both, blocks, sides)]

@@ -241,7 +241,7 @@ class _Block(NamedTuple):
     least: FloatArray
 
     def information(self) -> FloatArray:
-        """Return the inverse of the second moment in the drive so far, [n, p, p]; 0 where it is not known."""
+        """Return the inverse of the second moment in the drive so far, [n, p, p]; 0 if unknown."""
         p = self.step.shape[1]
         finite = np.asarray(np.isfinite(self.step).all(axis=1) & np.isfinite(self.effects).all(axis=(1, 2)))
         rows = np.where(finite[:, None], self.step, 0.0)

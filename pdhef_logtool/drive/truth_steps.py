@@ -1,4 +1,4 @@
-"""Sensors whose bias, gain or delay steps away from the ground truth in mid-drive: reported, and not corrected.
+"""Steps of a sensor's bias, gain or delay against the ground truth in mid-drive: reported, and not corrected.
 
 Ground truth must not improve the signals of the estimators. Over means of ``BLOCK_S``, the difference y between sensor
 and ground truth x is regressed on what constant errors do (1, x, and the change of x over the block, which is what a

@@ -142,7 +142,7 @@ def _shares(weights: FloatArray) -> FloatArray:
 
 
 def _column(track: StateTrack, name: str) -> FloatArray:
-    """Return a column of a track [N], zeros if it has none."""
+    """Return a column of a track [N], zeros without one."""
     column: FloatArray = getattr(track, name)
     return column if len(column) == len(track) else np.zeros(len(track))
 

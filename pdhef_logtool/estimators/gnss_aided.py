@@ -87,7 +87,7 @@ class Aiding(NamedTuple):
 
 @njit(cache=True)
 def filtered_velocity(point, row, h):  # type: ignore[no-untyped-def]
-    """Measure the wrapped filter's v_y, whose error has a correlated and a white part."""
+    """Measure the wrapped filter's v_y; its error has a correlated and a white part."""
     h[:] = 0.0
     error_m_s = row[f.LAW_STD] * max(row[f.SPEED], 1.0)
     h[f.VY], h[f.LAW_ERROR] = 1.0, -error_m_s

@@ -52,7 +52,7 @@ def smooth_covariances(P, predicted_P, cross):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _factorize(P, L):  # type: ignore[no-untyped-def]
-    """Write the lower Cholesky factor of a covariance; a state without variance of its own has a column of zeros."""
+    """Write the lower Cholesky factor of a covariance; a state without further variance has a column of zeros."""
     for i in range(P.shape[0]):
         for j in range(i + 1):
             rest = P[i, j]

@@ -317,7 +317,7 @@ class McapContainer(container.FileContainer):
     def _check_data(self) -> None:
         """Check the CRC of the data section if no other checksum or count protects the messages.
 
-        Of a large remote file, this would fetch parts that nothing else needs: it is not verified, with a note.
+        Of a large remote file, this would fetch parts that are not needed otherwise: it is not verified, with a note.
 
         After other damage, the check is skipped: it adds no information.
         """

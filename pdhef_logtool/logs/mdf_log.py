@@ -48,7 +48,7 @@ _LOCAL, _WITH_OFFSETS = 1, 2
 _NO_TIMES = numbered(_MDF["no_times"])
 
 # Blocks that are surveyed before asammdf opens a file.
-#: The start: kind, first digit of the version, and flags of what is unfinished.
+#: The start: kind, first digit of the version, and flags of unfinished parts.
 _FIRST, _START = 64, struct.Struct("7sxc51x2s")
 #: Heads of blocks: kind, and in version 4 the number of links. Link, or length of a block, of version 4.
 _HEAD_3, _HEAD, _LINK = struct.Struct("<2s2x"), struct.Struct("<2x2s12xQ"), struct.Struct("<Q")

@@ -258,7 +258,7 @@ def _storage_file(folder: Path, name: str) -> Path | None:
 
 
 def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
-    """Return the serialization format that metadata.yaml declares for each topic; nothing of a malformed list."""
+    """Return the serialization format that metadata.yaml declares for each topic; empty for a malformed list."""
     with suppress(TypeError, KeyError):
         topics = [entry["topic_metadata"] for entry in information["topics_with_message_count"]]
         formats = {_text(topic["name"]): _text(topic["serialization_format"]) for topic in topics}

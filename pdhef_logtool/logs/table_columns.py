@@ -116,7 +116,7 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
 
     Raises
     ------
-    LogError : no column contains times, and no rate is given.
+    LogError : no column contains times, and the rate is unknown.
     """
     names = {snake(name): name for name in reversed([*sheet.columns])}
     if (in_parts := _in_parts(sheet, names)) is not None:

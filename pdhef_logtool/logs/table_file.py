@@ -96,7 +96,7 @@ class Tables:
     losses: Sequence[Loss] = field(default=())
 
     def of_group(self, group: str, where: str) -> "Tables":
-        """Return the tables of a group; raises LogError if there are none."""
+        """Return the tables of a group; raises LogError without any."""
         names = [table.name for table in self.tables]
         its = [
             t for t in self.tables if t.name == group or t.name.startswith(f"{group}_") or t.name.endswith(f"_{group}")

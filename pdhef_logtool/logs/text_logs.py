@@ -613,7 +613,7 @@ def _name_of(value: Any) -> str:
 
 
 def _json_column(name: str, values: Sequence[Any], lines: Sequence[int], file: TableFile, losses: list[Loss]) -> Any:
-    """Return numbers [N] with NaN where a line has none, or texts [N]."""
+    """Return numbers [N] with NaN for lines without one, or texts [N]."""
     if any(isinstance(value, str) for value in values):
         series = pl.Series([None if value is None else str(value) for value in values], dtype=pl.String)
         cells = read_cells(series, ".")

@@ -54,7 +54,7 @@ class WireLayout:
 
     Raises
     ------
-    NoLayoutError : the message has none, or ends early.
+    NoLayoutError : the message has no layout, or ends early.
     """
 
     def __init__(self, root: schemas.Node, wire: str, message: bytes) -> None:

@@ -103,7 +103,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._encoders[topic] = (channel, encoder)
 
     def add_channel(self, record: ChannelRecord) -> int:
-        """Add a channel and return its id; without name and encoding of the schema it has none.
+        """Add a channel and return its id; without name and encoding of the schema, a channel without schema.
 
         Raises
         ------

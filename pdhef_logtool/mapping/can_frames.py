@@ -37,7 +37,7 @@ NO_DATA_FLAGS = (1 << 30) | (1 << 29)
 
 
 def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
-    """Return a log with a view for each ``can:`` source of the mapping, or ``log`` if the mapping has none of them.
+    """Return a log with a view for each ``can:`` source of the mapping, or ``log`` if the mapping has no such source.
 
     Raises
     ------

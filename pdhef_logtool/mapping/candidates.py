@@ -59,7 +59,7 @@ class Candidate:
     ----------
     section : ``signals`` or ``truth``. source : the field, with its likeliest scale and offset.
     score : probability of the reading. reason : evidence for the quantity.
-    doubt : uncertain properties; empty if there are none. taken : the mapping contains it.
+    doubt : uncertain properties; may be empty. taken : the mapping contains it.
     """
 
     section: Literal["signals", "truth"]

@@ -170,7 +170,7 @@ class Mapping:
     can : settings for raw CAN frames, for sources with a field ``can:<message>.<signal>``.
     estimates : estimates recorded by other programs, by estimator and quantity (``ESTIMATE_UNITS``). Only ``pdhef
         metrics`` reads them; :meth:`sources` excludes them.
-    fill_recognised : signals missing in the file are taken from recognised types.
+    fill_recognised : recognised types provide the signals that the file lacks.
     checks : undecided checks of fields that were taken by their names.
     open_signs : groups of signals (ground truth: ``truth.NAME``) with an undocumented common sign.
     file : name of the file. recorder : type by topic of the logs that it is for.

@@ -74,7 +74,7 @@ def weigh(
     truth: Mapping[str, SignalSource],
     vendors: Vendors,
 ) -> "Weighing":
-    """Select fields for the missing signals, and for ground truth if there is none.
+    """Select fields for the missing signals, and for missing ground truth.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ class PdhefError(Exception):
     expected : valid input.
     got : actual input.
     where : file, topic, field or option.
-    remedy : action of the user; empty if there is none.
+    remedy : action of the user; may be empty.
     missing : a file or folder in the user's input does not exist, which is a usage error.
     """
 

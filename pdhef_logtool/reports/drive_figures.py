@@ -40,7 +40,7 @@ class Tracks:
         return replace(track, valid=np.ones(len(track), dtype=np.bool_)) if name == TRUTH else track
 
     def drawn(self, track: StateTrack) -> StateTrack:
-        """Return the track with sideslip NaN where it is invalid or the speed is below the low-speed limit."""
+        """Return the track with sideslip NaN at invalid stamps and below the low-speed limit."""
         slow = track.without_sideslip_below(self.low_speed_m_s)
         beta, std = (np.where(track.valid, c, np.nan) for c in (slow.sideslip_rad, slow.sideslip_std_rad))
         return replace(slow, sideslip_rad=beta, sideslip_std_rad=std)

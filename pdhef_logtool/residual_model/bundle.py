@@ -65,7 +65,7 @@ class Normalisation:
 
 @checked_dataclass(frozen=True, config=_CHECKED)
 class NetworkDesign:
-    """What decides the outputs of a network, beside its weights.
+    """Everything but the weights that decides the outputs of a network.
 
     Attributes
     ----------

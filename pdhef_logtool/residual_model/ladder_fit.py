@@ -27,7 +27,7 @@ MOST_BLOCKS, LEAST_BLOCK_S, FORGET_S = 10, 4.0, 2.0
 LEAST_DRIVES = 3
 #: Arrays of the random features.
 RANDOM_ARRAYS = ("odd_directions", "even_directions", "phases")
-#: Number of features whose responses are computed together, for the memory of a long drive.
+#: Number of features with responses computed together, for the memory of a long drive.
 TOGETHER = 25
 #: A model replaces a simpler one if its squared error in held-out blocks is lower by at least this many standard errors
 #: of the paired differences, and its RMSE by this share. λ is the largest value within one standard error.

@@ -85,7 +85,7 @@ class OpenedLog:
         return report
 
     def readable_report(self) -> dict[str, Any] | None:
-        """Return report.json, None also where it is damaged."""
+        """Return report.json, None also if it is damaged."""
         with suppress(OutputError):
             return self.report()
         return None

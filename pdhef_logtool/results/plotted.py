@@ -37,7 +37,7 @@ class Plot:
 
     @property
     def error_title(self) -> str:
-        """Title of its error."""
+        """Title of the plot of its error."""
         return f"Error of {self.title[0].lower()}{self.title[1:]}"
 
 

@@ -45,7 +45,7 @@ class Estimates:
 
     @property
     def signals(self) -> Signals:
-        """Input of the estimators."""
+        """Signals that the estimators used."""
         return self.estimated.signals
 
     def frame(self, *, errors: bool = False) -> "pl.DataFrame":
@@ -76,7 +76,7 @@ class Estimates:
         return axes
 
     def _errors(self, track: StateTrack) -> "dict[str, pl.Expr]":
-        """Return the errors of a track by column; the ground truth has none."""
+        """Return the errors of a track by column; empty for the ground truth."""
         import polars as pl
 
         truth, slow = self.estimated.truth, self.drive.car.vehicle.low_speed_blend_m_s

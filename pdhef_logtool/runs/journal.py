@@ -121,7 +121,7 @@ class Journal:
 
     @classmethod
     def read(cls, folder: Path) -> "Journal":
-        """Return the journal of a folder, empty if there is none; damaged lines are ignored and counted.
+        """Return the journal of a folder, empty without a file; damaged lines are ignored and counted.
 
         Raises
         ------

@@ -80,7 +80,7 @@ def score_log(
 
     Parameters
     ----------
-    argument : the log. config : of it count vehicle, mapping, slice, ground truth choice and plan.
+    argument : the log. config : vehicle, mapping, slice, choice of ground truth and plan are used.
     estimates : ``[SIGNAL=]TOPIC[.FIELD]``, together one estimator called ``name`` (default: its topic); without any,
         the mapping's ``[estimates.NAME.SIGNAL]`` tables, all or the one called ``name``.
     truth : likewise; without any, the mapping's or the recognised ground truth.

@@ -35,7 +35,7 @@ class Contradiction(NamedTuple):
 
 
 def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradiction | None:
-    """Return what contradicts an estimate: a lower ``d2`` of one that passes the yaw test; None if nothing does.
+    """Return the contradiction of an estimate: a lower ``d2`` of one that passes the yaw test; None without one.
 
     The yaw test alone contradicts nothing: at the limit of the tyres the right sideslip can fail it. A log without
     steering has no yaw test, and then no estimate to compare with.

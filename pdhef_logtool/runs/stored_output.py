@@ -129,7 +129,7 @@ class StoredOutput(Mirror):
             self.objects.get_all(sorted(needed), self.folder)
 
     def take(self, stored: StoredEnd | None) -> DriveEnd | None:
-        """Store the files of a drive and return its result; None if there is none."""
+        """Store the files of a drive and return its result; None without one."""
         if stored is None:
             return None
         for name in stored.names:

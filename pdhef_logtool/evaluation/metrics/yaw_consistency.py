@@ -26,7 +26,7 @@ def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
 
 
 def yaw_rate_errors(calibrated: CalibratedSignals, vys: Iterable[FloatArray]) -> Iterator[FloatArray]:
-    """Yield the modelled minus the measured yaw rate [N], rad/s, for each v_y [N], m/s, NaN where there is none."""
+    """Yield the modelled minus the measured yaw rate [N], rad/s, for each v_y [N], m/s; NaN without one."""
     signals, vehicle, delay_s = calibrated
     t, rate = signals.stamps_ns, signals.yaw_rate_rad_s
     steer = np.interp(t - round(delay_s * NS_PER_S), t, signals.steer_rad)
