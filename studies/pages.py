@@ -14,6 +14,7 @@ from typing import Any
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
+from pdhef_logtool.storage import templates
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.toml_text import toml_text
 
@@ -49,9 +50,16 @@ def fill(page: str, blocks: Mapping[str, str], where: str) -> str:
     return page
 
 
-def template(module: str, **texts: object) -> str:
-    """Return the Markdown file beside a module (its ``__file__``) with texts in place of ``{name}``."""
-    return Path(module).with_suffix(".md").read_text(encoding="utf-8").format(**texts)
+def template(module: str, **context: object) -> str:
+    """Render the Markdown template beside a module (its ``__file__``)."""
+    return templates.template(Path(module).with_suffix(".md"), number=number).render(context)
+
+
+def blocks(module: str, **context: object) -> dict[str, str]:
+    """Render the blocks of the Markdown template beside a module (its ``__file__``); return them by name."""
+    page = templates.template(Path(module).with_suffix(".md"), number=number)
+    made = {name: "".join(render(page.new_context(context))) for name, render in page.blocks.items()}
+    return {name: text.strip("\n") for name, text in made.items()}
 
 
 def update(folder: Path, name: str, blocks: Mapping[str, str]) -> None:
