@@ -56,10 +56,9 @@ def template(module: str, **context: object) -> str:
 
 
 def blocks(module: str, **context: object) -> dict[str, str]:
-    """Render the blocks of the Markdown template beside a module (its ``__file__``); return them by name."""
-    page = templates.template(Path(module).with_suffix(".md"), number=number)
-    made = {name: "".join(render(page.new_context(context))) for name, render in page.blocks.items()}
-    return {name: text.strip("\n") for name, text in made.items()}
+    """Render the Markdown template beside a module; return the blocks between comments as of :func:`fill`."""
+    found = re.findall(r"<!-- begin (\w+) -->\n(.*?)<!-- end \1 -->", template(module, **context), re.DOTALL)
+    return {name: text.strip("\n") for name, text in found}
 
 
 def update(folder: Path, name: str, blocks: Mapping[str, str]) -> None:

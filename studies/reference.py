@@ -33,7 +33,7 @@ from studies import pages
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
 from studies.gates.tool import Tool, estimates, metrics, reports, sideslip_rmse_deg
 from studies.mcap_logs import Message, messages, write_log
-from studies.pages import DRIVES, ROOT, number, table, write_toml
+from studies.pages import DRIVES, ROOT, write_toml
 from studies.peers.drives import PEER_DRIVES, mapping_table, peer_drive, vehicle_table
 from studies.recalibrate import input_digest
 from truthsim.batch import DriveSpec
@@ -325,50 +325,26 @@ def rankings(folder: Path, errors: dict[str, float]) -> tuple[int, int, int, int
     return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)
 
 
-_HEAD = "drive, GNSS, fault, true RMS, RMSE, target, ±, coverage, valid, RMSE there, physics, with GNSS, refused"
-
-
-def _row(case: Case, got: Figures) -> list[str]:
-    """Return the line of a case; an error above its target is bold."""
-    gnss = case.gnss if got["used_gnss"] or case.gnss == NONE else f"{case.gnss}, not used"
-    rmse, target = number(got["rmse"]), case.target_deg
-    missed = target is not None and not (got["rmse"] <= target and not got["refused"])
-    coverage = f"{100 * got['coverage']:.0f} %" if math.isfinite(got["coverage"]) else "–"
-    return [
-        case.title, gnss, case.fault or "–", number(got["truth"], 2), f"**{rmse}**" if missed else rmse,
-        "–" if target is None else f"{target:.2f}", number(got["std"], 2), coverage,
-        f"{100 * got['valid_share']:.0f} %", number(got["valid_rmse"], 2), number(got["physics"]), number(got["aided"]),
-        got["refused"].partition(" (")[0] or "–",
-    ]  # fmt: skip
-
-
-def _rankings(done: Sequence[tuple[Case, Figures]]) -> list[list[str]]:
-    rows = []
-    for name, titles in (
-        ("recorded", [entry["title"] for entry in _TABLES["recorded"].values()]),
-        ("simulated", (*SIMULATED, *_TABLES["road"])),
-        ("simulated, other cars", OTHER_CARS),
-    ):
-        pairs = [f["pairs"] for c, f in done if c.title in titles and c.fault != AT_ANTENNA]
-        claimed, agreed, clear, found = np.sum(np.array(pairs).reshape(-1, 4), axis=0, dtype=int).tolist()
-        agree = "–" if not claimed else f"{100.0 * agreed / claimed:.0f} %"
-        share = "–" if not clear else f"{100.0 * found / clear:.0f} %"
-        rows.append([name, str(claimed), agree, str(clear), share])
-    return rows
-
-
 def blocks(results: dict[str, Figures]) -> dict[str, str]:
     """Return the tables of the stored figures by name."""
     done = [(case, results[case.name]) for case in cases() if case.name in results]
-    aided = [f for c, f in done if math.isfinite(f["aided"]) and c.fault != AT_ANTENNA]
-    worse = sum(f["aided"] > f["physics"] + max(0.05 * f["physics"], 0.003) for f in aided)
-    head = f"drives, ranked, as by ground truth, pairs that differ by more than {CLEAR_DEG}°, of these ranked"
-    return {
-        "recorded": table(_HEAD, [_row(c, f) for c, f in done if c.log]),
-        "simulated": table(_HEAD, [_row(c, f) for c, f in done if c.spec is not None]),
-        "causal": f"In {worse} of {len(aided)} rows, `physics` is worse with GNSS by more than 5 % and 0.003°.",
-        "rankings": table(head, _rankings(done)),
+    ranked = [(case, got) for case, got in done if case.fault != AT_ANTENNA]
+    aided = [got for _, got in ranked if math.isfinite(got["aided"])]
+    titles = {
+        "recorded": [entry["title"] for entry in _TABLES["recorded"].values()],
+        "simulated": [*SIMULATED, *_TABLES["road"]],
+        "simulated, other cars": OTHER_CARS,
     }
+    pairs = {name: [got["pairs"] for case, got in ranked if case.title in of] for name, of in titles.items()}
+    return pages.blocks(
+        __file__,
+        recorded=[(case, got) for case, got in done if case.log],
+        simulated=[(case, got) for case, got in done if case.spec is not None],
+        worse=sum(got["aided"] > got["physics"] + max(0.05 * got["physics"], 0.003) for got in aided),
+        aided=len(aided),
+        clear_deg=CLEAR_DEG,
+        rankings={name: np.sum(np.reshape(of, (-1, 4)), axis=0, dtype=int).tolist() for name, of in pairs.items()},
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
