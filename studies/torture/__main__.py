@@ -24,7 +24,7 @@ from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
 from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
-from studies.pages import DOCS, ROOT, options, read_json, table, update, write_json
+from studies.pages import DOCS, ROOT, blocks, options, read_json, update, write_json
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
 from studies.torture.mutants import HANG_S, format_judge, log_judge
@@ -99,45 +99,16 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-# ------------------------------------------------------------------------------------------------ the page
-
-
-def _list(rows: list[dict[str, Any]]) -> str:
-    """Return a line for each case, with its costs."""
-    costs = [key for key in rows[0] if key not in ("name", "end", "problem")]
-    body = [
-        [r["name"], r["end"] + (f", **wrong**: {_cell(r['problem'])}" if r["problem"] else ""),
-         *(_cost(key, r[key]) if key in r else "–" for key in costs)]
-        for r in rows
-    ]  # fmt: skip
-    return table(["case", "ended", *("MiB" if key == "bytes" else key for key in costs)], body, right_from=2)
-
-
-def _cost(key: str, value: float) -> str:
-    return f"{value:.1f}" if key == "s" else f"{int(value) >> 20 if key == 'bytes' else value:.0f}"
-
-
-def _cell(text: str) -> str:
-    return " ".join(text.split())[-200:].replace("|", "/")
-
-
 _ENDS = ("exit 0", "exit 1", "exit 2", "exit 3", "internal error", NO_VERDICT)
 
 
-def _mutations(collected: dict[str, Any]) -> str:
-    rows = []
-    for name, r in collected.items():
-        ends: Counter[str] = Counter()
-        for end, n in r["ends"].items():
-            ends[end.partition(",")[0]] += n
-        counted = [ends[k] for k in _ENDS]
-        counts = [f"{n:,}" for n in (r["count"], *counted, r["count"] - sum(counted))]
-        rows.append([name, str(r["seed"]), *counts, f"{r['slowest_s']:.1f}", str(r["peak_bytes"] >> 20)])
-    text = table(["what", "seed", "cases", *_ENDS, "other", "slowest s", "peak MiB"], rows, right_from=1)
-    wrong = [(name, *p) for name, r in collected.items() for p in r["problems"]]
-    if wrong:
-        text += "\n\nWrong, by number:\n\n" + "\n".join(f"- {n} {i}: `{_cell(p)}`" for n, i, p in wrong[:40])
-    return text
+def _counts(judged_kind: Mapping[str, Any]) -> list[int]:
+    """Return the number of cases of a kind, with each of the usual ends, and with others."""
+    ends: Counter[str] = Counter()
+    for end, n in judged_kind["ends"].items():
+        ends[end.partition(",")[0]] += n
+    counted = [ends[k] for k in _ENDS]
+    return [judged_kind["count"], *counted, judged_kind["count"] - sum(counted)]
 
 
 def main() -> int:
@@ -178,11 +149,7 @@ def main() -> int:
             write_json(kept, (read_json(kept) if again and kept.is_file() else {}) | do() if again else do())
         if kept.is_file():
             results[name] = read_json(kept)
-    counts = f"--logs {given.logs} --count {given.count}"
-    counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"
-    tables = {name: (_list if isinstance(r, list) else _mutations)(r) for name, r in results.items() if r}
-    asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
-    update(given.out, "reliability.md", tables | asked)
+    update(given.out, "reliability.md", blocks(__file__, results=results, given=given, ends=_ENDS, counts=_counts))
     rows = [r for part in results.values() for r in (part if isinstance(part, list) else part.values())]
     return int(any(r.get("problem") or r.get("problems") for r in rows))
 
