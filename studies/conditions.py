@@ -24,7 +24,7 @@ import polars as pl
 from pdhef_logtool import PdhefError, __version__
 from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool
-from studies.pages import INDEPENDENT, ROOT, number, page_options, read_json, table, update, write_json, write_toml
+from studies.pages import INDEPENDENT, ROOT, blocks, page_options, read_json, update, write_json, write_toml
 from studies.pictures import save, subplots
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
@@ -149,26 +149,14 @@ def write_page(out: Path, folder: Path) -> None:
     label = f"median sideslip RMSE of {SUBJECT} over that of the reference, 95 % interval"
     plot(pictures / "ratios.png", rows, ratios, label, limits={1.0: "-", MARGIN: ":"})
 
-    covered = metrics.filter(metric="coverage95", estimator=SUBJECT)
-    summary, counts = [], []
-    for i, row in enumerate(rows):
-        of = covered.filter(row=row)
-        share = f"{100 * np.average(of['value'], weights=of['n']):.0f} %" if len(of) else "–"
-        cells = [number(drawn[n][i, 1]) for n in drawn]
-        summary.append([row, facts["rows"][row], str(errors.filter(row=row).height), *cells, share])
-    for reference, bounds in ratios.items():
-        words = [verdict(low, high) for low, _, high in bounds]
-        above = [f"{r} ({value:.2f})" for r, (_, value, _) in zip(rows, bounds, strict=True) if value > MARGIN]
-        numbers = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
-        counts.append([reference, *numbers, ", ".join(above) or "none"])
-    head = ["row", "condition", "drives", *drawn, f"coverage of {SUBJECT}"]
-    few = [cells[1:-1] for name in README_ROWS for cells in summary if cells[0] == name]
-    update(out, "README.md", {"conditions": table(head[1:-1], few, right_from=1)})
-    update(out, "conditions.md", {
-        "command": f"Command: `{facts['command']}`. Car: {facts['car']}; pdhef-logtool {facts['version']}.",
-        "summary": table(head, summary),
-        "counts": table(f"reference, better, not worse, open, worse, ratio above {MARGIN}", counts),
-    })  # fmt: skip
+    covered = metrics.filter(metric="coverage95", estimator=SUBJECT).group_by("row")
+    coverage = covered.agg((pl.col("value") * pl.col("n")).sum() / pl.col("n").sum())
+    about = {"facts": facts, "rows": rows, "drawn": drawn, "ratios": ratios, "readme_rows": README_ROWS}
+    about |= {"drives": dict(errors["row"].value_counts().iter_rows()), "coverage": dict(coverage.iter_rows())}
+    verdicts = {o: [verdict(low, high) for low, _, high in bounds] for o, bounds in ratios.items()}
+    made = blocks(__file__, subject=SUBJECT, margin=MARGIN, verdicts=verdicts, **about)
+    update(out, "README.md", {"conditions": made.pop("conditions")})
+    update(out, "conditions.md", made)
 
 
 def plot(
