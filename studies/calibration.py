@@ -25,7 +25,7 @@ from pdhef_logtool import Car, PdhefError
 from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from studies.drawn_cars import KINDS, draw_car
 from studies.gates.tool import Tool, metrics, reports
-from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, update, write_toml, write_validated_car
+from studies.pages import ROOT, SAMPLE_VEHICLE, number, options, table, update, write_toml, write_validated_car
 from truthsim.batch import sensor_noise
 from truthsim.drive import simulate_drive
 from truthsim.vehicle import GRAVITY_M_S2
@@ -233,11 +233,7 @@ def coverage_table(scores: pl.DataFrame) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Simulate, calibrate, and write the page."""
-    parser = options("calibration", __doc__)
-    parser.add_argument("--cars", type=int, default=CARS)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "calibration")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    given = parser.parse_args(arguments)
+    given = options("calibration", __doc__, "work out", cars=CARS).parse_args(arguments)
     runs, scores = list[dict[str, Any]](), list[dict[str, Any]]()
     for index in range(given.cars):
         of_car = outcomes(Tool(ROOT, given.work.resolve()), index)

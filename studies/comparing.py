@@ -2,22 +2,21 @@
 
     python -m studies.comparing [--times 5000] [--planted 2000] [--out docs]
 
-The paired log ratios of drives are drawn from a normal and a heavy-tailed distribution (Student's t with 3 degrees of
-freedom, scaled to the same standard deviation), 0.2 wide. Without a change, relabelling flips the sign of each ratio at
-random.
+``--times``: relabellings without a change. ``--planted``: runs with a change. The paired log ratios of drives are drawn
+from a normal and a heavy-tailed distribution (Student's t with 3 degrees of freedom, scaled to the same standard
+deviation), 0.2 wide. Without a change, relabelling flips the sign of each ratio at random.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool.evaluation.statistics import paired_change
 from pdhef_logtool.records.signals import FloatArray
-from studies.pages import DOCS, options, table, update
+from studies.pages import options, table, update
 
 LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2
 COUNTS = (5, 10, 30, 100)
@@ -95,11 +94,7 @@ def blocks(times: int, planted: int) -> dict[str, str]:
 
 def main() -> None:
     """Write the tables into docs/calibration.md."""
-    parser = options("comparing", __doc__)
-    parser.add_argument("--times", type=int, default=5000, help="relabellings without a change")
-    parser.add_argument("--planted", type=int, default=2000, help="runs with a change")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    given = parser.parse_args()
+    given = options("comparing", __doc__, "out", times=5000, planted=2000).parse_args()
     update(given.out, "calibration.md", blocks(given.times, given.planted))
 
 

@@ -24,7 +24,7 @@ import polars as pl
 from pdhef_logtool import PdhefError, __version__
 from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool
-from studies.pages import INDEPENDENT, ROOT, blocks, page_options, read_json, update, write_json, write_toml
+from studies.pages import INDEPENDENT, OF_PAGES, ROOT, blocks, options, read_json, update, write_json, write_toml
 from studies.pictures import save, subplots
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
@@ -190,14 +190,11 @@ def plot(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the table; 1 with one line where an input is wrong."""
-    parser = page_options("conditions", __doc__)
+    parser = options("conditions", __doc__, OF_PAGES, drives=10, seed=1, jobs=2)
     parser.add_argument("--car", default="saloon")
     parser.add_argument("--network", type=Path, help="instead of the car's")
     all_rows = (*ROW_NAMES, INDEPENDENT_ROW)
     parser.add_argument("--rows", nargs="+", choices=all_rows, default=all_rows, metavar="ROW", help="all by default")
-    parser.add_argument("--drives", type=int, default=10, help="drives a row")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args(arguments)
     try:
         if not given.stored:

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
 from functools import cache
+from typing import Any
 
 from pdhef_logtool.car.assumed_values import RULES
 from pdhef_logtool.car.vehicle import Sensors

@@ -114,17 +114,26 @@ def write_validated_car(folder: Path, vehicle: Mapping[str, Any]) -> Path:
     return folder
 
 
-def options(name: str, text: str | None) -> argparse.ArgumentParser:
-    """Return the parser of ``python -m studies.NAME``; ``text`` is its module's."""
+def options(name: str, text: str | None, usual: str = "", **numbers: float) -> argparse.ArgumentParser:
+    """Return the parser of ``python -m studies.NAME``; ``text``, which describes its options, is its module's.
+
+    Parameters
+    ----------
+    usual : names of usual options. numbers : further options with their defaults.
+    """
     shape = argparse.RawDescriptionHelpFormatter
-    return argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)
-
-
-def page_options(name: str, text: str | None) -> argparse.ArgumentParser:
-    """Return the parser of a study with stored results and a page."""
-    parser = options(name, text)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / name, help="folder of logs and runs")
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of the page")
-    parser.add_argument("--results", type=Path, default=RESULTS / name, help="folder of the results")
-    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
+    parser = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)
+    known: dict[str, dict[str, Any]] = {
+        "work": {"type": Path, "default": ROOT / "out" / name, "help": "folder of logs and runs"},
+        "out": {"type": Path, "default": DOCS, "help": "folder of the page"},
+        "results": {"type": Path, "default": RESULTS / name, "help": "folder of the results"},
+        "stored": {"action": "store_true", "help": "write the page of the stored results"},
+    }
+    known |= {option: {"type": type(default), "default": default} for option, default in numbers.items()}
+    for option in (*usual.split(), *numbers):
+        parser.add_argument(f"--{option.replace('_', '-')}", **known[option])
     return parser
+
+
+#: Usual options of a study with stored results and a page.
+OF_PAGES = "work out results stored"

@@ -349,7 +349,7 @@ def blocks(results: dict[str, Figures]) -> dict[str, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compute the cases that are not stored yet, and write the page."""
-    parser = pages.page_options("reference", __doc__)
+    parser = pages.options("reference", __doc__, pages.OF_PAGES)
     parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="parts of the names of cases")
     given = parser.parse_args(arguments)
     file = given.results / STORED

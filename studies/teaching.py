@@ -194,7 +194,7 @@ def mean(ratios: Sequence[float]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the pairs and write the page."""
-    parser = pages.page_options("teaching", __doc__)
+    parser = pages.options("teaching", __doc__, pages.OF_PAGES)
     parser.add_argument("--cars", nargs="+", choices=[c.name for c in CARS], default=[c.name for c in CARS])
     given = parser.parse_args(arguments)
     if not given.stored:

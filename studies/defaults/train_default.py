@@ -56,8 +56,8 @@ def simulate(t: Namespace) -> None:
     t.output.mkdir(parents=True, exist_ok=True)
     text = part_toml(read_vehicle_file(SAMPLE_VEHICLE).vehicle, "Written by python -m studies.defaults.train_default.")
     (t.output / VEHICLE_FILE).write_text(f"{text}\n[network]\ngain = {GAIN}\n", encoding="utf-8")
-    write_suite(t.work / "one_car", count=t.drives, seed=SEED, processes=t.jobs)
-    paper_drives.write_drives(t.work / PAPER_DRIVES, count=min(t.drives, paper_drives.COUNT), processes=t.jobs)
+    write_suite(t.work / "one_car", count=DRIVES, seed=SEED, processes=t.jobs)
+    paper_drives.write_drives(t.work / PAPER_DRIVES, processes=t.jobs)
 
 
 def fit(t: Namespace) -> None:
@@ -69,7 +69,7 @@ def noise(t: Namespace) -> None:
     """Tune the noise of all tuned filters alike, on validation drives."""
     config = RunConfig(car=t.output, mapping=fit_physics.MAPPING)
     logs = chosen_logs([str(t.work / "one_car")], LearnSettings(config=config, split="validation"))
-    fitted = read_fit(t.output / FIT_FILE).model_copy(update={"filter": tune(logs, config, t.trials)})
+    fitted = read_fit(t.output / FIT_FILE).model_copy(update={"filter": tune(logs, config, TRIALS)})
     (t.output / FIT_FILE).write_text(part_toml(fitted, fit_physics.HEAD), encoding="utf-8")
 
 
@@ -89,7 +89,7 @@ def extract(t: Namespace) -> None:
 def train(t: Namespace) -> None:
     """Train the residual network and the baselines."""
     train_baselines(read_dataset(t.work / NOMINAL_MODEL, NOMINAL_MODEL), t.output / NETWORK_FOLDER)
-    _train(t, PHYSICS_MODEL, PHYSICS_MODEL, "", Recipe(epochs=t.epochs))
+    _train(t, PHYSICS_MODEL, PHYSICS_MODEL, "", Recipe(epochs=EPOCHS))
 
 
 def paper(t: Namespace) -> None:
@@ -114,9 +114,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, default=HOME, help="the car's folder")
     parser.add_argument("--work", type=Path, default=Path("out/train-default"), help="logs and dataset; kept")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    parser.add_argument("--drives", type=int, default=DRIVES, help="number of drives")
-    parser.add_argument("--epochs", type=int, default=EPOCHS)
-    parser.add_argument("--trials", type=int, default=TRIALS, help="of each tuned estimator")
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=list(STEPS), help="default: all")
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)  # small networks: a second thread gains nothing

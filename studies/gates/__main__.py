@@ -123,12 +123,10 @@ def means(measured: dict[tuple[str, str], Figures], frozen: dict[Key, Frozen]) -
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure the rows, and freeze or compare them."""
-    parser = options("gates", __doc__)
+    parser = options("gates", __doc__, "work", jobs=2)
     parser.add_argument("--quick", action="store_true", help="a representative part")
     parser.add_argument("--only", nargs="+", default=[], help="parts of gate/row")
     parser.add_argument("--tree", type=Path, default=ROOT, help="source tree under test")
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "gates")
     parser.add_argument("--freeze", metavar="COMMIT", help="write the figures as those of this commit")
     parser.add_argument("--list", action="store_true", help="print the rows")
     given = parser.parse_args(arguments)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from pdhef_logtool.car.car import Car
 from studies.gates.tool import Tool
-from studies.pages import ROOT, page_options, read_json, write, write_json
+from studies.pages import OF_PAGES, ROOT, options, read_json, write, write_json
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
 from studies.paper.page import PAGE_FIGURES, write_page
@@ -34,9 +34,7 @@ def render(results: Path, docs: Path) -> None:
 
 def main() -> int:
     """Run the command line."""
-    parser = page_options("paper", __doc__)
-    parser.add_argument("--noise-seeds", type=int, default=NOISE_SEEDS, metavar="N", help=f"{NOISE_SEEDS} by default")
-    given = parser.parse_args()
+    given = options("paper", __doc__, OF_PAGES, noise_seeds=NOISE_SEEDS).parse_args()
     if not given.stored:
         seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + given.noise_seeds)
         results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)

@@ -1,6 +1,6 @@
 """Choose the constants that the paper leaves open by one rule on training drives, and show their sensitivity.
 
-    python -m studies.paper.constants [-o FILE]
+    python -m studies.paper.constants
 
 Rule: cyclic search over :data:`GRID`, one constant after the other, until a whole cycle changes nothing; the goal is
 the lowest geometric mean of the sideslip RMSE over :data:`COUNT` training drives of the paper's network, each with and
@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -129,9 +128,7 @@ def sensitivity(chosen: Constants, goals: Mapping[str, Goal]) -> list[dict[str, 
 
 def main() -> int:
     """Run the command line."""
-    parser = options("paper.constants", __doc__)
-    parser.add_argument("-o", "--output", type=Path, default=FILE)
-    arguments = parser.parse_args()
+    options("paper.constants", __doc__).parse_args()
     car = Car.load("saloon")
     training = goal_of(cases_of(training_drives(), car))
     chosen = choose(training)
@@ -151,7 +148,7 @@ def main() -> int:
                   "errors_deg": {title: goal(START) for title, goal in goals.items()}},
                  *sensitivity(chosen, goals)],
     }  # fmt: skip
-    write_json(arguments.output, document)
+    write_json(FILE, document)
     return 0
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from studies.pages import DOCS, RESULTS, ROOT, options, read_json, read_toml, write, write_json
+from studies.pages import DOCS, RESULTS, options, read_json, read_toml, write, write_json
 from studies.strangers.containers import write as write_log
 from studies.strangers.layouts import layouts, mountings
 from studies.strangers.page import Result, merged, page
@@ -83,10 +83,9 @@ def _wanted(name: str, only: Sequence[str]) -> bool:
 
 def main() -> int:
     """Make the logs, score them, write the page."""
-    parser = options("strangers", __doc__)
+    parser = options("strangers", __doc__, "work")
     parser.add_argument("--only", nargs="+", default=[], help="parts of names of logs")
     parser.add_argument("--held-out", nargs="*", metavar="GROUP", help="with layouts that were built last")
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "strangers", help="folder for the logs")
     parser.add_argument("--out", type=Path, default=DOCS / "third_party_logs.md", help="the page")
     parser.add_argument("--keep", type=Path, help="write the results as JSON, to compare with later")
     given = parser.parse_args()

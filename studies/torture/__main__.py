@@ -3,7 +3,8 @@
     python -m studies.torture [PART ...] [--work out/torture] [--seed 1] [--logs 200000] [--drives 24] [--kills 20]
                               [--count 500] [--format blf ...] [--hours 10] [--jobs 2] [--out docs]
 
-Parts: bombs, shared, mutations, formats, crashes, hours; all without one.
+Parts: bombs, shared, mutations, formats, crashes, hours; all without one. ``--logs``: mutated recordings; ``--count``:
+mutants of each other format; ``--drives`` and ``--kills``: of the crashes.
 
 Resumable: results in the work folder are not computed again; remove it after a change of the code. Exit code 1:
 something ended as it should not.
@@ -24,7 +25,7 @@ from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
 from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
-from studies.pages import DOCS, ROOT, blocks, options, read_json, update, write_json
+from studies.pages import ROOT, blocks, options, read_json, update, write_json
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
 from studies.torture.mutants import HANG_S, format_judge, log_judge
@@ -113,18 +114,10 @@ def _counts(judged_kind: Mapping[str, Any]) -> list[int]:
 
 def main() -> int:
     """Run the parts that are not done, and write the page."""
-    parser = options("torture", __doc__)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "torture")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--logs", type=int, default=200_000)
-    parser.add_argument("--drives", type=int, default=24, help="simulated drives of the crashes")
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--hours", type=float, default=10.0)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--count", type=int, default=500, help="mutants of each table and CAN format")
+    numbers = {"seed": 1, "logs": 200_000, "drives": 24, "kills": 20, "hours": 10.0, "jobs": 2, "count": 500}
+    parser = options("torture", __doc__, "work out", **numbers)
     parser.add_argument("--format", action="append", choices=FORMATS, help="a table or CAN format; may be given again")
     parser.add_argument("parts", nargs="*", help="parts; all without one")
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of the page")
     given = parser.parse_args()
     parts: list[str] = given.parts
     work: Path = given.work

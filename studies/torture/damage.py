@@ -300,6 +300,7 @@ def damage_database(content: bytes, rng: random.Random) -> bytes:
 
 # ------------------------------------------------------------------------------------------------ tables
 
+
 def zeros(size: int) -> bytes:
     """Return a zlib stream of zeros (a multiple of 1 MiB), quickly: blocks that end with a full flush are equal."""
     compressor = zlib.compressobj(9)
