@@ -46,7 +46,7 @@ def section(module: ModuleType, rows: Sequence[Row]) -> str:
     return f"{about}\n\n{table(_HEAD, map(cells, rows))}\n\nMachine: {machine}."
 
 
-def main() -> int:
+def main() -> None:
     """Run the benchmarks of the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.performance", description="Speed against peers.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; default: all")
@@ -62,8 +62,7 @@ def main() -> int:
         print(table(_HEAD, map(cells, rows)), end="\n\n", flush=True)
         if arguments.write_docs:
             update(DOCS, PAGE, {name: section(module, rows)})
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

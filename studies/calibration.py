@@ -13,7 +13,7 @@ import copy
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -231,9 +231,9 @@ def coverage_table(scores: pl.DataFrame) -> str:
     return table(head, body, right_from=1)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> None:
     """Simulate, calibrate, and write the page."""
-    given = options("calibration", __doc__, "work out", cars=CARS).parse_args(arguments)
+    given = options("calibration", __doc__, "work out", cars=CARS).parse_args()
     runs, scores = list[dict[str, Any]](), list[dict[str, Any]]()
     for index in range(given.cars):
         of_car = outcomes(Tool(ROOT, given.work.resolve()), index)
@@ -248,8 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "d2": d2_table(done),
         "plus_minus": coverage_table(pl.DataFrame(scores)),
     })  # fmt: skip
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -15,7 +15,7 @@ import heapq
 import json
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -347,11 +347,11 @@ def blocks(results: dict[str, Figures]) -> dict[str, str]:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> None:
     """Compute the cases that are not stored yet, and write the page."""
     parser = pages.options("reference", __doc__, pages.OF_PAGES)
     parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="parts of the names of cases")
-    given = parser.parse_args(arguments)
+    given = parser.parse_args()
     file = given.results / STORED
     stored: dict[str, Figures] = pages.read_json(file) if file.is_file() else {}
     source = input_digest(ROOT, [f"{folder}/**/*.py" for folder in ("pdhef_logtool", "truthsim", "studies")])
@@ -366,8 +366,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stored[case.name] = {"key": key, **figures(case, tool)}
         pages.write_json(file, stored)
     pages.update(given.out, "reference.md", blocks(stored))
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

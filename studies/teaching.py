@@ -192,15 +192,15 @@ def mean(ratios: Sequence[float]) -> str:
     return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({len(ratios)} pairs)" if ratios else "–"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> None:
     """Run the pairs and write the page."""
     parser = pages.options("teaching", __doc__, pages.OF_PAGES)
     parser.add_argument("--cars", nargs="+", choices=[c.name for c in CARS], default=[c.name for c in CARS])
-    given = parser.parse_args(arguments)
+    given = parser.parse_args()
     if not given.stored:
         if not DRIVES.is_dir():
             print("nothing is done: needs ../shared beside the repository")
-            return 0
+            return
         results = []
         for car in (c for c in CARS if c.name in given.cars):
             for result in pairs_of(Tool(ROOT, given.work.resolve()), car):
@@ -210,8 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     made = blocks(pages.read_json(given.results / STORED))
     pages.update(given.out, "README.md", {"teaching": made.pop("teaching")})
     pages.update(given.out, "peers.md", made)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -27,7 +27,6 @@ The single filter here has force scale and bank as states; in operation they are
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -389,7 +388,7 @@ def read_drive(path: Path, car: Car) -> reading.WholeDrive:
         return drive.whole()
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None) -> None:
     """Simulate, fit, write."""
     parser = options("defaults.fit_physics", __doc__)
     parser.add_argument("-o", "--output", type=Path, default=SHIPPED_CARS["saloon"], help="the car's folder")
@@ -410,8 +409,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
     part = Fit(physics_sha256=physics_sha256(car.vehicle), physics=physics, drives=tuple(learnt_on))
     (given.output / FIT_FILE).write_text(part_toml(part, HEAD), encoding="utf-8")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

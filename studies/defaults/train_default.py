@@ -108,22 +108,21 @@ STEPS: dict[str, Callable[[Namespace], None]] = {
 }
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> None:
     """Train and write the car."""
     parser = options("defaults.train_default", __doc__)
     parser.add_argument("-o", "--output", type=Path, default=HOME, help="the car's folder")
     parser.add_argument("--work", type=Path, default=Path("out/train-default"), help="logs and dataset; kept")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=list(STEPS), help="default: all")
-    given = parser.parse_args(arguments)
+    given = parser.parse_args()
     torch.set_num_threads(1)  # small networks: a second thread gains nothing
     began = time.monotonic()
     for name, step in STEPS.items():
         if name in given.steps:
             print(f"[{(time.monotonic() - began) / 60.0:5.1f} min] {name}: {step.__doc__}", flush=True)
             step(given)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -128,13 +128,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", default=[], help="parts of gate/row")
     parser.add_argument("--tree", type=Path, default=ROOT, help="source tree under test")
     parser.add_argument("--freeze", metavar="COMMIT", help="write the figures as those of this commit")
-    parser.add_argument("--list", action="store_true", help="print the rows")
     given = parser.parse_args(arguments)
     rows = [r for r in all_rows() if r.quick or not given.quick]
     rows = [r for r in rows if not given.only or any(text in f"{r.gate}/{r.name}" for text in given.only)]
-    if given.list:
-        print("\n".join(f"{r.gate}/{r.name}" for r in rows))
-        return 0
     for row in rows:
         if absent := [str(file) for file in row.needs if not file.exists()]:
             print(f"{row.gate}/{row.name}: skipped, because {', '.join(absent)} is absent", file=sys.stderr)

@@ -7,8 +7,8 @@ The constants that the paper leaves open come from ``python -m studies.paper.con
 
 from __future__ import annotations
 
+import re
 import shutil
-import sys
 from pathlib import Path
 
 from pdhef_logtool.car.car import Car
@@ -16,7 +16,7 @@ from studies.gates.tool import Tool
 from studies.pages import OF_PAGES, ROOT, options, read_json, write, write_json
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
-from studies.paper.page import PAGE_FIGURES, write_page
+from studies.paper.page import write_page
 from studies.paper.results import document, gather
 
 #: Results of this command and of the constants, in the folder of results.
@@ -26,13 +26,14 @@ STORED = ("results.json", "constants.json")
 def render(results: Path, docs: Path) -> None:
     """Write the page from the stored results and figures of a folder."""
     stored, constants = (read_json(results / name) for name in STORED)
+    page = write_page(stored, constants)
     (docs / "paper").mkdir(parents=True, exist_ok=True)
-    for name in PAGE_FIGURES:
+    for name in re.findall(r"\(paper/(\w+\.png)\)", page):
         shutil.copyfile(results / name, docs / "paper" / name)
-    write(docs / "paper.md", write_page(stored, constants))
+    write(docs / "paper.md", page)
 
 
-def main() -> int:
+def main() -> None:
     """Run the command line."""
     given = options("paper", __doc__, OF_PAGES, noise_seeds=NOISE_SEEDS).parse_args()
     if not given.stored:
@@ -41,8 +42,7 @@ def main() -> int:
         draw(results, given.results)
         write_json(given.results / STORED[0], document(results))
     render(given.results, given.out)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -11,7 +11,6 @@ the chosen point, on these drives and on scenarios A and B, which have no part i
 from __future__ import annotations
 
 import itertools
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -126,7 +125,7 @@ def sensitivity(chosen: Constants, goals: Mapping[str, Goal]) -> list[dict[str, 
     return rows
 
 
-def main() -> int:
+def main() -> None:
     """Run the command line."""
     options("paper.constants", __doc__).parse_args()
     car = Car.load("saloon")
@@ -149,8 +148,7 @@ def main() -> int:
                  *sensitivity(chosen, goals)],
     }  # fmt: skip
     write_json(FILE, document)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -10,11 +10,6 @@ from studies.pages import template
 from studies.paper.schemes import HYBRID, PAPER, PUBLISHED, SCHEMES
 from truthsim.sensors import SensorNoise
 
-#: Figures of the page; the folder of results contains all.
-PAGE_FIGURES = (
-    "figure09_convergence.png", "figure12_sideslip_a.png", "figure16_sideslip_b.png", "figure22_rmse.png",
-    "figure23_step_time.png",
-)  # fmt: skip
 Document = Mapping[str, Any]
 
 

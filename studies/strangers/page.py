@@ -12,14 +12,6 @@ from studies.strangers.recordings import Recording
 
 #: Outcomes of an item, the worst first.
 OUTCOMES = ("wrong, not reported", "wrong, reported", "missing", "right")
-GROUPS = {
-    "fault": "logs with a fault",
-    "layout": "published layouts",
-    "held-out": "held-out layouts",
-    "recorders": "layouts of recorders, first contact",
-    "contact": "layouts of recorders, second contact",
-    "recording": "third-party recordings",
-}
 #: Groups with sound and excited logs: checks may neither fail nor stay undecided.
 HELD_OUT = ("held-out", "recorders", "contact")
 SOUND = ("layout", *HELD_OUT)
@@ -84,6 +76,6 @@ def tally(results: Iterable[Result]) -> Counter[str]:
 def page(results: Sequence[Result], **context: object) -> str:
     """Return the page; ``results``: one for each kind; ``context``: the other fields of ``page.md``."""
     sound = [r for r in results if r.log.group in SOUND]
-    context |= {"results": results, "groups": GROUPS, "held_out": HELD_OUT, "sound": SOUND, "tally": tally}
+    context |= {"results": results, "held_out": HELD_OUT, "sound": SOUND, "tally": tally}
     verdicts = Counter(verdict for r in sound for verdict in r.verdicts.values())
     return template(__file__, verdicts=verdicts, doubted=sum(len(r.doubted) for r in sound), **context)
