@@ -14,7 +14,7 @@ import pytest
 from pdhef_logtool import Car, inspect_log
 from pdhef_logtool.records.tracks import make_track
 from studies import conditions, reference
-from studies.calibration import coverage_table
+from studies.calibration import coverages
 from studies.drawn_cars import fit_vehicle
 from studies.gates import __main__ as gates
 from studies.gates.rows import GateRow
@@ -151,8 +151,8 @@ def test_a_calibrated_figure_is_accepted_and_others_are_not():
         for name, sd in {"right": 1.0, "narrow": 0.5, "wide": 3.0}.items()
         for e in errors
     ]
-    lines = [line.split("|") for line in coverage_table(pl.DataFrame(scores)).splitlines()[2:]]
-    assert {line[1].strip(): line[-2].strip() for line in lines} == {"right": "yes", "narrow": "no", "wide": "too wide"}
+    found = {row[0]: row[-1] for row in coverages(pl.DataFrame(scores))}
+    assert found == {"right": "yes", "narrow": "no", "wide": "too wide"}
 
 
 def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
