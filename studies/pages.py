@@ -1,4 +1,4 @@
-"""Shared by the pages: paths of the repository, Markdown tables and numbers, filled blocks, options of the commands."""
+"""Shared by the pages: paths of the repository, numbers, templates and filled blocks, options of the commands."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,6 @@ DRIVES = ROOT.parent / "shared" / "data" / "drives"
 INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
 
 
-def table(head: str | Iterable[str], body: Iterable[Iterable[str]], *, right_from: int | None = None) -> str:
-    """Return a Markdown table, columns from ``right_from`` on ranged right; a text as head has commas between names."""
-    names = head.split(", ") if isinstance(head, str) else list(head)
-    rule = ["---" if right_from is None or i < right_from else "---:" for i in range(len(names))]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, rule, *body))
-
-
 def number(value: float, digits: int = 3) -> str:
     """Format a figure; a non-finite value is a dash."""
     return "–" if not math.isfinite(value) else f"{value:.{digits}f}"
@@ -50,7 +43,7 @@ def fill(page: str, blocks: Mapping[str, str], where: str) -> str:
     return page
 
 
-def template(module: str, **context: object) -> str:
+def template(module: str | Path, **context: object) -> str:
     """Render the Markdown template beside a module (its ``__file__``)."""
     return templates.template(Path(module).with_suffix(".md"), number=number).render(context)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from pdhef_logtool.evaluation.statistics import pooled
 from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.signals import BoolArray
 from studies import pages
-from studies.pages import number, table
 from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, SMALL, PeerDrive, vehicle_of
 
 SEDAN, CAUSAL, NO_FILE = "open-loop-sedan", "pd-hef, causal", "pd-hef, no file"
@@ -80,23 +80,17 @@ def car_means(rows: pl.DataFrame) -> pl.DataFrame:
 def estimator_table(rows: pl.DataFrame) -> str:
     """Return a line for each estimator, the lowest error of `zero` first."""
     zero, means = rows.filter(estimator="zero").select("log", of_zero="rmse_deg"), car_means(rows)
-    lines = []
+    estimators = []
     for (name,), own in rows.join(zero, on="log").group_by("estimator", maintain_order=True):
         weights, values, others = (own[c].to_numpy() for c in ("scored_s", "rmse_deg", "of_zero"))
         factors = {factor: own[factor].to_list() for factor in ("car", "drive")}
         error = pooled(weights, values, None, squares=True, positive=True, factors=factors)
         ratio = float(np.sqrt(np.average(values**2, weights=weights) / np.average(others**2, weights=weights)))
-        share, covers, winkler, cost = (
-            float(np.average(own[c].to_numpy(), weights=weights))
-            for c in ("available", "coverage95", "winkler_deg", "seconds_per_hour")
-        )
-        mean, spread = means.filter(estimator=name).row(0)[1:]
-        cells = [str(len(own)), number(error.value, 2), f"{number(error.low, 2)} to {number(error.high, 2)}"]
-        cells += [number(x, 2) for x in (ratio, mean, spread)]
-        cells += [f"{share:.0%}", number(covers, 2), number(winkler, 2), number(cost, 1)]
-        lines.append((ratio, [f"`{name}`", *cells]))
-    head = "estimator, drives, RMSE, 95 %, of zero, mean of cars, spread, available, covers, Winkler, s/h"
-    return table(head, [cells for _, cells in sorted(lines)], right_from=1)
+        about = {"name": name, "drives": len(own), "error": error, "ratio": ratio}
+        averages = ("available", "coverage95", "winkler_deg", "seconds_per_hour")
+        about |= {c: float(np.average(own[c].to_numpy(), weights=weights)) for c in averages}
+        estimators.append(about | means.filter(estimator=name).row(0, named=True))
+    return pages.template(Path(__file__).with_name("estimators"), estimators=estimators).rstrip("\n")
 
 
 def agreements(documents: Sequence[dict[str, Any]]) -> Iterator[tuple[str, BoolArray, float]]:
