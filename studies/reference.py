@@ -15,7 +15,7 @@ import heapq
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -53,19 +53,9 @@ LATE_S = 0.06
 RANKED, CLEAR_DEG = ("zero", "kinematic", "open-loop", "phy-ukf", "physics"), 0.3
 
 
-@dataclass(frozen=True, slots=True)
-class Receiver:
-    """GNSS velocity made from ground truth: rate, white and correlated 1-sigma errors, and how late it is."""
-
-    rate_hz: float
-    white_m_s: float
-    correlated_m_s: float
-    correlated_s: float
-    delay_s: float = 0.0
-
-
 _TABLES = pages.read_toml(Path(__file__).with_suffix(".toml"))
-RECEIVERS = {name: Receiver(**entries) for name, entries in _TABLES["receivers"].items()}
+#: GNSS velocity made from ground truth: rate, white and correlated 1-sigma errors, and how late it is.
+RECEIVERS: dict[str, dict[str, float]] = _TABLES["receivers"]
 NONE, REAL = "none", "recorded"
 
 
@@ -100,25 +90,25 @@ class Motion(NamedTuple):
     roll_rate_rad_s: FloatArray
 
 
-def made_gnss(motion: Motion, receiver: Receiver, fault: str) -> tuple[IntArray, FloatArray]:
+def made_gnss(motion: Motion, receiver: Mapping[str, float], fault: str) -> tuple[IntArray, FloatArray]:
     """Return the stamps [M] and the velocities [M, 2] to the east and north that a receiver would show."""
     rng = np.random.default_rng(7)
     t = (motion.stamps_ns - motion.stamps_ns[0]) * 1e-9
-    sampled = np.arange(0.0, t[-1], 1.0 / receiver.rate_hz)
+    sampled = np.arange(0.0, t[-1], 1.0 / receiver["rate_hz"])
     rate = np.gradient(np.unwrap(motion.heading_rad), t)
     forward = motion.vx_m_s - ANTENNA_M[1] * rate
     left = motion.vy_m_s + ANTENNA_M[0] * rate - ANTENNA_HEIGHT_M * motion.roll_rate_rad_s
     cos, sin = np.cos(motion.heading_rad + 0.7), np.sin(motion.heading_rad + 0.7)
-    keep = math.exp(-1.0 / (receiver.rate_hz * receiver.correlated_s))
+    keep = math.exp(-1.0 / (receiver["rate_hz"] * receiver["correlated_s"]))
     columns = []
     for component in (cos * forward - sin * left, sin * forward + cos * left):
         drawn = rng.standard_normal(len(sampled) + 1)[:-1]
         drawn[1:] *= math.sqrt(1.0 - keep**2)
         correlated = lfilter([1.0], [1.0, -keep], drawn)
         good = np.isfinite(component)
-        made = np.interp(sampled - receiver.delay_s, t[good], component[good])
+        made = np.interp(sampled - receiver.get("delay_s", 0.0), t[good], component[good])
         columns.append(
-            made + receiver.correlated_m_s * correlated + receiver.white_m_s * rng.standard_normal(len(made))
+            made + receiver["correlated_m_s"] * correlated + receiver["white_m_s"] * rng.standard_normal(len(made))
         )
     velocity = np.stack(columns, axis=1)
     stamps = motion.stamps_ns[0] + np.rint(sampled * 1e9).astype(np.int64)

@@ -86,20 +86,7 @@ class Car:
         return self.sensors[name]
 
 
-_DRIVES = read_toml(Path(__file__).with_name("drives.toml"))
-#: Channel of the simulator and its columns, by the name in :class:`Car`.
-_SENSORS = {
-    "force": ("imu", "ax_m_s2", "ay_m_s2", "az_m_s2"),
-    "rate": ("imu", "roll_rate_rad_s", "pitch_rate_rad_s", "yaw_rate_rad_s"),
-    "steer": ("steering", "steer_rad"),
-    "steering_wheel": ("steering", "steering_wheel_rad"),
-    "wheels": ("wheels", "fl_m_s", "fr_m_s", "rl_m_s", "rr_m_s"),
-    "position": ("rtk", "x_m", "y_m", "z_m"),
-    "attitude": ("rtk", "roll_rad", "pitch_rad", "yaw_rad"),
-    "body_velocity": ("rtk", "vx_m_s", "vy_m_s"),
-    "yaw_rate": ("rtk", "yaw_rate_rad_s"),
-    "fix": ("fix", "lat_deg", "lon_deg", "alt_m"),
-}
+_DRIVES, _SENSORS = (read_toml(Path(__file__).with_name(f"{name}.toml")) for name in ("drives", "sensors"))
 
 
 @lru_cache(maxsize=16)
