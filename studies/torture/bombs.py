@@ -20,7 +20,7 @@ import lz4.frame
 import zstandard
 
 from studies.pages import ROOT
-from studies.torture.damage import ENDLESS_VIEW, MAGIC, Record, join_bag, join_mcap
+from studies.torture.damage import ENDLESS_VIEW, HUGE_ROWS, MAGIC, Record, join_bag, join_mcap
 from studies.torture.seeds import SEEDS, START_NS
 from studies.torture.workers import LIMIT_S, Verdict, judge_process, measured
 
@@ -192,11 +192,6 @@ def _database(statement: str, folder: Path) -> Path:
     return path
 
 
-_HUGE_ROW = (
-    "CREATE TABLE rows AS SELECT * FROM messages; DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, "
-    "topic_id INTEGER, timestamp INTEGER, data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL); "
-    "INSERT INTO messages (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM rows"
-)
 _FLOAT, _CDR = b"float64 data\n", b"\0\1\0\0" + bytes(8)
 _DECLARED = _schema(b"std_msgs/msg/Float64", b"ros2msg", _FLOAT), _channel(1, b"/x", b"cdr")
 _ODD_NAME = b"/wheels[/red]\x1b[2J\nwarning: all is well\0\xe2\x80\xae"
@@ -286,7 +281,7 @@ BOMBS = (
     Bomb("metadata.yaml that unfolds to 10^11 names", partial(_metadata, _laughs()), (1, 2)),
     Bomb("metadata.yaml 3000 deep", partial(_metadata, "rosbag2_bagfile_information: " + "[" * 3000), (1, 2)),
     Bomb("database whose messages are an endless view", partial(_database, ENDLESS_VIEW), _EITHER),
-    Bomb("database whose rows are 900 MB of nothing each", partial(_database, _HUGE_ROW), _EITHER),
+    Bomb("database whose rows are 900 MB of nothing each", partial(_database, HUGE_ROWS), _EITHER),
 )
 
 

@@ -271,7 +271,7 @@ def _packed(compression: bytes, body: bytes) -> bytes:
 
 #: Statements with a value and an identifier, and statements that change the structure.
 _SQL = read_toml(Path(__file__).with_name("statements.toml"))
-ENDLESS_VIEW: str = _SQL["structure"][-1]
+ENDLESS_VIEW, HUGE_ROWS = _SQL["structure"][-1], _SQL["huge_rows"]
 
 
 def damage_database(content: bytes, rng: random.Random) -> bytes:

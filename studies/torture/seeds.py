@@ -16,6 +16,7 @@ import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
 from studies.mcap_logs import Message, messages, write_log
+from studies.pages import read_toml
 from studies.strangers.cars import Series
 from studies.strangers.containers import Topic, copied, write
 from studies.strangers.recordings import imu, message, steering, velocity
@@ -120,18 +121,10 @@ def write_seeds(folder: Path) -> dict[str, bytes]:
 
 
 RECORDINGS = ("mcap", "bag", "db3")
-#: Suffix and layouts of each format; a number after a version of MDF is its compression.
-FORMATS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "csv": ("csv", ("csv", "csv-german", "csv-gps", "csv-lab", "csv-dated", "csv-sources", "csv-pipes", "csv-long")),
-    "vbo": ("vbo", ("vbo",)),
-    "parquet": ("parquet", ("parquet", "parquet-nested", "parquet-long")),
-    "mat5": ("mat", ("mat", "mat-series", "mat-pairs", "mat-recorder")),
-    "mat73": ("mat", ("mat-7.3",)),
-    "mdf3": ("mdf", ("3.30 0",)),
-    "mdf4": ("mf4", ("mdf", "4.11 2", "can-mdf")),
-    "blf": ("blf", ("can-blf",)),
-    "asc": ("asc", ("can-asc",)),
-    **{suffix: (suffix, tuple(name for name in SEEDS if name.endswith(suffix))) for suffix in RECORDINGS},
+#: Suffix and layouts of each format; those of the recordings are seeds.
+FORMATS: dict[str, tuple[str, list[str]]] = {
+    **{name: (suffix, layouts) for name, (suffix, *layouts) in read_toml(Path(__file__).with_suffix(".toml")).items()},
+    **{suffix: (suffix, [name for name in SEEDS if name.endswith(suffix)]) for suffix in RECORDINGS},
 }
 
 
