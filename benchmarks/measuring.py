@@ -4,8 +4,6 @@ Processor seconds (user + system) of a single-threaded way and the best of inter
 on a machine that others use too.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

@@ -7,8 +7,6 @@ A benchmark is a module of this package: its docstring heads its section of the 
 both run in turns (:mod:`benchmarks.versions`).
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from importlib import import_module

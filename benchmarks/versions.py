@@ -4,8 +4,6 @@ Processor and elapsed seconds are the best of two turns, memory the smallest pea
 The last column: cost of the earlier version over that of this one.
 """
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

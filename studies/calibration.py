@@ -7,8 +7,6 @@ error of a factor 0.5 to 2 at each axle; inertia, roll gradient, IMU position an
 prior of the calibration expects. All drives run by ``pdhef run`` with both files, with and without calibration.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import re

@@ -7,8 +7,6 @@ from a normal and a heavy-tailed distribution (Student's t with 3 degrees of fre
 deviation), 0.2 wide. Without a change, relabelling flips the sign of each ratio at random.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -9,8 +9,6 @@ only with the factor of the row. The runs of the independent simulator are a row
 repository.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence

@@ -3,8 +3,6 @@
 A table is between ``<!-- table: metrics -->`` and ``<!-- end -->``; ``documentation_tables.md`` contains all.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields

@@ -4,8 +4,6 @@ Saloons, SUVs and hatchbacks of all loads, heights, tyres and wear, with sensors
 fitted to a ramp steer (``fit_vehicle``), as after a measurement.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -7,8 +7,6 @@ remedy, *refused* if the mapping file is, *stopped* if a check of its signal fai
 another signal fails instead, *silent* if its checks pass, and *open* if they are undecided.
 """
 
-from __future__ import annotations
-
 import copy
 import re
 import tempfile

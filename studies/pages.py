@@ -1,7 +1,5 @@
 """Shared by the pages: paths of the repository, numbers, templates and filled blocks, options of the commands."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

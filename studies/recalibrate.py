@@ -9,8 +9,6 @@ first. Comments, docstrings and the layout of pages (``studies.pages``, ``studie
 The stamp files are in ``out/recalibrate``. ``--evidence``: only the stages that write pages of ``docs``.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import shlex

@@ -8,8 +8,6 @@ from ground truth and marked so. Only cases with changed inputs are recomputed.
 Recorded drives were seen while constants were chosen: their figures are development figures.
 """
 
-from __future__ import annotations
-
 import hashlib
 import heapq
 import json

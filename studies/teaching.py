@@ -8,8 +8,6 @@ for a car taught by the sideslip reference in place of ground truth, if the refe
 ``../shared`` and may not be redistributed. Without them, the command ends with 0 and writes no file.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator, Sequence

@@ -12,8 +12,6 @@ angle over friction, so that the peak follows friction and the stiffness stays. 
 other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

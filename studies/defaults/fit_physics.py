@@ -24,8 +24,6 @@ The single filter here has force scale and bank as states; in operation they are
 (:mod:`~pdhef_logtool.estimators.adaptive_physics`). With a filter bank, the noise would overfit to few drives.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

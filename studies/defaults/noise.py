@@ -7,8 +7,6 @@ The objective is the mean over drives of ln √(RMSE² + floor²) of the sidesli
 mean in degrees: every drive counts by its relative error. The floor limits the effect of drives that hardly turn.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 

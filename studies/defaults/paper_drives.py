@@ -5,8 +5,6 @@ and friction 0.3 to 1.0, both uniform; 70 % training, 15 % validation and 15 % t
 speed and friction that the condition table holds out are excluded. Only ``pd-hef-paper`` is trained on a fishhook.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -9,8 +9,6 @@ the drives of :mod:`studies.defaults.paper_drives`. Filter noise of all tuned es
 in one search. Existing logs with unchanged settings are kept.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

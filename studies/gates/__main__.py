@@ -8,8 +8,6 @@ tree under test, for figures in the file and for rows missing from it. It saves 
 The tool is used by its command line and its files only.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The rows of the gates: each measures figures of the tool by its command line and its files."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import threading

@@ -1,7 +1,5 @@
 """The tool under test as its users see it: the command line, and the files of a run."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

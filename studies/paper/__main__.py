@@ -5,8 +5,6 @@
 The constants that the paper leaves open come from ``python -m studies.paper.constants``.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

@@ -8,8 +8,6 @@ without the wheel speed (``sensors=esp``, the paper's sensor set). The sensitivi
 the chosen point, on these drives and on scenarios A and B, which have no part in the choice.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

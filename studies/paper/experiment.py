@@ -3,8 +3,6 @@
 The runs get the friction of the drive. Noise seeds change the sensors alone.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """``docs/paper.md`` from ``results.json`` and ``published.toml``; its sentences and tables are in ``page.md``."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

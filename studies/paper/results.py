@@ -1,7 +1,5 @@
 """Everything that the page and the pictures need, gathered once, and as one JSON document."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

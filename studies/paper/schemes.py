@@ -1,7 +1,5 @@
 """The schemes of the comparison, the selection for the figures, and published values."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from studies.pages import read_toml

@@ -8,8 +8,6 @@ page is written; without these drives, nothing is done. Otherwise the table is p
 vehicle file and the same mapped and aligned signals; ground truth is used for scores only.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Tables of the scores of recorded drives, and of the agreement of calibrated parameters between drives of a car."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations

@@ -6,8 +6,6 @@
 layouts that were built last: its groups, by default ``held-out``. Exit code 1: something is wrong and not reported.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections import Counter

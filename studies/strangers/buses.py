@@ -3,8 +3,6 @@
 A topic is a message, its type the bus. Every field takes 16 bits, from the first byte on.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import shutil
 from collections.abc import Sequence

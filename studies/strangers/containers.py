@@ -1,7 +1,5 @@
 """Topics as columns into the containers and encodings that recorders leave."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

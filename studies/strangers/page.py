@@ -1,7 +1,5 @@
 """``docs/third_party_logs.md``: the score, every log, and the wrong items by name, as in ``page.md``."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Compare the mapping and messages of the tool with the right answers by value, independent of field names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from contextlib import closing

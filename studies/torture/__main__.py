@@ -10,8 +10,6 @@ Resumable: results in the work folder are not computed again; remove it after a 
 something ended as it should not.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import sys

@@ -3,8 +3,6 @@
 Each must end within the limits of :mod:`studies.torture.workers` and with one of the exit codes that it names.
 """
 
-from __future__ import annotations
-
 import bz2
 import json
 import os

@@ -7,8 +7,6 @@ new is put behind the others, and a link to another block is directed to it. HDF
 own libraries. The same seed and number give the same file.
 """
 
-from __future__ import annotations
-
 import bz2
 import io
 import random

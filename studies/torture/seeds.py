@@ -3,8 +3,6 @@
 They are written by :mod:`studies.strangers.containers`.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Commands in this process or another one under limits; cases in supervised processes, killed if they hang or grow."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
