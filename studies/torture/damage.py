@@ -195,7 +195,7 @@ def _damage_mcap_chunk(record: Record, rng: random.Random) -> Record | None:
     try:
         start, end, size, _, n = struct.unpack_from("<QQQII", payload)
         compression = payload[32 : 32 + n]
-        inner = _split_mcap(_unpacked(compression, payload[40 + n :], size))
+        inner = _split_mcap(_CODECS.get(compression, _PLAIN)[0](payload[40 + n :], size))
     except Exception:  # noqa: BLE001 (the decompressor raises any exception on an earlier fault)
         return op, damage_bytes(payload, rng)
     if inner:
@@ -204,7 +204,7 @@ def _damage_mcap_chunk(record: Record, rng: random.Random) -> Record | None:
     size, crc = len(body), zlib.crc32(body)
     if rng.random() < 0.1:
         compression = rng.choice((b"", b"lz4", b"zstd", b"xz", b"\xff"))
-    packed = _packed(compression, body)
+    packed = _CODECS.get(compression, _PLAIN)[1](body)
     if rng.random() < 0.15:
         size = rng.choice(EDGES)
     if rng.random() < 0.15:
@@ -239,30 +239,25 @@ def _damage_bag_chunk(record: Record, rng: random.Random) -> Record | None:
     if found is None:
         return None
     try:
-        inner = _split_bag(_unpacked(found[1], data, 0))
+        inner = _split_bag(_CODECS.get(found[1], _PLAIN)[0](data, 0))
     except Exception:  # noqa: BLE001 (as above)
         return header, damage_bytes(data, rng)
     if inner:
         _damage_list(inner, rng)
     body = join_bag(inner)
     size = struct.pack("<I", len(body) if rng.random() < 0.95 else rng.choice(EDGES) % 2**32)
-    return re.sub(rb"(?s)(?<=size=).{4}", lambda _: size, header), _packed(found[1], body)
+    return re.sub(rb"(?s)(?<=size=).{4}", lambda _: size, header), _CODECS.get(found[1], _PLAIN)[1](body)
 
 
-def _unpacked(compression: bytes, stored: bytes, size: int) -> bytes:
-    if compression == b"zstd":
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-    if compression == b"lz4":
-        return bytes(lz4.frame.decompress(stored))
-    return bz2.decompress(stored) if compression == b"bz2" else stored
-
-
-def _packed(compression: bytes, body: bytes) -> bytes:
-    if compression == b"zstd":
-        return zstandard.ZstdCompressor().compress(body)
-    if compression == b"lz4":
-        return bytes(lz4.frame.compress(body))
-    return bz2.compress(body) if compression == b"bz2" else body
+_CODECS: dict[bytes, tuple[Callable[[bytes, int], bytes], Callable[[bytes], bytes]]] = {
+    b"zstd": (
+        lambda stored, size: zstandard.ZstdDecompressor().decompress(stored, max_output_size=size),
+        lambda body: zstandard.ZstdCompressor().compress(body),
+    ),
+    b"lz4": (lambda stored, _: lz4.frame.decompress(stored), lz4.frame.compress),
+    b"bz2": (lambda stored, _: bz2.decompress(stored), bz2.compress),
+}
+_PLAIN = (lambda stored, _: stored, bytes)
 
 
 # ------------------------------------------------------------------------------------------------ databases
