@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import polars as pl
 from scipy.signal import lfilter
 
 from pdhef_logtool import Car
@@ -257,13 +256,6 @@ def run(
     return tool.run(name, log, *files, "--keep", "estimates", "--reference", "on", *waived, *given)
 
 
-def tracks_of(folder: Path) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return ground truth and reference of a run at the stamps that both have."""
-    tracks = estimates(folder)
-    truth, reference = (tracks.filter(estimator=name).sort("stamp_ns") for name in ("truth", "reference"))
-    return truth.join(reference, on="stamp_ns", how="semi"), reference.join(truth, on="stamp_ns", how="semi")
-
-
 def motion_of(folder: Path) -> Motion:
     """Return the motion of a recorded drive from the ground truth of a run."""
     truth = estimates(folder).filter(estimator="truth").sort("stamp_ns")
@@ -273,9 +265,10 @@ def motion_of(folder: Path) -> Motion:
 
 
 def scored_run(folder: Path, case: Case, vehicle: dict[str, Any]) -> Figures:
-    """Return the figures of the reference of a run."""
+    """Return the figures of the reference of a run at the stamps that it shares with the ground truth."""
     (report,) = (r["reference"] for r in reports(folder).values())
-    truth, reference = tracks_of(folder)
+    sides = [estimates(folder).filter(estimator=name).sort("stamp_ns") for name in ("truth", "reference")]
+    truth, reference = (a.join(b, on="stamp_ns", how="semi") for a, b in (sides, sides[::-1]))
     vx, vy = (truth[n].to_numpy() for n in ("vx_m_s", "vy_m_s"))
     if case.fault == AT_ANTENNA:
         (antenna,) = (p["value"] for p in report["parameters"] if p["name"] == "antenna x")

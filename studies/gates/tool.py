@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -102,12 +101,3 @@ def estimates(run: Path) -> pl.DataFrame:
 def reports(run: Path) -> dict[str, dict[str, Any]]:
     """Return the report.json of every log of a run by name."""
     return {f.parent.name: read_json(f) for f in sorted(run.glob("logs/*/report.json"))}
-
-
-def commands_and_options(tool: Tool) -> dict[str, set[str]]:
-    """Return the options of each command, as ``--help`` lists them."""
-    listed = re.findall(r"^  ([a-z]+)(?: suite| conditions)?  +[A-Z]", tool.pdhef("--help").stdout, re.MULTILINE)
-    return {
-        name: set(re.findall(r"^  .*?(--[a-z-]+)", tool.pdhef(name, "--help").stdout, re.MULTILINE))
-        for name in dict.fromkeys(listed)
-    }

@@ -50,12 +50,12 @@ def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> Results:
     """Run the whole experiment."""
     experiment = paper.run_experiment(tool, scenarios=SCENARIOS, noise_seeds=noise_seeds)
     pair = paper.SCENARIO_PAIR
-    drives = {s.name: paper.read_log(experiment.logs[s.name], paper.on_the_road(car, s.friction)) for s in pair}
+    drives = {s.name: paper.read_log(experiment.logs[s.name], paper.on_the_road(car, s.driven.friction)) for s in pair}
     fits = {name: residual_fit(whole, car) for name, whole in drives.items()}
     curves = {s.name: trust_curve(experiment, s.name, PAPER) for s in pair}
     inflations = {name: inflation(experiment, name, paper.BURST_S) for name in ADAPTIVE}
     names = [n for n in SCHEMES if not n.endswith(ESP)]
-    times = step_times(drives[paper.B.name], paper.on_the_road(car, paper.B.friction), names)
+    times = step_times(drives[paper.B.name], paper.on_the_road(car, paper.B.driven.friction), names)
     return Results(experiment, car, fits, curves, inflations, times)
 
 
@@ -98,7 +98,7 @@ def document(r: Results) -> dict[str, Any]:
     plain: dict[str, Any] = _plain(
         {
             "made_by": "python -m studies.paper",
-            "scenarios": [{**asdict(s), "speed_km_h": s.speed_km_h, "friction": s.friction} for s in SCENARIOS],
+            "scenarios": [asdict(s) | {n: getattr(s.driven, n) for n in ("speed_km_h", "friction")} for s in SCENARIOS],
             "vehicle": {"name": r.car.vehicle.name, "sha256": r.car.physics_sha256},
             "networks": [n.sha256 for n in (network, network and network.paper_network) if n is not None],
             "losses": r.losses,
