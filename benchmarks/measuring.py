@@ -44,13 +44,6 @@ class Row:
     peers: Mapping[str, float] = field(default_factory=dict)
     command: str = ""
 
-    @property
-    def passed(self) -> bool | None:
-        """Whether the target is met; None without one."""
-        if self.target is None:
-            return None
-        return self.value <= self.target if self.sense == "at most" else self.value >= self.target
-
 
 def best_seconds(ways: Mapping[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:
     """Return the processor seconds of each way: the best of ``rounds``, in turns, so that all see the same machine."""

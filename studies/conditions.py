@@ -40,9 +40,6 @@ DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
 #: Okabe and Ito (2008), without yellow.
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
 RESAMPLES = 2000
-README_ROWS = (
-    "extrapolation", "other-vehicle", "friction-minus-20", "bank-and-grade", INDEPENDENT_ROW, "paper-a", "paper-b",
-)  # fmt: skip
 KEPT_METRICS = ("rmse", "availability", "coverage95", "lag_s", "nees", "nis", "nis_dof")
 
 
@@ -149,7 +146,7 @@ def write_page(out: Path, folder: Path) -> None:
 
     covered = metrics.filter(metric="coverage95", estimator=SUBJECT).group_by("row")
     coverage = covered.agg((pl.col("value") * pl.col("n")).sum() / pl.col("n").sum())
-    about = {"facts": facts, "rows": rows, "drawn": drawn, "ratios": ratios, "readme_rows": README_ROWS}
+    about = {"facts": facts, "rows": rows, "drawn": drawn, "ratios": ratios, "independent": INDEPENDENT_ROW}
     about |= {"drives": dict(errors["row"].value_counts().iter_rows()), "coverage": dict(coverage.iter_rows())}
     verdicts = {o: [verdict(low, high) for low, _, high in bounds] for o, bounds in ratios.items()}
     made = blocks(__file__, subject=SUBJECT, margin=MARGIN, verdicts=verdicts, **about)

@@ -77,10 +77,8 @@ def extract(t: Namespace) -> None:
     for drives, residuals, model in (*sets, (t.work / PAPER_DRIVES, t.work / PAPER_RESIDUALS, NOMINAL_MODEL)):
         given = ("--car", t.output, "--mapping", fit_physics.MAPPING, "--filter", model, "--jobs", t.jobs, "--resume")
         words = ("pdhef_logtool", "extract", drives, *given, "-o", residuals)
-        if subprocess.run([sys.executable, "-m", *map(str, words)], check=False).returncode not in (
-            EXIT_OK,
-            EXIT_PARTIAL,
-        ):
+        ended = subprocess.run([sys.executable, "-m", *map(str, words)], check=False)
+        if ended.returncode not in (EXIT_OK, EXIT_PARTIAL):
             raise SystemExit(f"failed: {words}")
 
 

@@ -1,6 +1,6 @@
 """Everything that the page and the pictures need, gathered once, and as one JSON document."""
 
-import math
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
@@ -59,15 +59,12 @@ def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> Results:
     return Results(experiment, car, fits, curves, inflations, times)
 
 
-def _plain(value: Any) -> Any:
-    """Return JSON-able values: floats to six digits, null for non-finite ones."""
-    if isinstance(value, float):
-        return float(f"{value:.6g}") if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    return value
+def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document with floats of six digits, null for non-finite ones."""
+    plain: dict[str, Any] = json.loads(
+        json.dumps(document), parse_float=lambda text: float(f"{float(text):.6g}"), parse_constant=lambda _: None
+    )
+    return plain
 
 
 def document(r: Results) -> dict[str, Any]:
@@ -95,7 +92,7 @@ def document(r: Results) -> dict[str, Any]:
         scenario: {PAPER: {"centre_g": c.centre_g.tolist(), "median": c.median.tolist(), "mean": float(c.trust.mean())}}
         for scenario, c in r.curves.items()
     }
-    plain: dict[str, Any] = _plain(
+    return _plain(
         {
             "made_by": "python -m studies.paper",
             "scenarios": [asdict(s) | {n: getattr(s.driven, n) for n in ("speed_km_h", "friction")} for s in SCENARIOS],
@@ -113,4 +110,3 @@ def document(r: Results) -> dict[str, Any]:
             "step_time_us": r.times,
         }
     )
-    return plain
