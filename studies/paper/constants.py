@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from studies.defaults.paper_drives import plan_drives
-from studies.pages import RESULTS, options, write_json
+from studies.pages import RESULTS, options, read_toml, write_json
 from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, as_logged, on_the_road, paper_network
 from truthsim.drive import Drive, simulate_drive
 
@@ -34,17 +35,10 @@ COUNT, NOISE_SEEDS = 12, 5
 SENSOR_SETS = {"wheel speed": True, "esp": False}
 
 
-def _tops(low: float, middle: float, high: float) -> tuple[tuple[float, float, float], ...]:
-    return tuple((f * low, f * middle, f * high) for f in (0.1, 0.25, 0.5, 1.0, 2.0))
-
-
-#: Values of each constant; the paper requires θ in (0, 1] and, as Q is inflated, γ above 0.
+#: Values of each constant.
 GRID: Mapping[str, Sequence[Any]] = {
-    "forgetting": (0.9, 0.95, 0.99, 0.999, 1.0),
-    "process_noise_gain": (0.1, 0.3, 1.0, 3.0, 10.0),
-    "deviation_tops_m_s2": _tops(0.3, 1.0, 2.5),
-    "intensity_tops": _tops(0.3, 0.6, 0.85),
-    "ay_variance": (0.1, 0.3, 1.0, 3.0),
+    name: [tuple(value) if isinstance(value, list) else value for value in values]
+    for name, values in read_toml(Path(__file__).with_suffix(".toml")).items()
 }
 #: First point of the search.
 START = Constants(0.95, 3.0, (0.3, 1.0, 2.5), (0.3, 0.6, 0.85), 0.1)

@@ -61,8 +61,8 @@ def _texts() -> Iterator[Message]:
         yield Message(stamp, stamp, "/note", data, "cdr", ("std_msgs/msg/String", "ros2msg", b"string data\n"))
 
 
-def _mcap(container: str, path: Path, **options: Any) -> None:
-    """Write a log with a metadata record and an attachment; ``options`` of ``mcap.writer.Writer``."""
+def _mcap(path: Path, container: str, compression: str = "ZSTD", index: str = "ALL", use_chunking: bool = True) -> None:
+    """Write a log with a metadata record and an attachment."""
 
     def notes(writer: Writer) -> None:
         writer.add_metadata("drive", {"driver": "nobody", "tyres": "summer"})
@@ -74,10 +74,12 @@ def _mcap(container: str, path: Path, **options: Any) -> None:
         topics, texts = (Topic("/vehicle/state", "car.State", _FEW_NS, _FEW_NS, state),), []
     with tempfile.TemporaryDirectory() as folder:
         written = sorted([*messages(write(topics, Path(folder) / "log", container)), *texts], key=lambda m: m[0])
-    write_log(path, written, "ros2" if texts else "", notes, chunk_size=_CHUNK_BYTES, **options)
+    options = {"compression": CompressionType[compression], "index_types": IndexType[index]}
+    profile = "ros2" if texts else ""
+    write_log(path, written, profile, notes, chunk_size=_CHUNK_BYTES, use_chunking=use_chunking, **options)
 
 
-def _bag(compression: str, path: Path) -> None:
+def _bag(path: Path, compression: str = "") -> None:
     from rosbags.rosbag1 import Writer
 
     writer = Writer(path)
@@ -93,19 +95,12 @@ def _database(path: Path) -> None:
         shutil.copyfile(database, path)
 
 
+#: Options of each seed, and suffix and layouts of each format, documented in their file.
+_TABLES = read_toml(Path(__file__).with_suffix(".toml"))
+_WRITERS: dict[str, Callable[..., None]] = {".mcap": _mcap, ".bag": _bag, ".db3": _database}
 #: Writer of each seed, by file name.
 SEEDS: dict[str, Callable[[Path], None]] = {
-    "zstd.mcap": partial(_mcap, "mcap"),
-    "lz4.mcap": partial(_mcap, "mcap", compression=CompressionType.LZ4),
-    "plain.mcap": partial(_mcap, "mcap", compression=CompressionType.NONE),
-    "unchunked.mcap": partial(_mcap, "mcap", compression=CompressionType.NONE, use_chunking=False),
-    "noindex.mcap": partial(_mcap, "mcap", index_types=IndexType.NONE),
-    "json.mcap": partial(_mcap, "mcap-json"),
-    "protobuf.mcap": partial(_mcap, "mcap-protobuf"),
-    "plain.bag": partial(_bag, ""),
-    "bz2.bag": partial(_bag, "BZ2"),
-    "lz4.bag": partial(_bag, "LZ4"),
-    "rosbag2.db3": _database,
+    name: partial(_WRITERS[Path(name).suffix], **entry) for name, entry in _TABLES["seeds"].items()
 }
 
 
@@ -121,7 +116,7 @@ def write_seeds(folder: Path) -> dict[str, bytes]:
 RECORDINGS = ("mcap", "bag", "db3")
 #: Suffix and layouts of each format; those of the recordings are seeds.
 FORMATS: dict[str, tuple[str, list[str]]] = {
-    **{name: (suffix, layouts) for name, (suffix, *layouts) in read_toml(Path(__file__).with_suffix(".toml")).items()},
+    **{name: (suffix, layouts) for name, (suffix, *layouts) in _TABLES["formats"].items()},
     **{suffix: (suffix, [name for name in SEEDS if name.endswith(suffix)]) for suffix in RECORDINGS},
 }
 
