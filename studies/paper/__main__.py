@@ -7,7 +7,6 @@ The constants that the paper leaves open come from ``python -m studies.paper.con
 
 import re
 import shutil
-from pathlib import Path
 
 from pdhef_logtool.car.car import Car
 from studies.gates.tool import Tool
@@ -21,25 +20,19 @@ from studies.paper.results import document, gather
 STORED = ("results.json", "constants.json")
 
 
-def render(results: Path, docs: Path) -> None:
-    """Write the page from the stored results and figures of a folder."""
-    stored, constants = (read_json(results / name) for name in STORED)
-    page = write_page(stored, constants)
-    (docs / "paper").mkdir(parents=True, exist_ok=True)
-    for name in re.findall(r"\(paper/(\w+\.png)\)", page):
-        shutil.copyfile(results / name, docs / "paper" / name)
-    write(docs / "paper.md", page)
-
-
 def main() -> None:
-    """Run the command line."""
+    """Run the experiment and write the page from the stored results and figures."""
     given = options("paper", __doc__, OF_PAGES, noise_seeds=NOISE_SEEDS).parse_args()
     if not given.stored:
         seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + given.noise_seeds)
         results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)
         draw(results, given.results)
         write_json(given.results / STORED[0], document(results))
-    render(given.results, given.out)
+    page = write_page(*(read_json(given.results / name) for name in STORED))
+    (given.out / "paper").mkdir(parents=True, exist_ok=True)
+    for name in re.findall(r"\(paper/(\w+\.png)\)", page):
+        shutil.copyfile(given.results / name, given.out / "paper" / name)
+    write(given.out / "paper.md", page)
 
 
 if __name__ == "__main__":
