@@ -120,8 +120,7 @@ def usable_stamps(signals: Signals, truth: StateTrack, vehicle: VehicleParameter
     is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s)
     moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
     tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
-    use: BoolArray = is_complete & moving & tame & np.isfinite(signals.steer_rad)
-    return use
+    return np.asarray(is_complete & moving & tame & np.isfinite(signals.steer_rad))
 
 
 def period_s(drive: FitDrive) -> float:

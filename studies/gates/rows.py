@@ -162,8 +162,7 @@ def mistakes(log: str, kinds: Sequence[tuple[str, str]], tool: Tool) -> Figures:
     path, folder = SAMPLES / log, tool.work / "mappings"
 
     def look(log: Path, mapping: Path) -> list[dict[str, Any]]:
-        checks: list[dict[str, Any]] = tool.json("inspect", log, "--mapping", mapping)["checks"]
-        return checks
+        return list(tool.json("inspect", log, "--mapping", mapping)["checks"])
 
     found = outcomes(look, path, tool.mapping(path), folder / f"mistakes-{len(kinds)}", kinds)
     counts = Counter(outcome.verdict for outcome in found)
@@ -174,8 +173,7 @@ def written(file: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any
     """Return a JSON document that a module has written; raises RuntimeError if it has not."""
     if not file.is_file():
         raise RuntimeError(done.stderr[-2000:])
-    document: dict[str, Any] = read_json(file)
-    return document
+    return dict(read_json(file))
 
 
 # ------------------------------------------------------------------------------------------------ third-party logs

@@ -48,8 +48,7 @@ class Tool:
         done = self.pdhef(*arguments, "--json")
         if done.returncode not in (0, 3, 4):
             raise RuntimeError(f"pdhef {' '.join(map(str, arguments))}: exit {done.returncode}\n{done.stderr[-2000:]}")
-        document: dict[str, Any] = json.loads(done.stdout)
-        return document
+        return dict(json.loads(done.stdout))
 
     def run(self, name: str, *arguments: str | Path) -> Path:
         """Run estimators on logs without pages; return the output folder."""

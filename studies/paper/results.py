@@ -61,10 +61,8 @@ def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> Results:
 
 def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
     """Return a document with floats of six digits, null for non-finite ones."""
-    plain: dict[str, Any] = json.loads(
-        json.dumps(document), parse_float=lambda text: float(f"{float(text):.6g}"), parse_constant=lambda _: None
-    )
-    return plain
+    text = json.dumps(document)
+    return dict(json.loads(text, parse_float=lambda x: float(f"{float(x):.6g}"), parse_constant=lambda _: None))
 
 
 def document(r: Results) -> dict[str, Any]:

@@ -117,7 +117,6 @@ def main() -> int:
     parser.add_argument("--format", action="append", choices=FORMATS, help="a table or CAN format; may be given again")
     parser.add_argument("parts", nargs="*", help="parts; all without one")
     given = parser.parse_args()
-    parts: list[str] = given.parts
     work: Path = given.work
     work.mkdir(parents=True, exist_ok=True)
     lengths = product((1.0, given.hours), (("inspect",), _THREE))
@@ -130,13 +129,13 @@ def main() -> int:
         "crashes": lambda: one_by_one("crashes", work, crash_cases(work, given.drives, given.kills, given.seed)),
         "hours": lambda: one_by_one("hours", work, hours),
     }
-    if unknown := set(parts) - set(todo):
+    if unknown := set(given.parts) - set(todo):
         parser.error(f"expected parts out of {', '.join(todo)}, got {', '.join(sorted(unknown))}")
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
         again = name == "formats" and given.format
-        if (again or not kept.is_file()) and (not parts or name in parts):
+        if (again or not kept.is_file()) and (not given.parts or name in given.parts):
             write_json(kept, (read_json(kept) if again and kept.is_file() else {}) | do() if again else do())
         if kept.is_file():
             results[name] = read_json(kept)

@@ -287,8 +287,7 @@ def damage_database(content: bytes, rng: random.Random) -> bytes:
             except sqlite3.Error:
                 continue
         database.commit()
-        stored: bytes = database.serialize()
-        return stored
+        return bytes(database.serialize())
 
 
 # ------------------------------------------------------------------------------------------------ tables
