@@ -1,4 +1,8 @@
-"""Shared by the pages: paths of the repository, numbers, templates and filled blocks, options of the commands."""
+"""Shared by the pages: paths of the repository, numbers, templates and filled blocks, options of the commands.
+
+The sentences and tables of a page are in the Markdown template beside its module: a whole page, or the blocks of a page
+of the documentation (:func:`blocks`).
+"""
 
 import argparse
 import json
@@ -33,11 +37,10 @@ def number(value: float, digits: int = 3) -> str:
 def fill(page: str, blocks: Mapping[str, str], where: str) -> str:
     """Put blocks between their comments ``<!-- begin NAME -->`` and ``<!-- end NAME -->``; no place is an error."""
     for name, text in blocks.items():
-        pattern = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-        places = list(pattern.finditer(page))
+        before, *places = re.split(rf"(?s)(?<=<!-- begin {name} -->\n).*?(?=<!-- end {name} -->)", page)
         if len(places) != 1:
             raise SystemExit(f"{where}: expected one place for {name}")
-        page = f"{page[: places[0].end(1)]}{text}\n{page[places[0].start(2) :]}"
+        page = f"{before}{text}\n{places[0]}"
     return page
 
 
